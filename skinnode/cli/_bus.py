@@ -1,4 +1,4 @@
-"""Finds a command's bus and node from its options, which name an interface or a bus in a hand file."""
+"""Finds a command's bus and node from options that name an interface, or a bus in a hand file."""
 
 from __future__ import annotations
 
@@ -107,7 +107,7 @@ def _of_one_bus(plan: HandConfig, bus: str | None) -> HandConfig:
 
 
 def _load(hand: Path, bitrate: int | None, fd: bool) -> HandConfig:
-    """Load a hand file, which cannot be combined with ``--bitrate`` or ``--fd``."""
+    """Load a hand file, after checking that neither ``--bitrate`` nor ``--fd`` is given."""
     from skinnode.config import load_hand
     from skinnode.errors import ConfigError, Shown
 
@@ -126,7 +126,7 @@ def find_node(
     hand: Path | None,
     bus: str | None,
 ) -> tuple[Place, int]:
-    """Return the bus and node-ID of NODE, a node-ID or the name of a patch on any bus of the hand.
+    """Return the bus and node-ID for NODE: a node-ID, or the name of a patch on any bus of the hand.
 
     The other arguments are as for :func:`find_buses`.
 

@@ -14,8 +14,8 @@ def contact_tables(field: FieldFrame | None) -> list[dict[str, Any]] | None:
     """Return the contacts of a field, strongest first, with the standard deviation of each value.
 
     Returns:
-        Lengths in m, areas in m², forces in N. None if there is no field yet, or if the solver's method is
-        not ``posterior``.
+        The contacts, with lengths in m, areas in m² and forces in N; None if there is no field yet, or if the
+        solver's method is not ``posterior``.
     """
     if field is None or field.method != "posterior":
         return None

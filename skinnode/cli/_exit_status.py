@@ -64,7 +64,7 @@ def main_of(module: str, argv: Sequence[str] | None = None) -> NoReturn:
 
 
 def _handle(handler: Callable[[int, FrameType | None], object] | signal.Handlers) -> None:
-    """Install ``handler`` for the signals if this is the main thread; Python allows it in no other thread."""
+    """Install ``handler`` for the signals if this is the main thread; Python allows this only there."""
     import threading
 
     if threading.current_thread() is threading.main_thread():

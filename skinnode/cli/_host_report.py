@@ -62,9 +62,9 @@ def final_state_text(plan: HandConfig) -> str:
 def faults_and_notes(running: Host) -> tuple[list[str], list[str]]:
     """Return the faults and the notes of the run, one line each.
 
-    A node that skips scans because its own computer is too slow sends EMCY 0x8110. In this case its missing
-    and late frames, and the emergency if it is still active at the end, are reported as notes. Wrong frames
-    remain faults.
+    A node that skips scans because the computer running it is too slow sends EMCY 0x8110. In this case
+    its missing and late frames, and the emergency if it is still active at the end, are reported as notes.
+    Wrong frames remain faults.
     """
     _let_overruns_end(running)
     stats = running.stats()
@@ -117,14 +117,14 @@ def _patch_faults_and_notes(
     explained = [losses.pop(counter) for counter in _EXPLAINED_BY_SLOWNESS if slow and counter in losses]
     if explained:
         notes.append(
-            f"{', '.join(explained)}, while the computer that runs the node was too slow "
+            f"{', '.join(explained)}, because the computer running the node could not keep up "
             f"(EMCY 0x8110{'' if slow_still else ', since cleared'})"
         )
     return [*faults, *losses.values()], notes
 
 
 def reason(health: PatchHealth, before: str = "") -> str:
-    """Return ``before`` and the reason why a patch is faulty or refused; empty if it is neither."""
+    """Return ``before`` and the reason why a patch is faulty or refused, or an empty string."""
     if health.condition == "refused" and health.refusal:
         return f"{before}{health.refusal}"
     if health.condition == "faulty" and health.defect is not None:
@@ -218,7 +218,7 @@ def _percentile(ordered: Sequence[float], share: float) -> float | None:
 
 
 class Report(Protocol):
-    """Report format of the host, for a person or for a program."""
+    """Format of the host's reports, for a person or for a program."""
 
     def note(self, text: str) -> None:
         """Report an event or a fault."""

@@ -78,7 +78,9 @@ Bus = Annotated[
 ]
 Node = Annotated[
     str,
-    typer.Argument(help="Node-ID, or the name of a patch of --hand.", metavar="NODE", autocompletion=nodes),
+    typer.Argument(
+        help="Node-ID, or the name of a patch in the --hand file.", metavar="NODE", autocompletion=nodes
+    ),
 ]
 Json = Annotated[bool, typer.Option("--json", help="Print JSON instead of text.")]
 JsonLines = Annotated[bool, typer.Option("--json", help="Print one JSON object per line instead of text.")]

@@ -33,7 +33,7 @@ def demo(
         typer.Option(help="Write a plot of truth, field and error to this file.", metavar="FILE.png"),
     ] = None,
 ) -> None:
-    """Press simulated patches and decode them from real CANopen traffic.
+    """Press simulated patches and decode their scans from real CANopen traffic.
 
     Each patch is a CANopen node on an embedded virtual bus. A spherical indenter presses and slides; the host
     collects the PDOs and solves the scans. Exit status 1 if a scan was torn, a frame was lost, or errors

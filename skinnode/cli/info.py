@@ -155,5 +155,5 @@ def _baseline(patch: PatchInfo) -> str:
     if patch.baseline_ohm is None:
         return "none: skinnode tare"
     least, median, greatest = patch.baseline_ohm
-    missing = f"; {patch.baseline_missing} crossings have none" if patch.baseline_missing else ""
+    missing = f"; {patch.baseline_missing} crossings without R0" if patch.baseline_missing else ""
     return f"{least:.4g} to {greatest:.4g} ohm, median {median:.4g}{missing}"

@@ -49,7 +49,9 @@ def monitor(
     ] = ".",
     seconds: Annotated[
         float | None,
-        typer.Option(min=0.0, help="End after this many seconds; default: when q is pressed.", metavar="S"),
+        typer.Option(
+            min=0.0, help="End after this many seconds; default: run until q is pressed.", metavar="S"
+        ),
     ] = None,
     as_json: Annotated[
         bool, typer.Option("--json", help="Print one JSON object per second instead of showing a screen.")

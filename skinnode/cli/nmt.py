@@ -25,7 +25,9 @@ def nmt(
     node: Annotated[
         str,
         typer.Argument(
-            help="Node-ID, patch of --hand, or all.", metavar="NODE|all", autocompletion=_nodes_or_all
+            help="Node-ID, patch in the --hand file, or all.",
+            metavar="NODE|all",
+            autocompletion=_nodes_or_all,
         ),
     ],
     command: Annotated[

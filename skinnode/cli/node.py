@@ -63,12 +63,12 @@ def node(
     seconds: Seconds = None,
     as_json: JsonLines = False,
 ) -> None:
-    """Run one patch as a CANopen node; its resistances come from your source.
+    """Run one patch as a CANopen node; the resistances come from your source.
 
-    A source is a class or function that takes the layout and returns an object whose read(t_ns) returns (U,
-    K) ohms. `--source simulated` needs no hardware. The command reports every second until Ctrl-C. Exit
-    status 1 if the source failed, scans were skipped, frames were not sent, another node used its node-ID or
-    the --store file could not be used; 2 if the node could not run.
+    A source is a class or function that takes the layout and returns an object whose read(t_ns) returns
+    the (U, K) resistances in ohms. `--source simulated` needs no hardware. The command reports every second
+    until Ctrl-C. Exit status 1 if the source failed, scans were skipped, frames were not sent, another node
+    used its node-ID or the --store file could not be used; 2 if the node could not run.
     """
     from skinnode.canopen.lss import NOT_CONFIGURED
     from skinnode.cli._layout_option import find_layout, import_from_here

@@ -34,7 +34,9 @@ def od(
     bus: Bus = None,
     write: Annotated[
         str | None,
-        typer.Option(help="Write this value, with the type in the EDS, and read it back.", metavar="VALUE"),
+        typer.Option(
+            help="Write this value as the type given in the EDS, and read it back.", metavar="VALUE"
+        ),
     ] = None,
     as_hex: Annotated[
         bool, typer.Option("--hex", help="Print and accept values as raw bytes in hexadecimal.")
@@ -89,7 +91,9 @@ def od(
     else:
         _print(readings, as_hex, single=where is not None)
         if where is None and not sheet.eds.entries and not sheet.note:
-            typer.echo(f"note: node {node_id} is not a skinnode patch; --eds FILE names all its objects")
+            typer.echo(
+                f"note: node {node_id} is not a skinnode patch; to name all its objects, add --eds FILE"
+            )
 
 
 def _require_combination(

@@ -123,7 +123,7 @@ def _follow(
     as_json: bool,
     check: Callable[[], object] = lambda: None,
 ) -> None:
-    """Print a line every second until stopped or until time is up; ``check`` may raise to end it early."""
+    """Print a line every second until stopped or until time is up; ``check`` may raise to stop early."""
     start_s = time.monotonic()
     end_s = float("inf") if seconds is None else start_s + seconds
     due_s = start_s + 1.0

@@ -19,7 +19,7 @@ def tare(
     patches: Annotated[
         list[str] | None,
         typer.Argument(
-            help="Names of patches of --hand, or node-IDs; default: all patches of --hand.",
+            help="Names of patches in the --hand file, or node-IDs; default: all its patches.",
             metavar="[PATCH]...",
             autocompletion=nodes,
             show_default=False,

@@ -1,6 +1,6 @@
 """Reads the electronic data sheet (CiA 306) of a device under test.
 
-The reader uses :mod:`configparser` only, so that its result depends neither on the EDS writer of this project
+The reader uses only :mod:`configparser`, so that its result depends neither on the EDS writer of this project
 nor on the canopen library. Contradictions within the file are kept for case EDS-01 (:func:`parse_eds`); a
 file that cannot be read raises ProfileError.
 """
@@ -63,7 +63,7 @@ class EdsEntry:
 
     @property
     def size(self) -> int:
-        """Size of the value, bytes; 0 if its length is variable."""
+        """Size of the value in bytes; 0 if its length is variable."""
         return SIZES.get(self.data_type, 0)
 
     @property
@@ -311,7 +311,7 @@ def _add(
 
 
 def _listed(sections: Mapping[str, Mapping[str, str]], described: set[int]) -> Iterator[str]:
-    """Yield a line per object that is only listed or only described, and a line per wrong count of a list."""
+    """Yield a line for each object that is only listed or only described, and for each wrong count."""
     listed: set[int] = set()
     for name in ("mandatoryobjects", "optionalobjects", "manufacturerobjects"):
         options = sections.get(name, {})

@@ -28,7 +28,7 @@ _PAUSE_S: Final = 0.02
 
 @dataclass(frozen=True, slots=True)
 class Pdo:
-    """PDO, identified by its communication parameter (0x1400 or 0x1800 and above)."""
+    """PDO, identified by the index of its communication parameter (0x1400, 0x1800 or above)."""
 
     parameter: int
 

@@ -85,15 +85,15 @@ def _own_eds(sdo: SdoClient) -> Eds:
             "--eds", "nothing", f"the device's EDS, because its identity is unknown: {failure}"
         ) from None
     raise ConfigError(
-        "--eds", "nothing", f"the device's EDS, because product code 0x{product:08X} is not a patch's"
+        "--eds", "nothing", f"the device's EDS, because product code 0x{product:08X} is not that of a patch"
     )
 
 
 def run_cases(dut: Dut, cases: Iterable[Case], say: Callable[[Result], None] = lambda _: None) -> Report:
     """Run ``cases`` one after another.
 
-    Every case yields a result, however the node behaves. At the end the node is reset and has its original
-    configuration.
+    Every case yields a result, however the node behaves. At the end the node is reset and has its
+    original configuration back.
 
     Args:
         dut: The device.

@@ -15,7 +15,7 @@ from skinnode.text.words import counted
 from skinnode.transport import Frame
 
 GENERAL_ERROR: Final = 0x0800_0000
-"""General-error abort code, which a device may send instead of a more specific code."""
+"""Abort code for a general error, which a device may send instead of a more specific code."""
 
 MEANINGS: Final = {
     0x0503_0000: "toggle bit not alternated",
@@ -126,7 +126,7 @@ class SdoClient:
     def aborts(self, request: bytes, index: int, subindex: int, codes: Collection[int], what: str) -> int:
         """Send a request that the device must abort; return the abort code.
 
-        The abort must name the object and carry one of ``codes`` or the general error.
+        The abort must name the object and have one of ``codes`` or the general-error code.
         """
         return self.check_abort(self.ask(request, what), index, subindex, codes, what)
 
@@ -134,7 +134,7 @@ class SdoClient:
     def check_abort(answer: bytes, index: int, subindex: int, codes: Collection[int], what: str) -> int:
         """Return the abort code of ``answer``.
 
-        Raises Failed unless it is an abort of that object with one of ``codes`` or the general error.
+        Raises Failed unless it names the object and has one of ``codes`` or the general-error code.
         """
         allowed = " or ".join(f"0x{code:08X}" for code in sorted({*codes, GENERAL_ERROR}))
         expected = f"{what} aborted with {allowed}"

@@ -142,7 +142,7 @@ class BusConnection:
         return newest[1].hex(" ") or "no data"
 
     def heartbeat_s(self, node_id: int) -> float | None:
-        """Return the heartbeat period (0x1017), s; 0 if off, None if the node does not answer."""
+        """Return the heartbeat period (0x1017) in s; 0 if off, None if the node does not answer."""
         try:
             return float(self.od(node_id).read(od.HEARTBEAT_PRODUCER, 0, "u16")) * 1e-3
         except NodeError:

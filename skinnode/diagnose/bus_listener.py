@@ -56,7 +56,7 @@ class BusListener:
         self.cob_ids: Counter[int] = Counter()
         """Number of data frames by 11-bit COB-ID."""
         self.nmt: Counter[bytes] = Counter()
-        """Count of NMT commands by their two bytes, command specifier and node-ID; ``b""`` for commands of
+        """Number of NMT commands by their two bytes, command specifier and node-ID; ``b""`` for commands of
     another length."""
         self.extended = self.remote = self.errors = 0
         """Counts of frames with 29-bit identifiers, remote frames and error frames."""
@@ -71,7 +71,7 @@ class BusListener:
         return self._nodes.get(node_id) or NodeTraffic()
 
     def newest_beat(self, node_id: int, since_ns: int = 0) -> Beat | None:
-        """Return the newest heartbeat or guarding response received after ``since_ns``; None without one."""
+        """Return the newest heartbeat or guarding response received after ``since_ns``, or None."""
         beats = self.node(node_id).beats
         newest = beats[-1] if beats else None
         return newest if newest is not None and newest.t_ns > since_ns else None

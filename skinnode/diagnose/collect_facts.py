@@ -232,7 +232,7 @@ def _listen(  # noqa: PLR0913 - one call, the state of one examination
 
 
 def _scan_s(patch: PatchFacts, profiles: dict[int, PatchProfile]) -> float:
-    """Return the minimum SYNC period, s, for a node that no host has configured; 0 for any other node.
+    """Return the minimum SYNC period in s for a node that no host has configured; 0 for any other node.
 
     With its default inhibit time, a node needs at least this period to finish each scan before the next SYNC.
     Bring-up sets an inhibit time that fits the hand's period.

@@ -42,12 +42,12 @@ class PatchInfo:
     baseline_missing: int
     """Number of crossings without R0."""
     baseline_ohm: tuple[float, float, float] | None
-    """Minimum, median and maximum R0, ohm; None without a baseline."""
+    """Minimum, median and maximum R0 in ohm; None without a baseline."""
     send_changed_only: bool
     send_threshold_codes: int
     send_refresh_scans: int
     period_ms: int
-    """Period of the node's own scan timer, ms; 0 for one scan per SYNC."""
+    """Period of the node's own scan timer in ms; 0 for one scan per SYNC."""
     averaging: int
     open_upper: tuple[int, ...]
     shorted_upper: tuple[int, ...]
@@ -61,7 +61,7 @@ class PatchInfo:
 
 @dataclass(frozen=True, slots=True)
 class NodeInfo:
-    """Information about a node; fields that the node lacks are None."""
+    """Information about a node; None for whatever the node does not provide."""
 
     node_id: int
     state: str
@@ -273,7 +273,7 @@ def _spread(values: Float) -> tuple[float, float, float]:
 
 
 def read_baseline(remote: RemoteOd, profile: PatchProfile) -> Float:
-    """Return the (U, K) baseline R0, ohm; 0 for a crossing without a baseline. Raises NodeError."""
+    """Return the (U, K) baseline R0 in ohm; 0 for a crossing without a baseline. Raises NodeError."""
     data = remote.read_large(od.BASELINE_DOMAIN)
     if len(data) != 4 * profile.n_codes:
         raise NodeError(

@@ -142,7 +142,7 @@ def _unexplained(moved: Float) -> Float:
 
 
 def _of_wires(moved: Float, noise: Float, known: Mask) -> Float:
-    """Return, for each wire of the first axis, the smaller of noise floor and median noise; 0 if unknown."""
+    """Return the smaller of noise floor and median noise for each wire on the first axis; 0 if unknown."""
     levels = np.zeros(moved.shape[1])
     for wire, there in enumerate(known):
         if there.any():

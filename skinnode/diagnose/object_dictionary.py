@@ -54,7 +54,7 @@ class Reading:
     data_type: str
     access: str
     value: Value | None
-    """The value; None if the bytes represent no simple value, or if the node refused the request."""
+    """The value; None if the bytes do not represent a simple value, or if the node refused the request."""
     data: bytes | None
     """The bytes transferred; None if the node refused the request."""
     refused: str
@@ -205,7 +205,7 @@ def entries_at(eds: Eds, index: int, subindex: int | None, count: Callable[[], i
 
 
 def dump_standard(remote: RemoteOd, progress: Callable[[str], None] = lambda _: None) -> Iterator[Reading]:
-    """Read every object of CiA 301 that the node has; this dump needs no EDS."""
+    """Read every CiA 301 object that the node has, without needing an EDS."""
     progress("objects of CiA 301")
     for index in SINGLE:
         yield from _standard(remote, index)

@@ -134,7 +134,7 @@ RULES: Final = (
     ),
     Rule(
         "its layout differs",
-        ("the code width differs from the hand file", "the EDS of the hand file"),
+        ("the code width differs from the hand file", "the EDS in the hand file"),
         _ANYTHING,
     ),
     Rule("SYNCs are missing", ("whole scans are missing", "SYNC is irregular"), _ANYTHING),

@@ -20,7 +20,7 @@ from skinnode.transport import Frame
 _MOST_SCANS: Final = 1000
 _MOST_SYNCS: Final = 100_000
 _LONGEST_NS: Final = 10_000_000_000
-"""Maximum time, ns, from a SYNC to the first frame of its scan."""
+"""Maximum time from a SYNC to the first frame of its scan, ns."""
 
 
 class ScanCapture:
@@ -32,7 +32,7 @@ class ScanCapture:
 
     def __init__(self) -> None:
         self.syncs: deque[tuple[int, int]] = deque(maxlen=_MOST_SYNCS)
-        """Time, ns, and counter of each SYNC; the counter is 0 if the SYNC has none."""
+        """Time in ns and counter of each SYNC; the counter is 0 if the SYNC has none."""
         self._patches: dict[int, _Patch] = {}
         self._takers: dict[int, tuple[_Patch, bool]] = {}
 

@@ -142,7 +142,7 @@ def _runs(connection: BusConnection, node_id: int) -> bool:
 
 
 def _baseline(connection: BusConnection, remote: RemoteOd, profile: PatchProfile) -> Float:
-    """Read the (U, K) baseline R0, ohm; repeat the upload if another client interrupts it.
+    """Read the (U, K) baseline R0 in ohm; repeat the upload if another client interrupts it.
 
     Raises NodeError if the upload fails or has the wrong size.
     """

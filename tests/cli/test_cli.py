@@ -68,7 +68,10 @@ def skinnode_version() -> str:
         ("doctor x.toml --bitrate 5", "--bitrate: got 5, allowed: only without a hand file"),
         ("doctor x.toml --fd", "--fd: got yes, allowed: only without a hand file"),
         ("scan --hand x.toml --fd", "--fd: got yes, allowed: only without a hand file"),
-        ("info", "skinnode info: NODE: got nothing, allowed: node-ID, or the name of a patch of --hand"),
+        (
+            "info",
+            "skinnode info: NODE: got nothing, allowed: node-ID, or the name of a patch in the --hand file",
+        ),
         (
             "node",
             "skinnode node: --source: got nothing, allowed: source of the resistances: MODULE:NAME, or a",

@@ -169,7 +169,7 @@ def test_another_layout_serial_and_eds(hand_file: HandFile, on: On, tmp_path: Pa
     assert status == 1
     assert found.keys() == {
         "thumb: the serial number differs from the hand file",
-        "thumb: the EDS of the hand file describes another patch",
+        "thumb: the EDS in the hand file describes another patch",
         "thumb: its layout differs from the hand file",
     }
 

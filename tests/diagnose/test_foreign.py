@@ -146,7 +146,7 @@ def test_a_dump_without_an_eds_has_what_the_standard_names(bus: BusConfig, forei
     ):
         assert line in told
     assert "2000:0" not in done.stdout
-    assert "note: node 16 is not a skinnode patch; --eds FILE names all its objects" in done.stdout
+    assert "note: node 16 is not a skinnode patch; to name all its objects, add --eds FILE" in done.stdout
 
 
 def test_a_dcf_takes_an_eds(bus: BusConfig, foreign: object, tmp_path: Path) -> None:

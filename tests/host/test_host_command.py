@@ -383,7 +383,7 @@ def test_an_overrun_that_was_taken_back_is_a_note(monkeypatch: pytest.MonkeyPatc
         assert "the computer that runs the node is too slow" in host.health("thumb").emergency_text
         assert eventually(lambda: faults_and_notes(host)[0] == [])
         notes = faults_and_notes(host)[1]
-        assert any("while the computer that runs the node was too slow" in note for note in notes), notes
+        assert any("because the computer running the node could not keep up" in note for note in notes), notes
         monkeypatch.setattr("skinnode.cli._host_report._OVERRUN_S", 0.0)  # it is not waited for
         monkeypatch.setattr("skinnode.cli._host_report._OVERRUN_SYNCS", 0)
         assert held_up_until(sources[0], faulty_and_a_note)

@@ -12,7 +12,7 @@ _GUARD_MS, _FACTOR = 100, 3
 
 
 def guarded(dut: Dut, state: int, toggle: int | None, what: str) -> None:
-    """Raise Failed unless the node answers a remote frame with this state and toggle bit (None: any bit)."""
+    """Raise Failed unless the node answers a remote frame with this state and toggle bit (None: either)."""
     got = dut.guard(what)
     toggle_text = "any toggle bit" if toggle is None else f"toggle bit {toggle}"
     if got is None:

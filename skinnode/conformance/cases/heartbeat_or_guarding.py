@@ -57,7 +57,7 @@ def both_off(dut: Dut) -> None:
     dut.bus.expect_silence(dut.error_control_id, "frame of error control", 3 * _PERIOD_MS * 1e-3)
 
 
-@case("HBVG-03", "Heartbeat off, guarding on: remote frames are answered, nothing else is sent", _CLAUSE)
+@case("HBVG-03", "Heartbeat off, guarding on: remote frames are answered, and nothing else is sent", _CLAUSE)
 def guarding_on(dut: Dut) -> None:
     _both(dut, 0, 1000)
     for number in range(4):
@@ -84,7 +84,9 @@ def both_on(dut: Dut) -> None:
 
 
 @case(
-    "HBVG-07", "Heartbeat on, guarding on: remote frames are not answered and start no life guarding", _CLAUSE
+    "HBVG-07",
+    "Heartbeat on, guarding on: remote frames are not answered and do not start life guarding",
+    _CLAUSE,
 )
 def both_on_remote(dut: Dut) -> None:
     _both(dut, _PERIOD_MS, 50)

@@ -1,4 +1,4 @@
-"""OD 1 to 9: all EDS objects on the device; 1 to 6 for indices up to 0x1FFF, 7 to 9 for higher indices."""
+"""OD 1 to 9: the objects in the EDS; 1 to 6 cover indices up to 0x1FFF, 7 to 9 higher indices."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def _compare_defaults(dut: Dut, entries: Iterable[EdsEntry]) -> None:
         if value != default:
             text = f"{entry}: {value.hex(' ').upper()}, EDS {default.hex(' ').upper()}"
             (doubts if entry.index in (STORE, RESTORE) and entry.subindex else faults).append(text)
-    _none("the defaults of the EDS", faults)
+    _none("the default values given in the EDS", faults)
     if doubts:
         raise Warned(f"its store or restore capabilities differ from those in the EDS: {'; '.join(doubts)}")
 
@@ -74,7 +74,7 @@ def read_communication(dut: Dut) -> None:
     _read_all(dut, dut.eds.between(*_COMMUNICATION))
 
 
-@case("OD-02", "Objects from 0x1000 to 0x1FFF have the defaults in the EDS", "7.5.1; CiA 306-1")
+@case("OD-02", "Objects from 0x1000 to 0x1FFF have the default values given in the EDS", "7.5.1; CiA 306-1")
 def communication_defaults(dut: Dut) -> None:
     dut.to_defaults()
     _compare_defaults(dut, dut.eds.between(*_COMMUNICATION))
@@ -135,7 +135,7 @@ def limits(dut: Dut) -> None:
                 request = expedited(entry.index, entry.subindex, value)
                 dut.sdo.aborts(request, entry.index, entry.subindex, codes, f"{entry} beyond {limit}")
     if not found:
-        raise NotApplicable("no writable object of the EDS has a limit within the range of its type")
+        raise NotApplicable("no writable object in the EDS has a limit within the range of its type")
 
 
 @case(
@@ -149,12 +149,14 @@ def read_rest(dut: Dut) -> None:
 
 
 @case(
-    "OD-08", "Objects from 0x2000 to 0x9FFF have the defaults in the EDS (ObjFlags bit 1 clear)", "CiA 306-1"
+    "OD-08",
+    "Objects from 0x2000 to 0x9FFF have the default values given in the EDS (ObjFlags bit 1 clear)",
+    "CiA 306-1",
 )
 def rest_defaults(dut: Dut) -> None:
     entries = [e for e in dut.eds.between(*_REST) if e.default and not e.flags & _REFUSE_READ]
     if not entries:
-        raise NotApplicable("no object of the EDS from 0x2000 to 0x9FFF has a default")
+        raise NotApplicable("no object from 0x2000 to 0x9FFF has a default in the EDS")
     dut.to_defaults()
     _compare_defaults(dut, entries)
 

@@ -89,7 +89,7 @@ def store_all_wrong(dut: Dut) -> None:
     _wrong_signature(dut, STORE, 1)
 
 
-@case("OTHER-02", "0x1010:01 stores with the signature 'save': values survive a node reset", "7.5.2.13")
+@case("OTHER-02", "0x1010:01 stores if the signature is 'save': values survive a node reset", "7.5.2.13")
 def store_all(dut: Dut) -> None:
     _store(dut, 1)
 
@@ -99,7 +99,9 @@ def restore_all_wrong(dut: Dut) -> None:
     _wrong_signature(dut, RESTORE, 1)
 
 
-@case("OTHER-04", "0x1011:01 restores with the signature 'load': defaults after a node reset", "7.5.2.14")
+@case(
+    "OTHER-04", "0x1011:01 restores if the signature is 'load': defaults apply after a node reset", "7.5.2.14"
+)
 def restore_all(dut: Dut) -> None:
     _restore(dut, 1)
 
@@ -109,7 +111,11 @@ def store_communication_wrong(dut: Dut) -> None:
     _wrong_signature(dut, STORE, 2)
 
 
-@case("OTHER-06", "0x1010:02 (communication) stores with 'save': values survive a node reset", "7.5.2.13")
+@case(
+    "OTHER-06",
+    "0x1010:02 (communication) stores if the signature is 'save': values survive a node reset",
+    "7.5.2.13",
+)
 def store_communication(dut: Dut) -> None:
     _store(dut, 2)
 
@@ -119,12 +125,16 @@ def restore_communication_wrong(dut: Dut) -> None:
     _wrong_signature(dut, RESTORE, 2)
 
 
-@case("OTHER-08", "0x1011:02 (communication) restores with 'load': defaults after a node reset", "7.5.2.14")
+@case(
+    "OTHER-08",
+    "0x1011:02 (communication) restores if the signature is 'load': defaults apply after a node reset",
+    "7.5.2.14",
+)
 def restore_communication(dut: Dut) -> None:
     _restore(dut, 2)
 
 
-@case("OTHER-09", "0x1020 keeps date and time after storing and reset; a write to another object clears it",
+@case("OTHER-09", "0x1020 keeps date and time through a store and reset; a write to another object clears it",
       "7.5.2.23")  # fmt: skip
 def verify(dut: Dut) -> None:
     dut.need(_VERIFY, 1)

@@ -30,7 +30,7 @@ from skinnode.conformance.tester import ANSWER_S, QUIET_S, Failed
 
 _EVENT_MS = 50
 _FIRST_S = 0.4
-"""Maximum wait for the first TPDO of a cycle after a SYNC; a later SYNC may trigger that TPDO."""
+"""Maximum wait after a SYNC for the first TPDO of a cycle, which a later SYNC may trigger instead."""
 _SYNC_COUNTER = 0x1019
 _RESERVED_KINDS = range(241, 252)
 
@@ -43,12 +43,12 @@ def _scan(dut: Dut, pdos: list[Pdo], base: int) -> None:
         default = dut.need(pdo.parameter, 1).default_bytes(dut.node_id)
         if default is not None and cob_id != int.from_bytes(default, "little"):
             raise Failed(
-                f"{pdo} COB-ID 0x{int.from_bytes(default, 'little'):08X} of the EDS", f"0x{cob_id:08X}"
+                f"{pdo} COB-ID 0x{int.from_bytes(default, 'little'):08X} given in the EDS", f"0x{cob_id:08X}"
             )
         number = pdo.parameter % 0x200
         wanted = base + 0x100 * number + dut.node_id
         if number < 4 and not cob_id & INVALID and cob_id & CAN_ID != wanted:
-            raise Failed(f"{pdo} on 0x{wanted:03X} by the pre-defined connection set", f"0x{cob_id:08X}")
+            raise Failed(f"{pdo} on 0x{wanted:03X} as in the pre-defined connection set", f"0x{cob_id:08X}")
         if not cob_id & INVALID and (other := valid.setdefault(cob_id & CAN_ID, pdo)) != pdo:
             raise Failed("a different CAN-ID for each PDO", f"0x{cob_id & CAN_ID:03X} for {other} and {pdo}")
         kind = dut.sdo.integer(pdo.parameter, 2)
@@ -156,7 +156,7 @@ def event_timer(dut: Dut) -> None:
     each_tpdo(dut, trial)
 
 
-@case("PDO-06", "OPERATIONAL: a TPDO of type 1 is sent after every SYNC, of type 3 only after every third",
+@case("PDO-06", "OPERATIONAL: a TPDO of type 1 is sent after every SYNC, one of type 3 after every third",
       "7.2.2.2, 7.5.2.37")  # fmt: skip
 def cyclic(dut: Dut) -> None:
     def trial(dut: Dut, pdo: Pdo) -> None:

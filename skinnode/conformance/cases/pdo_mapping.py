@@ -40,7 +40,7 @@ def _changeable(dut: Dut, pdos: list[Pdo]) -> list[Pdo]:
         if count is not None and count.writable and cob_id is not None and cob_id.writable:
             found.append(pdo)
     if not found:
-        raise NotApplicable("no PDO of the EDS has a mapping that can be written (0x1600, 0x1A00)")
+        raise NotApplicable("no PDO in the EDS has a mapping that can be written (0x1600, 0x1A00)")
     return found
 
 
@@ -75,7 +75,7 @@ def _slots(dut: Dut, pdo: Pdo) -> int:
     return max(entry.subindex for entry in dut.eds.between(pdo.mapping, pdo.mapping))
 
 
-@case("PDO-21", "Default mappings name mappable objects of the EDS with their lengths, and fit into a frame",
+@case("PDO-21", "Default mappings name mappable objects in the EDS with their lengths, and fit into a frame",
       "7.5.2.36, 7.5.2.38")  # fmt: skip
 def default_mapping(dut: Dut) -> None:
     pdos = [*rpdos(dut), *tpdos(dut)]
@@ -99,12 +99,12 @@ def _check_mapped(dut: Dut, pdo: Pdo, subindex: int, word: int) -> None:
         return
     entry = dut.eds.find(word >> 16, word >> 8 & 0xFF)
     if entry is None or (entry.size and word & 0xFF != 8 * entry.size):  # a string may have any length
-        raise Failed(f"{where} to name an object of the EDS and its length", f"0x{word:08X}")
+        raise Failed(f"{where} to name an object in the EDS and its length", f"0x{word:08X}")
     if not (entry.into_tpdo if pdo.transmits else entry.into_rpdo):
         raise Failed(f"{where} to name an object that may be mapped into {pdo}", str(entry))
 
 
-@case("PDO-22", "A PDO remapped by the standard procedure reads back and is sent with its new length",
+@case("PDO-22", "A PDO remapped by the standard procedure has the new mapping and is sent with the new length",
       "7.5.2.36, 7.5.2.38")  # fmt: skip
 def remap(dut: Dut) -> None:
     for pdo in _changeable(dut, [*rpdos(dut), *tpdos(dut)]):
@@ -173,7 +173,7 @@ def too_many(dut: Dut) -> None:
             dut.sdo.write_integer(pdo.mapping, subindex, entry.mapping, 4)
         request = expedited(pdo.mapping, 0, bytes((slots + 1,)))
         dut.sdo.aborts(
-            request, pdo.mapping, 0, TOO_MUCH, f"{pdo}: {slots + 1} entries, there is room for {slots}"
+            request, pdo.mapping, 0, TOO_MUCH, f"{pdo}: {slots + 1} entries, but only room for {slots}"
         )
         if dut.sdo.integer(pdo.mapping, 0):
             raise Failed(f"{pdo} still without entries", str(dut.sdo.integer(pdo.mapping, 0)))
@@ -280,7 +280,7 @@ def unmappable_transmitted(dut: Dut) -> None:
     _refuses(dut, tpdos(dut), _unmappable, "object that cannot be mapped")
 
 
-@case("PDO-33", "A dummy entry of the EDS can be mapped into an RPDO", "7.5.2.36; CiA 306-1")
+@case("PDO-33", "A dummy entry allowed by the EDS can be mapped into an RPDO", "7.5.2.36; CiA 306-1")
 def dummy(dut: Dut) -> None:
     if not dut.eds.dummies:
         raise NotApplicable("the EDS allows no dummy entry (section DummyUsage)")

@@ -47,7 +47,7 @@ def long_object(dut: Dut) -> tuple[EdsEntry, bytes]:
             value = dut.sdo.read(entry.index, entry.subindex)
             if len(value) > 4:
                 return entry, value
-    raise NotApplicable("no readable object of the EDS is longer than four bytes")
+    raise NotApplicable("no readable object in the EDS is longer than four bytes")
 
 
 def check(dut: Dut, index: int, value: int, size: int) -> None:
@@ -57,7 +57,7 @@ def check(dut: Dut, index: int, value: int, size: int) -> None:
         raise Failed(f"0x{value:0{2 * size}X} read back from 0x{index:04X}:00", f"0x{got:0{2 * size}X}")
 
 
-@case("SDO-01", "0x1000 is read by expedited transfer, four bytes", "7.2.4.3.6")
+@case("SDO-01", "0x1000 is read by an expedited transfer of four bytes", "7.2.4.3.6")
 def read_expedited(dut: Dut) -> None:
     answer = dut.sdo.served(b"\x40" + mux(_DEVICE_TYPE, 0), "read of 0x1000:00")
     if answer[:4] != b"\x43" + mux(_DEVICE_TYPE, 0):
@@ -200,7 +200,11 @@ def too_low(dut: Dut) -> None:
     _unchanged(dut, entry, before)
 
 
-@case("SDO-12", "0x1200 names the default SDO: 0x600 and 0x580 + node-ID", "7.5.2.33; 7.3.3")
+@case(
+    "SDO-12",
+    "0x1200 holds the COB-IDs of the default SDO: node-ID + 0x600 and node-ID + 0x580",
+    "7.5.2.33; 7.3.3",
+)
 def default_sdo(dut: Dut) -> None:
     for subindex, base in ((1, 0x600), (2, 0x580)):
         dut.need(0x1200, subindex)

@@ -20,7 +20,9 @@ def _block(transfer: Callable[[], bytes | None]) -> bytes | None:
         return transfer()
     except Aborted as abort:
         if abort.code in UNKNOWN_COMMAND:
-            raise NotApplicable(f"block transfer is optional, and the device has none: {abort}") from abort
+            raise NotApplicable(
+                f"block transfer is optional, and the device does not support it: {abort}"
+            ) from abort
         raise
 
 
@@ -115,7 +117,7 @@ def wrong_sequence(dut: Dut) -> None:
     dut.sdo.aborts(b"\xa2\x80\x14", 0x1000, 0, codes, "an acknowledgement of segment 128")
 
 
-@case("SDO-28", "0x1201 to 0x127F: objects in the EDS can be read, no other object exists", "7.5.2.33")
+@case("SDO-28", "0x1201 to 0x127F: objects in the EDS can be read, and no others exist", "7.5.2.33")
 def further_servers(dut: Dut) -> None:
     for index in range(0x1201, 0x1280):
         if dut.eds.has(index):

@@ -49,7 +49,7 @@ def boot_up(dut: Dut) -> None:
             # The device may refuse the write, but a new value must not survive the reset.
             changed += dut.sdo.ask(request, f"write to 0x{index:04X}:{subindex:02X}")[0] == 0x60
     if not changed:
-        raise Failed("at least one parameter of 0x1000 to 0x1FFF that can be changed", "none")
+        raise Failed("at least one parameter from 0x1000 to 0x1FFF that can be changed", "none")
     dut.reset()
     _check_state(dut, 127, "after a node reset")
     for (index, subindex), value in before.items():
@@ -72,7 +72,9 @@ def _check_state(dut: Dut, state: int, what: str) -> None:
         guarded(dut, state, None, what)
 
 
-@case("STATE-02", "PRE-OPERATIONAL: SDO, EMCY, SYNC and error control are served, PDOs are not", "7.3.2.2.2")
+@case(
+    "STATE-02", "PRE-OPERATIONAL: SDO, EMCY, SYNC and error control are served, but PDOs are not", "7.3.2.2.2"
+)
 def pre_operational(dut: Dut) -> None:
     _check_state(dut, 127, "after a reset")
     dut.sdo.read(0x1000)

@@ -42,7 +42,7 @@ def check_bus(bus: BusFacts) -> Iterator[Finding]:
             f"the controller is {bus.link_state}",
             Sure.CERTAIN,
             "reported by the kernel (ip -details link show)",
-            "check bit rate, cable and the two terminations of 120 ohm; then take the interface down and up",
+            "check bit rate, cable and the two 120 ohm terminations; then take the interface down and up",
         )
     if bus.link_bitrate_bps not in (None, bus.bitrate_bps):
         yield found(

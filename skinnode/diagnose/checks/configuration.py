@@ -28,7 +28,7 @@ def _check_layout(patch: PatchFacts) -> Iterator[Finding]:
         yield Finding(
             "configuration",
             patch.name,
-            "the EDS of the hand file describes another patch",
+            "the EDS in the hand file describes another patch",
             Sure.CERTAIN,
             patch.eds_problem,
             "create the correct EDS with skinnode eds",

@@ -1,4 +1,4 @@
-"""Runs all checks on the facts of a bus."""
+"""Runs all checks on the facts about a bus."""
 
 from __future__ import annotations
 

@@ -17,7 +17,7 @@ from skinnode.protocol.device_time import TIME_WRAP_US
 from skinnode.text.words import counted
 
 NOISY: Final = 5.0
-"""Minimum ratio of a noisy crossing's noise to the stated noise; 20 scans do not exceed it by chance."""
+"""Minimum ratio of a noisy crossing's noise to the stated noise; not exceeded by chance in 20 scans."""
 
 _DRIFT: Final = 0.003
 """Minimum |R/R0 − 1| at rest that justifies a tare: 100 times the noise of a good converter, or
@@ -163,7 +163,7 @@ def _check_noise(patch: PatchFacts, scans: ScanFacts, analysis: NoiseAnalysis) -
             f"noise at {_crossings(noisy)}",
             Sure.POSSIBLE,
             f"{_places(noisy)}; {figures}",
-            "check the contact at the electrodes, unless the skin is touched lightly",
+            "check the contact at the electrodes, unless the skin is being touched lightly",
         )
 
 

@@ -26,7 +26,7 @@ def list_nodes(
     bus: Bus = None,
     as_json: Json = False,
 ) -> None:
-    """Find nodes without a node-ID on one bus or every bus of --hand, by LSS fastscan. Changes nothing."""
+    """Find nodes without a node-ID by LSS fastscan, on one bus or every bus of the hand. Changes nothing."""
     from skinnode.cli._bus import find_buses
     from skinnode.cli._console import console, print_json, progress, table
     from skinnode.diagnose.bus_connection import BusConnection

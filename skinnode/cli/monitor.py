@@ -188,7 +188,7 @@ def _show(source: Source, stop: threading.Event, seconds: float | None, output: 
     app.run(mouse=False)  # the terminal keeps the mouse, for selecting and copying text
     if app.failure is not None:
         raise app.failure
-    if app.return_code:  # a defect in the screen's code; textual has printed it
+    if app.return_code:  # a defect in the screen's code, which textual has reported
         raise typer.Exit(2)
     if app.terminal_is_deaf:  # output would not be visible
         raise typer.Exit(1 if app.faults.lines else 0)

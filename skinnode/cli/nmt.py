@@ -43,7 +43,7 @@ def nmt(
 ) -> None:
     """Start, stop or reset nodes, and print their states before and after the command.
 
-    `all` means every node on the bus, or on every bus of --hand.
+    `all` means every node on the bus or, with --hand, on every bus of the hand.
 
     Exit status 0 if every node obeyed, 1 if any did not, 2 if the command could not run.
     """

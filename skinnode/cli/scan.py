@@ -26,7 +26,7 @@ def scan(
 
     With --hand the command scans every bus of the hand. The command changes nothing in any node and takes two
     seconds per bus. Exit status 0 if nodes were found and none has a fault; 1 if none was found, two share a
-    node-ID, or a node of --hand is missing or is a different device; 2 if the scan could not run.
+    node-ID, or a node of the hand is missing or is a different device; 2 if the scan could not run.
     """
     from skinnode.cli._bus import find_buses
     from skinnode.cli._console import print_json, progress

@@ -16,8 +16,8 @@ _PDO_PARAMETERS: Final = (*range(0x1400, 0x1600), *range(0x1800, 0x1A00))
 _MAPPINGS: Final = (*range(0x1600, 0x1800), *range(0x1A00, 0x1C00))
 _INVALID: Final = 1 << 31
 _LAST: Final = {_SYNC_COUNTER: 1, _PERIOD: 2, _SYNC: 3, _VERIFY: 4}
-"""Write order: the counter can be written only while the period is 0; the producer starts after both; 0x1020
-comes last, because writing any other object clears it."""
+"""Write order: the overflow value can be written only while the period is 0; the producer starts after both;
+0x1020 comes last, because writing any other object clears it."""
 
 
 def read_configuration(dut: Dut) -> dict[tuple[int, int], bytes]:

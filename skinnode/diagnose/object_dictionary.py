@@ -155,7 +155,11 @@ def encode(entry: EdsEntry, text: str, node_id: int) -> bytes:
             return value.to_bytes(entry.size, "little", signed=entry.data_type in SIGNED)
     except (ValueError, OverflowError, struct.error):
         raise ConfigError("--write", text, f"a value of {entry}: {kind}") from None
-    where = f"{entry} is {kind}" if entry.data_type else f"only the EDS (--eds FILE) defines {entry}'s type"
+    where = (
+        f"{entry} is {kind}"
+        if entry.data_type
+        else f"the type of {entry} is given only in its EDS (--eds FILE)"
+    )
     raise ConfigError("--write", text, f"--hex and bytes in hexadecimal: {where}")
 
 

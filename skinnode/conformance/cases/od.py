@@ -34,7 +34,7 @@ def _read_all(dut: Dut, entries: Iterable[EdsEntry]) -> None:
                 faults.append(f"{entry}: {abort}")
             continue
         if entry.size and len(value) != entry.size:
-            faults.append(f"{entry}: {counted(len(value), 'byte')}, its type needs {entry.size}")
+            faults.append(f"{entry}: {counted(len(value), 'byte')}, but its type needs {entry.size}")
     _none("every object readable, with the length of its type", faults)
 
 

@@ -104,7 +104,7 @@ def _check_mapped(dut: Dut, pdo: Pdo, subindex: int, word: int) -> None:
         raise Failed(f"{where} to name an object that may be mapped into {pdo}", str(entry))
 
 
-@case("PDO-22", "A PDO remapped by the standard procedure has the new mapping and is sent with the new length",
+@case("PDO-22", "After remapping by the standard procedure, a PDO has the new mapping and the new length",
       "7.5.2.36, 7.5.2.38")  # fmt: skip
 def remap(dut: Dut) -> None:
     for pdo in _changeable(dut, [*rpdos(dut), *tpdos(dut)]):

@@ -18,7 +18,7 @@ _BUSY = (0x0800_0022,)
 
 
 def consume_only(dut: Dut) -> None:
-    """Stop the producer and set the period to 0, so that the counter can be written."""
+    """Stop the producer and set the period to 0, so that the counter overflow value can be written."""
     dut.need(COB_ID)
     dut.sdo.write_integer(COB_ID, 0, SYNC_ID, 4)
     if dut.eds.find(PERIOD) is not None:
@@ -38,7 +38,7 @@ def produce(dut: Dut, period_ms: int = PERIOD_MS) -> None:
         raise
 
 
-@case("SYNC-01", "0x1005 is 0x80, a consumer", "7.5.2.5; 7.3.3")
+@case("SYNC-01", "0x1005 is 0x80: the device is a SYNC consumer", "7.5.2.5; 7.3.3")
 def default(dut: Dut) -> None:
     dut.need(COB_ID)
     cob_id = dut.sdo.integer(COB_ID)

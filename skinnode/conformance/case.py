@@ -26,7 +26,7 @@ class Verdict(StrEnum):
 class NotApplicable(Exception):
     """The device does not offer the feature that the case checks.
 
-    The text names the object, EDS entry or response that shows the feature to be absent.
+    The text names the object, EDS entry or response that shows that the feature is absent.
     """
 
 

@@ -24,7 +24,7 @@ from skinnode.errors import BusLoadError, ConfigError, Shown
 from skinnode.protocol.profile import PatchProfile
 
 SCAN_SHARE: Final = 0.8
-"""Fraction of the SYNC period in which a node sends its scan; the rest is for SDO, EMCY and late frames."""
+"""Fraction of the SYNC period for a node's scan; the rest is left for SDO, EMCY and late frames."""
 
 SDO_SHARE: Final = 0.01
 """Fraction of the bus bandwidth reserved for SDO; at 1 Mbit/s, one request and its response every 27 ms."""
@@ -36,7 +36,7 @@ PACE_JITTER_S: Final = 0.2e-3
 """Maximum deviation of a chunk from its scheduled time, s, as specified for a patch on an idle machine."""
 
 _SAMPLES: Final = 512
-"""Number of random-data frames averaged to estimate the typical length to a standard error of 0.1 bits."""
+"""Number of random-data frames averaged to estimate the typical length with a standard error of 0.1 bits."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,13 +52,13 @@ class PlannedFrame:
     count: int
     """Number of frames per period."""
     spacing_s: float
-    """Minimum time between consecutive frames of a period, s."""
+    """Minimum time between consecutive frames in a period, s."""
     jitter_s: float
     """Maximum deviation from this spacing, s."""
     worst_s: float
-    """Time on the bus with the maximum number of stuff bits, s."""
+    """Duration of a frame with the maximum number of stuff bits, s."""
     typical_s: float
-    """Mean time on the bus with random data, s."""
+    """Mean duration of a frame with random data, s."""
     scans: bool = False
     """Whether the period is the SYNC period."""
     response_s: float | None = None
@@ -201,7 +201,7 @@ def plan_of(hand: HandConfig) -> tuple[BusPlan, ...]:
 
 
 def inhibit_time_100us(period_ms: int, frames: int) -> int:
-    """Return the inhibit time (0x1800:3) that spreads frames over SCAN_SHARE of a period, in units of 100 µs.
+    """Return the inhibit time (0x1800:3), in units of 100 µs, to spread frames over SCAN_SHARE of a period.
 
     Args:
         period_ms: SYNC period, ms.
@@ -334,7 +334,7 @@ def _ceil_ns(time_s: float) -> int:
 def _scan_time(
     patch: PatchConfig, profile: PatchProfile, hand: HandConfig, answers: dict[int, float | None]
 ) -> ScanTime:
-    """Return the scan time; its worst case sums SYNC, node latency, pacing, last chunk and summary."""
+    """Return the scan time; its worst case adds up SYNC, node latency, pacing, last chunk and summary."""
     spacing_s = inhibit_time_100us(hand.sync.period_ms, profile.n_chunks + 1) * 1e-4
     paced_s = (profile.n_chunks - 1) * spacing_s
     parts = [

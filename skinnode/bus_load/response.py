@@ -75,8 +75,8 @@ def response_time_ns(message: Message, others: Sequence[Message], bit_ns: int) -
     Args:
         message: the message.
         others: the other messages on the bus.
-        bit_ns: bit time, ns; a frame queued up to one bit time after an arbitration starts still takes part
-        in it.
+        bit_ns: bit time, ns; a frame queued up to one bit time after arbitration starts still takes part in
+            it.
 
     Returns:
         The time, or None if it is unbounded because the message and all higher-priority messages together

@@ -16,7 +16,7 @@ from skinnode.compiled.jit import njit_brief
 HEAD_BITS: Final = 19  # SOF, 11-bit identifier, RTR, IDE, r0, 4-bit DLC
 CRC_BITS: Final = 15
 TAIL_BITS: Final = 13
-"""Total length of CRC delimiter, ACK slot, ACK delimiter, end of frame (7), inter-frame space (3), bits."""
+"""Total length of CRC delimiter, ACK slot and delimiter, end of frame (7) and inter-frame space (3), bits."""
 FD_NOMINAL_BITS: Final = 17 + 12  # SOF, 11-bit identifier, RRS, IDE, FDF, res, BRS; then the tail
 _CRC_POLYNOMIAL: Final = 0x4599
 _RUN: Final = 5
@@ -28,7 +28,7 @@ _Bytes = NDArray[np.uint8]
 
 @functools.cache
 def tables() -> tuple[tuple[int, ...], tuple[int, ...], tuple[int, ...]]:
-    """Return tables: the CRC by byte; the next run and the number of stuff bits by ``run << 8 | byte``.
+    """Return tables of the CRC by byte, and of the next run and the stuff bits by ``run << 8 | byte``.
 
     A run is encoded as 0 before the first bit, otherwise as (value << 2 | length − 1) + 1 with a length of 1
     to 4. After the fifth equal bit, a stuff bit is inserted, which begins a new run.
@@ -128,8 +128,8 @@ def _classic(  # noqa: PLR0913 - arrays of a compiled kernel
         for k in range(begin, begin + length):
             crc = (crc << 8 & 0x7FFF) ^ np.int64(crc_of[crc >> 7 ^ np.int64(payload[k])])
         # Head and CRC have 19 + 15 bits, two more than four bytes, so six filler bits complete five bytes.
-        # Bytes of the stuffed region straddle payload bytes, so each is assembled from two adjacent payload
-        # bytes.
+        # The bytes of the stuffed region straddle payload bytes, so each is assembled from two adjacent
+        # payload bytes.
         stream = (ALTERNATING & 0x3F) << 18 | head >> 1
         stuff: Any = 0
         run: Any = 0

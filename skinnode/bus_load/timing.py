@@ -56,7 +56,7 @@ def nominal_bits(dlc: int, *, extended: bool = False) -> int:
 
 
 def worst_case_bits(dlc: int, *, extended: bool = False) -> int:
-    """Return the maximum number of bits in a frame, with a stuff bit after the first 5 and each further 4.
+    """Return the maximum number of bits in a frame, with a stuff bit after 5 bits and every 4 thereafter.
 
     Davis, Burns, Bril, Lukkien, "Controller Area Network (CAN) schedulability analysis", 2007, eq. 1.
     """
@@ -245,7 +245,7 @@ class BusLoad:
         dlc: int = 0,
         fd: bool = False,
     ) -> None:
-        """Count a frame and its bits, as given by :func:`exact_bits` or, if ``fd``, :func:`fd_bits`.
+        """Count a frame and its bits, as given by :func:`exact_bits` or, for CAN FD, :func:`fd_bits`.
 
         ``data`` is kept until the next batch, without being copied.
         """
@@ -280,7 +280,7 @@ class BusLoad:
         return self._bits + round(self._fast_bits * self._data_bit)
 
     def load(self, time_s: float) -> float:
-        """Return the fraction of a time interval that the counted frames occupy; above 1, they do not fit.
+        """Return the fraction of a time interval that the counted frames occupy; above 1 if they do not fit.
 
         Args:
             time_s: length of the interval, s.

@@ -124,7 +124,7 @@ class BringUpConfig(Table):
     ``wait`` for the missing patch."""
     heartbeat_ms: Annotated[int, Field(ge=20, le=10_000), Allowed("an integer from 20 to 10000")] = 250
     """Heartbeat period of the nodes, milliseconds. The host sets this period in the nodes; a guest that sends
-    nothing merely assumes this period. At 250 ms, a lost node is detected within a second, and the heartbeats
+    nothing merely assumes it. At 250 ms, a lost node is detected within a second, and the heartbeats
     of four nodes take 0.1 % of the bandwidth."""
 
     @property

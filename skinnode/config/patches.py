@@ -67,7 +67,7 @@ class LayoutConfig(Table):
     """Resistance of the rubber per metre between two electrodes."""
     coordinates: Annotated[Coordinates, one_of(Coordinates)] = "preset"
     """``node``: the host reads the positions of the electrodes from the patch (0x2300). Plans and simulations
-    still use the preset or file, so its numbers of wires and electrodes must be correct."""
+    still use the preset or file, whose numbers of wires and electrodes must therefore be correct."""
 
     @field_validator("file")
     @classmethod
@@ -106,8 +106,8 @@ class LayoutConfig(Table):
 def _preset(name: str, **sizes: float | int | None) -> PatchLayout:
     """Return a preset layout from a cache.
 
-    Most patches of a hand have the same layout, which every check of the hand needs. Layouts are immutable
-    and can be shared.
+    Most patches of a hand have the same layout, and every check of the hand needs it. Layouts are
+    immutable and can be shared.
     """
     return PatchLayout.preset(name, **sizes)  # type: ignore[arg-type]
 

@@ -18,8 +18,8 @@ class SolverConfig(Table):
     """Settings for computing displacements from resistances."""
 
     method: Annotated[Method, one_of(Method)] = "auto"
-    """Method: ``exact`` inverse of each wire, ``posterior`` of the patch, or ``auto`` to choose between them
-    according to layout and noise."""
+    """Method: ``exact`` inverse for each wire, ``posterior`` for the patch, or ``auto`` to choose between
+    them according to layout and noise."""
     operator: Annotated[Operator, one_of(Operator)] = "dogleg"
     """Operator of the exact inverse."""
     stiffness_n_per_m: Stiffness | None = None

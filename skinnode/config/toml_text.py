@@ -1,6 +1,6 @@
 """TOML reader that returns the value of each key with its line and column.
 
-tomllib parses the file and checks its syntax, but records no positions. Files that tomllib accepts are
+tomllib parses the file and checks its syntax, but does not record positions. Files that tomllib accepts are
 therefore scanned again for the positions of keys. The scanner is hand-written because no maintained TOML
 reader with positions is as strict as tomllib.
 """

@@ -38,6 +38,6 @@ for every chunk, and 7 % with 2 ms of slack. With the slack, each node sends bur
 
 A kernel with 100 timer ticks per second wakes a thread 10 to 20 ms late, and even later on a busy machine.
 With ``catch_up_ns`` at 10 ms, nodes in a User Mode Linux guest skipped a third of their scans at 10 scans/s
-and kept reporting an overrun (0x8110). At 50 ms, they skipped no scans. The mean pace is unchanged, but a
+and kept reporting an overrun (0x8110). At 50 ms, they did not skip any. The mean pace is unchanged, but a
 thread that was delayed by 50 ms sends 50 ms of chunks in one burst.
 """

@@ -52,7 +52,7 @@ class CanopenDevice:
         application: called once, with the device's services, to create the application.
         send: called with the COB-ID and payload of each frame that the node sends, in order.
         serial: serial number (0x1018:4), u32.
-        memory: keeps values across a power cycle; None to keep nothing, as 0x1010 then indicates.
+        memory: keeps values across a power cycle; None to keep nothing, which 0x1010 then indicates.
         kind: sizes and layout of the patch, which must match those in the memory; see
             :class:`~skinnode.node.memory.Kept`.
         set_bit_rate: changes the bit rate (bit/s) for LSS; None if the node cannot change it.

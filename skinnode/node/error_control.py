@@ -38,7 +38,7 @@ class ErrorControl:
     Args:
         services: the resources that the node's services share.
         listen: called when the result of :meth:`handlers` has changed.
-        failed: called with the time in ns of a heartbeat event or life guarding event.
+        failed: called with the time of a heartbeat event or life guarding event, ns.
     """
 
     def __init__(

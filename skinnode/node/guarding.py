@@ -18,7 +18,7 @@ class Guarding:
     Args:
         store: object dictionary.
         emcy: reports a life guarding event.
-        failed: called, after the EMCY, with the time in ns of a life guarding event.
+        failed: called, after the EMCY, with the time of a life guarding event, ns.
     """
 
     def __init__(self, store: ObjectStore, emcy: EmcyProducer, failed: Callable[[int], None]) -> None:

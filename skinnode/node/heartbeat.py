@@ -71,7 +71,7 @@ class HeartbeatConsumer:
     Args:
         store: object dictionary.
         emcy: reports missed heartbeats and restarts.
-        failed: called, after the EMCY, with the time in ns at which heartbeats were missed.
+        failed: called, after the EMCY, with the time at which a heartbeat was missed, ns.
     """
 
     def __init__(self, store: ObjectStore, emcy: EmcyProducer, failed: Callable[[int], None]) -> None:
@@ -107,7 +107,7 @@ class HeartbeatConsumer:
         self._plan()
 
     def on_heartbeat(self, node_id: int, state: int, t_ns: int) -> None:
-        """Handle a heartbeat or boot-up message of a monitored node.
+        """Handle a heartbeat or boot-up message from a monitored node.
 
         A boot-up message does not start monitoring, because a node that boots need not send heartbeats. A
         boot-up message after a heartbeat shows that the node has restarted.

@@ -30,7 +30,7 @@ class NmtSlave:
         """Current state."""
 
     def command(self, data: bytes, node_id: int) -> NmtCommand | None:
-        """Return the command in a frame on COB-ID 0; None if the frame is malformed or for another node.
+        """Return the command in a frame with COB-ID 0; None if the frame is malformed or for another node.
 
         Args:
             data: the payload.

@@ -19,9 +19,9 @@ class Rejected(IntEnum):
     SYNC = 2
     """SYNC message that is longer or shorter than 0x1019 requires."""
     TIME = 3
-    """TIME message that is not six bytes long, or that holds no valid time of day."""
+    """TIME message that is not six bytes long, or does not hold a valid time of day."""
     HEARTBEAT = 4
-    """Heartbeat from a monitored node that is not one byte long."""
+    """Heartbeat that is not one byte long, from a monitored node."""
     SDO = 5
     """SDO request that is not eight bytes long."""
     RPDO = 6

@@ -24,8 +24,8 @@ _RETRY_S: Final = 0.02
 """Pause after a bus error, s; a full queue drains within this time."""
 
 _CATCH_UP_FRAMES: Final = 4096
-"""Maximum number of frames served before a node is reported as silent; a full bus at 1 Mbit/s carries as many
-in half a second."""
+"""Maximum number of frames served before a node is reported as silent; a full bus at 1 Mbit/s carries
+that many in half a second."""
 
 OFF_AFTER_S: Final = 0.1
 """Duration of uninterrupted bus errors after which nodes treat their controller as bus-off, s; a full queue

@@ -1,4 +1,4 @@
-"""Store parameters (0x1010), restore defaults (0x1011) and verify configuration (0x1020) of CiA 301 v4.2.
+"""Store parameters (0x1010), restore defaults (0x1011) and verify configuration (0x1020), as in CiA 301 v4.2.
 
 The module also saves the baseline and the LSS configuration. A *parameter* is an object that a client can
 write and read back; commands and computed objects are not parameters.
@@ -106,8 +106,8 @@ class Storage:
     def report(self, t_ns: int) -> None:
         """Send emergencies for the faults recorded since the last call.
 
-        A fault of the whole memory stays active in the error register, even across resets, until the memory
-        is reliable again.
+        A fault that affects the whole memory stays active in the error register, even across resets, until
+        the memory is reliable again.
         """
         for fault, detail in self._lasting.items():
             self._emcy.report(EmcyCode.DATA_SET, detail, t_ns, fault)

@@ -120,7 +120,7 @@ class Sync:
         """Handle a change of the NMT state.
 
         SYNC is produced and consumed in PRE-OPERATIONAL and OPERATIONAL. The counter restarts at 1 when the
-        node enters one of these states from a state other than these two.
+        node enters one of these two states from any other state.
         """
         if communicates != self._communicates:
             self._communicates, self._wrong_length, self._period_ns = communicates, None, 0

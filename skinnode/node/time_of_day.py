@@ -1,8 +1,8 @@
 """TIME consumer: the time of day (CiA 301 v4.2, 7.2.6 and object 0x1012).
 
-A device has no real-time clock. Instead, the node keeps the last time received, and the time of its own clock
-at reception. From these two times, object 0x2022 gives the current time of day, and the device time of a scan
-can be converted to a date.
+A device has no real-time clock. Instead, the node keeps the last time received, and the reading of its own
+clock at that moment. From these two times, object 0x2022 gives the current time of day, and the device time
+of a scan can be converted to a date.
 """
 
 from __future__ import annotations

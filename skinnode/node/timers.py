@@ -47,8 +47,8 @@ class Timers:
     def take(self, t_ns: int) -> Iterator[int]:
         """Yield the keys that are due at ``t_ns``, earliest first.
 
-        Each key is removed when it is yielded, so an exception in the caller's loop loses no other key. A key
-        set again to a time that has passed is yielded again.
+        Each key is removed when it is yielded, so an exception in the caller's loop does not lose any other.
+        A key set again to a time that has passed is yielded again.
         """
         while self.deadline_ns <= t_ns:
             _, key = heapq.heappop(self._heap)

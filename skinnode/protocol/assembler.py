@@ -1,4 +1,4 @@
-"""Assembly of one patch's received chunks and summaries into scans, not thread-safe and without a clock.
+"""Assembly of one patch's received chunks and summaries into scans; not thread-safe; uses no clock.
 
 **Scans are never mixed.** A scan holds only frames with its own counter that arrived within the *timeout* of
 its first frame, and it is closed permanently when a frame of a newer scan arrives. Frames of two scans can
@@ -145,7 +145,7 @@ class ScanAssembler:
             t_ns: time of reception, ns.
 
         Returns:
-            The scan ended by the chunk; None if the chunk ended no scan.
+            The scan ended by the chunk; None if it did not end a scan.
         """
         if len(data) != self._chunk_bytes:
             self._reject_length(chunk_cob_id(self._node_id), data, self._chunk_bytes, "chunk")
@@ -171,7 +171,7 @@ class ScanAssembler:
             t_ns: time of reception, ns.
 
         Returns:
-            The scan ended by the summary; None if the summary ended no scan.
+            The scan ended by the summary; None if it did not end a scan.
         """
         if len(data) != PDO_BYTES:
             self._reject_length(summary_cob_id(self._node_id), data, PDO_BYTES, "scan summary")

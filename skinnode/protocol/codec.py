@@ -2,7 +2,7 @@
 
 ``codes`` converts resistances to codes, ``chunk`` and ``summary`` pack the PDOs, ``scan_check`` and
 ``device_time`` compute two fields of the summary, ``command`` packs the host's commands, and ``self_test``
-the record 0x2023. All functions are pure, without a bus or clock.
+the record 0x2023. All functions are pure and need neither a bus nor a clock.
 """
 
 from skinnode.protocol.chunk import (

@@ -22,8 +22,8 @@ DEFAULT_CODE_LO: Final = 0.25
 DEFAULT_CODE_HI: Final = 1.25
 """R/R0 at the highest code; pressing moves electrodes together and lowers R, but sliding moves some apart."""
 DEFAULT_REFRESH_SCANS: Final = 10
-"""Number of scans from one full scan to the next; lost codes are sent again within 0.8 s, at a tenth of the
-full traffic."""
+"""Number of scans from one full scan to the next; lost codes are sent again within 0.8 s, with a tenth of the
+traffic of full scans."""
 
 
 def patch_objects(profile: PatchProfile) -> tuple[Object, ...]:

@@ -6,8 +6,8 @@ scan and carries a check over all codes of the matrix (:mod:`skinnode.protocol.s
 
 Over CAN FD a chunk carries part of one upper wire: u8 wire, u8 scan counter, u16 first column and up to 30
 codes of 16 bits (or 20 of 24 bits). All chunks of a patch have the same length, the length of the mapping
-padded to the next valid CAN FD length. If a patch has more columns, the codes of each upper wire are split
-into several chunks, as equal in size as possible.
+padded to the next valid CAN FD length. If a patch has more columns than fit into a chunk, the codes of each
+upper wire are split into several chunks, as equal in size as possible.
 
 ``python -m skinnode.protocol.profile eds/`` regenerates the reference EDS files
 (:mod:`skinnode.protocol.eds_files`).

@@ -12,7 +12,7 @@ from skinnode.protocol.codes import Codes
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Scan:
-    """Scan of a patch. Times are in ns of the receiving host's monotonic clock."""
+    """Scan of a patch. Times are in ns on the receiving host's monotonic clock."""
 
     codes: Codes
     """(U, K) codes; :data:`~skinnode.protocol.codes.MISSING` where the code is unknown."""
@@ -49,7 +49,7 @@ class Scan:
 
 @dataclass(frozen=True, slots=True)
 class AssemblerStats:
-    """Assembler counters since construction. Each frame counts once, in one of the fields marked with *."""
+    """Assembler counters since construction. Each frame is counted in exactly one field marked with *."""
 
     scans_complete: int
     """Scans published as complete."""

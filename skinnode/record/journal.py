@@ -1,4 +1,4 @@
-"""Journal of a recording: a JSON Lines file next to the log, with all that a replay needs except the frames.
+"""Journal of a recording: a JSON Lines file next to the log, with all that a replay needs besides the frames.
 
 The first line holds the hand and the offset of the host's clock (:class:`Header`). Each further line is an
 event that affected how the host decoded the frames: ``at`` is the number of frames received on ``bus`` before
@@ -44,7 +44,7 @@ COMPLAINTS_KEPT: Final = 100
 
 _MOST: Final = 2**63 - 1
 _LONGEST_LINE: Final = 2 << 20
-"""Maximum length of a line, bytes: enough for the facts of the largest patch. A longer line is read as
+"""Maximum length of a line, bytes: enough for the facts about the largest patch. A longer line is read as
 several lines."""
 _OF_PATCHES: Final = ("resumed", "withheld", "polled", "overtaken")
 

@@ -58,7 +58,7 @@ def replay(path: Path | str, *, speed: float | None = None, cancelled: Callable[
         for field in skinnode.record.replay("runs/hand-20260102-030405.log"):
             ...
 
-    A replay skips no scan that was solved live, whatever the speed.
+    Whatever its speed, a replay does not skip any scan that was solved live.
 
     Args:
         path: File ending in .log or .blf.
@@ -110,7 +110,7 @@ class Replay:
             for number, bus in enumerate(self.hand.buses)
         }
         self.strange = 0
-        """Frames on channels that belong to no bus of the hand."""
+        """Frames on channels that do not belong to any bus of the hand."""
 
     def __iter__(self) -> Iterator[FieldFrame]:
         fields = self._publisher.subscribe(64, None, None)
@@ -200,7 +200,7 @@ class Replay:
         self.complaints.append(f"{self._journal} line {event['line']}: {what}")
 
     def clock(self) -> int:
-        """Return the current time in the recording, ns on its host's monotonic clock."""
+        """Return the current time in the recording on its host's monotonic clock, ns."""
         return self._now_ns
 
     @property
@@ -310,5 +310,5 @@ class _Bus:
                 facts = facts_of(event["facts"], replay.hand.patch(name), self._config)
                 self._solvers[name] = ScanSolver(facts, replay.hand.solver, replay.clock)
             except (KeyError, TypeError, OverflowError, ValueError) as error:
-                replay.complain(event, f"no facts about {name} ({type(error).__name__}: {error})")
+                replay.complain(event, f"unusable facts about {name} ({type(error).__name__}: {error})")
         return self._solvers.get(name)

@@ -103,7 +103,7 @@ class Acquisition:
         self.forget_sent()
 
     def set_baseline(self, row: int, column: int, value_ohm: float) -> None:
-        """Set one R0, ohm; the client must also set all others: the node no longer tares by itself."""
+        """Set one R0, ohm; the client must then set all others too, as the node no longer tares by itself."""
         self.baseline_ohm[row, column] = value_ohm
         self.tared = True
         self.forget_sent()

@@ -1,4 +1,4 @@
-"""Patch application, which takes scans at SYNC, on its own timer or on command, tares, and tests itself.
+"""Patch application, which takes scans (at SYNC, on its own timer or on command), tares, and tests itself.
 
 :mod:`skinnode.node.patch.objects` binds the manufacturer objects (0x2000 to 0x2301). The CANopen
 communication around the application is in :mod:`skinnode.node.device`.

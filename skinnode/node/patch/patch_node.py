@@ -37,8 +37,8 @@ class PatchNode(CanopenDevice):
         baseline_ohm: (U, K) initial R0, ohm; None to tare at the first power-on. A baseline in the memory
             takes precedence.
         pacing: :data:`~skinnode.node.clock.EXACT` for a board, THRIFTY for many nodes on one machine.
-        memory: keeps configuration, baseline and node-ID across a power cycle; None to keep nothing, as
-            0x1010 then indicates.
+        memory: keeps configuration, baseline and node-ID across a power cycle; None to keep nothing,
+            which 0x1010 then indicates.
         set_bit_rate: changes the bit rate (bit/s) for LSS; None if the node cannot change it.
 
     Raises:

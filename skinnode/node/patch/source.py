@@ -18,7 +18,7 @@ class ResistanceSource(Protocol):
         failure and reads again at the next scan.
 
         Args:
-            t_ns: current time, ns of the monotonic clock.
+            t_ns: current time on the monotonic clock, ns.
         """
         ...
 

@@ -127,8 +127,8 @@ class PdoRecords:
         self._store = store
         self._parameter, self._mapping, self._transmits = parameter, mapping, transmits
         self._taken = taken
-        # The maximum length of a PDO in bytes equals its number of mapping entries, because the smallest
-        # object is one byte long.
+        # The maximum length of a PDO in bytes equals its maximum number of mapping entries, because the
+        # smallest object is one byte long.
         self._longest = sum([store.has(mapping, sub) for sub in range(1, _MOST_MAPPED + 1)])
         store.guard(parameter, self._guard_parameter)
         store.guard(mapping, self._guard_mapping)

@@ -101,14 +101,14 @@ class BlockUpload(Transfer):
         self._block_size = _checked(upload.block_size)
         self._first = 0  # segments sent before the current block
         self._pace_ns = SEGMENT_NS
-        self._sent = 0  # segments sent of the current block
+        self._sent = 0  # segments of the current block sent so far
         self._waits_for = _Upload.START
         self._previous, self._previous_ns = b"", t_ns
         # Both sides must offer a CRC. Some clients expect a CRC they did not request if the server offers it.
         channel.send(MULTIPLEXER_U32.pack(0xC2 | crc << 2, target.index, target.subindex, len(data)))
 
     def wants(self, request: bytes) -> bool:
-        """Return whether a frame of the client belongs to this transfer."""
+        """Return whether a frame from the client belongs to this transfer."""
         return request[0] >> 5 == 5 and request[0] & 3 != 0
 
     def on_request(self, request: bytes, t_ns: int) -> bool:

@@ -41,8 +41,8 @@ _NAMELESS: Final = (0, 3, 5, 6)
 class SdoServer:
     """SDO server with one channel to the object dictionary, which serves one transfer at a time.
 
-    A new initiate request ends an unfinished transfer, because its client has given up. An error raised by
-    ``send`` propagates to the caller, and the next call continues the transfer.
+    A new initiate request ends an unfinished transfer, because it shows that the client has given up. An
+    error raised by ``send`` propagates to the caller, and the next call continues the transfer.
 
     Args:
         store: object dictionary.
@@ -166,7 +166,7 @@ class _Upload(Transfer):
         channel.send(MULTIPLEXER_U32.pack(0x41, target.index, target.subindex, len(data)))
 
     def wants(self, request: bytes) -> bool:
-        """Return whether a frame of the client belongs to this transfer."""
+        """Return whether a frame from the client belongs to this transfer."""
         return request[0] >> 5 == _Client.UPLOAD_SEGMENT
 
     def on_request(self, request: bytes, t_ns: int) -> bool:
@@ -193,7 +193,7 @@ class _Download(Transfer):
         channel.send(MULTIPLEXER_U32.pack(0x60, target.index, target.subindex, 0))
 
     def wants(self, request: bytes) -> bool:
-        """Return whether a frame of the client belongs to this transfer."""
+        """Return whether a frame from the client belongs to this transfer."""
         return request[0] >> 5 == _Client.DOWNLOAD_SEGMENT
 
     def on_request(self, request: bytes, t_ns: int) -> bool:

@@ -57,7 +57,7 @@ class Transfer(ABC):
 
     @abstractmethod
     def wants(self, request: bytes) -> bool:
-        """Return whether a frame of the client belongs to this transfer."""
+        """Return whether a frame from the client belongs to this transfer."""
 
     @abstractmethod
     def on_request(self, request: bytes, t_ns: int) -> bool:

@@ -1,6 +1,6 @@
 """Compiled kernels of :mod:`skinnode.bus_load.timing` that count the bits of frames on the bus.
 
-The kernels are pure functions of arrays: uint32 identifiers, uint8 lengths and payloads, int64 bit counts.
+The kernels operate on arrays: uint32 identifiers, uint8 lengths and payloads, int64 bit counts.
 """
 
 from __future__ import annotations

@@ -64,7 +64,8 @@ class BusConfig(Table):
     role: Annotated[Role, one_of(Role)] = "master"
     """``guest`` if the robot's own master sends NMT and SYNC on this bus; the host then sends neither."""
     guest_sends: Annotated[GuestSends, one_of(GuestSends)] = "nothing"
-    """Frames that a guest may send: ``sdo`` to identify and configure the patches and to read their data."""
+    """Frames that a guest may send: ``nothing``, or ``sdo`` to identify and configure the patches and to
+    read their data."""
     heartbeat_node_id: Annotated[NodeId | None, Allowed("an integer from 1 to 127 that no node uses")] = None
     """Node-ID under which the host, as master, sends a heartbeat. The patches monitor this heartbeat and go
     pre-operational when it stops. None: no heartbeat."""

@@ -177,8 +177,8 @@ def load_hand(path: Path | str) -> HandConfig:
 
     Raises:
         ConfigError: The file cannot be read, is not TOML, has an unknown or missing key, has a value of the
-            wrong type or out of range, or fails a check of :class:`HandConfig`. The message is one line with
-            line and column.
+            wrong type or out of range, or fails a check of :class:`HandConfig`. The message is one
+            line and gives the line and column in the file.
     """
     path = Path(path)
     return _parse(read_toml(path, "hand file"), path.parent)

@@ -205,7 +205,7 @@ class PatchConfig(Table):
     baseline: Annotated[
         Path | None, Field(strict=False), Allowed("the path of a file of resistances in ohm")
     ] = None
-    """File of the resistances at rest, ohm: one line per upper wire, one number per lower wire.
+    """File with the resistances at rest, ohm: one line per upper wire, one number per lower wire.
     None: the host reads them from the node."""
     calibration: CalibrationConfig = CalibrationConfig()
 

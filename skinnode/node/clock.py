@@ -1,11 +1,11 @@
-"""Time in a node, which the caller passes in as nanoseconds of its own monotonic clock."""
+"""Time in a node, passed in by the caller as nanoseconds on the caller's monotonic clock."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
 
 NO_DEADLINE_NS: Final = 1 << 63
-"""Deadline later than any other, ns, meaning that nothing is scheduled."""
+"""Deadline (ns) later than any other, meaning that nothing is scheduled."""
 
 Clock = Callable[[], int]
 """Callback that returns the time of the event being handled, ns."""
@@ -16,7 +16,7 @@ class Pacing:
     """Timer precision of a node's thread, traded against processor time."""
 
     slack_ns: int
-    """Permitted lateness of a timer, ns, so that one wake-up can serve several timers. Frames are always
+    """Permitted lateness of a timer, ns; it lets one wake-up serve several timers. Frames are always
     served immediately."""
     catch_up_ns: int
     """Maximum lateness for which the chunk pacing compensates, ns; 0 for a strict inhibit time. See

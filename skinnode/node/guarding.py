@@ -24,7 +24,7 @@ class Guarding:
     def __init__(self, store: ObjectStore, emcy: EmcyProducer, failed: Callable[[int], None]) -> None:
         self._store, self._emcy, self._failed = store, emcy, failed
         self._toggle = 0
-        self._guarded = False  # true from the first request on
+        self._guarded = False  # true from the first request onwards
         self.deadline_ns = NO_DEADLINE_NS
         """Time at which the life time expires, ns."""
 
@@ -35,7 +35,7 @@ class Guarding:
         self.deadline_ns = NO_DEADLINE_NS
 
     def answer(self, state: NmtState, t_ns: int) -> bytes:
-        """Return the answer to a remote frame on the error control COB-ID, and restart the life time.
+        """Return the answer to a remote frame with the error control COB-ID, and restart the life time.
 
         Args:
             state: state of the node.

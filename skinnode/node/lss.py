@@ -101,10 +101,10 @@ class LssSlave:
 
         A pending node-ID that was never stored is lost. Call :meth:`reset_communication` afterwards.
 
-        Two public CiA 305 stacks do the same. c-open copies the persistent node-ID to the pending node-ID in
-        the NMT sub-state *reset application*, and the pending node-ID to the active node-ID in *reset
-        communication* (src/co_nmt.c). CANopenNode initialises the pending node-ID from non-volatile memory
-        after *reset node* and does not change it at *reset communication* (305/CO_LSSslave.h).
+        Two open-source CiA 305 stacks do the same. c-open copies the persistent node-ID to the pending
+        node-ID in the NMT sub-state *reset application*, and the pending node-ID to the active node-ID in
+        *reset communication* (src/co_nmt.c). CANopenNode initialises the pending node-ID from non-volatile
+        memory after *reset node* and does not change it at *reset communication* (305/CO_LSSslave.h).
         """
         self.pending_node_id = self._persistent_node_id
 

@@ -38,8 +38,8 @@ class FileMemory:
     The file is replaced atomically (written under a temporary name, flushed to the medium, renamed), so a
     killed process or a power failure leaves either the old content or the new. The file is readable only by
     its owner (mode 0600), and a symbolic link in its place is refused. A file that is damaged or belongs to
-    another patch is not overwritten; it is renamed to a name that ends in ``.unused-`` and a digest of its
-    bytes.
+    another patch is not overwritten; it is renamed to a name that ends in ``.unused-`` followed by a digest
+    of its bytes.
 
     Args:
         path: the file; its folder must exist.

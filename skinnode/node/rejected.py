@@ -31,7 +31,7 @@ class Rejected(IntEnum):
 
 
 class RejectedFrames:
-    """Counters of object 0x2040, which start at power-on or *reset node* and saturate at their maximum.
+    """Counters of object 0x2040, which restart at power-on and *reset node*, and saturate at their maximum.
 
     Args:
         store: object dictionary.

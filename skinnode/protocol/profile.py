@@ -57,7 +57,7 @@ class PatchProfile:
     lower_electrodes: int
     """Electrodes per lower wire, M."""
     code_bits: int = 16
-    """Width of a code, bits: 16 or 24."""
+    """Width of a code in bits, 16 or 24."""
     rpdos: int = 4
     """Number of RPDOs: RPDO1 carries commands; the others are spare."""
     tpdos: int = 4
@@ -97,7 +97,7 @@ class PatchProfile:
 
         Args:
             layout: electrodes of the patch.
-            code_bits: width of a code, bits: 16 or 24.
+            code_bits: width of a code in bits, 16 or 24.
             bus: type of frame that carries PDOs.
         """
         rows, upper_electrodes = layout.upper_m.shape[:2]

@@ -74,8 +74,8 @@ class AssemblerStats:
     summaries_accepted: int
     """* Summaries assigned to a scan."""
     chunks_lost: int
-    """Chunks missing when their scan was published. The chunks of missed scans are not counted. While only
-    changed chunks are sent, neither are the chunks of scans without a summary."""
+    """Chunks missing when their scan was published. The chunks of missed scans are not counted. Nor, while
+    only changed chunks are sent, are the chunks of scans without a summary."""
     summaries_lost: int
     """Summaries missing when their scan was published."""
     duplicates: int

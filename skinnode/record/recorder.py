@@ -57,13 +57,13 @@ class RecorderStats:
 
 
 def name_in(folder: Path, hand: HandConfig, kind: LogFormat, now: datetime.datetime) -> Path:
-    """Return the path of a recording in ``folder``, named after the hand, the date and the time."""
+    """Return the path for a recording in ``folder``, named after the hand, the date and the time."""
     name = "".join(c if c.isalnum() or c in "-_" else "-" for c in hand.name)
     return folder / f"{name}-{now:%Y%m%d-%H%M%S}.{kind}"
 
 
 def make_folder(path: Path) -> Path | None:
-    """Create the folder ``path`` with its parents, and return it; None if it already existed.
+    """Create the folder ``path`` and any missing parents, and return it; None if it already existed.
 
     A name with a suffix is treated as the misspelt name of a recording file. Raises ConfigError for such a
     name, or if the folder cannot be created.

@@ -1,4 +1,4 @@
-"""Replay of a recording as fields, by the code that decodes live frames.
+"""Replay of a recording into fields, by the same code that decodes live frames.
 
 The dispatcher, assembler, decoder, stream, solver and publisher are those of the host. No threads are used:
 each scan is solved when its last frame is dispatched.

@@ -15,8 +15,8 @@ from skinnode.protocol.codes import Codes, CodeScale, encode
 from skinnode.protocol.profile import PatchProfile
 
 TARE_READS: Final = 16
-"""Number of readings averaged for a baseline; its noise, 1/4 of a reading's, adds 3 % to the noise of
-R/R0."""
+"""Number of readings averaged for a baseline; its noise, a quarter of that of one reading, adds 3 % to the
+noise of R/R0."""
 
 
 class Acquisition:
@@ -130,7 +130,7 @@ class Acquisition:
         threshold, or has changed to or from a reserved code.
 
         Args:
-            threshold: largest change of a code that is ignored.
+            threshold: largest code change that does not cause a chunk to be sent.
             full_every: number of scans from one full scan to the next; 0 for no full scans.
 
         Returns:

@@ -1,7 +1,7 @@
 """SDO block transfer (CiA 301 v4.2, 7.2.4.3.9 to 7.2.4.3.15): up to 127 segments, then one acknowledgement.
 
 CAN delivers a frame twice if the last bit of its end of frame is disturbed (ISO 11898-1), and a frame does
-not identify its block. If a repeated acknowledgement were mistaken for the acknowledgement of the next block,
+not say which block it belongs to. If a repeated acknowledgement were mistaken for that of the next block,
 segments would be skipped. For this reason a frame equal to the previous frame is ignored unless the protocol
 allows a repetition there.
 """
@@ -24,7 +24,7 @@ SEGMENT_NS: Final = 500_000
 
 PDOs may use 70 % of a bus. At 1 Mbit/s at least 2200 frames/s remain, of which this pace uses 2000, so the
 transmit queue, which is shared with PDOs, does not fill up. A block takes 64 ms, or 100 ms if the thread
-wakes late; clients wait for a frame for at least 300 ms (canopen library). Each time the bus refuses a
+wakes late; clients wait at least 300 ms for a frame (canopen library). Each time the bus refuses a
 segment, as slower buses do, this time is doubled for the rest of the transfer.
 """
 SLOWEST_SEGMENT_NS: Final = 8 * SEGMENT_NS

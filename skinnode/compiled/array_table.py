@@ -1,8 +1,8 @@
 """Tables that pass many arrays and numbers to a kernel in one argument, with access by name.
 
 Numba checks and unpacks every argument of every call. For the fifty arrays of a patch, this takes 4 µs with
-warm caches; with cold caches it takes 40 µs, as long as solving four wires. An :class:`ArrayTable` is one
-array of addresses and shapes. A subclass declares the fields once, for Python and for kernels:
+warm caches and 40 µs with cold caches, as long as solving four wires. An :class:`ArrayTable` is one array of
+addresses and shapes. A subclass declares the fields once, for Python and for kernels:
 
     class Scan(ArrayTable):
         ohm: Annotated[NDArray[np.float64], "U K"]     # element type and axes

@@ -1,14 +1,14 @@
 """Compilation of kernels: ``@njit`` with a cache that cannot go stale.
 
-A plain file cache notices edits to the file that defines a function, but not to functions in other files that
-it calls. Therefore the cache folder (:mod:`skinnode.compiled.kernel_cache`) is named after a digest of every
-file that contains kernels: an edit to any of these files recompiles all kernels. The folder is created under
-``$SKINNODE_CACHE_DIR``, the user's cache folder or the system's temporary folder, whichever is writable
-first. If no folder is writable, nothing is cached.
+A plain file cache notices edits to the file that defines a function, but not edits to other files whose
+functions it calls. Therefore the cache folder (:mod:`skinnode.compiled.kernel_cache`) is named after a digest
+of every file that contains kernels: an edit to any of these files recompiles all kernels. The folder is
+created under ``$SKINNODE_CACHE_DIR``, the user's cache folder or the system's temporary folder, whichever is
+writable first. If no folder is writable, nothing is cached.
 
-``error_model="numpy"`` makes a division by zero yield inf (reported by a status) instead of an exception, and
-``nogil`` lets a thread pool solve several patches at the same time. ``fastmath`` stays off because results
-must not depend on how a compiler reorders sums.
+``error_model="numpy"`` makes a division by zero yield inf (reported by a status) instead of raising an
+exception, and ``nogil`` lets a thread pool solve several patches at the same time. ``fastmath`` stays off
+because results must not depend on how a compiler reorders sums.
 """
 
 from __future__ import annotations
@@ -106,7 +106,7 @@ def njit_brief(function: _F) -> _F:
     """Compile ``function`` as :func:`njit` does, but hold the interpreter lock while it runs.
 
     Use this decorator for kernels that take about a microsecond: if the lock were released, another thread
-    could hold it for longer than the rest of the field takes.
+    could hold it for longer than the rest of the field takes to compute.
     """
     return _kept(function, nogil=False)
 

@@ -1,9 +1,9 @@
 """File cache of compiled kernels that verifies each file before use.
 
-Numba's own file cache unpickles any file it finds: a truncated file raises an exception in the first call of
-a kernel, on every run, and machine code with a flipped bit is executed. All signatures of a function share
-one index, so two processes that compile different signatures at the same time can store the code of one under
-the name of the other.
+Numba's own file cache unpickles any file it finds: a truncated file causes an exception in the first call to
+a kernel on every run, and machine code with a flipped bit is executed. All signatures of a function share one
+index, so two processes that compile different signatures at the same time can store the code of one under the
+name of the other.
 
 Here each compiled signature has its own file, with a magic number, the SHA-256 of the payload, and the
 payload itself. The file name contains a digest of everything that the code depends on, so no index is needed.
@@ -189,7 +189,7 @@ def _locked(folder: Path) -> Iterator[None]:
 
 
 def _report(folder: Path, what: str) -> None:
-    """Log ``what`` once per process and folder: forty kernels on a full disk then produce one line."""
+    """Log ``what`` once per process and folder, so that forty kernels on a full disk produce one line."""
     kind = f"{folder} {what[:1].isdigit()}"
     if kind not in _reported:
         _reported.add(kind)

@@ -92,8 +92,8 @@ def rectangle_compliance(rubber: Rubber, offset_m: ArrayLike, size_m: tuple[floa
     """Return the displacement of surface points per unit traction on a rectangle; finite everywhere.
 
     Closed form for a uniform load on a rectangle (Love, Phil. Trans. A 228, 1929, for the normal part;
-    Johnson eq. 3.25): each entry of the module's matrix has an elementary antiderivative in x and y, which is
-    evaluated at the corners.
+    Johnson eq. 3.25): each entry of the compliance matrix has an elementary antiderivative in x and y, which
+    is evaluated at the corners.
 
     Args:
         rubber: The material.
@@ -137,7 +137,7 @@ def _antiderivatives(x: Float, y: Float) -> Float:
 def _compliance(  # noqa: PLR0913 - the six functions in the matrix
     rubber: Rubber, inverse: Float, xx: Float, yy: Float, xy: Float, x_r2: Float, y_r2: Float
 ) -> Float:
-    """Return the module's matrix (P, 3, 3) from 1/r, x²/r³, y²/r³, xy/r³, x/r², y/r² or their integrals."""
+    """Return the compliance (P, 3, 3) from 1/r, x²/r³, y²/r³, xy/r³, x/r², y/r² or their integrals."""
     nu = rubber.poisson
     matrix = np.empty((*inverse.shape, 3, 3))
     matrix[..., 0, 0] = (1 - nu) * inverse + nu * xx
@@ -157,9 +157,9 @@ class HertzContact:
     """Hertzian contact with a rigid sphere that presses on the rubber and slides over it.
 
     The traction on the rubber is p (t_x, t_y, −1) with p = p₀ √(1 − r²/a²) inside the contact circle. The
-    surface displacement has a closed form everywhere: p is radially symmetric, so all integrals of the matrix
-    follow from two radial functions, Φ = ∫ p/|d| (Johnson eqs. 3.41a, 3.42a) and P, the load within r. The
-    model assumes that shear does not change the pressure, which is exact for incompressible rubber and an
+    surface displacement has a closed form everywhere: p is radially symmetric, so all the integrals follow
+    from two radial functions, Φ = ∫ p/|d| (Johnson eqs. 3.41a, 3.42a) and P, the load within r. The model
+    assumes that shear does not change the pressure, which is exact for incompressible rubber and an
     approximation for ν < 0.5 (Johnson 7.1).
 
     Args:
@@ -207,7 +207,7 @@ class HertzContact:
         return self.traction_ratio[0] * normal, self.traction_ratio[1] * normal, -normal
 
     def traction_pa(self, points_m: ArrayLike) -> Float:
-        """Return the load per unit area (P, 3), Pa, at surface points (P, 2), metres; 0 outside the contact.
+        """Return the traction (P, 3) in Pa at surface points (P, 2) in metres; 0 outside the contact.
 
         Raises:
             ValueError: If the array has the wrong shape or contains NaN.
@@ -221,7 +221,7 @@ class HertzContact:
         return np.asarray(pressure[:, None] * np.array([*self.traction_ratio, -1.0]))
 
     def displacement_m(self, points_m: ArrayLike) -> Float:
-        """Return the displacement (P, 3) of surface points (P, 2), metres; exactly 0 without contact.
+        """Return the displacement (P, 3) in m of surface points (P, 2) in m; exactly 0 without contact.
 
         Raises:
             ValueError: If the array has the wrong shape or contains NaN.

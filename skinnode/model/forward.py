@@ -23,7 +23,7 @@ def _offsets(layout: PatchLayout, upper_m: ArrayLike) -> Float:
 
 
 def potential_per_m(layout: PatchLayout, upper_m: ArrayLike) -> Float:
-    """Return F (U, K), 1/m, for electrodes at ``upper_m`` (U, N, 3), metres; inf if two electrodes coincide.
+    """Return F (U, K) in 1/m for electrodes at ``upper_m`` (U, N, 3) in metres; inf if two coincide.
 
     Raises:
         ValueError: If the array has the wrong shape or contains NaN.

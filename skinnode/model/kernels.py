@@ -1,9 +1,9 @@
 """Compiled forward model of one wire, with arrays in structure-of-arrays layout.
 
 Lower electrodes are stored as (3, M, K) and the Jacobian as its transpose (3N, K), so vectors of neighbouring
-lower wires k are contiguous in memory and their sums stay in registers. Computing distances is the main cost:
-a square root and a division per pair would saturate one slow unit of the processor, so 1/√ is computed from
-multiplications instead. Lengths may be in any unit; F has the inverse unit.
+lower wires k are contiguous in memory, and their sums stay in registers. Computing distances is the main
+cost: a square root and a division per pair would saturate one slow execution unit of the processor, so 1/√ is
+computed from multiplications instead. Lengths may be in any unit; F has the inverse unit.
 """
 
 from __future__ import annotations

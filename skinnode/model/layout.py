@@ -21,7 +21,7 @@ PRESETS: Final = ("aligned", "symmetric", "staggered")
 PRESET_IDS: Final = {"custom": 0, "aligned": 1, "symmetric": 2, "staggered": 3}  # object 0x2000, layout id
 
 MOST_ELECTRODES: Final = 1024
-"""Maximum number of upper electrodes of a patch, for example 32 × 32. A covariance matrix of their 3072
+"""Maximum number of upper electrodes on a patch, for example 32 × 32. A covariance matrix of their 3072
 coordinates takes 75 MB, and the posterior stores several."""
 
 MOST_PAIRS: Final = 1 << 22
@@ -95,7 +95,7 @@ class PatchLayout:
         upper_m: (U, N, 3) electrodes of the U upper wires, metres; they move with the surface.
         lower_m: (K, M, 3) electrodes of the K lower wires, metres; they do not move.
         resistivity_ohm_per_m: Resistance of the rubber per metre between two electrodes, the paper's g.
-        name: Name of the layout; need not be a preset's.
+        name: Name of the layout; need not be the name of a preset.
 
     Raises:
         ValueError: If a shape is wrong, a coordinate is NaN, the resistivity is not positive, an upper

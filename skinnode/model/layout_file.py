@@ -31,8 +31,8 @@ def read_npz(path: Path) -> PatchLayout:
     """Read a layout from an NPZ file. Nothing in the file is executed.
 
     Args:
-        path: File with the arrays ``upper_m`` (U, N, 3) and ``lower_m`` (K, M, 3), metres, and optionally the
-            number ``resistivity_ohm_per_m``.
+        path: File with the arrays ``upper_m`` (U, N, 3) and ``lower_m`` (K, M, 3) in metres and, optionally,
+            the number ``resistivity_ohm_per_m``.
 
     Raises:
         ConfigError: If the file is not an NPZ file, or does not contain a layout.

@@ -81,11 +81,11 @@ class Pose:
         return turned
 
     def points_m(self, of_patch_m: ArrayLike) -> Float:
-        """Convert points (..., 3), metres, from the patch's frame to the hand's frame."""
+        """Convert points (..., 3) in metres from the patch's frame to the hand's frame."""
         points: Float = self.vectors(of_patch_m) + np.array(self.position_m)
         return points
 
 
 def positions_in_hand_m(field: FieldFrame, layout: PatchLayout, pose: Pose) -> Float:
-    """Return the positions (U, N, 3), metres, of the upper electrodes in the hand's frame."""
+    """Return the positions (U, N, 3) of the upper electrodes in the hand's frame, metres."""
     return pose.points_m(layout.upper_m + field.displacement_m)

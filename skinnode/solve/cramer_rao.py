@@ -1,6 +1,6 @@
-"""Cramér-Rao bound J⁺ diag(σ²) J⁺ᵀ of a wire: how precisely its resistances determine its rest position.
+"""Cramér-Rao bound J⁺ diag(σ²) J⁺ᵀ for a wire: how precisely its resistances determine its rest position.
 
-J is the Jacobian of the relative residual a F − 1 at rest and σ the relative noise in each resistance.
+J is the Jacobian of the relative residual a F − 1 at rest, and σ is the relative noise in each resistance.
 Standard deviations are in clearances; the clearance is the smallest distance at rest between an upper and a
 lower electrode.
 """
@@ -24,7 +24,7 @@ def patch_std(layout: PatchLayout, relative_noise: ArrayLike, normal_only: bool 
 
 
 def wire_std(layout: PatchLayout, relative_noise: ArrayLike, normal_only: bool = False) -> Float:
-    """Return the standard deviation of each wire's exact inverse at rest.
+    """Return the standard deviation of the exact inverse of each wire at rest.
 
     Args:
         layout: The patch.

@@ -21,7 +21,7 @@ class CodeMap:
     baseline_ohm: Float
     """(U, K) R0, ohm; a code is invalid if its R0 is not positive and finite."""
     lo: float
-    """R / R0 of code 0."""
+    """R / R0 at code 0."""
     step: float
     """Change in R / R0 per code."""
     steps: int

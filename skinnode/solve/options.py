@@ -35,7 +35,7 @@ class EstimateOptions:
         drift_std: Prior standard deviation of a gain error, as a fraction.
         model_error: Standard error of the forward model, as a fraction of the change in each resistance
             (from thickness, electrode size and conductivity under strain): the full value for an error common
-            to all resistances, and 0.7 of it for an independent error of each resistance.
+            to all resistances, and 0.7 times this value for an independent error in each resistance.
         normal_only: Whether only z is unknown, which leaves a third of the unknowns.
         hold: Whether to keep the last solution of wires whose resistances changed no more than their noise.
         deadline_us: Time limit of an update, µs; the update may exceed it by one step. Wires not solved by

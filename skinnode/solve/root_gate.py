@@ -1,4 +1,4 @@
-"""Gate of the exact inverse: finds its doubtful wires and checks them with the posterior.
+"""Gate for the exact inverse: finds its doubtful wires and checks them with the posterior.
 
 A wire is doubtful if it has no root, if it jumped, or if its displacement is too rough to be a press. If a
 layout has folds within the reach of a press, every solved wire is doubtful, because F = b has nearby roots
@@ -29,7 +29,7 @@ from skinnode.solve.wires.root_check import SOME_ROUGH, SOME_SUSPECT, RootCheck,
 
 PAUSE: Final = 16
 """Number of frames without a posterior solve after the posterior has missed a deadline; a futile solve in
-every frame would delay other patches on the same thread by 2 ms."""
+each frame would delay the other patches on the thread by 2 ms."""
 APART: Final = 3.0
 """Factor applied to the distance between a root near a fold and the posterior estimate that confirms it. The
 product is added in quadrature to the standard deviation, because two roots may be too close for the posterior

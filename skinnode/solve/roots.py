@@ -109,12 +109,12 @@ undiscovered roots."""
 # -- the posterior of the patch -----------------------------------------------------------------------------
 
 REFEREE_NOISE: Final = 1e-5
-"""Smallest relative noise of a posterior that checks roots; with less noise, the posterior itself is forced
-onto a root of F = b."""
+"""Smallest relative noise assumed by a posterior that checks roots; with less noise, the posterior itself is
+forced onto a root of F = b."""
 AGREE: Final = 6.0
 """Number of standard deviations within which the posterior confirms a root."""
 NEAR: Final = 0.25
-"""Largest first correction of an electrode, in clearances; after a larger correction, annealing is used."""
+"""Largest first correction of an electrode, in clearances; after a larger one, annealing is used."""
 FAR: Final = 0.1
 """Movement of an electrode, in clearances, after which the estimate is compared with an estimate annealed
 from rest. Without the comparison, presses of 0.3 or more crossed folds unnoticed, one frame at a time."""

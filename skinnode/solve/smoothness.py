@@ -1,7 +1,7 @@
 """Gaussian covariance of the displacement of one upper wire, a model of the smoothness of rubber.
 
 C_ij = s² exp(−d_ij² / 2ℓ²) for each coordinate, where d is the distance between two electrodes at rest. This
-assumption is weaker than elasticity of the patch and needs no material constant. The covariance provides
+assumption is weaker than that of an elastic patch and needs no material constant. The covariance provides
 starting points for solves (:mod:`skinnode.solve.starts`) and ranks two roots of one wire: the root with the
 smaller roughness √(uᵀ C⁻¹ u) is likelier.
 """
@@ -54,7 +54,7 @@ class Smoothness:
 
 @functools.lru_cache(maxsize=64)
 def _covariance(layout: PatchLayout, size: float) -> tuple[Float, Float]:
-    """Return C (U, n, n) and its whitening for displacements of ``size`` (not critical), pitches."""
+    """Return C (U, n, n) and its whitening for displacements of about ``size`` pitches (not critical)."""
     electrodes: Float = layout.upper_m / layout.pitch_m
     wires, most = electrodes.shape[:2]
     gaps = electrodes[:, :, None, :] - electrodes[:, None, :, :]

@@ -23,7 +23,7 @@ from skinnode.solve.wires.problem import PatchProblem
 
 NOISE_LEVELS: Final[Float] = np.power(10.0, -0.5 * np.arange(2.0, 16.0))
 """Noise levels of r in the guided start, 0.1 to 3e-8, with one step per level. With steps of a whole decade,
-one more wire in a hundred is lost in presses of 50 % at h = 1."""
+one more wire in a hundred is lost for presses of 50 % at h = 1."""
 POWER_STEPS: Final = 8
 """Number of inverse iterations; the second-smallest singular value is about 3 times the smallest."""
 DIFFERENCE: Final = 1e-4

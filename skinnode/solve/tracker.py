@@ -1,4 +1,4 @@
-"""Tracker of a live stream: computes one field per frame with the method that suits the patch.
+"""Tracker for a live stream: computes one field per frame with the method that suits the patch.
 
 ``exact`` inverts each wire separately, as the paper does; ``posterior`` estimates the whole patch with an
 elastic prior. ``auto`` chooses the exact inverse if it is accurate enough at the converter's noise. Wires on
@@ -22,9 +22,9 @@ from skinnode.solve.posterior.posterior import Posterior
 from skinnode.solve.root_gate import RootGate
 
 EXACT_STD: Final = 0.0025
-"""Standard deviation of the exact inverse at rest, in clearances, up to which ``auto`` chooses it: 2.5 % of
-the depth of a press that indents the layer by a tenth. With 16-bit codes, the standard deviation is 0.0005 on
-the staggered layout, h = 0.5, and 0.05 on the aligned layout."""
+"""Standard deviation of the exact inverse at rest, in clearances, up to which ``auto`` chooses the exact
+inverse: 2.5 % of the depth of a press that indents the layer by a tenth. With 16-bit codes, the standard
+deviation is 0.0005 on the staggered layout, h = 0.5, and 0.05 on the aligned layout."""
 
 
 class Tracker:

@@ -1,18 +1,19 @@
 """Options of the exact tracker that omit unknowns, and standard deviations of the omitted coordinates.
 
-With ``normal_only``, x and y of every electrode stay at rest. With ``active_only``, electrodes that no
-contact moves stay at rest: a wire starts with all electrodes at rest; while χ² rejects the fit, the electrode
-that explains most of the residual joins the unknowns together with its neighbours; once more than half have
-joined, all join. All electrodes return to rest when the rest position explains the frame. The standard
-deviation of an omitted coordinate is the smallest movement that χ² would detect if no other electrode moved,
-to first order at rest: √(quantile − degrees of freedom) σ / ‖the coordinate's column of J outside the range
-of the unknowns and of the electrode's other columns‖.
+With ``normal_only``, x and y of every electrode stay at their rest values. With ``active_only``, electrodes
+that no contact moves stay at rest: a wire starts with all electrodes at rest; while χ² rejects the fit, the
+electrode that explains most of the residual joins the unknowns together with its neighbours; once more than
+half have joined, all join. All electrodes return to rest when the rest position explains the frame. The
+standard deviation of an omitted coordinate is the smallest movement that χ² would detect if no other
+electrode moved, to first order at rest: √(quantile − degrees of freedom) σ / ‖the coordinate's column of J
+outside the range of the unknowns and of the electrode's other columns‖.
 
-Each option makes an assumption about the skin, and the standard deviations of the unknowns are valid only if
-the assumption holds. χ² tests the assumption of active_only well, and that of normal_only less well, because
-a smooth shear resembles a gradient of z. On the staggered layout, h = 0.5, noise 1e-5, a strong Hertzian
-press with a shear of 30 % of its depth is rejected; a weaker press is accepted, with errors in z of up to 16
-standard deviations (only 0.2 % of h). Allowing for these errors would cost more than solving for the shear.
+Each option rests on an assumption about the skin, and the standard deviations of the unknowns are valid only
+if the assumption holds. χ² tests the assumption of active_only well, and that of normal_only less well,
+because a smooth shear resembles a gradient of z. On the staggered layout, h = 0.5, noise 1e-5, a strong
+Hertzian press whose shear is 30 % of its depth is rejected; a weaker press is accepted, with errors in z of
+up to 16 standard deviations (only 0.2 % of h). Allowing for these errors would cost more than solving for the
+shear.
 """
 
 from __future__ import annotations
@@ -49,7 +50,7 @@ class LeftOut:
         self._layout = layout = problem.layout
         self._stream = stream
         self._active_only = active_only
-        # ∂r/∂x at rest of every coordinate, (U, 3N, K)
+        # ∂r/∂x at rest with respect to every coordinate, (U, 3N, K)
         slopes = jacobian(layout, layout.upper_m).reshape(*layout.shape, -1) * layout.pitch_m**2
         self._slopes = np.ascontiguousarray((slopes * problem.a_rest[:, :, None]).transpose(0, 2, 1))
         # (U, 3N) undetectable movement of each coordinate, pitches per unit of σ, and its weights (U, K)
@@ -145,7 +146,7 @@ class LeftOut:
         return np.asarray(whole | (self._stream.roots() & content))
 
     def _widen(self, u: int, frame: Frame) -> None:
-        """Add electrodes of wire u until they explain the frame; undo this if not even all electrodes do."""
+        """Add electrodes of wire u until they explain the frame; undo this if even all of them do not."""
         stream, solver, most = self._stream, self._stream.solver, self._layout.unknowns // 3
         before = solver.electrodes(u).copy()
         while stream.solvable()[u] and not self._explained()[u]:
@@ -185,7 +186,7 @@ class LeftOut:
 
 
 def _changed(weight: Float, before: Float) -> NDArray[np.bool_]:
-    """Return the wires (U,) with a weight that changed by more than a factor of ``STALE``."""
+    """Return the wires (U,) on which a weight changed by more than a factor of ``STALE``."""
     return np.asarray(((weight > STALE * before) | (before > STALE * weight)).any(axis=1))
 
 

@@ -21,17 +21,17 @@ from skinnode.solve.wires.arrays import solve_options
 from skinnode.solve.wires.stages import DEADLINE
 
 BRIDGES: Final = (3, 5, 10)
-"""Numbers of substeps of successive bridges. On the staggered layout, h = 0.5, from rest, 3 substeps solve
-every wire if a 50 % press occurs between two frames, and 5 solve 23 of 24 wires at 70 %. Adaptive steps
-restricted to the trusted branch do worse, because the straight line crosses singular points that the press
-avoids."""
+"""Number of substeps in each successive bridge. On the staggered layout, h = 0.5, from rest, 3 substeps solve
+every wire if a 50 % press occurs between two frames, and 5 substeps solve 23 of 24 wires at 70 %. Adaptive
+steps restricted to the trusted branch do worse, because the straight line crosses singular points that the
+press avoids."""
 BRIDGE_TOLERANCE: Final = 1e-6
 """Tolerance of bridge substeps: the paper's intermediate tolerance."""
 BRIDGE_STEPS: Final = 20
 """Maximum steps per substep."""
 RECOVERY_STEPS: Final = 300
 """Maximum total steps of all bridges in a frame, about 15 ms; a corrupt frame must not stall the stream."""
-# Levenberg-Marquardt is the most robust operator for gaps, regardless of the stream's operator.
+# Bridges use Levenberg-Marquardt, the operator most robust to gaps, whatever the stream's operator is.
 _ACROSS: Final = solve_options(op.LEVENBERG_MARQUARDT, 0, BRIDGE_TOLERANCE, BRIDGE_TOLERANCE, BRIDGE_STEPS)
 _LAST: Final = solve_options(op.LEVENBERG_MARQUARDT, TASKS, TOLERANCE, TOLERANCE, BRIDGE_STEPS)
 

@@ -35,9 +35,9 @@ from skinnode.solve.wires.solve_wires import COVARIANCE_UNITS
 from skinnode.solve.wires.stages import DEADLINE
 
 UNIT_S: Final = 10e-6
-"""Maximum time for one evaluation of F and J with its step, s. Each call solves as many wires as are certain
-to fit into the remaining time, because splitting one call into ten takes as much extra time as solving ten
-wires."""
+"""Maximum time for one evaluation of F and J and the step that follows, s. Each call solves as many wires as
+are certain to fit into the remaining time, because splitting one call into ten takes as much extra time as
+solving ten wires."""
 WIRE_UNITS: Final = FRAME_STEPS + 1 + COVARIANCE_UNITS
 """Maximum cost of a wire per frame, in evaluations."""
 
@@ -131,7 +131,7 @@ class ExactTracker:
 
         No resistance value raises an exception. A wire with fewer usable resistances than unknowns is
         ILL_CONDITIONED, or NON_FINITE if resistances not marked as missing were unusable. Such a wire, and
-        any wire that no solve brings to a root, keeps its last trusted position with an infinite standard
+        any wire for which no solve finds a root, keeps its last trusted position with an infinite standard
         deviation; its residual is computed at that position, or is inf if the deadline left no time. Raises
         ValueError if a shape is wrong.
         """
@@ -227,7 +227,7 @@ class ExactTracker:
         return residual
 
     def _complete(self) -> None:
-        """Write the values of ``a`` that the missing equations of solved wires would have."""
+        """Write the values that ``a`` would have in the missing equations of solved wires."""
         stream, arrays = self._stream, self.arrays
         solved = arrays.good & (stream.solver.report[:, wires.HELD] == 0)
         for u in np.flatnonzero(solved & (arrays.used == 0).any(axis=1)).tolist():

@@ -107,8 +107,8 @@ def damped_solve(  # noqa: PLR0913 - every result of the decomposition
     Uses Givens rotations (Eldén, Algorithms for the regularization of ill-conditioned least squares problems,
     1977).
 
-    The factor R in BᵀB + lam I = RᵀR is bidiagonal too. Writes 1 / its diagonal to ``inverse`` (n,) and its
-    superdiagonal to ``ru`` (n,). The squares of lam and B must not both underflow.
+    The factor R in BᵀB + lam I = RᵀR is bidiagonal too. Writes the reciprocal of its diagonal to ``inverse``
+    (n,) and its superdiagonal to ``ru`` (n,). The squares of lam and B must not both underflow.
     """
     below, rest = lam, 0.0  # row below row i of B: square of its single element, and its right-hand side
     for i in range(x.size):

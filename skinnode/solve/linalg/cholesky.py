@@ -1,8 +1,8 @@
 """Dense kernels for a few hundred unknowns: Cholesky factorisation, triangular solves, products.
 
-LAPACK is not used because the last bits of OpenBLAS results depend on its number of threads, and equal frames
-must give equal fields. Here each element of a result is a single sum in index order, which neither the number
-of threads nor a split of the columns changes.
+LAPACK is not used because the last bits of an OpenBLAS result depend on the number of threads, and equal
+frames must give equal fields. Here each element of a result is a single sum in index order, whatever the
+number of threads or the split of the columns.
 
 All kernels share one loop: a tile of 6 rows and 2 vectors of the result stays in registers while k runs, so
 that 12 multiply-adds need only 8 loads (Goto & van de Geijn, Anatomy of high-performance matrix

@@ -5,7 +5,7 @@
     shorten    if the Newton step leaves the trust region, replace the trial with one inside it
     assess     given r at ``trial`` in ``r_trial``, accept or reject the step, and update the radius
 
-The same compiled steps therefore serve the compiled solver of a skin wire and any pair of Python callables.
+The same compiled steps therefore serve the compiled solver for a skin wire and any pair of Python callables.
 Gauss-Newton accepts every step in full; Levenberg-Marquardt and dogleg accept a step only if it reduces r.
 
 For a square system, CONVERGED means a root: max|r| ≤ tol_f *and* a simplified Newton correction
@@ -134,7 +134,7 @@ def shorten(operator: int, w: Work) -> int:
 
 @njit_part
 def _within_rounding(w: Work, norm: float) -> bool:
-    """Return whether the rounding of x explains ``r_trial``, whose norm is ``norm``."""
+    """Return whether rounding of x explains ``r_trial``, whose norm is ``norm``."""
     if not (norm < math.inf and norm > 0.25 * w.s[NORM] and w.flag[SINGULAR] == 0):
         return False
     rounding(w, w.trial)

@@ -1,4 +1,4 @@
-"""Trust region ‖D s‖ ≤ radius: its size, and the decision whether to accept a step.
+"""Trust region ‖D s‖ ≤ radius: its size, and the decision on whether to accept a step.
 
 A step is accepted only if it reduces r. Source: Moré, The Levenberg-Marquardt algorithm, 1978.
 """

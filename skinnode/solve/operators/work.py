@@ -59,9 +59,9 @@ class Work(NamedTuple):
     qr: Annotated[Float, "m n"]
     """QR factors of J if the system is tall."""
     right: Annotated[Float, "n+3 lanes_m"]
-    """Reflectors of the bidiagonal form from the right."""
+    """Right reflectors of the bidiagonal form."""
     left: Annotated[Float, "n lanes_n+3"]
-    """Reflectors of the bidiagonal form from the left."""
+    """Left reflectors of the bidiagonal form."""
     wide: Annotated[Float, "lanes_m"]
     """Scratch of the same length as a row of ``right``."""
     pivot: Annotated[Index, "n"]

@@ -1,4 +1,4 @@
-"""Corrector of a path tracker: solves wires at positions on a path and logs the cost of each call.
+"""Corrector for a path tracker: solves wires at positions on a path and logs the cost of each call.
 
 Positions count samples from 0; the rest position is −1. Between two samples, ``a`` is interpolated linearly.
 (Interpolating 1/a or log a makes no difference: with layers 0.3 to 1 pitch apart and presses of up to 70 %,
@@ -39,7 +39,7 @@ class Accuracy:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PathLog:
-    """Cost of each call of a corrector, in S rows; NaN or 0 if the call skipped the wire."""
+    """Cost of each call to a corrector, in S rows; NaN or 0 if the call skipped the wire."""
 
     position: Float
     """(S, U) position on the path."""

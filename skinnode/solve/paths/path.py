@@ -34,8 +34,8 @@ from skinnode.solve.posterior.posterior import Posterior
 from skinnode.solve.wires.problem import PatchProblem
 
 SELECTION: Final = Accuracy(tolerance=1e-12, max_steps=100)
-"""Accuracy of a solve started from the posterior: the paper's final tolerance, with its maximum number of
-steps for an intermediate sample."""
+"""Accuracy of a solve started from the posterior: the paper's final tolerance, but the maximum number of
+steps of its intermediate samples."""
 STARTS: Final = 12
 """Number of random starting points in the search for other roots on a layout with folds. They are drawn from
 the posterior with a fixed seed."""

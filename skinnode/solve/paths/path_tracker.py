@@ -65,7 +65,7 @@ class PathEnd:
 
 
 class PathTracker:
-    """Tracker of the wires along the samples of one press. Do not share an instance between owners.
+    """Tracker that follows the wires along the samples of one press. Do not share an instance between owners.
 
     Args:
         problem: The patch.
@@ -76,7 +76,8 @@ class PathTracker:
         end: Outcome at the last sample, after :meth:`finish`.
         cycle: Number of samples from one solve to the next, if step control found or was given a cycle.
         searched: Number of leading log rows spent on the search for the cycle.
-        second_tries: Whether a wire may move away from the end of its path; if not, only its status changes.
+        second_tries: Whether a wire may move away from the end of its path; if not, only its status may
+            change.
         stumbled: (U,) wires on which at least one step was undone.
     """
 
@@ -156,7 +157,7 @@ class PathTracker:
     # -- wire by wire ----------------------------------------------------------------------------------
 
     def predict(self, position: Float) -> Float:
-        """Predict x (U, n), pitches, at ``position`` (U,) from the last converged solve of each wire."""
+        """Predict x (U, n) in pitches at ``position`` (U,) from the last converged solve of each wire."""
         solver = self.solver
         return euler(solver.x, solver.inverse, solver.a_solved, self.corrector.a_at(position))
 

@@ -39,7 +39,7 @@ class PatchEstimate:
     """(U, n) standard deviations, pitches."""
 
     def agrees(self, x: Float) -> Mask:
-        """Return the wires (U,) whose position (U, n), pitches, the estimate confirms."""
+        """Return the wires (U,) whose position (U, n) in pitches is confirmed by the estimate."""
         return roots.agrees(np.abs(x - self.x), roots.AGREE * self.std)
 
 
@@ -135,7 +135,7 @@ def keep_likeliest(
     Args:
         tracker: Tracker at the end of its path.
         starts: (S, U, n) starting positions, pitches.
-        energy: Function that returns −2 log of the density of a displacement field (U, n), pitches, up to a
+        energy: Function that returns −2 log of the density of a displacement field (U, n) in pitches, up to a
             constant.
         unlikely: (U,) energy difference above which a less likely root is ruled out.
         accuracy: Accuracy of the root that is kept.

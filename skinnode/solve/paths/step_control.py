@@ -1,4 +1,4 @@
-"""Step control: chooses the points of a path to solve, and their tolerances.
+"""Step control: chooses which points on a path to solve, and to what tolerance.
 
 A schedule moves a :class:`skinnode.solve.paths.path_tracker.PathTracker` from the rest position to the last
 sample.
@@ -53,7 +53,7 @@ class Uniform:
             each wire at the outcome of the last sample. Otherwise each sample starts on the secant through
             the last two solutions, and a wire with no root or a rough root is solved again from the smoothest
             displacement that explains the last sample. On the staggered layout, h = 1, with 10 samples of
-            each of 21 presses of 50 %, starting on the secant by itself reduces the number of lost wires from
+            each of 21 presses of 50 %, starting on the secant alone reduces the number of lost wires from
             7 of 197 to none, and the evaluations per sample from 4 to 2.9.
         intermediate_tolerance: Tolerance of r, and of x in pitches, at all samples except the last.
         final_tolerance: Tolerance at the last sample.

@@ -4,8 +4,8 @@ The loads q ~ N(0, s² D) of the prior move the electrodes by u = G q + slack. G
 of q is D Gᵀ C⁻¹ u. Given the frame, the variance of a sum wᵀ q is s² wᵀ D w − ‖L⁻¹ J G s² D w‖², in the
 notation of :mod:`skinnode.solve.posterior.measurement_update`.
 
-Errors of single cells are large and cancel between neighbours, so contacts are found in sums of 3 × 3 cells.
-Cells whose sum is significant, and not much smaller than the largest sum, form contacts with their
+The errors in single cells are large but cancel between neighbours, so contacts are found in sums of 3 × 3
+cells. Cells whose sum is significant, and not much smaller than the largest sum, form contacts with their
 neighbours.
 """
 
@@ -159,9 +159,9 @@ def _sum_region(  # noqa: PLR0913 - a kernel: cells, loads and outputs by name
     loads: Index,
     weights: Float,
 ) -> tuple[float, float]:
-    """Return the normal force, N, and the mean r² of the pressure, m², on the cells ``region`` (n,).
+    """Return the normal force in N and the mean r² of the pressure in m² on the cells ``region`` (n,).
 
-    Writes ``centroid`` (3,), m, and ``shear`` (3,), N. Also writes ``loads`` and ``weights`` (7, n), the
+    Writes ``centroid`` (3,) in m and ``shear`` (3,) in N. Also writes ``loads`` and ``weights`` (7, n), the
     first-order sensitivities of force, centroid, mean r² and shear to the loads (delta method). If the force
     is not positive, all other outputs are undefined.
     """

@@ -26,7 +26,7 @@ did not show."""
 
 
 class Fit(NamedTuple):
-    """Misfit of a displacement to a frame."""
+    """Misfit between a displacement and a frame."""
 
     chi_squared: Float
     """(U,) χ² of each wire."""

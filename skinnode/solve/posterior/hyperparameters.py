@@ -18,9 +18,9 @@ from skinnode.solve.posterior.map_estimate import MapEstimator
 from skinnode.solve.posterior.observation import Observation
 
 SCALE_WORTH: Final = 2.0
-"""Weight of the prior of s², as a number of directions; the data determine 100 to 200 directions."""
+"""Weight of the prior on s², as a number of directions; the data determine 100 to 200 directions."""
 SCALE_REST: Final = 0.005
-"""Scale that the prior of s² expects, in clearances: typical of presses that indent the layer by a tenth."""
+"""Scale that the prior on s² expects, in clearances: typical of presses that indent the layer by a tenth."""
 SCALE_MOST: Final = 1.0
 """Largest scale, in clearances; above it the surface would lie below the lower layer."""
 SCALE_STEP: Final = math.log(1.25)
@@ -39,11 +39,11 @@ NOISE_STEP: Final = math.log(1.1)
 """Logarithm of the noise change that triggers an update."""
 
 Observe = Callable[[float], Observation]
-"""Function that returns the observation of a frame for a noise factor."""
+"""Function that returns the observation of a frame for a given noise factor."""
 
 
 class Hyperparameters:
-    """Scale, expected load locations and noise of one patch. Do not share an instance between owners.
+    """Scale, expected load locations and noise for one patch. Do not share an instance between owners.
 
     Args:
         estimator: Estimator of the patch.
@@ -82,13 +82,13 @@ class Hyperparameters:
         self._least = min(least, self._most)
 
     def spread(self, observation: Observation, members: Index) -> None:
-        """Expect equal loads over the whole patch, then set the scale suggested by the frame."""
+        """Reset the prior to equal loads over the whole patch, then set the scale the frame suggests."""
         self._prior.spread(self._fixed or self._expected)
         if self._fixed is None:
             self._prior.scale2 = self._bounded(self._estimator.guess_scale(observation, members))
 
     def spread_as_seen(self, observation: Observation, members: Index) -> None:
-        """Expect equal loads over the whole patch, at the scale the frame suggests under the old prior."""
+        """Reset the prior to equal loads, at the scale the frame suggests under the old prior."""
         guess = self._fixed or self._bounded(self._estimator.guess_scale(observation, members))
         self._prior.spread(guess)
 

@@ -44,7 +44,7 @@ class LoadPosterior:
         return self._estimator.factors
 
     def mean(self) -> Float:
-        """Return the mean of the loads (Q, 3) given the displacement, in units of the prior's loads."""
+        """Return the mean loads (Q, 3), given the displacement, in units of the prior's loads."""
         return self._prior.loads(self._estimator.free_displacement())
 
     def std(self, loads: Index, weights: Float) -> Float:
@@ -65,7 +65,7 @@ class LoadPosterior:
         return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
 
     def expected(self, least: float) -> Float:
-        """Return the load variances (Q,), pitch², implied by the loads found; at least ``least``.
+        """Return the load variances (Q,) in pitch² implied by the loads found; at least ``least``.
 
         Without its own prior, a load has the estimate q / s² k and the variance 1/k − s², where k is the
         increase in χ² per unit of the load (Tipping and Faul, Fast marginal likelihood maximisation for

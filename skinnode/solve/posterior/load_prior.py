@@ -1,4 +1,4 @@
-"""Prior of the loads on a patch and of the displacement caused by them.
+"""Prior of the loads on a patch and of the displacement they cause.
 
 At first, equal loads are expected over the whole patch, at one scale s². Once loads are found, the prior
 expects loads there and hardly any elsewhere (:meth:`LoadPrior.localise`), so the skin next to a contact moves
@@ -29,7 +29,7 @@ LOCAL_SPREAD: Final = 0.7
 A smaller value relies on single cells, which is better if the rubber matches the prior but overconfident if
 it does not; a value of 1 loses a quarter of the improvement."""
 LOCAL_FLOOR: Final = 0.05
-"""Mean square load expected in cells without a load found, relative to the mean over the patch; allows for
+"""Mean square load expected in cells where no load was found, relative to the mean over the patch; allows for
 light touches near a press."""
 LOCAL_CHANGE: Final = 0.35
 """Fraction of the expected loads that must move elsewhere before the prior is rebuilt. At 0.5, errors in a
@@ -69,14 +69,14 @@ class LoadPrior:
         self._loads: tuple[Float, Float] | None = None  # displacement and its loads
 
     def spread(self, scale2: float) -> None:
-        """Expect equal loads over the whole patch, at scale s²."""
+        """Reset the prior to equal loads over the whole patch, at scale s²."""
         self.scale2 = scale2
         self.share[:] = 1.0
         self.covariance[:] = self.uniform
         self._made_anew(self.uniform)
 
     def localise(self, variance: Float) -> bool:
-        """Expect loads of these variances.
+        """Set the variances of the loads.
 
         Args:
             variance: (Q,) variance of the loads of each cell, pitch².
@@ -97,7 +97,7 @@ class LoadPrior:
         return True
 
     def expected(self, found: Float, least: float, *, certain: bool) -> Float:
-        """Return the variances (Q,), pitch², implied by the loads found; at least ``least``.
+        """Return the variances (Q,) in pitch² implied by the loads found; at least ``least``.
 
         The variances move halfway from their current values to the implied values, because with full steps
         neighbouring cells would alternate. If a press is certain and equal loads were expected over the whole
@@ -135,7 +135,7 @@ class LoadPrior:
         return self._loads[1]
 
     def roughness(self, displacement: Float) -> float:
-        """Return uᵀ C⁻¹ u, pitch², of a displacement (U f,), which is overwritten.
+        """Return uᵀ C⁻¹ u in pitch² for a displacement (U f,), which is overwritten.
 
         The value is the number of unknowns times the squared scale that fits the displacement best.
         """

@@ -120,7 +120,7 @@ class MapEstimator:
         return self.members.size * self._rows
 
     def reset(self, scale2: float) -> None:
-        """Return to rest, discard the factors, and expect loads everywhere at scale s², pitch²."""
+        """Return to rest, discard the factors, and reset the prior to equal loads at scale s², pitch²."""
         self.moved[:] = 0.0
         self.g[:] = 0.0
         self.forget_factors()
@@ -195,7 +195,7 @@ class MapEstimator:
         return self._b.r.copy()
 
     def fit(self, observation: Observation, moved: Float | None) -> Fit:
-        """Return the misfit of a displacement (U, 3N), pitches, to a frame; None means the rest position."""
+        """Return the misfit between a displacement (U, 3N) in pitches (None: rest) and a frame."""
         if moved is None:
             self._linearise_at_rest(observation)
         else:
@@ -215,7 +215,7 @@ class MapEstimator:
         return square + prior + float((g**2 / observation.d).sum())
 
     def roughness(self, moved: Float) -> float:
-        """Return uᵀ C⁻¹ u, pitch², of a displacement (U, 3N)."""
+        """Return uᵀ C⁻¹ u in pitch² for a displacement (U, 3N)."""
         return self.load_prior.roughness(np.ascontiguousarray(moved[:, self._free]).ravel())
 
     def free_displacement(self) -> Float:
@@ -240,7 +240,7 @@ class MapEstimator:
     # -- evidence --------------------------------------------------------------------------------------
 
     def signal(self) -> Float:
-        """Return the variance (U, K), pitch⁻², of each relative change in R at rest if s = 1."""
+        """Return the variance (U, K) in pitch⁻² of each relative change in R at rest for s = 1."""
         wires, f, a = len(self.moved), self._free.size, self._problem.a_rest
         plain = Observation(a, np.ones_like(a), np.zeros((*a.shape, 0)), np.zeros(0))
         self._linearise_at_rest(plain)
@@ -249,7 +249,7 @@ class MapEstimator:
         return np.asarray(np.einsum("uik,uij,ujk->uk", slopes, own, slopes))
 
     def guess_scale(self, observation: Observation, members: Index) -> float:
-        """Return the s², pitch², at which the expected deviation of R from rest matches the measurement."""
+        """Return the s² in pitch² at which the expected deviation of R from rest matches the measured one."""
         self._linearise_at_rest(observation)
         trace = self._assemble(observation, members, 1.0, np.zeros_like(self.moved))
         square = float((self._b.r[members] ** 2).sum())
@@ -265,10 +265,10 @@ class MapEstimator:
         return self._gamma
 
     def evidence_scale(self, weight: float, scale2: float) -> float:
-        """Return the next s², pitch², of MacKay's fixed-point iteration (Neural Computation 4, 415, 1992).
+        """Return the next s² in pitch² by MacKay's fixed-point iteration (Neural Computation 4, 415, 1992).
 
         Args:
-            weight: Weight of the prior of s², in directions.
+            weight: Weight of the prior on s², in directions.
             scale2: s² that the prior expects, pitch².
         """
         return (self.roughness(self.moved) + weight * scale2) / (self.gamma() + weight)
@@ -311,7 +311,7 @@ class MapEstimator:
         return kernels.assemble(members, self._free, covariance, scale2, o.h, o.d, moved, self._b)
 
     def _newton(self, observation: Observation, members: Index) -> float:
-        """Take a Gauss-Newton step with new factors; return max |step|, pitches, or inf on failure."""
+        """Take a Gauss-Newton step with new factors; return max |step| in pitches, or inf on failure."""
         b, prior = self._b, self.load_prior
         self._factored = None
         self._linearise(observation, self.moved, members)

@@ -42,7 +42,7 @@ with up to ten times as much noise."""
 LEFT_OUT: Final = 3
 """Maximum number of wires to leave out, one after another, before the whole frame is INCONSISTENT."""
 LEAST_STEPS: Final = 3.0
-"""Minimum time of a solve from rest, in factorisations of all wires including standard deviations; 11 to 20
+"""Minimum time for a solve from rest, in factorisations of all wires including standard deviations; 11 to 20
 were measured for presses on 1 to 10 wires."""
 
 Mask = NDArray[np.bool_]

@@ -1,4 +1,4 @@
-"""Elastic prior: the displacement of the rubber that is expected before any resistance is measured.
+"""Elastic prior: the displacement of the rubber expected before any resistance is measured.
 
 Each electrode site lies in a cell one pitch wide. Independent surface loads on the cells displace the
 electrodes by the response G of an elastic half-space (Boussinesq, Cerruti;
@@ -7,7 +7,7 @@ electrodes by the response G of an elastic half-space (Boussinesq, Cerruti;
     u ~ N(0, s² C),   C = G diag(q) Gᵀ + ε² I
 
 with one scale s for the patch, set from the data. The cells extend beyond the outermost electrodes, because
-the skin can be pressed there too. ε allows small independent deviations of each electrode from the
+the skin can be pressed there too. ε allows for small independent deviations of each electrode from the
 half-space.
 
 Curved skin is unrolled: distances are chords, and the response to a load is expressed in the tangent frame
@@ -28,7 +28,7 @@ from skinnode.model.layout import Float, PatchLayout
 from skinnode.solve.linalg.cholesky import multiply
 
 MARGIN: Final = 2
-"""Number of rings of cells beyond the outermost electrodes. A third and a fourth ring change the evidence of
+"""Number of rings of cells beyond the outermost electrodes. A third and a fourth ring change the evidence for
 Hertz presses, on the patch or half outside it, by less than 1 in 800."""
 SHEAR_SHARE: Final = 0.4
 """Ratio of the standard deviations of shear and normal loads; a contact that slides with a friction
@@ -61,7 +61,7 @@ class ElasticPrior:
 
     @classmethod
     def of(cls, layout: PatchLayout, rubber: Rubber | None = None) -> ElasticPrior:
-        """Return the prior of ``layout`` on ``rubber``, whose modulus only scales the forces."""
+        """Return the prior for ``layout`` on ``rubber``, whose modulus only scales the forces."""
         rubber = Rubber() if rubber is None else rubber
         wires, electrodes = layout.upper_m.shape[:2]
         cell, along, across, normal = _lattice(layout)

@@ -124,7 +124,7 @@ class FrameArrays(ArrayTable):
     code_gain: Annotated[Float, "U K"]
     rounding_ohm: Annotated[Float, "U K"]
     code_map: Annotated[Float, "4"]
-    """R/R0 of code 0, change in R/R0 per code, largest valid code, relative noise before the converter."""
+    """R/R0 at code 0, change in R/R0 per code, largest valid code, relative noise before the converter."""
     ohm: Annotated[Float, "U K"]
     noise: Annotated[Float, "U K"]
     """Relative standard deviation of the resistance."""
@@ -215,4 +215,4 @@ class FrameArrays(ArrayTable):
 
 
 read_options, read_solver, read_frame = reader(SolveOptions), reader(SolverArrays), reader(FrameArrays)
-"""Functions with which kernels read the fields of a table."""
+"""Functions that kernels use to read the fields of a table."""

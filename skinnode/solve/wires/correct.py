@@ -1,6 +1,6 @@
 """Compiled corrector: brings one wire to a root of r = w (a F − 1) with an operator.
 
-A wire is solved for all coordinates of its electrodes or for fewer: some electrodes may stay at rest, and z
+A wire is solved for all coordinates of its electrodes or for fewer: some electrodes may stay at rest, or z
 may be the only unknown (``normal_only``). With fewer unknowns than equations, the system is tall, and χ² = Σ
 (ρ_k/σ_k)² at its minimum tests the fit. Above the 1 − 1e-9 quantile, no position explains the frame, and the
 wire is ILL_CONDITIONED; above the 95 % quantile, the standard deviations are multiplied by √(χ²/dof) (Birge,
@@ -83,7 +83,7 @@ def _evaluate(  # noqa: PLR0913 - arrays of one wire
 
 @njit_part
 def _take_jacobian(raw: Float, a: Float, weight: Float, jt: Float) -> None:
-    """Write ∂r/∂x of the unknowns into ``jt`` from ∂F/∂x of all coordinates."""
+    """Write ∂r/∂x with respect to the unknowns into ``jt``, given ∂F/∂x with respect to all coordinates."""
     normal_only = jt.shape[0] != raw.shape[0]
     for j in range(jt.shape[0]):
         target, source = jt[j], raw[3 * j + 2 if normal_only else j]
@@ -93,7 +93,7 @@ def _take_jacobian(raw: Float, a: Float, weight: Float, jt: Float) -> None:
 
 @njit_part
 def coordinate(electrodes: Index, j: int, each: int) -> int:
-    """Return the coordinate, below 3N, of unknown ``j`` for ``each`` = 3 or 1 (z) unknowns per electrode."""
+    """Return the coordinate index (< 3N) of unknown ``j``; ``each`` = 3 or 1 (z) unknowns per electrode."""
     if each == 3:
         return int(3 * electrodes[j // 3] + j % 3)
     return int(3 * electrodes[j] + 2)
@@ -158,7 +158,7 @@ def report_correction(  # noqa: C901, PLR0913 - one wire of a call; its results 
 ) -> int:  # fmt: skip
     """Write x, report and measures of wire ``u``, for which :func:`correct` returned ``status``.
 
-    ``count`` is the number of equations. If COVARIANCE is among the tasks, also writes the inverse and the
+    ``count`` is the number of equations. If COVARIANCE is one of the tasks, also writes the inverse and the
     arrays that belong to it. Returns ``status``, or ILL_CONDITIONED if the root is too poorly determined.
     """
     w: Any = solver.work

@@ -52,7 +52,7 @@ def follow(  # noqa: PLR0913 - arrays of one wire
     x: Float, lower: Float, a: Float, inverse: Float, moved: float, tol_f: float, tol_x: float,
     rho: Float, step: Float,
 ) -> tuple[int, int, float]:  # fmt: skip
-    """Take simplified Newton steps of a square system whose unknowns are all coordinates ``x`` (3N,).
+    """Take simplified Newton steps for a square system whose unknowns are all coordinates ``x`` (3N,).
 
     ``moved`` is the size of the prediction that led to ``x``. Returns the number of evaluations of F
     (negative if no root was found), the number of steps added to ``x``, and the size of the first step

@@ -28,8 +28,7 @@ from skinnode.model.layout import Float
 Z_HOLD: Final = 2.326
 """Normal quantile for 99 %: an unmoved wire is solved needlessly once in a hundred frames."""
 FRESHER: Final = 2.0
-"""Maximum ratio of the noise variance of the frame that x was solved from to that of the current frame, for a
-wire to be held."""
+"""Maximum ratio of noise variances (frame x was solved from / current frame) at which a wire is held."""
 
 
 def chi2_quantile(dof: float, z: float) -> float:

@@ -154,7 +154,7 @@ class PatchSolver:
         self._still[u] = self.problem.share_at_rest[u, rest].sum(axis=0)
 
     def solve_rest(self) -> Index:
-        """Compute J⁻¹ at the rest position; return the sign of det J (U,), 0 if that is 0 or undefined."""
+        """Compute J⁻¹ at the rest position; return the sign of det J (U,), 0 if det J is 0 or undefined."""
         todo, weight = np.full(len(self.x), wires.SOLVE, np.uint8), np.ones_like(self.a_solved)
         self.x[:] = self.problem.rest
         options = solve_options(self.operator, wires.COVARIANCE, REST_TOLERANCE, REST_TOLERANCE, 1)
@@ -182,8 +182,8 @@ class PatchSolver:
             options: Operator, tasks and tolerances.
             sigma: Standard deviation of a residual of weight 1; 0 if unknown.
             order: (U,) wires in processing order; the default is 0, 1, 2, …
-            units: Time allowed, as in :func:`skinnode.solve.wires.solve_wires.solve_wires`. A wire that was
-                processed has TURN 1 in its report.
+            units: Time allowed, as in :func:`skinnode.solve.wires.solve_wires.solve_wires`. The report of a
+                processed wire has TURN = 1.
 
         Raises TypeError if ``todo``, ``a`` or ``weight`` has the wrong element type or shape.
         """

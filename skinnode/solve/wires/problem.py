@@ -66,7 +66,7 @@ class PatchProblem:
         return TRUST_SHARE * float(self.clearance.min())
 
     def displacement_m(self, x: Float) -> Float:
-        """Return the displacement (U, N, 3), m, of ``x`` (U, 3N), pitches."""
+        """Return the displacement (U, N, 3) in m for ``x`` (U, 3N) in pitches."""
         return np.asarray((x - self.rest) * self.layout.pitch_m).reshape(self.layout.upper_m.shape)
 
     def out_of_reach(self, x: Float) -> NDArray[np.bool_]:

@@ -22,7 +22,7 @@ SOME_ROUGH: Final = 2
 
 
 class RootCheck(ArrayTable):
-    """Field to check, limits of the check, and findings."""
+    """Field to check, limits for the check, and findings."""
 
     moved_m: Annotated[Float, "U N 3"]
     """Displacement."""

@@ -29,7 +29,7 @@ inverses in turn."""
 COVARIANCE_UNITS: Final = 3.0
 """Cost of the covariance of a square system of 30 unknowns, in evaluations of F and J with their step."""
 HELD_UNITS: Final = 0.25
-"""Cost of determining that a wire can be held, in evaluations of F and J with their step."""
+"""Cost of finding that a wire can be held, in evaluations of F and J with their step."""
 
 
 @njit_part

@@ -17,8 +17,7 @@ from skinnode.solve.wires import arrays as wires
 from skinnode.solve.wires.arrays import FrameArrays, SolverArrays
 
 STALE: Final = 2.0
-"""Maximum factor by which the weight of an equation may have changed since the J⁺ of a tall system was
-computed, for that J⁺ to be reused."""
+"""Maximum change in an equation's weight, as a factor, before the J⁺ of a tall system is recomputed."""
 DEADLINE: Final = int(Status.DEADLINE)
 
 

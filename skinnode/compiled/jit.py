@@ -3,8 +3,8 @@
 A plain file cache notices edits to the file that defines a function, but not edits to other files whose
 functions it calls. Therefore the cache folder (:mod:`skinnode.compiled.kernel_cache`) is named after a digest
 of every file that contains kernels: an edit to any of these files recompiles all kernels. The folder is
-created under ``$SKINNODE_CACHE_DIR``, the user's cache folder or the system's temporary folder, whichever is
-writable first. If no folder is writable, nothing is cached.
+created under the first of these that is writable: ``$SKINNODE_CACHE_DIR``, the user's cache folder, the
+system's temporary folder. If no folder is writable, nothing is cached.
 
 ``error_model="numpy"`` makes a division by zero yield inf (reported by a status) instead of raising an
 exception, and ``nogil`` lets a thread pool solve several patches at the same time. ``fastmath`` stays off

@@ -75,7 +75,7 @@ class LeftOut:
             self._set_electrodes(u, np.arange(self._layout.unknowns // 3))
 
     def leave_out(self, sigma: float) -> None:
-        """Return wires to rest if that explains the frame; write the std of omitted coordinates."""
+        """Move wires back to rest if that explains the frame; write the std of omitted coordinates."""
         solver, arrays = self._stream.solver, self._stream.arrays
         if self._active_only:
             a_rest = self._stream.problem.a_rest

@@ -73,7 +73,7 @@ class StreamState:
         self.options = solve_options(operator, TASKS, TOLERANCE, TOLERANCE, FRAME_STEPS)
 
     def reset(self) -> None:
-        """Return to the rest position."""
+        """Go back to the rest position."""
         solver, arrays = self.solver, self.arrays
         arrays.x[:], arrays.a_solved[:] = self.problem.rest, self.problem.a_rest
         solver.inverse[:] = self._rest_inverse

@@ -271,7 +271,7 @@ class ExactTracker:
             self._stream.solve(todo, frame, units=units)
 
     def _held_residual(self, u: int) -> float:
-        """Return the RMS of F/b − 1 of wire u at its held position; inf if no resistance is usable."""
+        """Return the RMS of F/b − 1 for wire u at its held position; inf if no resistance is usable."""
         arrays = self.arrays
         used = arrays.used[u] > 0
         if not used.any():

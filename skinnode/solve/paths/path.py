@@ -148,7 +148,7 @@ def solve_path(
 def _ask_posterior(
     tracker: PathTracker, layout: PatchLayout, last_ohm: Float, baseline_ohm: ArrayLike | None
 ) -> PatchEstimate | None:
-    """Select the roots of the last sample with the posterior; return its estimate, or None if untrusted."""
+    """Select the roots at the last sample with the posterior; return its estimate, or None if untrusted."""
     patch = Posterior(layout, relative_noise=roots.REFEREE_NOISE, baseline_ohm=baseline_ohm, hold=False)
     field = patch.update(last_ohm)
     if not field.trusted:

@@ -117,7 +117,7 @@ class PathTracker:
         return self.corrector.sample_a(self.samples - 1)
 
     def restart(self) -> None:
-        """Return all wires to the rest position."""
+        """Move all wires back to the rest position."""
         self.solver.x[:] = self.problem.rest
         self.solver.inverse[:], self.solver.a_solved[:] = self._rest
         self._branch = self._rest_branch.copy()

@@ -90,7 +90,7 @@ class Uniform:
 
 @dataclass(frozen=True)
 class Periodic:
-    """Schedule that solves one sample per cycle T (section 5.2).
+    """Schedule that solves one sample per cycle T (section 5.2 of the paper).
 
     Between two solves, the tracked point stays within the relaxed tolerance, so the skipped samples add no
     information.

@@ -35,7 +35,7 @@ HERTZ_SPREAD: Final = 2.5
 
 
 class ContactFinder:
-    """Finder of the contacts of one patch, frame by frame.
+    """Finder of the contacts on one patch, frame by frame.
 
     Args:
         prior: Elasticity of the patch.

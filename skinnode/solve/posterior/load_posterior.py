@@ -67,7 +67,7 @@ class LoadPosterior:
     def expected(self, least: float) -> Float:
         """Return the load variances (Q,) in pitch² implied by the loads found; at least ``least``.
 
-        Without its own prior, a load has the estimate q / s² k and the variance 1/k − s², where k is the
+        Without its own prior, a load has the estimate q / (s² k) and the variance 1/k − s², where k is the
         increase in χ² per unit of the load (Tipping and Faul, Fast marginal likelihood maximisation for
         sparse Bayesian models, 2003).
         """

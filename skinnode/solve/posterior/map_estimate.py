@@ -30,7 +30,7 @@ from skinnode.solve.posterior.prior import ElasticPrior
 from skinnode.solve.wires.problem import PatchProblem
 
 ANNEAL_NOISE: Final = 0.03
-"""Initial relative noise of annealing, at which one Gauss-Newton step from rest gets close to the maximum."""
+"""Initial relative noise for annealing: one Gauss-Newton step from rest gets close to the maximum."""
 ANNEAL_RATIO: Final = 4.0
 """Ratio of the noise of one annealing step to that of the next. For presses of up to 70 % from rest on
 the staggered and aligned layouts, h = 0.5 and 1, a ratio of 3 leads to the correct maximum in 80 of 80 cases,
@@ -120,7 +120,7 @@ class MapEstimator:
         return self.members.size * self._rows
 
     def reset(self, scale2: float) -> None:
-        """Return to rest, discard the factors, and reset the prior to equal loads at scale s², pitch²."""
+        """Go back to rest, discard the factors, and reset the prior to equal loads at scale s², pitch²."""
         self.moved[:] = 0.0
         self.g[:] = 0.0
         self.forget_factors()

@@ -49,7 +49,7 @@ from skinnode.solve.linalg.vectors import Index, dot
 
 
 class Buffers(NamedTuple):
-    """Arrays written by a step of one patch.
+    """Arrays written by a step for one patch.
 
     A patch has U wires with K equations and f free coordinates each, p nuisances, and R = min(K, f + p) rows
     per wire after reduction.

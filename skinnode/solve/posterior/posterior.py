@@ -104,7 +104,7 @@ class Posterior:
             self.reset()
 
     def _warm_up(self) -> None:
-        """Solve a touched frame so that the first touch of a stream does not wait for the compiler."""
+        """Solve a touched frame so that the first touch in a stream does not wait for the compiler."""
         touched = self.layout.upper_m.copy()
         touched[0, 0, 2] -= 0.1 * self._problem.clearance[0, 0] * self.layout.pitch_m
         potential = potential_per_m(self.layout, touched) * self.layout.pitch_m

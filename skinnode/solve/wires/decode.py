@@ -15,7 +15,7 @@ from skinnode.solve.wires.arrays import FrameArrays
 
 A_MIN: Final = 1e-12
 A_MAX: Final = 1e12
-"""Range of usable a; at rest a is about 1 / N M, and no plausible resistance lies outside the range."""
+"""Range of usable a; at rest a is about 1 / (N M), and no plausible resistance lies outside the range."""
 
 
 @njit_part

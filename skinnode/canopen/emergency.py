@@ -182,7 +182,7 @@ def _skipped(detail: bytes) -> str:
         return ""
     skipped = f"{counted(_word(detail), 'scan')} skipped so far"
     slow = says_too_slow(EmcyCode.CAN_OVERRUN, detail)
-    return f"{skipped} because the computer that runs the node is too slow" if slow else skipped
+    return f"{skipped} because the computer running the node is too slow" if slow else skipped
 
 
 def _silent(detail: bytes) -> str:

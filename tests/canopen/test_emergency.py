@@ -24,7 +24,7 @@ def test_every_code_of_the_node_has_words_of_its_own() -> None:
             0x8110,
             "01 00 01",
             "overrun: messages or scans lost: 1 scan skipped so far "
-            "because the computer that runs the node is too slow",
+            "because the computer running the node is too slow",
         ),
         (0x8110, "00 00 01 00 00", "overrun: messages or scans lost"),  # emergencies, not scans
         (0x8150, "0b 07", "CAN-ID collision: another node has this node-ID: 0x70B"),

@@ -380,7 +380,7 @@ def test_an_overrun_that_was_taken_back_is_a_note(monkeypatch: pytest.MonkeyPatc
         before = fleet.report()
         assert eventually(lambda: host.stats().patches["thumb"].solved > 3)
         assert held_up_until(sources[0], missed)
-        assert "the computer that runs the node is too slow" in host.health("thumb").emergency_text
+        assert "the computer running the node is too slow" in host.health("thumb").emergency_text
         assert eventually(lambda: faults_and_notes(host)[0] == [])
         notes = faults_and_notes(host)[1]
         assert any("because the computer running the node could not keep up" in note for note in notes), notes

@@ -11,7 +11,7 @@ FD_LENGTHS: Final[tuple[int, ...]] = (*range(9), 12, 16, 20, 24, 32, 48, 64)
 
 
 def fd_length(n_bytes: int) -> int:
-    """Return the shortest CAN FD data length that holds a number of bytes.
+    """Return the shortest CAN FD data length that can hold the given number of bytes.
 
     Args:
         n_bytes: number of bytes.

@@ -61,7 +61,7 @@ class Entry:
     access: str
     """ro, rw, wo, const, or rww (rw and mappable into an RPDO)."""
     default: Value | None = None
-    """Default value; None if it is device-specific, like a serial number, and therefore starts at zero."""
+    """Default value; None if it is device-specific, such as a serial number, and therefore starts at zero."""
     plus_node_id: bool = False
     """Whether the node-ID is added to the default at start-up, as for a COB-ID."""
     mappable: bool = False

@@ -13,7 +13,8 @@ from typing import Final, NamedTuple
 ASCII: Final = "ASCII"
 
 MOST_EDS_BYTES: Final = 2 << 20
-"""Maximum file size, bytes; twenty times the size of a patch's EDS, and more than any known device needs."""
+"""Maximum file size, bytes; twenty times the size of a patch's EDS, and larger than the EDS of any known
+device."""
 
 _UTF_16: Final = {codecs.BOM_UTF16_LE: "utf-16-le", codecs.BOM_UTF16_BE: "utf-16-be"}
 _CODECS: Final = {

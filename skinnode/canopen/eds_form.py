@@ -28,7 +28,7 @@ def check_form(text: str, source: str) -> None:
         source: name of the file, shown in the error.
 
     Raises:
-        ProfileError: at the first mistake, with its line number.
+        ProfileError: for the first mistake, with its line number.
     """
     for line, section, key, value in _lines(text):
         if not key:

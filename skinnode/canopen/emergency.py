@@ -37,7 +37,7 @@ class EmcyCode(IntEnum):
 
     @property
     def register_bit(self) -> int:
-        """Error register mask of the code, with bit 4 (communication) or 7 (manufacturer-specific) set."""
+        """Error register mask for the code, with bit 4 (communication) or 7 (manufacturer-specific) set."""
         return 0x10 if self >> 12 == 8 else 0x80
 
 
@@ -209,4 +209,4 @@ _DETAILS: Final[dict[int, Callable[[bytes], str]]] = {
     EmcyCode.CAN_ID_COLLISION: lambda detail: f"0x{_word(detail):03X}",
     EmcyCode.SOURCE: lambda detail: _SOURCE_FAULTS.get(detail[0], ""),
 }
-"""Functions that convert the manufacturer-specific bytes (at least two) of a skinnode patch to text."""
+"""Functions that convert the manufacturer-specific bytes (at least two) from a skinnode patch to text."""

@@ -169,7 +169,7 @@ TEST_STATUS, TEST_FAULTS, TEST_READINGS, TEST_NOISE = 1, 2, 3, 4
 TEST_OPEN_WIRES, TEST_SHORTED_WIRES, TEST_OUT_OF_RANGE, TEST_UNTARED = 5, 6, 7, 8
 UPPER_WIRE_FAULTS: Final = 0x2030
 LOWER_WIRE_FAULTS: Final = 0x2031
-"""Masks of 32 wires, starting at wire 32 i: open wires at sub-index 2 i + 1, shorted wires at 2 i + 2."""
+"""Masks for 32 wires each, from wire 32 i on: open wires at sub-index 2 i + 1, shorted wires at 2 i + 2."""
 REJECTED_FRAMES: Final = 0x2040
 """Counters; see :class:`skinnode.node.rejected.Rejected`."""
 CODES: Final = 0x2100

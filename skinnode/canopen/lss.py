@@ -27,7 +27,7 @@ LSS_MANUFACTURER_ERROR: Final = 0xFF
 """Error code announcing that the next byte holds a manufacturer-specific error code."""
 
 RESET_SCAN: Final = 0x80
-"""Fastscan bit-check value that makes every node without a node-ID answer and restart at the vendor-ID."""
+"""Fastscan bit-check value that makes every node without a node-ID answer, and restarts the scan."""
 
 
 class LssCommand(IntEnum):
@@ -53,7 +53,7 @@ class LssCommand(IntEnum):
 
 
 class LssState(IntEnum):
-    """States of the slave; the value is the mode of *switch state global*."""
+    """States of the slave, with the values of the mode byte of *switch state global*."""
 
     WAITING = 0
     CONFIGURATION = 1

@@ -10,8 +10,8 @@ STOPPED           command 2            NMT, error control
 ================  ===================  ===========================================================
 
 A node obeys every command in every state except INITIALISING, in which it receives no commands. *Reset node*
-(129) resets all objects to their defaults, and *reset communication* (130) the objects from 0x1000 to 0x1FFF.
-The node boots after either command.
+(129) resets all objects to their defaults; *reset communication* (130) resets only the objects from 0x1000 to
+0x1FFF. The node boots after either command.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ AFTER_COMMAND: Final = {
     NmtCommand.STOP: NmtState.STOPPED,
     NmtCommand.ENTER_PRE_OPERATIONAL: NmtState.PRE_OPERATIONAL,
 }
-"""State after each command that is not a reset."""
+"""State after each command other than the resets."""
 
 
 def state_name(state: int) -> str:

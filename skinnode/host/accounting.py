@@ -1,4 +1,4 @@
-"""Check that a host's counters add up: everything received was passed on or is counted as lost.
+"""Check that a host's counters add up: everything received has been passed on or counted as lost.
 
 Counters are read one after another rather than simultaneously, so check only a closed or idle host.
 """

@@ -84,7 +84,7 @@ class BaselineWatch:
         node.read_ns = now_ns + (LEAST_NS if stream.withholding else _DOUBT_NS)
         try:
             read = job.result()
-        except (BusError, ConfigError) as error:  # missing heartbeats will reveal a node that is gone
+        except (BusError, ConfigError) as error:  # if the node is gone, missing heartbeats will reveal it
             stream.doubtful = True
             _log.warning("%s; reading its baseline again", error)
             return

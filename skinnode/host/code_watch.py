@@ -3,25 +3,26 @@
 **Frozen.** A converter whose noise is visible in the codes cannot repeat the same codes for long. If the
 noise has a standard deviation of σ codes, a reading repeats its code with a probability of at most 2Φ(1/2σ) −
 1 (the value for a true resistance in the middle of a step), and the probability that n scans of m codes are
-all equal is at most that value to the power of n·m. For a run of equal scans to count as frozen, this bound
-must be below ``FALSE_ALARM``, with σ from the hand file. A converter quieter than the file states may repeat
-its codes for hours. Therefore the stream itself must also have shown noise, that is, ``FLICKERS`` scans in
-which a code returned to its previous value (a touch or creeping rubber moves codes in one direction only),
-and the run must be ``LONGER`` times as long as any earlier run that ended on its own. A converter that never
-flickers is never reported as frozen. Scans that contain only the changed chunks, or lack chunks, are ignored.
-One false alarm remains possible: if a converter has only a third of the noise stated in the hand file, its
-codes flicker while rubber creeps and are constant afterwards, so the converter may be reported once.
+all equal is at most that value raised to the power n·m. For a run of equal scans to count as frozen, this
+bound must be below ``FALSE_ALARM``, with σ from the hand file. A converter quieter than the file states may
+repeat its codes for hours. Therefore the stream itself must also have shown noise, that is, ``FLICKERS``
+scans in which a code returned to its previous value (a touch or creeping rubber moves codes in one direction
+only), and the run must be ``LONGER`` times as long as any earlier run that ended on its own. A converter that
+never flickers is never reported as frozen. Scans that contain only the changed chunks, or lack chunks, are
+ignored. One false alarm remains possible: if a converter has only a third of the noise stated in the hand
+file, its codes flicker while rubber creeps and are constant afterwards, so the converter may be reported
+once.
 
 **Wires.** A wire is open or shorted if all its crossings are open or shorted in a complete scan. Noise and
 drift are evaluated over windows of ``WINDOW`` scans, and their criteria must be met in ``WINDOWS``
 consecutive windows. Taking the second difference of a code over time removes steady movement; a wire is noisy
 if the mean square of this difference exceeds ``NOISY`` times the value of the median wire on its side, and
-``NOISY`` times the value of the expected noise. A wire drifts if the resistances of all its crossings changed
-by the same fraction of R0, by more than ``DRIFT`` relative to both the median wire and the rest state, and
-its neighbours did not follow. A touch, in contrast, changes the crossings of a wire unevenly, and the rubber
-spreads the change to the adjacent wires. Simulated touches (spheres of 2 mm to 0.3 m pressed in by 10 to
-60 %) changed a wire by more than ``DRIFT`` at 780,000 instants; none was mistaken for drift. Consequently,
-two neighbours that drift alike are not reported, nor is a wire while it is touched.
+``NOISY`` times the value of the expected noise. A wire drifts if the resistances of all its crossings have
+changed by the same fraction of R0, if this change exceeds ``DRIFT`` relative to both the median wire and the
+rest state, and if its neighbours have not followed. A touch, in contrast, changes the crossings of a wire
+unevenly, and the rubber spreads the change to the adjacent wires. Simulated touches (spheres of 2 mm to 0.3 m
+pressed in by 10 to 60 %) changed a wire by more than ``DRIFT`` at 780,000 instants; none was mistaken for
+drift. Consequently, two neighbours that drift alike are not reported, nor is a wire while it is touched.
 """
 
 from __future__ import annotations

@@ -3,7 +3,7 @@
 Nothing is written before identity and layout are known to match the hand file, because the node could be a
 drive. Every written value is read back. On a bus that another master runs, the host sends no NMT commands,
 leaves the SYNC parameters alone, and writes patch-specific parameters only if they differ. If the host must
-send nothing (``guest_sends = "nothing"``), all facts come from files.
+send nothing (``guest_sends = "nothing"``), all information about the node comes from files.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ BOOT_DEADLINE_S: Final = 3.0
 """Maximum time until the first response from a node, s; controllers boot and tare within a second."""
 
 HEARTBEATS_WATCHED: Final = 3
-"""Number of host heartbeats that a node may miss before it stops sending, when the host sends heartbeats."""
+"""Number of consecutive heartbeats from the host that a node may miss before it stops sending."""
 
 _POLL_S: Final = 0.02
 
@@ -63,7 +63,7 @@ class Configurator:
         On a bus where the host is the master, the node is pre-operational afterwards.
 
         Args:
-            patch: The patch of the hand file.
+            patch: The patch as described in the hand file.
             profile: Its wire format.
             remote: The object dictionary of its node.
 
@@ -201,7 +201,7 @@ class Configurator:
         if not master:
             overflow = remote.read(od.SYNC_COUNTER_OVERFLOW, 0, "u8")
             if overflow != sync.counter_overflow:
-                allowed = f"{sync.counter_overflow} as in sync.counter_overflow of the hand file"
+                allowed = f"{sync.counter_overflow} as in sync.counter_overflow in the hand file"
                 raise _mismatch(patch, "SYNC counter overflow, set by another master", str(overflow), allowed)
         write = remote.write_checked if master else remote.write_if_different
         write(od.ACQUISITION, od.ACQUISITION_PERIOD, "u16", 0)

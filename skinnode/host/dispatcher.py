@@ -1,7 +1,7 @@
-"""Count the frames of a bus and dispatch them to handlers by COB-ID. No thread, no clock.
+"""Count the frames on a bus and dispatch them to handlers by COB-ID; uses no thread and no clock.
 
-A :class:`~skinnode.host.link.BusLink` feeds the dispatcher with the frames of a bus, a replay with the frames
-of a recording.
+A :class:`~skinnode.host.link.BusLink` feeds the dispatcher with the frames from a bus; a replay feeds it with
+the frames from a recording.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ frames arrive a millisecond apart."""
 
 @dataclass(frozen=True, slots=True)
 class BusStats:
-    """Counters of a bus since the host opened it."""
+    """Counters for a bus since the host opened it."""
 
     received: int
     """Data frames read, excluding the host's own."""
@@ -81,7 +81,7 @@ class PortCounters:
     dropped: int = 0
     outages: int = 0
     read: int | None = None
-    """None if all frames that were read have been dispatched."""
+    """Number of frames read; None if all of them have been dispatched."""
     waiting: int = 0
     kernel_dropped: int = 0
 
@@ -145,7 +145,7 @@ class Dispatcher:
         """Handle ``error``, which was raised by the operation ``doing``.
 
         Raises:
-            Exception: ``error`` itself, because a replay has no live bus that must be kept running.
+            Exception: ``error`` itself, because a replay has no live bus to keep running.
         """
         raise error
 

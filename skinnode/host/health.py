@@ -45,8 +45,8 @@ class Condition(enum.StrEnum):
     FROZEN = "frozen"
     """Scans arrive, but always with the same values: see :mod:`skinnode.host.code_watch`."""
     FAULTY = "faulty"
-    """The node's error register is not zero, or serving the patch raised an exception:
-    :attr:`PatchHealth.defect`."""
+    """The node's error register is not zero, or serving the patch raised an exception
+    (:attr:`PatchHealth.defect`)."""
     REFUSED = "refused"
     """The node answers, but does not match the hand file or does not keep its configuration."""
     LOST = "lost"

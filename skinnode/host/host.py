@@ -44,7 +44,7 @@ class HostStats:
     """Frames from other masters, by bus."""
     sync: SyncStats
     malformed: tuple[CodecError, ...]
-    """First malformed frame of each bus; buses without malformed frames are omitted."""
+    """First malformed frame on each bus; buses without malformed frames are omitted."""
     defects: Mapping[str, DefectStats]
     """Exceptions contained by the host, by patch and by bus; ``host`` holds the remaining exceptions."""
 
@@ -95,7 +95,7 @@ class Host:
         cancelled: Callable[[], bool] = never,
         tap: HostTap | None = None,
     ) -> Iterator[Host]:
-        """Bring up the hand that a hand file describes; shut it down at the end of the ``with`` block.
+        """Bring up the hand described in a hand file; shut it down at the end of the ``with`` block.
 
         Args:
             path: The hand file.
@@ -149,12 +149,13 @@ class Host:
             open_port: Opens a bus whose interface is not one of python-can's.
 
         Raises:
-            ConfigError: if options, EDS or baseline files contradict the hand, or a layout cannot be solved.
-            BusLoadError: if the planned traffic does not fit a bus.
+            ConfigError: if an option, EDS file or baseline file does not match the hand, or a layout cannot
+                be solved.
+            BusLoadError: if the planned traffic is too much for a bus.
             BusError: if an interface cannot be opened, or no node on a bus answers and ``bring_up.missing``
                 is not ``wait``.
             NodeTimeout: if a node does not answer and ``bring_up.missing`` is not ``wait``.
-            NodeError: if a node does not match the hand, or does not keep its configuration.
+            NodeError: if a node is not the patch described in ``hand``, or does not keep its configuration.
             BringUpCancelled: if ``cancelled`` returned True.
             ValueError: if ``boot_deadline_s`` is negative, infinite or not a number.
         """

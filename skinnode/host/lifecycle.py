@@ -95,7 +95,7 @@ def running_parts(hand: HandConfig, options: StartOptions) -> Iterator[HostParts
     loops of subscribers end.
 
     Raises:
-        SkinError: as listed at :meth:`skinnode.host.Host.from_config`.
+        SkinError: as listed under :meth:`skinnode.host.Host.from_config`.
     """
     check_plan(hand)
     check_files(hand)

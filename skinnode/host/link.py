@@ -28,8 +28,8 @@ class BusLink(Dispatcher):
     """An open bus, from construction to :meth:`close` or the end of a ``with`` block.
 
     If a handler, a poller, a listener or a job raises an exception, only the current frame or call is lost;
-    after an exception in the mainline's own work, the bus is paused while received frames wait. An interface
-    that fails after opening is reopened until it works.
+    after an exception in the mainline's own work, the bus is paused, and received frames wait. If the
+    interface fails after it has been opened, reopening is tried until it works.
 
     Threads: :meth:`send`, :meth:`ask_remote`, :meth:`call` and :meth:`stats` may be called from any thread; a
     :class:`~skinnode.host.mainline.Mainline` calls the other methods. A separate thread reopens the
@@ -54,7 +54,7 @@ class BusLink(Dispatcher):
     ) -> None:
         super().__init__(config, handlers, time.monotonic_ns())
         self.defects = Defects(config.name, on_defect)
-        """Collector of the exceptions raised while serving the bus itself, not one of its patches."""
+        """Collector of the exceptions raised while serving the bus itself rather than one of its patches."""
         self._sent_listeners: tuple[Callable[[Frame], None], ...] = ()
         self._jobs: deque[tuple[Callable[[], object], Defects]] = deque()
         self.failure: BusError | None = None
@@ -143,7 +143,7 @@ class BusLink(Dispatcher):
         self._sent_listeners = tuple(each for each in self._sent_listeners if each is not listener)
 
     def call(self, job: Callable[[], object], defects: Defects | None = None) -> None:
-        """Run ``job`` on the mainline before it dispatches any frame received from now on. Any thread.
+        """Run ``job`` on the mainline, before any frame received from now on is dispatched. Any thread.
 
         Args:
             job: The function to run.
@@ -245,7 +245,7 @@ class BusLink(Dispatcher):
         return bool(batch)
 
     def _rest(self) -> None:
-        """End a pause that is over, or retry starting the thread that reopens the interface."""
+        """End a pause that is over, or try again to start the thread that reopens the interface."""
         if not self._opening:
             self._rests = time.monotonic() < self._rest_end_s
         elif (
@@ -262,7 +262,7 @@ class BusLink(Dispatcher):
         if self.failure is None:
             self._outages += 1
             self.failure = error
-            _log.warning("%s; reopening the interface until it is back", error)
+            _log.warning("%s; trying to reopen the interface until it is back", error)
         self._begin_reopening()
 
     def _begin_reopening(self) -> None:

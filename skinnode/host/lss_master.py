@@ -1,6 +1,6 @@
 """LSS master (CiA 305 v3.0): finds nodes without a node-ID, and sets a node's node-ID and bit rate.
 
-A slave that does not match stays silent, so every negative answer costs a timeout. Responses are not
+A slave that does not match stays silent, so every negative result costs a timeout. Responses are not
 numbered: a late response to an earlier request looks like a response to the current request. Therefore a node
 counts as found or selected only once it has sent its own address, which is unlike any other response; and
 after a service without a response, the master waits until no late response can arrive.
@@ -37,7 +37,7 @@ STORE_ANSWER_S: Final = 2.0
 it synchronises to disk. CANopenNode's LSS master waits 1 s for any response."""
 
 _SCAN_ANSWERS_S: Final = (0.03, 0.15)
-"""Timeouts of the requests in a fastscan, s; every negative answer costs one timeout, and the longer timeout
+"""Timeouts for the requests in a fastscan, s; every negative result costs one timeout, and the longer timeout
 is used if the first attempt found no node."""
 
 _TRIES: Final = 2
@@ -53,8 +53,8 @@ _UNDER_WAY_S: Final = 0.4
 _PARTS: Final = 4
 _REVISIONS: Final = od.REVISION_NUMBER, od.UNCHECKED_REVISION_NUMBER
 _LIKELY: Final = (od.VENDOR_ID,), (od.PRODUCT_CODE,), _REVISIONS
-"""Address parts of skinnode patches, which fastscan tries first; the search then takes three or four requests
-instead of 96."""
+"""Values of the address parts in skinnode patches; fastscan tries them first, and the search then takes three
+or four requests instead of 96."""
 
 
 class LssFailed(BusError):
@@ -175,7 +175,7 @@ class LssMaster:
         return False
 
     def select_patch(self, serial: int) -> LssAddress | None:
-        """Switch the patch with this serial number, of any revision, to configuration state.
+        """Switch the patch with this serial number, whatever its revision, to configuration state.
 
         Returns:
             Its address, or None if there is no such patch.

@@ -24,7 +24,7 @@ from skinnode.host.health import (
 _log = logging.getLogger(__name__)
 
 RESTART_MEMORY_NS: Final = 5_000_000_000
-"""Time after the last restart during which a node counts as restarting in a loop."""
+"""Time after the last restart during which a node counts as restarting in a loop, ns."""
 
 SETTLED_NS: Final = 500_000_000
 """Time after the last restart in a loop during which a node counts as restarting even if it is operational
@@ -47,7 +47,7 @@ class NodeMonitor:
     Args:
         patch: Name of the patch.
         node_id: Node-ID of its node.
-        on_reject: Called with each malformed heartbeat and EMCY.
+        on_reject: Called with each malformed heartbeat or EMCY.
         watch: Evaluates the codes of the patch.
     """
 
@@ -63,7 +63,7 @@ class NodeMonitor:
         self._beats: deque[int] = deque(maxlen=BEATS)
         self._restarts: deque[int] = deque(maxlen=LOOP_RESTARTS)
         self.on_reject = on_reject
-        """Called with each malformed heartbeat and EMCY."""
+        """Called with each malformed heartbeat or EMCY."""
         self.nmt_state: int | None = None
         self._t_heartbeat_ns: int | None = None
         self._t_scan_ns: int | None = None

@@ -25,7 +25,8 @@ periods."""
 
 _PROBE_NS: Final = 250_000_000
 """Interval between requests to an absent node: its boot-up message may have been lost, and a node that sends
-no heartbeat would never be noticed. For four nodes, the requests take 0.1 % of the capacity of a bus."""
+no heartbeat would otherwise never be noticed. For four nodes, the requests take 0.1 % of the capacity of a
+bus."""
 
 _SEARCH_NS: Final = 1_000_000_000
 """Interval between LSS searches for an absent node."""
@@ -89,7 +90,7 @@ class NodeSupervision:
             node.searching = self._pool.submit(_search, remote)
 
     def _begin(self, node: Supervised, now_ns: int) -> None:
-        """Start configuring the node, unless another job still uses it.
+        """Start configuring the node, unless another job is still using it.
 
         Such a job is aborted, and the configuration is started in a later iteration.
         """

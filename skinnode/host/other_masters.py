@@ -50,10 +50,10 @@ class OtherMasters:
     def handlers(self, node_ids: list[int]) -> dict[int, Callable[[bytes, int], None]]:
         """Return handlers for frames that only a master sends.
 
-        If another master runs the bus, there are no handlers for SYNC and NMT commands.
+        If another master runs the bus, there are no handlers for SYNC or NMT commands.
 
         Args:
-            node_ids: Node-IDs of the hand on this bus.
+            node_ids: Node-IDs of the hand's nodes on this bus.
         """
 
         def counter_of(what: str) -> Callable[[bytes, int], None]:

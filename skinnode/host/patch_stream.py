@@ -271,7 +271,7 @@ class PatchStream:
 
         Args:
             times_ns: Monotonic times at which the last frames of these scans arrived.
-            within_ns: Tolerance of these times.
+            within_ns: Tolerance for these times.
         """
         self._left_out, self._left_out_within_ns = sorted(times_ns), within_ns
 

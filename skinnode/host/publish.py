@@ -39,7 +39,7 @@ def check_capacity(capacity: int) -> None:
 
 
 class Subscription:
-    """Subscription to fields, newest last. Iterate with ``for`` or ``async for``, or use :meth:`get`.
+    """Subscription to fields, oldest first. Iterate with ``for`` or ``async for``, or use :meth:`get`.
 
     When the queue is full, its oldest field is dropped and counted in ``dropped``. The subscription ends with
     :meth:`close`, at the end of a ``with`` block, or when the last reference to it is deleted. Any thread or

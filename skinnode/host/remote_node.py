@@ -26,8 +26,8 @@ _MAINLINE_S: Final = 1.0
 bus is unavailable."""
 
 _ANSWER_S: Final = 0.05
-"""Time to wait for the responses to a single SDO request, s. If no other node has the node-ID, a failed
-bring-up takes longer by two such waits."""
+"""Time to wait for the responses to a single SDO request, s. If no other node has the node-ID, two such waits
+are added to the duration of a failed bring-up."""
 
 _MUTE_S: Final = 0.4
 _MUTE_SCANS: Final = 5
@@ -77,7 +77,7 @@ class RemoteNode:
 
     @property
     def heard(self) -> bool:
-        """Whether any frame from the node has been received since the host opened its bus."""
+        """Whether any frame from the node has been received since the host opened the bus."""
         return self.monitor.t_heartbeat_ns is not None or self.stream.stats().withheld > 0
 
     @property
@@ -107,7 +107,7 @@ class RemoteNode:
         """
         self.boot_ups = self.monitor.boot_ups
         if self.monitor.running and self.monitor.nmt_state == NmtState.STOPPED and not self.has_other_master:
-            nmt_master.stand_by(self.link.send, self.patch.node_id)  # stopped nodes serve no SDO request
+            nmt_master.stand_by(self.link.send, self.patch.node_id)  # SDO needs a node that is not stopped
 
         def answered(patch: PatchConfig) -> None:
             self.boot_ups = self.monitor.boot_ups  # earlier boot-ups were expected
@@ -181,7 +181,7 @@ class RemoteNode:
         self.link.call(lambda: self.monitor.on_register_read(register, said), self.defects)
 
     def is_mute(self, since_ns: int) -> bool:
-        """Return whether an operational node sends no scans and so may have lost its configuration.
+        """Return whether an operational node is not sending scans and so may have lost its configuration.
 
         Always False on another master's bus, because only that master may restore the configuration.
 

@@ -61,7 +61,7 @@ _SEGMENT_S: Final = 0.02
 
 _PLAIN: Final = {"u8": "<B", "u16": "<H", "u32": "<I", "f32": "<f"}
 
-# Transfer errors are raised here with the node and the object. Without a handler, Python would also print
+# Transfer errors are raised here, naming the node and the object. Without a handler, Python would also print
 # canopen's own warnings on the terminal.
 logging.getLogger("canopen").addHandler(logging.NullHandler())
 
@@ -109,7 +109,7 @@ class RemoteOd:
     Raises:
         NodeTimeout: from all methods, if the node does not answer.
         SdoAbort: from all methods, if the node aborts the transfer.
-        NodeError: from all methods, if a response is malformed, longer than allowed, or has no end.
+        NodeError: from all methods, if a response is malformed, is longer than allowed, or never ends.
     """
 
     def __init__(
@@ -124,7 +124,7 @@ class RemoteOd:
 
     @contextmanager
     def abort_if(self, abandoned: Callable[[], bool]) -> Iterator[None]:
-        """Abort the transfers of this ``with`` block once ``abandoned`` returns True."""
+        """Abort the transfers in this ``with`` block once ``abandoned`` returns True."""
         before, self.abandoned = self.abandoned, abandoned
         try:
             yield

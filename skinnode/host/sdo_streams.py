@@ -41,12 +41,12 @@ _SETTLE_S: Final = 0.1
 """Maximum wait for that silence, s: another SDO client may keep the node busy."""
 
 _RETRANSMISSIONS: Final = 20
-"""Maximum number of retransmitted blocks in one transfer; a node that needs more is assumed to accept no
-block at all."""
+"""Maximum number of retransmitted blocks in one transfer; a node that needs more is assumed not to accept
+any."""
 
 
 class Client(SdoClient):
-    """canopen's SDO client for the server of ``node_id``, without an object dictionary."""
+    """canopen's SDO client for the server on node ``node_id``, without an object dictionary."""
 
     def __init__(self, network: canopen.Network, node_id: int) -> None:
         empty: Any = ObjectDictionary  # its constructor is not typed
@@ -163,7 +163,7 @@ class BlockDownload(BlockDownloadStream):
         """Send the segments after number ``ackseq`` of the block again."""
         self._left -= 1
         if self._left < 0:
-            raise SdoCommunicationError("the node acknowledges no segment")
+            raise SdoCommunicationError("the node does not acknowledge any segment")
         again = self._current_block[ackseq:]
         self.pos -= sum(len(segment) for segment in again)
         self._done = False

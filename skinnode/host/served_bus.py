@@ -1,4 +1,4 @@
-"""A bus of the hand, and the host's tasks on it except serving patches."""
+"""A bus of the hand, and the host's tasks on it other than serving patches."""
 
 from __future__ import annotations
 

@@ -150,7 +150,7 @@ class _Start:
 
 
 def start_all(ready: dict[RemoteNode, ScanSolver]) -> None:
-    """Start all nodes whose master is the host, and wait until their heartbeats show them operational.
+    """Start the nodes whose master is the host; wait for heartbeats that report the operational state.
 
     The deadline is counted in polling pauses, so that time during which the host's machine is suspended does
     not count.

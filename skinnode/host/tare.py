@@ -15,7 +15,8 @@ TARE_DEADLINE_S: Final = 5.0
 baseline takes 0.1 to 0.3 s, and the supervisor may pause for 2 s after the previous reading."""
 
 TARE_DEADLINE_SYNCS: Final = 3
-"""SYNC periods added to the deadline, because the summary of the next scan announces the new baseline."""
+"""Number of SYNC periods added to the deadline, because the summary of the next scan announces the new
+baseline."""
 
 _POLL_S: Final = 0.005
 

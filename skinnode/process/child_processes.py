@@ -1,9 +1,9 @@
 """Starts child processes that survive signals from the command's terminal.
 
-A terminal sends SIGINT (Ctrl-C) and SIGHUP not only to a command but also to its children. Python would print
-a traceback in a child that is still importing, and SIGHUP would end the resource tracker of
+A terminal sends SIGINT (Ctrl-C) and SIGHUP not only to a command but also to its children. On SIGINT, a child
+that is still importing modules would print a traceback, and SIGHUP would end the resource tracker of
 ``multiprocessing`` before it has cleaned up. Children therefore start with both signals blocked and keep them
-blocked; the command terminates them.
+blocked; the command itself ends the children.
 """
 
 from __future__ import annotations

@@ -26,7 +26,7 @@ def without_long_collections() -> Iterator[None]:
 
 @contextmanager
 def responsive_threads() -> Iterator[None]:
-    """Make computing threads yield after 0.5 ms, instead of Python's 5 ms, for the duration of the block.
+    """Make computing threads yield after 0.5 ms, not Python's default of 5 ms, for the duration of the block.
 
     With 5 ms, a thread that receives or draws could delay a scan by more than the time needed to solve it.
     """

@@ -17,7 +17,7 @@ def stop_on_signal() -> Iterator[threading.Event]:
     ignored before, as under nohup.
 
     Raises:
-        ValueError: If the caller is not the main thread, because no other thread can set signal handlers.
+        ValueError: if not called from the main thread, because no other thread can set signal handlers.
     """
     stop = threading.Event()
 

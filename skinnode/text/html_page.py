@@ -1,4 +1,4 @@
-"""Skeleton of all HTML pages of this project, and escaping of untrusted text in them."""
+"""Skeleton for all HTML pages of this project, and escaping of untrusted text in them."""
 
 from __future__ import annotations
 

@@ -20,7 +20,7 @@ import re
 from typing import Any, Final, TextIO
 
 MOST: Final = 200
-"""Maximum number of characters shown of an untrusted text; longer than any name, but short enough for one
+"""Maximum number of characters shown of any untrusted text; longer than any name, but short enough for one
 line."""
 
 _SUSPECT: Final = re.compile(r"[^ -~]")
@@ -32,7 +32,7 @@ def printable(text: str | bytes, most: int = MOST) -> str:
 
     Args:
         text: The text. Bytes are read as a VISIBLE_STRING: one character per byte; trailing NULs are dropped.
-        most: Maximum characters; longer text is truncated and ends in ``…``.
+        most: Maximum number of characters; longer text is truncated and ends in ``…``.
     """
     if isinstance(text, bytes):
         text = text.rstrip(b"\0").decode("latin-1")

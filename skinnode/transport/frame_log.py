@@ -82,7 +82,7 @@ class FrameLog:
         self.frames += 1
 
     def flush(self, *, to_disk: bool) -> None:
-        """Pass everything written so far to the kernel, which keeps it if this process is killed.
+        """Pass everything written so far to the kernel, which keeps it even if this process is killed.
 
         Args:
             to_disk: Whether to wait until the data is on the disk, so that it survives a loss of power.

@@ -148,7 +148,7 @@ class FrameLogReader:
                 return damaged._replace(objects=body)
             return _Container(end, body, intact=True)
         if method != _DEFLATE:
-            self._complain(None, at, f"a container compressed by unknown method {method}")
+            self._complain(None, at, f"a container compressed by the unknown method {method}")
             return damaged
         inflater = zlib.decompressobj()
         try:
@@ -191,7 +191,7 @@ class FrameLogReader:
                 at = start + length
 
     def _frames(self, header: bytes, objects: bytes, container: int) -> Iterator[LoggedFrame]:
-        """Yield the frames among ``objects``, read by python-can from a small file of these objects."""
+        """Yield the frames among ``objects``, read by python-can from a small file that holds them."""
         head = _OBJECT.pack(b"LOBJ", _OBJECT.size, 1, _CONTAINER_HEAD_BYTES + len(objects), _LOG_CONTAINER)
         file = io.BytesIO(header + head + struct.pack("<H6xL4x", _STORED, len(objects)) + objects)
         try:

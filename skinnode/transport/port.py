@@ -48,8 +48,8 @@ _OLDEST_STAMP_S: Final = 10.0
 the time of reading is used."""
 
 _LINK_GONE: Final = (errno.ENETDOWN, errno.ENODEV, errno.ENXIO)
-"""Errors by which the kernel reports, once per socket, that the interface went down; a send call may receive
-such an error instead of a receive call."""
+"""Errors by which the kernel reports, once per socket, that the interface went down; the error may be raised
+by a send call rather than a receive call."""
 
 _SOCKETCAN: Final = "socketcan"
 _MULTICAST: Final = "udp_multicast"
@@ -198,8 +198,8 @@ class CanPort:
     def send(self, can_id: int, data: bytes, *, remote: bool = False) -> None:
         """Send a frame with an 11-bit identifier.
 
-        On a bus with ``fd``, more than 8 bytes are sent as a CAN FD frame with bit-rate switch, padded with
-        zeros to a valid length. On a virtual bus, another endpoint whose queue is full loses the frame.
+        On a bus with ``fd``, more than 8 bytes are sent as a CAN FD frame with bit-rate switching, padded
+        with zeros to a valid length. On a virtual bus, another endpoint whose queue is full loses the frame.
 
         Args:
             can_id: 0 to 0x7FF.
@@ -347,7 +347,7 @@ class CanPort:
 
 
 def _tune_socket(fileno: int) -> None:
-    """Request a large receive buffer, and only frames of this multicast group."""
+    """Request a large receive buffer, and frames from this multicast group only."""
     duplicate = socket.socket(fileno=os.dup(fileno))
     try:
         try:

@@ -117,7 +117,7 @@ class Intake:
         """Predict when the last frame of ``what`` will arrive, so that it is fetched without delay.
 
         Args:
-            what: Name of the group of frames. A new prediction replaces the previous one of the same name.
+            what: Name of the group of frames. A new prediction replaces the previous one with the same name.
             times_ns: Possible monotonic times in ascending order; empty if the frame may arrive at any time.
         """
         self._expected[what] = times_ns

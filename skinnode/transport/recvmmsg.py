@@ -68,7 +68,7 @@ class MessageBatch:
         self._got = 0
 
     def receive(self, sock: socket.socket, most: int) -> int:
-        """Receive up to ``most`` messages, but at most ``count``, replacing the previous batch; never waits.
+        """Replace the batch with up to ``most`` new messages, but no more than ``count``; never wait.
 
         Returns:
             Number of messages received.

@@ -7,7 +7,7 @@ from typing import Final
 from skinnode.text.words import counted
 
 FD_LENGTHS: Final[tuple[int, ...]] = (*range(9), 12, 16, 20, 24, 32, 48, 64)
-"""Data lengths of a CAN FD frame, bytes, by length code."""
+"""Data lengths of a CAN FD frame in bytes, by length code."""
 
 
 def fd_length(n_bytes: int) -> int:

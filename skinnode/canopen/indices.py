@@ -175,11 +175,11 @@ REJECTED_FRAMES: Final = 0x2040
 CODES: Final = 0x2100
 """Index of the latest codes of upper wire 0, with one sub-index per column; add r for upper wire r."""
 BASELINE: Final = 0x2200
-"""Index of R0 of upper wire 0, ohm (0 if unknown), one sub-index per column; add r for upper wire r."""
+"""Index of R0 of upper wire 0 in ohm (0: unknown), with one sub-index per column; add r for upper wire r."""
 COORDINATES: Final = 0x2300
 """DOMAIN; see :func:`skinnode.protocol.coordinates.pack_coordinates`."""
 BASELINE_DOMAIN: Final = 0x2301
-"""DOMAIN: R0 of all crossings, U·K REAL32, ohm, one upper wire after another; written as a whole."""
+"""DOMAIN: R0 of all crossings in ohm as U·K REAL32, one upper wire after another; written as a whole."""
 
 TARE_SIGNATURE: Final = int.from_bytes(b"tare", "little")
 SELF_TEST_SIGNATURE: Final = int.from_bytes(b"test", "little")

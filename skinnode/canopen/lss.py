@@ -18,7 +18,8 @@ BIT_RATES_BPS: Final = {
     7: 20_000,
     8: 10_000,
 }
-"""Bit rates in table 0 of the bit timing service, bit/s; 5 is reserved, 9 means automatic detection."""
+"""Bit rates in table 0 of the bit timing service, bit/s; entry 5 is reserved, and entry 9 means automatic
+detection."""
 
 LSS_DONE: Final = 0
 """Error code returned by a successful configuration service."""

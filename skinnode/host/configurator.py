@@ -158,7 +158,7 @@ class Configurator:
         return layout
 
     def _read_layout(self, patch: PatchConfig, profile: PatchProfile, remote: RemoteOd) -> PatchLayout:
-        """Return the layout from the electrode coordinates stored in the node."""
+        """Return the layout given by the electrode coordinates stored in the node."""
         self._go_on()
         data = remote.read_block(od.COORDINATES)
         resistivity = remote.read(od.DESCRIPTOR, od.RESISTIVITY, "f32")

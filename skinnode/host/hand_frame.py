@@ -101,7 +101,7 @@ class HandGatherer:
         return HandFrame(scan, t_sync_ns, fields, {patch: self._reason(patch, scan) for patch in absent})
 
     def next_deadline_ns(self) -> int | None:
-        """Return the time from which :meth:`next` no longer waits for missing fields; None without a frame."""
+        """Return the time from which :meth:`next` stops waiting for missing fields; None without a frame."""
         return self._until_ns[min(self._open)] if self._open else None
 
     def _awaited(self, patch: str, scan: int) -> bool:

@@ -145,7 +145,7 @@ class Host:
             boot_deadline_s: Maximum time until the first response from a node, s.
             cancelled: Called repeatedly during bring-up; once it returns True, bring-up ends with
                 BringUpCancelled.
-            tap: Records the traffic, bring-up included: a :class:`skinnode.record.Recorder`.
+            tap: Records the traffic, including bring-up; see :class:`skinnode.record.Recorder`.
             open_port: Opens a bus whose interface is not one of python-can's.
 
         Raises:

@@ -29,7 +29,7 @@ class BusLink(Dispatcher):
 
     If a handler, a poller, a listener or a job raises an exception, only the current frame or call is lost;
     after an exception in the mainline's own work, the bus is paused, and received frames wait. If the
-    interface fails after it has been opened, reopening is tried until it works.
+    interface fails after it has been opened, the bus keeps trying to reopen it.
 
     Threads: :meth:`send`, :meth:`ask_remote`, :meth:`call` and :meth:`stats` may be called from any thread; a
     :class:`~skinnode.host.mainline.Mainline` calls the other methods. A separate thread reopens the
@@ -262,7 +262,7 @@ class BusLink(Dispatcher):
         if self.failure is None:
             self._outages += 1
             self.failure = error
-            _log.warning("%s; trying to reopen the interface until it is back", error)
+            _log.warning("%s; trying to reopen the interface", error)
         self._begin_reopening()
 
     def _begin_reopening(self) -> None:

@@ -1,4 +1,4 @@
-"""Collect the messages other than scans that a node sends, and derive the health of its patch from them."""
+"""Collect a node's messages other than scans, and derive the health of its patch from them."""
 
 from __future__ import annotations
 
@@ -111,7 +111,7 @@ class NodeMonitor:
         self._t_heartbeat_ns = t_ns
 
     def on_emergency(self, data: bytes, t_ns: int) -> None:
-        """Process an EMCY: u16 code, u8 error register, five manufacturer bytes.
+        """Process an EMCY: u16 code, u8 error register, five manufacturer-specific bytes.
 
         Code 0 means that the error has been cleared.
         """

@@ -22,7 +22,7 @@ from skinnode.protocol.command import pack_command
 from skinnode.protocol.profile import PatchProfile
 
 _MAINLINE_S: Final = 1.0
-"""Maximum wait, s, for a short job on the mainline, which runs jobs fifty times a second unless the node's
+"""Maximum wait in s for a short job on the mainline, which runs jobs fifty times a second unless the node's
 bus is unavailable."""
 
 _ANSWER_S: Final = 0.05
@@ -31,7 +31,7 @@ are added to the duration of a failed bring-up."""
 
 _MUTE_S: Final = 0.4
 _MUTE_SCANS: Final = 5
-"""Time, s, and number of SYNC periods without a scan after which a node's configuration is read back
+"""Time in s, and number of SYNC periods, without a scan after which a node's configuration is read back
 (whichever is longer): the stream must recover within a second."""
 
 
@@ -243,8 +243,8 @@ class RemoteNode:
     def _answers_to_one_question(self) -> int:
         """Return the number of responses to a single SDO request: two if two nodes have this node-ID.
 
-        The result is the smaller of two requests' counts, because a response to an earlier request may be
-        late.
+        The result is the smaller of the counts for two requests, because a response to an earlier request may
+        be late.
         """
         time.sleep(_ANSWER_S)
         counts = []

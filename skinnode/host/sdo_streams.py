@@ -35,7 +35,7 @@ from skinnode.canopen.indices import sdo_request_cob_id, sdo_response_cob_id
 from skinnode.canopen.sdo import ABORT
 
 _QUIET_S: Final = 0.02
-"""Duration of silence after an abort, s, that rules out further responses to the old transfer."""
+"""Duration in s of the silence after an abort that rules out further responses to the old transfer."""
 
 _SETTLE_S: Final = 0.1
 """Maximum wait for that silence, s: another SDO client may keep the node busy."""

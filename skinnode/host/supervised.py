@@ -14,7 +14,7 @@ from skinnode.host.scan_solver import ScanSolver
 from skinnode.model.layout import Float
 
 JOIN_DEADLINE_S: Final = 1.0
-"""Maximum time, s, for a node that has sent any frame to send its first SDO response or to tare itself."""
+"""Maximum time in s for a node that has sent any frame to send its first SDO response or to tare itself."""
 
 LEAST_NS: Final = 300_000_000
 """Minimum time from one bring-up of a node to the next, for nodes that restart in a loop."""

@@ -11,8 +11,8 @@ from skinnode.host.health import PatchHealth
 from skinnode.host.remote_node import RemoteNode
 
 TARE_DEADLINE_S: Final = 5.0
-"""Default deadline of a tare, excluding the SYNC periods below, s: 16 readings take milliseconds, reading a
-baseline takes 0.1 to 0.3 s, and the supervisor may pause for 2 s after the previous reading."""
+"""Default deadline for a tare in s, excluding the SYNC periods below: 16 readings take milliseconds, reading
+a baseline takes 0.1 to 0.3 s, and the supervisor may pause for 2 s after the previous reading."""
 
 TARE_DEADLINE_SYNCS: Final = 3
 """Number of SYNC periods added to the deadline, because the summary of the next scan announces the new

@@ -89,7 +89,7 @@ class MessageBatch:
         return self._got
 
     def used(self) -> Iterator[tuple[int, int]]:
-        """Yield the lengths of the ancillary data and the message, bytes, for each received message."""
+        """Yield the lengths in bytes of the ancillary data and of the message, for each received message."""
         return _USED.iter_unpack(self._memory[: self._got * _USED.size])
 
     def taken(self) -> memoryview:

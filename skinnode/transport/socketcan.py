@@ -193,8 +193,8 @@ class HardwareDelay:
         """Return the monotonic arrival time of a frame.
 
         Args:
-            hardware_ns: Time stamped by the controller.
-            kernel_ns: Monotonic time stamped by the kernel.
+            hardware_ns: Timestamp from the controller.
+            kernel_ns: Timestamp from the kernel, converted to the monotonic clock.
         """
         offset_ns = kernel_ns - hardware_ns
         if self._offset_ns is not None and abs(offset_ns - self._offset_ns) < _OLDEST_NS:

@@ -1,4 +1,5 @@
-"""Call a user's function with each field, on a separate thread, so that the calls delay nothing else."""
+"""Call a user's function with each field, on a separate thread, so that the calls do not delay anything
+else."""
 
 from __future__ import annotations
 

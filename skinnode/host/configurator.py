@@ -1,9 +1,9 @@
 """Configure a node: wait for it, check its identity and layout, write its parameters, read its baseline.
 
 Nothing is written before identity and layout are known to match the hand file, because the node could be a
-drive. Every written value is read back. On a bus that another master runs, the host sends no NMT commands,
-leaves the SYNC parameters alone, and writes patch-specific parameters only if they differ. If the host must
-send nothing (``guest_sends = "nothing"``), all information about the node comes from files.
+drive. Every written value is read back. On a bus that another master runs, the host does not send NMT
+commands, leaves the SYNC parameters alone, and writes patch-specific parameters only if they differ. If the
+host must not send anything (``guest_sends = "nothing"``), all information about the node comes from files.
 """
 
 from __future__ import annotations

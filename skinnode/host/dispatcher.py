@@ -1,4 +1,4 @@
-"""Count the frames on a bus and dispatch them to handlers by COB-ID; uses no thread and no clock.
+"""Count the frames on a bus and dispatch them to handlers by COB-ID; uses neither threads nor a clock.
 
 A :class:`~skinnode.host.link.BusLink` feeds the dispatcher with the frames from a bus; a replay feeds it with
 the frames from a recording.
@@ -43,7 +43,7 @@ class BusStats:
     """Data frames read, excluding the host's own."""
     sent: int
     foreign: int
-    """Data frames with a COB-ID that no part of the hand file uses."""
+    """Data frames with a COB-ID that is not used anywhere in the hand file."""
     ignored: int
     """Remote and extended frames; on a bus without ``fd`` also CAN FD frames."""
     error_frames: int

@@ -40,7 +40,7 @@ class HandFrame:
 
     @property
     def complete(self) -> bool:
-        """Whether no patch is missing."""
+        """Whether all patches are present."""
         return not self.missing
 
 
@@ -50,8 +50,8 @@ class HandGatherer:
     Has neither a thread nor a clock; only one owner may use it.
 
     A frame is ready when every awaited patch has delivered its field for the frame, or a newer field. A patch
-    that missed :data:`~skinnode.host.health.SCANS_MISSED` consecutive frames is not awaited until it delivers
-    again. No patch is awaited for longer than ``patience_ns`` after the first field.
+    that missed :data:`~skinnode.host.health.SCANS_MISSED` consecutive frames is no longer awaited until it
+    delivers again. No patch is awaited for longer than ``patience_ns`` after the first field.
 
     Args:
         patches: Names of the patches.

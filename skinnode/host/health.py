@@ -158,7 +158,7 @@ class BusHealth:
     """Frames dropped because the host's own queue was full."""
     malformed: int
     foreign: int
-    """Frames with COB-IDs that no part of the hand file uses; ``foreign_ids`` lists the COB-IDs."""
+    """Frames with COB-IDs not used anywhere in the hand file; ``foreign_ids`` lists the COB-IDs."""
     foreign_ids: tuple[int, ...]
     other_syncs: int
     """SYNC messages from another producer on a bus where the host is the master."""

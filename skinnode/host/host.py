@@ -261,7 +261,7 @@ class Host:
         return served.health(no_sync=self._lacks_sync(served))
 
     def _lacks_sync(self, bus: ServedBus) -> bool:
-        """Return whether SYNC is missing. Patches that scan on their own clocks need no SYNC."""
+        """Return whether SYNC is missing. Patches that scan on their own clocks do not need SYNC."""
         if not bus.sync_is_late(self._t_up_ns, self.hand.sync.period_ms * 1_000_000):
             return False
         streams = [node.stream for node in self._nodes.values() if node.link is bus.link]

@@ -83,7 +83,7 @@ class HostParts:
     callbacks: Callbacks
     events: Events
     defects: Defects
-    """Exceptions that concern no particular bus or patch."""
+    """Exceptions that do not concern a particular bus or patch."""
 
 
 @contextlib.contextmanager
@@ -199,7 +199,7 @@ def _logged_already(error: Exception) -> None:
 
 
 def _let_scans_end(streams: Sequence[tuple[PatchStream, Ticks]], period_s: float) -> None:
-    """Wait for the scans started by the last SYNC, so that the shutdown interrupts none of them."""
+    """Wait for the scans started by the last SYNC, so that the shutdown does not interrupt them."""
     end_s = time.monotonic() + min(1.5 * period_s, LAST_SCAN_S)
     while not all(stream.settled(ticks.newest) for stream, ticks in streams):
         if time.monotonic() > end_s:

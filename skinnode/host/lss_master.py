@@ -3,7 +3,7 @@
 A slave that does not match stays silent, so every negative result costs a timeout. Responses are not
 numbered: a late response to an earlier request looks like a response to the current request. Therefore a node
 counts as found or selected only once it has sent its own address, which is unlike any other response; and
-after a service without a response, the master waits until no late response can arrive.
+after a service without a response, the master waits until a late response can no longer arrive.
 """
 
 from __future__ import annotations

@@ -27,7 +27,8 @@ class Mainline:
 
     Args:
         links: The buses.
-        defects: Collects exceptions that concern no particular bus; the first bus's collector by default.
+        defects: Collects exceptions that do not concern a particular bus; the first bus's collector by
+            default.
     """
 
     def __init__(self, links: Sequence[BusLink], defects: Defects | None = None) -> None:

@@ -35,7 +35,7 @@ _FORGET_NS: Final = 2_000_000_000
 """Duration of silence after which a node is no longer reported as refused or faulty."""
 
 _MUTE_NS: Final = 1_000_000_000
-"""Minimum interval between two readings of the configuration of a node that sends no scans."""
+"""Minimum interval between two readings of the configuration of a node that is not sending scans."""
 
 
 class NodeSupervision:
@@ -241,7 +241,7 @@ class NodeSupervision:
 
 
 def _read_back(node: Supervised) -> None:
-    """Find out whether a node that sends no scans has lost its configuration."""
+    """Find out whether a node that is not sending scans has lost its configuration."""
     with contextlib.suppress(BusError, ConfigError):  # the configuration is read again later
         node.unconfigured = not node.remote.is_configured()
 

@@ -194,8 +194,8 @@ class PatchStream:
 
         Args:
             solver: Decodes and solves the scans.
-            withholdings: Number of withholdings known to the caller; if there have been more since, nothing
-                happens.
+            withholdings: Number of withholdings known to the caller; if there have been more since, the call
+                has no effect.
             anew: Whether the node has been started anew, so that frames received earlier belong to another
                 stream.
         """

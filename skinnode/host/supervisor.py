@@ -58,7 +58,7 @@ class Supervisor:
         nodes: All nodes of the hand.
         running: Nodes that are already running.
         heartbeat_s: Period of the host's heartbeat, s.
-        defects: Collects exceptions that concern no particular patch.
+        defects: Collects exceptions that do not concern a particular patch.
     """
 
     def __init__(
@@ -103,7 +103,7 @@ class Supervisor:
         }
 
     def close(self) -> None:
-        """Start no more jobs; end and join all threads."""
+        """Stop starting jobs; end and join all threads."""
         self._stop.set()
         self._thread.join()
         for node in self._nodes:

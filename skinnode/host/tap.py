@@ -64,7 +64,7 @@ class ContainedTap:
 
 
 def tap_link(tap: HostTap, link: BusLink) -> Callable[[], None]:
-    """Start passing every frame to ``tap``. Call on the mainline, or before it runs.
+    """Start passing every frame to ``tap``. Call on the mainline, or before the mainline runs.
 
     Returns:
         A function that ends the recording, to be called under the same condition.

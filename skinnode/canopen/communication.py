@@ -1,4 +1,4 @@
-"""Communication objects 0x1000 to 0x1FFF of a node (CiA 301 v4.2, 7.5.2), with the defaults of a patch."""
+"""Communication objects 0x1000 to 0x1FFF of a node (CiA 301 v4.2, 7.5.2), with the defaults for a patch."""
 
 from __future__ import annotations
 

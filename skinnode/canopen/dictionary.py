@@ -34,7 +34,7 @@ class DataType(enum.IntEnum):
 
     @property
     def bits(self) -> int:
-        """Length of a value, bits; 0 if the length varies."""
+        """Length of a value in bits; 0 if the length varies."""
         return _BITS[self]
 
 

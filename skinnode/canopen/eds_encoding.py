@@ -1,6 +1,6 @@
 """Reads the text of an EDS or DCF file in any encoding.
 
-CiA 306 requires ASCII, but tools also write other encodings. Reading loses nothing: each non-ASCII byte
+CiA 306 requires ASCII, but tools also write other encodings. Reading is lossless: each non-ASCII byte
 becomes a lone surrogate (PEP 383), from which the original bytes of a value can be recovered.
 :func:`for_people` decodes text for display.
 """

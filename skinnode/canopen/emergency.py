@@ -26,13 +26,14 @@ class EmcyCode(IntEnum):
     CAN_ID_COLLISION = 0x8150
     SYNC_WINDOW = 0x8200
     """A synchronous TPDO was not ready within the synchronous window (0x1007). Detail: u16 TPDO number. CiA
-    301 defines no code for this error, so the generic protocol error code is used."""
+    301 does not define a code for this error, so the generic protocol error code is used."""
     PDO_NOT_PROCESSED = 0x8210
     PDO_LENGTH_EXCEEDED = 0x8220
     SYNC_LENGTH = 0x8240
     RPDO_TIMEOUT = 0x8250
     SOURCE = 0xFF00
-    """The converter returned no valid reading. Detail: u8 fault (1 failed, 2 wrong array shape), u16 count.
+    """The converter did not return a valid reading. Detail: u8 fault (1 failed, 2 wrong array shape), u16
+    count.
     """
 
     @property

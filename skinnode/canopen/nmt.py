@@ -9,9 +9,9 @@ OPERATIONAL       command 1            the same, and PDO
 STOPPED           command 2            NMT, error control
 ================  ===================  ===========================================================
 
-A node obeys every command in every state except INITIALISING, in which it receives no commands. *Reset node*
-(129) resets all objects to their defaults; *reset communication* (130) resets only the objects from 0x1000 to
-0x1FFF. The node boots after either command.
+A node obeys every command in every state except INITIALISING, in which it does not receive commands. *Reset
+node* (129) resets all objects to their defaults; *reset communication* (130) resets only the objects from
+0x1000 to 0x1FFF. The node boots after either command.
 """
 
 from __future__ import annotations

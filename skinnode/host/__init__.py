@@ -1,11 +1,11 @@
 """The host: configure, start and supervise nodes; receive, assemble, solve and publish their scans.
 
-**Containment.** No exception ends a thread of the host. An exception raised while serving a patch makes that
-patch faulty and is recorded as the reason: the scans of the patch are withheld, and the patch is brought up
-again after a pause of 0.1 s, which doubles with each defect, up to 1 s; a boot-up of the node ends the pause.
-An exception raised while serving a bus pauses the bus, or causes its interface to be closed and reopened,
-with pauses of the same length. If an exception is raised while serving a subscriber, a callback or a tap,
-only the item meant for that recipient is lost. All exceptions are counted by subject
+**Containment.** Exceptions do not end the host's threads. An exception raised while serving a patch makes
+that patch faulty and is recorded as the reason: the scans of the patch are withheld, and the patch is brought
+up again after a pause of 0.1 s, which doubles with each defect, up to 1 s; a boot-up of the node ends the
+pause. An exception raised while serving a bus pauses the bus, or causes its interface to be closed and
+reopened, with pauses of the same length. If an exception is raised while serving a subscriber, a callback or
+a tap, only the item meant for that recipient is lost. All exceptions are counted by subject
 (``Host.stats().defects``), published as events, and logged once for each distinct message; see
 :mod:`skinnode.host.containment`.
 

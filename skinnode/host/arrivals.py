@@ -1,9 +1,9 @@
 """Predict when a patch's next scan will end, so that the receiver can let other frames accumulate until then.
 
-On a full bus, a scan does not always end one period after the previous scan: if heartbeats precede the
-frames of several nodes, the end may alternate between two instants within the period (in ``bench pipeline``,
-they were 12 ms apart at every fifth scan; without heartbeats, the end did not alternate). The prediction
-therefore includes each instant within the period at which one of the most recent scans ended.
+On a full bus, a scan does not always end one period after the previous scan: if heartbeats precede the frames
+from several nodes, the end may alternate between two instants within the period (in ``bench pipeline``, they
+were 12 ms apart at every fifth scan; without heartbeats, the end did not alternate). The prediction therefore
+includes each instant within the period at which one of the most recent scans ended.
 """
 
 from __future__ import annotations

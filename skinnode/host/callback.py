@@ -1,5 +1,4 @@
-"""Call a user's function with each field, on a separate thread, so that the calls do not delay anything
-else."""
+"""Call a user's function with each field, on a separate thread, so that the calls cannot delay other work."""
 
 from __future__ import annotations
 

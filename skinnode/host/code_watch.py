@@ -16,8 +16,8 @@ once.
 **Wires.** A wire is open or shorted if all its crossings are open or shorted in a complete scan. Noise and
 drift are evaluated over windows of ``WINDOW`` scans, and their criteria must be met in ``WINDOWS``
 consecutive windows. Taking the second difference of a code over time removes steady movement; a wire is noisy
-if the mean square of this difference exceeds ``NOISY`` times the value of the median wire on its side, and
-``NOISY`` times the value of the expected noise. A wire drifts if the resistances of all its crossings have
+if the mean square of this difference exceeds ``NOISY`` times the value for the median wire on its side, and
+``NOISY`` times the value for the expected noise. A wire drifts if the resistances of all its crossings have
 changed by the same fraction of R0, if this change exceeds ``DRIFT`` relative to both the median wire and the
 rest state, and if its neighbours have not followed. A touch, in contrast, changes the crossings of a wire
 unevenly, and the rubber spreads the change to the adjacent wires. Simulated touches (spheres of 2 mm to 0.3 m
@@ -49,7 +49,7 @@ FLICKERS: Final = 10
 LONGER: Final = 4
 """Minimum ratio of the length of a frozen run to that of the longest run that ended on its own."""
 LEAST_RUN: Final = 5
-"""Minimum length of a frozen run, scans."""
+"""Minimum length of a frozen run, in scans."""
 WINDOW: Final = 16
 """Number of scans in a window."""
 WINDOWS: Final = 3
@@ -90,7 +90,7 @@ class CodeWatch:
 
     Args:
         scale: Scale of the codes.
-        relative_noise: Noise of the converter from the hand file, as a fraction of the resistance.
+        relative_noise: Converter noise stated in the hand file, as a fraction of the resistance.
     """
 
     def __init__(self, scale: CodeScale, relative_noise: float) -> None:

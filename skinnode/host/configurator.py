@@ -98,7 +98,7 @@ class Configurator:
         )
 
     def _from_files(self, patch: PatchConfig, profile: PatchProfile) -> NodeFacts:
-        assert patch.baseline is not None  # ensured by the check of the hand file
+        assert patch.baseline is not None  # ensured when the hand file is checked
         baseline_ohm = load_baseline(patch.baseline, profile)
         scale, heartbeat_s = CodeScale(patch.code_bits), self.hand.bring_up.heartbeat_s
         return NodeFacts(patch, patch.layout.build(), profile, scale, baseline_ohm, None, heartbeat_s)
@@ -334,7 +334,7 @@ def _open_window(remote: RemoteOd) -> None:
 
 
 def _watch_master(remote: RemoteOd, watched: int) -> None:
-    """Write entry 1 of 0x1016, with which the node monitors the host's heartbeat.
+    """Write entry 1 of 0x1016, which makes the node monitor the host's heartbeat.
 
     Other entries stay unchanged, but an entry that also monitors the host is cleared, because a node-ID may
     occur only once.

@@ -67,7 +67,7 @@ class BusStats:
     outages: int
     """Number of times the interface failed and was reopened."""
     bits: int
-    """Exact total length of all data frames received and sent, bits; the value is up to a tenth of a second
+    """Exact total length in bits of all data frames received and sent; the value is up to a tenth of a second
     old."""
     load: float
     """Bus load over the last second, as a fraction of the capacity."""
@@ -113,7 +113,7 @@ class Dispatcher:
         self._polled_ns = 0
 
     def handle(self, cob_id: int, handler: Handler, defects: Defects | None = None) -> None:
-        """Pass the data frames of ``cob_id`` to ``handler`` from now on, on the mainline.
+        """Pass data frames with ``cob_id`` to ``handler`` from now on, on the mainline.
 
         Args:
             cob_id: Identifier of the frames.
@@ -189,7 +189,7 @@ class Dispatcher:
             self.contain(None, "counting frames", defect)
 
     def _tally(self, batch: Sequence[Frame], others: Sequence[Frame]) -> None:
-        """Count the frames of a batch; ``others`` are the frames of types that no handler accepts."""
+        """Count the frames in a batch; ``others`` are the frames whose type no handler accepts."""
         takes_fd = self.config.fd
         if others:
             set_aside = {id(frame) for frame in others}

@@ -19,7 +19,7 @@ from skinnode.model.frames import FieldFrame
 LATE: Final = "late"
 """Reason for a missing field: the patch is operational, but its field did not arrive in time."""
 OVERTAKEN: Final = "overtaken"
-"""Reason for a missing field: a newer scan of the patch arrived first."""
+"""Reason for a missing field: a newer scan from the patch arrived first."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -50,7 +50,7 @@ class Condition(enum.StrEnum):
     REFUSED = "refused"
     """The node answers, but does not match the hand file or does not keep its configuration."""
     LOST = "lost"
-    """The heartbeat of the node stopped."""
+    """The node's heartbeat has stopped."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -163,7 +163,7 @@ class BusHealth:
     other_syncs: int
     """SYNC messages from another producer on a bus where the host is the master."""
     other_masters: int
-    """NMT commands, SDO requests to nodes of the hand, and heartbeats with the host's node-ID, from other
+    """NMT commands, SDO requests to the hand's nodes, and heartbeats with the host's node-ID, from other
     senders."""
     controller: BusState | None = None
     """Newest reported state of the controller; None if none was reported."""

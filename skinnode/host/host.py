@@ -1,4 +1,4 @@
-"""A running host: fields, health, events, statistics and taring of a hand."""
+"""A running host: fields, health, events, statistics and taring for a hand."""
 
 from __future__ import annotations
 

@@ -37,7 +37,7 @@ class BusLink(Dispatcher):
 
     Args:
         config: The bus.
-        handlers: Called on the mainline with the data frames of their COB-IDs.
+        handlers: Called on the mainline with the data frames that have their COB-IDs.
         on_defect: Called with the first occurrence of each distinct message, on the thread that raised it.
         open_port: Opens the interface.
 

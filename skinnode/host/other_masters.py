@@ -32,7 +32,7 @@ class OtherMasterStats:
     syncs: int
     nmt_commands: int
     sdo_requests: int
-    """SDO requests to nodes of the hand, from a second host or a technician's tool."""
+    """SDO requests to the hand's nodes, from a second host or a technician's tool."""
     heartbeats: int
     """Heartbeats with the host's node-ID."""
     last_ns: int | None

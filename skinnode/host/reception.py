@@ -1,4 +1,4 @@
-"""Connect the handlers of a host to the frames of a bus, by COB-ID.
+"""Connect the handlers of a host to the frames on a bus, by COB-ID.
 
 Nothing in this module sends, waits or starts a thread, so a replay can use the module with recorded frames.
 """

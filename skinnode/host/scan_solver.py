@@ -23,7 +23,7 @@ class ScanSolver:
 
     Args:
         facts: Layout, code scale and baseline of the patch.
-        config: Settings of the solver.
+        config: Settings for the solver.
         clock: Returns the monotonic time at which a field is ready, ns.
     """
 
@@ -68,7 +68,7 @@ class ScanSolver:
         return ResistanceFrame(resistance_ohm, valid, stamp)
 
     def solve(self, scan: Scan, stamp: ScanStamp) -> tuple[FieldFrame, int]:
-        """Solve a scan. The noise of the front end and that of the codes are combined.
+        """Solve a scan. The noise from the front end and the noise in the codes are combined.
 
         Returns:
             The stamped field, with read-only arrays, and the number of codes that are not measurements.

@@ -44,8 +44,8 @@ _OUT_OF_STEP: Final = (
     AbortCode.INVALID_SEQUENCE,
     AbortCode.CRC,
 )
-"""SDO abort codes by which a node reports a missed frame of the transfer, which is then retried: toggle bit,
-time-out, command specifier, block size, sequence number, CRC."""
+"""SDO abort codes by which a node reports that it missed a frame of the transfer, which is then retried:
+toggle bit, time-out, command specifier, block size, sequence number, CRC."""
 
 MAX_UPLOAD_BYTES: Final = 4 * 254 * 254
 """Maximum length of a value in bytes: the baseline of the largest patch."""

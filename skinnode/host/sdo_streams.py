@@ -64,7 +64,7 @@ class Client(SdoClient):
         """Send a request and return the response.
 
         For a request that begins a transfer, the first response that names the same object is returned,
-        because a slow node may still be sending frames of the previous transfer.
+        because a slow node may still be sending frames from the previous transfer.
 
         Raises:
             SdoError: if there is no response, or the response is an abort.

@@ -60,7 +60,7 @@ class Supervised:
     phase: Phase
     since_ns: int
     read_ns: int
-    """Earliest time of the next reading of the node's baseline."""
+    """Earliest time for the next reading of the node's baseline."""
     job: Future[Joined | None] | None = None
     """Job that communicates with the node; its result is None if the job only reads the error register."""
     searching: Future[bool] | None = None

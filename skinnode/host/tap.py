@@ -1,4 +1,4 @@
-"""Taps: pass all frames of a host, and the events that affect their decoding, to a recorder."""
+"""Taps: pass all frames to and from a host, and the events that affect their decoding, to a recorder."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class HostTap(StreamTap, Protocol):
 
 
 class ContainedTap:
-    """Wrapper of a tap that never raises.
+    """Wrapper for a tap; never raises.
 
     An exception is reported to ``defects``, and the tap loses that entry.
     """

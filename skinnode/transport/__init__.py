@@ -3,7 +3,7 @@
 ``socketcan`` receives batches of frames through the system call in ``recvmmsg``, and reads how many frames
 the kernel dropped; ``port`` sends, counts and reopens; ``receiver`` contains the receiving threads.
 
-No other package of the project uses python-can at run time.
+No other package in the project uses python-can at run time.
 """
 
 from skinnode.transport.frame import Frame

@@ -32,14 +32,14 @@ def datagram(can_id: int, data: bytes, *, fd: bool = False) -> bytes:
 
 
 def free_channel() -> str:
-    """Return a UDP port of this machine on which no program currently listens."""
+    """Return a UDP port that no program on this machine is using."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
         sock.bind((LOOPBACK, 0))
         return str(sock.getsockname()[1])
 
 
 class DatagramPort(CanPort):
-    """Port that receives packets and never sends.
+    """Port that only receives packets.
 
     The ``channel`` of its configuration is a UDP port number.
     """

@@ -45,7 +45,7 @@ class Damage:
 
 
 class _Container(NamedTuple):
-    """Container of a BLF file."""
+    """Container in a BLF file."""
 
     end: int
     """Offset from which to look for the next container, bytes."""

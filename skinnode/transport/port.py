@@ -182,12 +182,12 @@ class CanPort:
 
     @property
     def undelivered(self) -> int:
-        """Frames lost because another endpoint of a virtual bus had no room for them."""
+        """Frames lost because another endpoint on a virtual bus had no room for them."""
         return self._undelivered
 
     @property
     def malformed(self) -> int:
-        """Packets of the multicast group that were not CAN frames."""
+        """Packets sent to the multicast group that were not CAN frames."""
         return self._malformed
 
     @property

@@ -52,7 +52,7 @@ _LAG_NS: Final = 50_000
 
 
 class Intake:
-    """Bounded queue of one port, between its receiving thread and the reader.
+    """Bounded queue for one port, between its receiving thread and the reader.
 
     A full queue drops the newest frame, as a kernel socket does: queued frames stay complete and in order,
     and only the receiving thread ever touches the end of the queue. ``dropped`` counts the lost frames.
@@ -135,7 +135,7 @@ class Intake:
     def gather(self, now_ns: int) -> None:
         """Set :attr:`due_ns` after a batch, so that frames accumulate until then."""
         known = now_ns > self._asked_ns + _ANSWER_NS
-        if now_ns < self._first_ns:  # fast path for the usual case: runs after every batch of every bus
+        if now_ns < self._first_ns:  # fast path for the usual case: runs after every batch from every bus
             awaited_ns = _before(self._first_ns, now_ns)
         else:
             awaited_ns, all_known = self._next_awaited(now_ns)

@@ -93,7 +93,7 @@ class MessageBatch:
         return _USED.iter_unpack(self._memory[: self._got * _USED.size])
 
     def taken(self) -> memoryview:
-        """Return the memory of the received messages.
+        """Return the memory that holds the received messages.
 
         Each message is followed by its ancillary data; both include unused space.
         """

@@ -55,7 +55,7 @@ BATCH_FRAMES: Final = 256
 
 
 class SocketReader:
-    """Reader of batches of frames from a bound socket. Owned by the receiving thread.
+    """Reader that takes batches of frames from a bound socket. Owned by the receiving thread.
 
     Hardware timestamps are used if the driver offers them: see :class:`HardwareDelay`.
     """

@@ -28,7 +28,8 @@ LSS_MANUFACTURER_ERROR: Final = 0xFF
 """Error code announcing that the next byte holds a manufacturer-specific error code."""
 
 RESET_SCAN: Final = 0x80
-"""Fastscan bit-check value that makes every node without a node-ID answer, and restarts the scan."""
+"""Fastscan bit-check value that makes every node without a node-ID answer, and restarts the
+scan at the vendor-ID."""
 
 
 class LssCommand(IntEnum):

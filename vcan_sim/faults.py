@@ -189,7 +189,7 @@ class Injected:
     """Resets in the middle of a scan."""
     corrupted: int = 0
     displaced: int = 0
-    """Scans of which a chunk was sent with the counter of the next scan."""
+    """Scans in which a chunk was sent with the counter of the next scan."""
     understated: int = 0
     unchecked: int = 0
     sync_lost: int = 0

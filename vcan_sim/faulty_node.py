@@ -50,7 +50,7 @@ class FaultyNode(PatchNode):
         layout: Layout of the patch.
         source: Resistances that the node's converter measures.
         emit: Puts a frame on the bus.
-        on_sent: Called with the COB-ID of each frame of the node after the frame was sent or lost.
+        on_sent: Called with the COB-ID of each frame from the node, after the frame was sent or lost.
         serial: Serial number.
         profile: Protocol of the node.
         faults: Initial faults; their seed stays in force.
@@ -151,7 +151,7 @@ class FaultyNode(PatchNode):
         self._do_due_events(t_ns)
 
     def next_deadline_ns(self) -> int | None:
-        """Return when :meth:`on_timer` must be called next; None if nothing is due before the next frame."""
+        """Return the time at which :meth:`on_timer` is due; None if nothing is due before the next frame."""
         faults = self.faults
         if faults.unplugged != self._unplugged:
             return 0

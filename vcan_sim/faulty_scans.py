@@ -232,7 +232,7 @@ class FaultyScans:
     # --- to the bus
 
     def _send(self, can_id: int, data: bytes, *, spoilt: bool = False) -> bool:
-        """Send a chunk or summary, and then the late chunks of earlier scans.
+        """Send a chunk or summary, and then the late chunks from earlier scans.
 
         A receiver does not assign a ``spoilt`` frame to its scan, so late chunks stay queued after such a
         frame. Returns whether the frame was sent.

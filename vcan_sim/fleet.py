@@ -162,7 +162,7 @@ class Fleet:
         self._ports[bus].off = off
 
     def truth_m(self, patch: str, device_time_us: int) -> Float:
-        """Return the true electrode positions (U, N, 3) of a scan, metres.
+        """Return the true electrode positions (U, N, 3) in a scan, metres.
 
         Args:
             patch: Name of the patch.

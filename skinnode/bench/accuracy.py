@@ -15,9 +15,9 @@ from skinnode.text.json_values import plain
 RATIO_LIMIT: Final = 1.15
 COVERAGE_LIMITS: Final = (0.90, 0.98)
 ERROR_LIMITS: Final = {"staggered": 0.03, "aligned": 0.10}
-"""Maximum error of the posterior on each layout, for a 10 % press at h = 0.5 and a relative noise of 1e-5."""
+"""Maximum error of the posterior on each layout, for a 10 % press at h = 0.5 with relative noise 1e-5."""
 SCENES_A_CELL: Final = 25
-"""Number of scenes per coverage row divided by that per cell of the noise and code tables (at least 3). The
+"""Ratio of scenes per coverage row to scenes per cell of the noise and code tables (at least 3 per cell). The
 RMS over a single scene already covers 300 coordinates."""
 
 
@@ -98,7 +98,7 @@ def print_all(figures: dict[str, Any], echo: Callable[[str], object]) -> None:
 
 
 def _text(value: float | None) -> str:
-    """Return a fraction as a percentage, whatever its size, so that a whole column has one unit."""
+    """Return a fraction as a percentage, whatever its size, so that a whole column uses one unit."""
     return "-" if value is None else f"{100.0 * value:.3g}%"
 
 
@@ -117,7 +117,7 @@ def _print_front(panels: list[dict[str, Any]], echo: Callable[[str], object]) ->
 
 
 def best_of_each(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return each solver's fastest row that reaches the accuracy or, if none does, its most accurate row."""
+    """Return each solver's fastest row that reaches ACCURACY or, if none does, its most accurate row."""
 
     def rank(row: dict[str, Any]) -> tuple[bool, float]:
         error = float("inf") if row["error"] is None else row["error"]
@@ -179,7 +179,7 @@ def _print_coverage(rows: list[dict[str, Any]], echo: Callable[[str], object]) -
             f"{row['scenes']:7}{row['converged']:7.0%}{_text(row['error']):>10}{_text(row['reported']):>10}"
             f"{ratio:>7}{covered:>9}"
         )
-    echo("  forces and contacts, if the posterior found any: RMS error (reported), fraction in 95 %")
+    echo("  forces and contacts, if the posterior found any: RMS error (reported), fraction in 95 % interval")
     for row in rows:
         if row["method"] == "posterior":
             where = f"{row['layout']} h={row['height']:g}"

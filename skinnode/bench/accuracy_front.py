@@ -1,8 +1,8 @@
-"""Error against time for a few wires: our solvers next to their peers on the same compiled F and J.
+"""Error against time for a few wires: our solvers and their peers on the same compiled F and J.
 
 Only the most deeply pressed wires of the patch are solved; the samples of the press contain no noise. Every
 solver starts from rest. It solves either the last sample alone or, as in the paper, all samples in turn, each
-from the solution of the previous sample. Each solver runs at several tolerances and gives one point per
+from the solution for the previous sample. Each solver runs at several tolerances and gives one point per
 tolerance. The time of ``solve_path`` includes work that the bare operators omit: setting up the patch,
 following the branch, estimating the error.
 """
@@ -33,7 +33,7 @@ intermediate samples, and the paper's own layout."""
 TOLERANCES: Final = (1e-4, 1e-7, 1e-10, 1e-13)
 SAMPLES: Final = (1, 5, 10, 20)
 SOLVED: Final = 0.01
-"""Maximum error, relative to the displacement, of a result that counts as solved and is drawn."""
+"""Maximum error, relative to the displacement, for a result to count as solved and be drawn."""
 ROUNDING: Final = 1e-11
 """Error below which results count as equal: rounding error in F, amplified by the condition number of J."""
 LOOSE: Final = 1e-6

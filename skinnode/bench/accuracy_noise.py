@@ -96,7 +96,8 @@ class Parts:
     _left: list[Float] = field(default_factory=list)
 
     def add(self, frame: FieldFrame, truth_m: Float) -> None:
-        """Add a scene and its truth (U, N, 3). Skips held frames, whose variance has additional terms."""
+        """Add a scene and its truth (U, N, 3). Held frames are skipped, because their variance has additional
+        terms."""
         if frame.core_std_m is None or (frame.held is not None and frame.held.all()):
             return
         used = np.array([status is Status.CONVERGED for status in frame.status])
@@ -133,7 +134,7 @@ class Parts:
 
 @dataclass
 class Bound:
-    """Pools the Cramér-Rao bounds of wires, without a prior, computed at the truth with the NumPy model."""
+    """Pools the Cramér-Rao bounds for wires, without a prior, computed at the truth with the NumPy model."""
 
     _variance: float = 0.0
     _size: float = 0.0
@@ -187,7 +188,7 @@ class Forces:
                 self._place.append((float(off), float(contacts[0].centroid_std_m[axis])))
 
     def row(self) -> dict[str, Any]:
-        """Return RMS errors, RMS standard deviations and the fractions within 95 % intervals."""
+        """Return RMS errors, RMS standard deviations and the fractions of errors within 95 % intervals."""
         figures: dict[str, Any] = {
             "contacts_right": self.found_right / self.scenes,
             "contacts_none": self.found_none / self.scenes,

@@ -1,4 +1,4 @@
-"""Time per tracked frame: the exact inverse, the posterior of a full frame, the posterior of a few wires."""
+"""Time per tracked frame: exact inverse, posterior for a full frame, posterior for a few wires."""
 
 from __future__ import annotations
 

@@ -32,7 +32,7 @@ STRIDE: Final = 4
 """Number of path samples per tracker frame."""
 DRIFT: Final = 0.02
 MODEL_ERROR: Final = 0.05
-"""Relative error of the wrong models of case 13 in predicting the change in R. Measured on a 30 % press,
+"""Relative error of the wrong models in case 13 when predicting the change in R. Measured on a 30 % press,
 staggered, h = 0.5: ‖ΔR‖ is off by 2.2 to 5 %; for a single pair of wires, the change is off by 1 to 5 % in
 the median and by 7 % at worst."""
 
@@ -47,7 +47,7 @@ class Case:
     make: Callable[[np.random.Generator], Stream]
     methods: tuple[str, ...] = TRACKERS
     converter: Converter = FINE
-    """Converter of the streams; the user knows its noise."""
+    """Converter for the streams; the user knows its noise."""
     drift: str = "none"
     stride: int = 1
     """Number of stream frames per tracker frame; a path uses all frames."""
@@ -265,7 +265,7 @@ def _impossible(rng: np.random.Generator, taken: Stream, skin: Skin) -> Stream:
 
 
 def _garbage(rng: np.random.Generator, taken: Stream, skin: Skin) -> Stream:
-    """Insert one frame that no deformation explains."""
+    """Insert one frame that no deformation can explain."""
     frames = taken.frames_ohm.copy()
     frames[4] = skin.rest_ohm * rng.uniform(0.3, 1.2, skin.layout.shape)
     return _spoilt(taken, frames, taken.valid)
@@ -424,7 +424,7 @@ def _many_times(skin: Skin) -> Callable[[np.random.Generator], Stream]:
 
 
 def fingertip(radius_m: float = 20e-3) -> Skin:
-    """Return the staggered patch with h = 0.5 on a cylinder whose axis is across the upper wires."""
+    """Return the staggered patch with h = 0.5 on a cylinder whose axis runs across the upper wires."""
     flat = preset("staggered", 0.5)
     middle = float(flat.upper_m[..., 0].mean())
     turned = []

@@ -53,9 +53,9 @@ class Sent:
     frames: dict[str, int]
     """Number of frames sent on each bus, excluding the heartbeats before the start."""
     bus_load: dict[str, float]
-    """Fraction of the time for which frames occupied the simulated bus."""
+    """Fraction of the time during which frames occupied the simulated bus."""
     late_p99_ms: float
-    """Delay of the frames behind their times on the simulated bus, caused by the generator itself."""
+    """Delay of the frames relative to their times on the simulated bus, caused by the generator itself."""
     late_max_ms: float
     cpu_s: float
 
@@ -230,10 +230,10 @@ def _durations_ns(bus: BusConfig, frames: Sequence[_Queued]) -> list[int]:
 
 
 def _arbitrate(frames: Sequence[tuple[int, int, bytes, bool, int]], durations: Sequence[int]) -> Stream:
-    """Arbitrate the frames, which share the bus one at a time.
+    """Arbitrate the frames, which occupy the bus one at a time.
 
-    Frames of a node keep their order, as in the queue of its controller; of the frames at the heads of these
-    queues, the frame with the lowest identifier is sent.
+    Frames from a node keep their order, as in the queue of its controller; of the frames at the heads of
+    these queues, the frame with the lowest identifier is sent.
     """
     order = sorted(range(len(frames)), key=lambda i: frames[i][0])
     waiting: dict[int, list[int]] = {}  # by node, in reverse order

@@ -2,8 +2,8 @@
 
 A frame's time is the time at which the node passes it to its interface, on the monotonic clock that also
 stamps SYNC. SYNC and load come from another endpoint in another thread of the same process, so the
-interpreter lock affects the result. Other processes on the machine affect the result even more; ``chrt -f 20
-skinnode bench node`` gives the figures of an idle machine.
+interpreter lock affects the result. Other processes on the machine affect the result even more; to get the
+figures of an idle machine, run ``chrt -f 20 skinnode bench node``.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from skinnode.transport import CanPort
 
 NODE_ID: Final = 4
 FULL_BUS_HZ: Final = 8_000
-"""Number of frames with eight data bytes per second that fills a bus at 1 Mbit/s."""
+"""Number of frames per second, with eight data bytes each, that fills a bus at 1 Mbit/s."""
 SCAN_PERIOD_S: Final = 0.1
 BEAT_MS: Final = 10
 _BURST_S: Final = 1e-3  # one burst per millisecond, because no thread can wake 8000 times a second

@@ -6,8 +6,8 @@ the middle of the patch; the wire nearest to that point is solved. Of 1000 sampl
 evenly spaced samples are used.
 
 Counts. The paper counts function calls with finite-difference Jacobians, each of which costs 30 calls in
-addition to that of F itself. Here F and J together cost about as much as two evaluations of F; ×31 gives the
-cost with finite differences. Calls per step are means over all samples but the last, as in the paper. The
+addition to the call of F itself. Here F and J together cost about as much as two evaluations of F; ×31 gives
+the cost with finite differences. Calls per step are means over all samples but the last, as in the paper. The
 accuracy is ‖X − X*‖ / ‖X* − X(0)‖ (RMS), averaged over the experiments that converged. The first-order
 optimality is that of r = a F − 1, dimensionless with lengths in pitches; MATLAB would give that of F, which
 is larger by a factor of F² and depends on the unit of length, which the paper does not state.
@@ -59,7 +59,7 @@ LABELS: Final = {
 }
 UNKNOWNS: Final = 30
 DIFFERENCES: Final = UNKNOWNS + 1
-"""Number of calls of F that give F and J by forward differences."""
+"""Number of calls of F needed to compute F and J by forward differences."""
 WRONG: Final = 1e-4
 """Relative error above which a CONVERGED wire counts as wrong; exact data give at most 1e-8."""
 
@@ -209,7 +209,7 @@ def _mean(values: Sequence[float]) -> float | None:
 
 
 def _path_rows(path: PathResult) -> slice:
-    """Return the rows of the path itself, without the cycle search, second attempts and checks."""
+    """Return the rows of the path itself, without the cycle search, second attempts or checks."""
     at = path.position[path.searched :, 0]
     return slice(path.searched, path.searched + int(np.argmax(at == np.nanmax(at))) + 1)
 
@@ -231,7 +231,7 @@ def _optimality(one: Experiment, samples: int, tolerance: float) -> list[float]:
 
 
 def _cycle(made: list[Experiment], samples: int, tolerance: float) -> float | None:
-    """Return the median cycle of the experiments that have a cycle; None if no experiment has a cycle."""
+    """Return the median cycle of the experiments that have a cycle; None if none has one."""
     cycles = []
     for one in made:
         path = one.solve(Uniform(plain=True, intermediate_tolerance=tolerance), samples=samples)

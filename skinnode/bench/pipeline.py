@@ -33,10 +33,10 @@ from skinnode.transport.datagram import DatagramPort, free_channel
 
 PATCHES_A_BUS: Final = 4
 CLASSIC_MS: Final = 50
-"""SYNC period of classic CAN: four patches of 101 frames give 8,080 frames/s plus SYNC and heartbeats."""
+"""SYNC period with classic CAN: four patches of 101 frames give 8,080 frames/s plus SYNC and heartbeats."""
 FD_MS: Final = 25
 STAGGER_MS: Final = 3.0
-"""Offset in ms between the SYNCs of successive buses when staggered; the four patches of one bus are then
+"""Offset in ms between the SYNCs of successive buses when staggered; the four patches on one bus are then
 solved before the next four are due."""
 SCENES: Final = (
     (False, True, 0.0),
@@ -254,7 +254,7 @@ class _Reader:
         self._thread = threading.Thread(target=self._run, name="subscriber", daemon=True)
 
     def since(self, begin_ns: int) -> tuple[list[float], list[float]]:
-        """Return the ms from last frame to field and to its delivery, for scans ended after ``begin_ns``."""
+        """Return the ms from last frame to field and to delivery, for scans that ended after ``begin_ns``."""
         stamps = [(stamp, read_ns) for stamp, read_ns in self._stamps if stamp.t_receive_ns >= begin_ns]
         published = [(stamp.t_solved_ns - stamp.t_receive_ns) * 1e-6 for stamp, _ in stamps]
         return published, [(read_ns - stamp.t_receive_ns) * 1e-6 for stamp, read_ns in stamps]

@@ -1,9 +1,9 @@
 """Scores decoded fields against the truth: error, reported uncertainty, and the bound set by the codes.
 
-The bound is the Cramér-Rao bound of one scan: with S the standard deviations of the relative residuals
-F/b − 1 and J their Jacobian at the true position, no unbiased estimate of a wire's electrodes has a
-covariance below J⁻¹ S Sᵀ J⁻ᵀ. The bound is computed here from the NumPy reference model, independently of
-the solver.
+The bound is the Cramér-Rao bound for one scan: with S the diagonal matrix of the standard deviations of the
+relative residuals F/b − 1, and J their Jacobian at the true position, no unbiased estimator of a wire's
+electrode positions has a covariance below J⁻¹ S Sᵀ J⁻ᵀ. The bound is computed here from the NumPy reference
+model, independently of the solver.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ EXCESS_LIMIT = 1.15
 
 
 def bound_std_m(layout: PatchLayout, upper_m: Float, relative_std: Float) -> Float:
-    """Return the Cramér-Rao bound of every coordinate as a standard deviation (U, N, 3), metres.
+    """Return the Cramér-Rao bound for every coordinate as a standard deviation (U, N, 3), metres.
 
     Args:
         layout: The patch.
@@ -49,7 +49,7 @@ def bound_std_m(layout: PatchLayout, upper_m: Float, relative_std: Float) -> Flo
 
 @dataclass(frozen=True, slots=True)
 class Score:
-    """Figures of a patch's run; lengths in metres, NaN if no scan was scored."""
+    """Figures for one patch in a run; lengths in metres, NaN if no scan was scored."""
 
     scans: int
     untrusted: int

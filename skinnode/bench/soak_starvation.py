@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from typing import Final
 
 _NICE: Final = -5
-"""Nice value of the children if this process may set it; otherwise they inherit that of the soak test."""
+"""Nice value of the children if this process may set it; otherwise they inherit the soak test's value."""
 _CHILDREN_PER_PROCESSOR: Final = 3
 _LONGEST_S: Final = 30.0
 """Maximum lifetime of a child, s; it also exits as soon as its parent has exited."""

@@ -106,7 +106,7 @@ def received_otherwise(fleet: Fleet, counter: FrameCounter, before: Mapping[str,
     Args:
         fleet: Fleet of the nodes.
         counter: Counts made by the host.
-        before: Numbers of frames that each bus carried before the host opened the bus.
+        before: Number of frames that each bus carried before the host opened it.
     """
     found = []
     for bus in fleet.hand.buses:

@@ -54,7 +54,7 @@ class Case:
         return np.asarray(self._jt * self.a)
 
     def residual_beside_jacobian(self) -> Float:
-        """Return r at the point of the last Jacobian, which was computed together with r."""
+        """Return r at the point of the last Jacobian; the two are computed together."""
         return np.asarray(self.a * self._scratch - 1.0)
 
     def jacobian(self, x: Float) -> Float:
@@ -67,7 +67,7 @@ class Case:
 
 
 def press(layout: PatchLayout, depth: float) -> Float:
-    """Return the displacement (U, N, 3) of a smooth dent with shear, ``depth`` heights deep, metres."""
+    """Return the displacement (U, N, 3) in metres of a smooth dent with shear, ``depth`` heights deep."""
     middle = layout.upper_m[..., :2].mean(axis=(0, 1)) + 0.3 * layout.pitch_m
     away = ((layout.upper_m[..., :2] - middle) ** 2).sum(axis=-1) / (2.0 * layout.pitch_m) ** 2
     dent = depth * layout.height_m / (1.0 + away)
@@ -138,7 +138,7 @@ def peers(problem: PatchProblem) -> dict[str, Solve]:
 
 
 def ceres() -> Solve:
-    """Return Ceres as a solver with dense QR and traditional dogleg, which prints nothing."""
+    """Return Ceres as a silent solver with dense QR and traditional dogleg."""
     pyceres = importlib.import_module("pyceres")
     options = pyceres.SolverOptions()
     options.trust_region_strategy_type = pyceres.TrustRegionStrategyType.DOGLEG
@@ -165,7 +165,7 @@ def ceres() -> Solve:
 
     def solve(case: Case, tolerance: float) -> Float:
         x = case.start.copy()
-        options.function_tolerance = tolerance**2  # tolerance of the sum of squares
+        options.function_tolerance = tolerance**2  # tolerance on the sum of squares
         options.gradient_tolerance = tolerance
         options.parameter_tolerance = tolerance
         problem = pyceres.Problem()

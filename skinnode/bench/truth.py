@@ -107,7 +107,7 @@ class Skin:
         return self.resistance_ohm(np.zeros(self.layout.upper_m.shape))
 
     def resistance_ohm(self, displacement_m: Float) -> Float:
-        """Return the resistances (U, K) at a displacement (U, N, 3)."""
+        """Return the resistances (U, K) for a displacement (U, N, 3)."""
         upper = self.body.upper_m + displacement_m
         if self.strain:
             found = self._strained(upper)
@@ -247,14 +247,14 @@ def stream(  # noqa: PLR0913 - the parts of a stream
     rng: np.random.Generator,
     gain: Float | None = None,
 ) -> Stream:
-    """Return a stream of presses that have the given fractions of their full depth.
+    """Return a stream of presses at the given fractions of their full depth.
 
     Args:
         skin: Patch that is pressed.
         presses: Superposed presses.
         shares: Fractions (T,) of the depth, one per frame.
         converter: Converter that reads the resistances.
-        rng: Random generator of the noise.
+        rng: Random generator for the noise.
         gain: Factors that scale the resistances, (T, U, K) or broadcastable to that shape.
     """
     truth = np.stack([skin.displacement_m(presses, share) for share in shares])

@@ -7,9 +7,9 @@ accurate   if it is CONVERGED and every coordinate is within the reported uncert
 wrong      if it is CONVERGED and an error is too large, or if it is not finite, whatever its status
 
 With noise, an error may reach 5 reported standard deviations; chance alone puts 6e-7 of all coordinates
-beyond this limit. A long run must not fail by chance, and a fault must not pass as chance, so each row must
-meet two conditions. For errors that are Gaussian with the reported standard deviation, each condition fails
-with a probability of 1e-4:
+beyond this limit. A long run must not fail by chance, and a fault must not be attributed to chance, so each
+row must meet two conditions. For errors that are Gaussian with the reported standard deviation, each
+condition fails with a probability of 1e-4:
 
 - no coordinate is beyond z(n) or 5, whichever is larger, where any of n independent coordinates exceeds z(n)
   standard deviations with probability 1e-4. z is 5.7 for 9,000 coordinates and 6.4 for 1e6 (Bonferroni's
@@ -88,7 +88,7 @@ def allowed_seeds(coordinates: int, seeds: int) -> int:
 
 @dataclass
 class Tally:
-    """Accumulates one row: a case solved by one method with all seeds."""
+    """Accumulates one row: a case solved by one method for all seeds."""
 
     exact: bool
     seeds: int = 0

@@ -13,7 +13,7 @@ _SYNC_MS_PER_PATCH: Final = 20
 
 
 def demo_hand(patches: int, seed: int) -> HandConfig:
-    """Return a hand of reference patches on one virtual bus, which no other program uses.
+    """Return a hand of reference patches on one virtual bus that no other program uses.
 
     Args:
         patches: Number of patches, 1 to 127.

@@ -34,7 +34,7 @@ BITRATE_BPS: Final = 1_000_000
 _REDRAW_S: Final = 0.2
 _LINE_S: Final = 1.0
 _LULL_S: Final = 0.004
-"""Time without a new field, s, that is taken as the gap between the scans of two SYNCs."""
+"""Time in s without a new field that is taken as the gap between the scans of two SYNCs."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -181,7 +181,7 @@ class _Progress:
         shown = ", ".join(f"{1e6 * abs(depth):.0f}" for _, depth, _, _ in errors) or "-"
         self._console.print(
             f"{elapsed_s:5.1f} s  {received} frames, {lost} lost, {sum(torn.values())} torn, "
-            f"load {100 * load:.0f} %, last frame to field p99 {p99:.1f} ms, depth {shown} µm",
+            f"load {100 * load:.0f} %, frame-to-field latency p99 {p99:.1f} ms, depth {shown} µm",
             soft_wrap=True,
         )
 

@@ -12,11 +12,11 @@ from pathlib import Path
 from typing import Final
 
 _TRIES: Final = 100
-"""Maximum locking attempts; an attempt fails only if the previous owner removes the file after we open it."""
+"""Maximum number of locking attempts; one fails only if the previous owner removes the file just opened."""
 
 
 class FileInUse(BlockingIOError):
-    """Error raised if another owner holds the lock; ``process`` is its process ID, or None if unknown."""
+    """Error raised if the lock is taken; ``process`` is the owner's process ID, or None if unknown."""
 
     def __init__(self, path: Path, process: int | None) -> None:
         self.process = process

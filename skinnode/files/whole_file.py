@@ -89,7 +89,8 @@ def discard_leftovers(path: Path) -> None:
 
 
 def flush_folder(folder: Path) -> None:
-    """Flush the directory entries of ``folder`` to the storage medium, which makes renames in it durable."""
+    """Flush the directory entries of ``folder`` to the storage medium, to make renames in this folder
+    durable."""
     descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
     try:
         os.fsync(descriptor)

@@ -57,7 +57,7 @@ class MonitorApp(App[None]):
 
     Args:
         source: Host or recording; the caller closes it.
-        folder: Folder of recordings.
+        folder: Folder for recordings.
         colours: Colours of the terminal.
         over: Called on each update; the monitor ends when it returns True.
         seconds: Maximum duration; None for no limit.
@@ -129,7 +129,7 @@ class MonitorApp(App[None]):
 
     @property
     def terminal_is_deaf(self) -> bool:
-        """Whether the terminal did not accept the final output."""
+        """Whether the terminal failed to accept the final output."""
         return isinstance(self._driver, PatientDriver) and self._driver.deaf
 
     @property

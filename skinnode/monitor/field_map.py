@@ -50,7 +50,7 @@ _STEPS_M: Final = tuple(
     step * 10.0**power for power in (-5, -4, -3, -2) for step in (1.0, 1.5, 2.0, 3.0, 5.0, 7.0)
 )
 _LEAST_M: Final = 5e-5
-"""Minimum full scale, m, so that noise does not look like a touch."""
+"""Minimum full scale in m, so that noise does not look like a touch."""
 _MEMORY_NS: Final = 6_000_000_000
 """Time for which a deep press determines the scale, ns."""
 
@@ -130,7 +130,7 @@ def arrow(x: float, y: float) -> str:
 
 
 def mean_shear_m(surface: Surface) -> tuple[float, float]:
-    """Return the mean shear (x, y), m, weighted by depth; zero if nothing is pressed."""
+    """Return the mean shear (x, y) in m, weighted by depth; zero if nothing is pressed."""
     weight = np.where(surface.unknown, 0.0, np.clip(surface.depth_m, 0.0, None))
     total = float(weight.sum())
     if total <= 0.0:
@@ -150,7 +150,7 @@ class Scale:
         self.full_m = _LEAST_M
 
     def update(self, t_ns: int, deepest_m: float) -> None:
-        """Update the scale with the depth, m, of the deepest press at ``t_ns``."""
+        """Update the scale with the depth in m of the deepest press at ``t_ns``."""
         while self._peaks and (self._peaks[0][0] < t_ns - _MEMORY_NS or self._peaks[0][0] > t_ns):
             self._peaks.popleft()
         while self._peaks and self._peaks[-1][1] <= deepest_m:
@@ -177,7 +177,7 @@ class MapStyle:
 def paint_map(
     surface: Surface, style: MapStyle, width: int, height: int, *, arrows: bool = False
 ) -> list[Line]:
-    """Draw depth as ``height`` lines of ``width`` characters; ``arrows`` also draws arrows for shear."""
+    """Draw depth as ``height`` lines of ``width`` characters and, if ``arrows`` is set, shear as arrows."""
     full_m, colours = style.full_m, style.colours
     levels = np.rint(
         np.clip(resample(surface.depth_m, width, 2 * height) / full_m, 0.0, 1.0) * (LEVELS - 1)

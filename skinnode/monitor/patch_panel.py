@@ -19,7 +19,7 @@ from skinnode.monitor.view_model import PatchView
 GONE: Final = ("lost", "never seen", "stale", "refused", "restarting", "booting", "starting")
 """Conditions of a patch whose newest field is out of date."""
 _AROUND: Final = 3
-"""Number of lines of a tile excluding its map."""
+"""Number of lines in a tile, excluding its map."""
 _LEAST_OUTLINED: Final = (8, 5)
 """Minimum size of a box whose map has an outline, in characters and lines."""
 _LABEL: Final = 10
@@ -140,7 +140,7 @@ def _health(patch: PatchView, theme: Theme, width: int) -> Line:
 
 
 def shear_text(shear_m: tuple[float, float]) -> str:
-    """Return a shear, m, as an arrow and a magnitude; empty below 1 µm."""
+    """Return a shear, given in m, as an arrow and a magnitude; empty below 1 µm."""
     size_um = 1e6 * float((shear_m[0] ** 2 + shear_m[1] ** 2) ** 0.5)
     return "" if size_um < 1.0 else f"{field_map.arrow(*shear_m)} {size_um:.0f} µm"
 

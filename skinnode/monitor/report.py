@@ -41,7 +41,7 @@ class FaultBook:
 
         Args:
             view: Current view of the hand.
-            real_ns: Monotonic time of the monitor, ns, also when it replays a recording.
+            real_ns: Monotonic time of the monitor in ns, even when it replays a recording.
             ending: Whether the session is ending, so that patches not yet operational count as faults.
         """
         if self._begun_ns is None:

@@ -11,10 +11,10 @@ from skinnode.model.frames import FieldFrame
 from skinnode.model.layout import Float
 
 TOUCH: Final = 0.35
-"""Minimum depth of skin that counts as touched, relative to the maximum, when contacts are found by depth.
+"""Minimum depth at which skin counts as touched, relative to the maximum, when contacts are found by depth.
 Under Hertzian pressure the rim of a contact is half as deep as its centre."""
 SURE: Final = 6.0
-"""Minimum depth of a touch, in standard deviations, which noise on 100 electrodes exceeds once in 10 million
+"""Minimum depth of a touch, in standard deviations; noise on 100 electrodes exceeds it once in 10 million
 fields."""
 LEAST_TOUCH_M: Final = 1e-5
 
@@ -67,7 +67,7 @@ def touches_of(field: FieldFrame, rest_m: Float) -> tuple[Touch, ...]:
 
 
 def _depth_at(field: FieldFrame, rest_m: Float, place_m: Float) -> float:
-    """Return the depth, m, at the electrode closest to a position."""
+    """Return the depth in m at the electrode closest to a position."""
     away = np.hypot(rest_m[..., 0] - place_m[0], rest_m[..., 1] - place_m[1])
     return float(-field.displacement_m[..., 2].flat[int(away.argmin())])
 

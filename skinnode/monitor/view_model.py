@@ -194,7 +194,7 @@ def _patch_view(patch: PatchConfig, history: Sequence[Snapshot], elapsed_s: floa
 
 
 def _latencies_s(history: Sequence[Snapshot], name: str) -> list[float]:
-    """Return the latency, s, of each field of a patch in these snapshots."""
+    """Return the latency in s of each field of a patch in these snapshots."""
     found: dict[int, float] = {}
     since_ns = history[-1].t_ns - HISTORY_NS
     for snapshot in history:
@@ -207,7 +207,7 @@ def _latencies_s(history: Sequence[Snapshot], name: str) -> list[float]:
 
 @functools.lru_cache(maxsize=128)
 def upper_m(layout: LayoutConfig) -> Float:
-    """Return (U, N, 3) positions at rest, m; a placeholder if only the patch stores its layout."""
+    """Return the positions (U, N, 3) at rest in m; a placeholder if only the patch stores its layout."""
     return layout.build().upper_m
 
 

@@ -1,4 +1,4 @@
-"""Time a benchmark of two commits alternately on one machine: ``python -m tools.compare.speed OLD [NEW]``.
+"""Time a benchmark for two commits alternately on one machine: ``python -m tools.compare.speed OLD [NEW]``.
 
 NEW is the working tree by default. Each round runs the benchmark once in each tree; the order alternates, so
 that a change in the machine's speed affects both trees equally. The report gives the shortest time of each
@@ -22,7 +22,7 @@ from tools.compare.__main__ import tree_of
 
 
 def rows_of(report: Any) -> dict[str, float]:
-    """Return every time in the JSON report of a benchmark, by the names of its row and key."""
+    """Return every time in the JSON report of a benchmark, keyed by the names of its row and key."""
     found: dict[str, float] = {}
     for index, row in enumerate(report["rows"]):
         label = " ".join(str(value) for value in row.values() if isinstance(value, str)) or f"row {index}"

@@ -3,7 +3,7 @@
 Each mutant is applied to a private copy of the repository, and the stages of ``stages.toml`` run on it, each
 until its first failure. A failure of a real-time test counts only if the test also fails when run alone. A
 stage that exceeds its time limit also kills the mutant. Verdicts are written to ``results.json`` immediately;
-the next run skips the mutants listed there, except survivors with ``--again``.
+the next run skips the mutants listed there except, with ``--again``, the survivors.
 
 One process imports the libraries and forks for every pytest run, because the imports take longer than most
 tests.
@@ -47,7 +47,7 @@ _KERNELS: Final = (
 _MEMORY_BYTES: Final = 8 << 30
 _FILE_BYTES: Final = 1 << 30
 _TEST_S: Final = 120
-"""Time limit of one test, s."""
+"""Time limit for one test, s."""
 _GRACE_S: Final = 60.0
 """Time allowed for a stage in addition to six times its unmutated duration, s."""
 _PR_SET_CHILD_SUBREAPER: Final = 36

@@ -32,7 +32,7 @@ def _save(figure: Any, file: Path, figures: dict[str, Any]) -> None:
 
 
 def _bars(axes: Any, rows: list[dict[str, Any]], heights: list[float], ours: list[bool]) -> None:
-    """Draw times on a log axis, each labelled with its value and its ratio."""
+    """Draw times on a logarithmic axis, each labelled with its value and ratio."""
     times = [row["us"] for row in rows if row["us"] is not None]
     low = 0.5 * min(times)
     axes.set_xscale("log")

@@ -96,8 +96,7 @@ class Parts:
     _left: list[Float] = field(default_factory=list)
 
     def add(self, frame: FieldFrame, truth_m: Float) -> None:
-        """Add a scene and its truth (U, N, 3). Held frames are skipped, because their variance has additional
-        terms."""
+        """Add a scene and its truth (U, N, 3); skip held frames, whose variance has additional terms."""
         if frame.core_std_m is None or (frame.held is not None and frame.held.all()):
             return
         used = np.array([status is Status.CONVERGED for status in frame.status])

@@ -1,5 +1,4 @@
-"""Dense kernels compared with LAPACK, in a process that limits LAPACK to one thread, as our kernels use only
-one.
+"""Dense kernels compared with LAPACK, in a process that limits LAPACK to one thread, as used by ours.
 
 LAPACK's worker threads keep spinning for a while after each call. If they share a core with the next
 candidate, that candidate takes up to three times as long; on a busy machine the threads also wait for each

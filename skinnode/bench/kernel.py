@@ -27,8 +27,7 @@ SHORT: Final = 1e-3
 
 
 class NumpyWire:
-    """Computes F and Jᵀ of one wire as fast as NumPy allows, with arrays by component and preallocated
-    buffers.
+    """Computes F and Jᵀ of one wire as fast as NumPy allows: structure of arrays, preallocated buffers.
 
     This is the fastest combination of axis order and summation method that was tried; it takes 85 % of the
     time of the obvious one.

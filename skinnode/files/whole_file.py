@@ -89,8 +89,7 @@ def discard_leftovers(path: Path) -> None:
 
 
 def flush_folder(folder: Path) -> None:
-    """Flush the directory entries of ``folder`` to the storage medium, to make renames in this folder
-    durable."""
+    """Flush the directory entries of ``folder`` to the storage medium, to make renames durable."""
     descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
     try:
         os.fsync(descriptor)

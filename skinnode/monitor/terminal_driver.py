@@ -45,8 +45,7 @@ class _Writer(threading.Thread):
                     self._gone.set()
 
     def end(self) -> None:
-        """Stop once the queue has been written. A thread blocked on a stalled terminal ends with the
-        process."""
+        """Stop once the queue is empty. A thread blocked on a stalled terminal ends with the process."""
         with suppress(queue.Full):
             self.queue.put_nowait(None)
         self.join(_END_S)

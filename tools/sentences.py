@@ -1,4 +1,4 @@
-"""Draw sentences of the project at random, for an editor to grade: ``python -m tools.sentences --seed 1``.
+"""Draw sentences from the project at random, for an editor to grade: ``python -m tools.sentences --seed 1``.
 
 Sentences come from docstrings, comments, messages (other strings of at least five words) and pages. Tests,
 the changelog, code blocks and tables are left out.
@@ -93,7 +93,7 @@ def _split(text: str) -> Iterator[str]:
 
 def main() -> None:
     """Print the drawn sentences, one per line, with their locations."""
-    parser = argparse.ArgumentParser(description="Draw sentences of the project at random.")
+    parser = argparse.ArgumentParser(description="Draw sentences from the project at random.")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--count", type=int, default=50)
     options = parser.parse_args()

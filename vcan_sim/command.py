@@ -36,7 +36,7 @@ def simulate(
     fault: Annotated[
         list[str] | None,
         typer.Option(
-            help="Faults of every node, such as lost=0.01,restart_every_s=5,frozen, or of one node, "
+            help="Faults for every node, such as lost=0.01,restart_every_s=5,frozen, or for one node, "
             "such as palm:open_upper=3. Can be repeated.",
             metavar="[PATCH:]FAULTS",
         ),

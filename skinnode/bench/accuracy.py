@@ -179,8 +179,8 @@ def _print_coverage(rows: list[dict[str, Any]], echo: Callable[[str], object]) -
             f"{row['scenes']:7}{row['converged']:7.0%}{_text(row['error']):>10}{_text(row['reported']):>10}"
             f"{ratio:>7}{covered:>9}"
         )
-    echo("  forces and contacts, if the posterior found any: RMS error (reported), fraction in the 95 %
-    interval") for row in rows:
+    echo("  forces and contacts found by the posterior: RMS error (reported), fraction in the 95 % interval")
+    for row in rows:
         if row["method"] == "posterior":
             where = f"{row['layout']} h={row['height']:g}"
             place = ""

@@ -312,9 +312,9 @@ HEAD: Final = (
 )
 LEGEND: Final = (
     "lost: frames, chunks and scans, lost anywhere. published, read: time from the last frame of a scan\n"
-    "(kernel timestamp) to its field, and to the delivery of that field. µs: time in threads receive and\n"
-    "mainline, including wake-ups. load: of the bus; of the replaying process. The scans of a SYNC end at\n"
-    "the same time on all patches, except where the SYNCs of the buses are some ms apart."
+    "(kernel timestamp) to its field, and to the delivery of that field. µs: time in the receive and\n"
+    "mainline threads, including wake-ups. load: of the bus; of the replaying process. The scans started by\n"
+    "one SYNC end at the same time on all patches, except where the SYNCs of the buses are a few ms apart."
 )
 
 

@@ -298,7 +298,7 @@ def _all_at_once(host: Host, fleet: Fleet, names: list[str]) -> None:
 
 
 def _inject(fleet: Fleet, chance: random.Random, names: list[str]) -> str:
-    """Inject the faults of a round. Returns their description."""
+    """Inject the faults for a round. Returns their description."""
     if chance.random() < 0.05:
         bus = chance.choice(fleet.hand.buses).name
         fleet.bus_off(bus, off=True)

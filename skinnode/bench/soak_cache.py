@@ -45,7 +45,7 @@ def environment(folder: Path) -> dict[str, str]:
 def damage(folder: Path, seed: int) -> list[str]:
     """Damage cache files under ``folder``, alternately by truncation and by filling with random bytes.
 
-    The same seed damages the same files. Returns one line per file.
+    The same seed always damages the same files. Returns one line per file.
     """
     chance = random.Random(seed)
     files = sorted(file for file in folder.rglob("*.nb[ci]") if file.stat().st_size > 1)

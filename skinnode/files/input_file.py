@@ -18,7 +18,7 @@ def read_input(key: str, path: Path, most_bytes: int = MOST_BYTES) -> bytes:
     """Read a whole file that the user named, or a pipe that has a writer, as in ``<(command)``.
 
     Args:
-        key: Option or key that named the file, for errors.
+        key: Option or key that named the file, for error messages.
         path: The file.
         most_bytes: Maximum size.
 

@@ -14,7 +14,7 @@ def require_writable(option: str, file: Path) -> None:
     """Check that a file can be written, before its content is computed.
 
     Args:
-        option: Option that named the file, for errors.
+        option: Option that named the file, for error messages.
         file: The file.
 
     Raises:

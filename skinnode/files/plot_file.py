@@ -30,7 +30,7 @@ def save_figure(option: str, file: Path, figure: Any, dpi: int) -> None:
     """Write a matplotlib figure atomically to a file, in the format given by the file's suffix.
 
     Args:
-        option: Option that named the file, for errors.
+        option: Option that named the file, for error messages.
         file: The file.
         figure: A ``matplotlib.figure.Figure``.
         dpi: Resolution in dots per inch.

@@ -224,7 +224,7 @@ def find(mutant: Mutant, source: str) -> str:
 
 
 def draw(group: str, count: int, seed: int, root: Path = ROOT) -> list[Mutant]:
-    """Draw ``count`` mutants in a group's packages, each at a different place."""
+    """Draw ``count`` mutants from a group's packages, each at a different place."""
     sources: dict[str, str] = {}
     places: dict[str, list[tuple[str, _Candidate]]] = defaultdict(list)
     folders = [root / "skinnode" / package for package in GROUPS[group]]

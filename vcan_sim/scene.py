@@ -26,8 +26,7 @@ LEAD_S: Final = 0.8
 """Duration of rest before the first press, s; leaves time to measure the baseline and to open a viewer."""
 
 PRESS, SLIDE, LIFT = 0.36, 0.40, 0.14
-"""Fractions of a cycle; the skin is at rest for the remainder of the cycle. In a 4 s cycle a press takes 1.4
-s."""
+"""Fractions of a cycle; the skin is at rest for the remainder. In a 4 s cycle a press takes 1.4 s."""
 
 _RAMP: Final = 0.2
 """Fraction of a slide in which the sphere accelerates, equal to the fraction in which it decelerates."""

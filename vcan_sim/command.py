@@ -108,7 +108,7 @@ def _too_slow(before: Sequence[NodeReport], now: Sequence[NodeReport]) -> str:
         return ""
     scans = skipped + sum(new.scans_sent - old.scans_sent for old, new in steps)
     return (
-        f"vcan-sim: this machine is too busy: {skipped} of {scans} scans of the last second were skipped "
+        f"vcan-sim: this machine is too busy: {skipped} of {scans} scans in the last second were skipped "
         "(EMCY 0x8110); stop other programs, simulate fewer patches, or use a longer sync.period_ms"
     )
 

@@ -228,7 +228,7 @@ NO_FAULTS: Final = Faults()
 
 
 def faults_of(texts: Sequence[str], patches: Sequence[str]) -> dict[str, Faults]:
-    """Return the faults of each patch from the values of ``--fault``.
+    """Return the faults for each patch from the values of ``--fault``.
 
     Args:
         texts: ``lost=0.01,silent`` applies to all patches, ``palm:open_upper=3`` to one. Later texts add to

@@ -77,7 +77,7 @@ class FaultyScans:
         self._swapped, self._late = None, []
 
     def send_chunk(self, data: bytes) -> None:
-        """Send a chunk, with its own fault or the fault of its scan."""
+        """Send a chunk, with its own fault or that of its scan."""
         counter = data[_CHUNK_COUNTER_BYTE]
         if counter != self._counter:
             self._begin_scan(counter)

@@ -123,7 +123,7 @@ class Scene:
         return () if contact is None else (contact,)
 
     def upper_m(self, t_s: float) -> Float:
-        """Return the electrodes (U, N, 3) at scene time ``t_s``, metres; ``layout.upper_m`` while at rest."""
+        """Return the electrodes (U, N, 3) in m at scene time ``t_s``; ``layout.upper_m`` while at rest."""
         contacts = self.contacts(t_s)
         if not contacts:
             return self.layout.upper_m

@@ -49,7 +49,7 @@ class Scene:
     name: str
     layout: PatchLayout
     samples_ohm: Float
-    """(T, U, K), ohm, without the sample at rest."""
+    """(T, U, K), resistances in ohm, without the sample at rest."""
     truth_m: Float
     """(U, N, 3), true displacement at the last sample, metres."""
 

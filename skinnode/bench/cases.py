@@ -66,7 +66,7 @@ def narrowed(layout: PatchLayout) -> PatchLayout:
 
 
 def press_and_release(steps: int) -> Float:
-    """Return fractions of the depth: zero, then equal steps up to one, then zero."""
+    """Return fractions of the depth: zero, equal steps up to one, and zero again."""
     return np.array([*np.linspace(0.0, 1.0, steps + 1), 0.0])
 
 

@@ -43,7 +43,7 @@ _BEAT_S: Final = 0.1
 _FULL_S: Final = 1e-4
 
 _Queued = tuple[int, int, bytes, bool]
-"""Time at which a node had the frame ready, ns; COB-ID; data; whether it is a CAN FD frame."""
+"""Time in ns at which a node had the frame ready; COB-ID; data; whether it is a CAN FD frame."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -292,7 +292,7 @@ def _settle(host: Host) -> None:
 
 
 def _cpu_s() -> dict[str, float]:
-    """Return the CPU time of each thread group of this process, s."""
+    """Return the CPU time of each thread group in this process, s."""
     used: dict[str, float] = defaultdict(float)
     names = {thread.native_id: thread.name.split()[0] for thread in threading.enumerate()}
     for task in os.listdir("/proc/self/task"):

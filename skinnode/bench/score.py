@@ -30,7 +30,7 @@ def bound_std_m(layout: PatchLayout, upper_m: Float, relative_std: Float) -> Flo
 
     Args:
         layout: The patch.
-        upper_m: Electrodes (U, N, 3), metres.
+        upper_m: Electrode positions (U, N, 3), metres.
         relative_std: Relative standard deviations (U, K) of the resistances.
 
     Returns:

@@ -53,7 +53,7 @@ class FrameCounter:
 
 @dataclass(frozen=True, slots=True)
 class KindSums:
-    """Counts of the frames of one kind over a whole soak."""
+    """Counts of the frames of one kind over a whole soak test."""
 
     kind: str
     wanted: int

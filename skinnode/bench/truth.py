@@ -216,7 +216,7 @@ class Stream:
     """Input of a solver, with the corresponding truth."""
 
     frames_ohm: Float
-    """(T, U, K), ohm; not finite where not valid."""
+    """(T, U, K), resistances in ohm; not finite where invalid."""
     valid: NDArray[np.bool_]
     """(T, U, K)"""
     noise: Float

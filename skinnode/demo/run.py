@@ -68,7 +68,7 @@ class Report:
     """Number of PDOs that became part of a scan."""
     frames_lost: int
     bus_load: float
-    """Fraction of a 1 Mbit/s bus that all frames of the scan phase would have used, including stuff bits."""
+    """Fraction of a 1 Mbit/s bus that all frames in the scan phase would have used, including stuff bits."""
     faults: tuple[str, ...]
     """Reasons for exit status 1; empty if there are none."""
 

@@ -1,7 +1,7 @@
 """Simulated patches for commands that show a host at work.
 
-The patches run in a separate process. Like a real hand, they share no interpreter with the host, so the
-host's figures cover the host alone.
+The patches run in a separate process. Like a real hand, they do not share an interpreter with the host, so
+the host's figures cover the host alone.
 """
 
 from __future__ import annotations

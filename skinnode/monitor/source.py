@@ -35,7 +35,7 @@ class Snapshot:
     """State of a hand at one instant, keyed by patch or bus."""
 
     t_ns: int
-    """Monotonic time of the host, ns; for a recording, of the recording host."""
+    """Monotonic time in ns of the host or, for a recording, of the recording host."""
     health: Mapping[str, PatchHealth]
     bus_health: Mapping[str, BusHealth]
     buses: Mapping[str, BusStats]

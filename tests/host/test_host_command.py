@@ -390,7 +390,7 @@ def test_an_overrun_that_was_taken_back_is_a_note(monkeypatch: pytest.MonkeyPatc
         monkeypatch.undo()
         after = fleet.report()
         line = _too_slow(before, after)
-        assert re.match(r"vcan-sim: this machine is too busy: \d+ of \d+ scans of the last second", line)
+        assert re.match(r"vcan-sim: this machine is too busy: \d+ of \d+ scans in the last second", line)
         assert _too_slow(after, after) == ""
         fleet.inject(Faults(corrupted=0.5), "thumb")  # nothing that a slow computer would do
         assert eventually(lambda: host.stats().patches["thumb"].assembler.scans_corrupt > 0)

@@ -49,7 +49,7 @@ def run_in(tree: Path, script: str, *arguments: str) -> None:
 
 
 def relative_difference(old: Any, new: Any) -> float:
-    """Return the largest difference between arrays, relative to the largest finite value of the old array.
+    """Return the largest difference between arrays, relative to the largest finite value in the old array.
 
     Returns inf if shape, type or the positions of NaN and infinity differ, or if the arrays are not float
     arrays.

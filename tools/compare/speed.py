@@ -2,7 +2,8 @@
 
 NEW is the working tree by default. Each round runs the benchmark once in each tree; the order alternates, so
 that a change in the machine's speed affects both trees equally. The report gives the shortest time of each
-row in each commit, and their ratio. The rows for NumPy and LAPACK show the timing noise of the machine.
+row in both commits, and the ratio of the two. The rows for NumPy and LAPACK show the timing noise of the
+machine.
 
 Exit status 0 if no row takes more than ``--limit`` times its old time, otherwise 1.
 """

@@ -58,7 +58,8 @@ def simulate(
         simulated.inject(faults, patch)
     with stop_on_signal() as stop, simulated as fleet, without_long_collections():
         where = ", ".join(f"{bus.name} ({bus.interface} {bus.channel})" for bus in plan.buses)
-        _say(f"{counted(len(plan.patches), 'patch', 'patches')} of {plan.name!r} on {where}; Ctrl-C ends")
+        patches = counted(len(plan.patches), "patch", "patches")
+        _say(f"{patches} of {plan.name!r} on {where}; press Ctrl-C to stop")
         _watch(fleet, stop.wait, seconds)
         injected = _injected(fleet) if fault else []
     reports = fleet.report()

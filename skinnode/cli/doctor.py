@@ -149,7 +149,7 @@ def _summary(groups: list[Group]) -> str:
     from skinnode.text.words import counted
 
     if not groups:
-        return "the checks that were made found no fault"
+        return "the checks that were run found no faults"
     below = sum(len(group.consequences) for group in groups)
     causes = counted(len(groups), "finding")
     return f"{causes} with {counted(below, 'consequence')}" if below else causes

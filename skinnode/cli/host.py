@@ -66,7 +66,7 @@ def _run(plan: HandConfig, seconds: float | None, report: Report, stop: threadin
     try:
         with without_long_collections(), Host.from_config(plan, cancelled=stop.is_set) as running:
             where = ", ".join(f"{bus.name} ({bus.interface} {bus.channel})" for bus in plan.buses)
-            report.note(f"{operational_text(running)} on {where}; Ctrl-C ends")
+            report.note(f"{operational_text(running)} on {where}; press Ctrl-C to stop")
             _watch(running, stop, seconds, report)
             faults, notes = faults_and_notes(running)
     except BringUpCancelled:

@@ -116,7 +116,7 @@ def _patch_rows(patch: PatchInfo) -> list[tuple[str, str]]:
             else "never all chunks"
         )
         mode = f"chunks that changed by more than {patch.send_threshold_codes} codes, {refresh}"
-    when = f"every {patch.period_ms} ms by its own timer" if patch.period_ms else "at SYNC"
+    when = f"every {patch.period_ms} ms on its own timer" if patch.period_ms else "on SYNC"
     averaged = f", mean of {patch.averaging}" if patch.averaging > 1 else ""
     wires = [
         f"{name} {', '.join(map(str, faulty))}"

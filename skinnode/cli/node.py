@@ -115,7 +115,7 @@ def node(
             where = f"{interface} {channel}{', CAN FD' if fd else ''}"
             sizes = f"{profile.rows} × {profile.columns} wires, {code_bits}-bit codes"
             who = _node_text(board.node_id, node_id)
-            _note(f"{who} ({sizes}, source {source}) on {where}; Ctrl-C ends", as_json)
+            _note(f"{who} ({sizes}, source {source}) on {where}; press Ctrl-C to stop", as_json)
             _watch(runner, port, stop, seconds, as_json)
         faults = _faults(_progress(runner, port, 0.0))
     for fault in faults:

@@ -130,7 +130,7 @@ def _diff(place: Place, node_id: int, file: Path, as_json: bool) -> None:
 
 
 def _dump(remote: RemoteOd, sheet: DataSheet, tell: Callable[[str], None]) -> list[Reading]:
-    """Read the whole dictionary: the objects in the data sheet or, if it has none, those of CiA 301."""
+    """Read the whole dictionary: the objects in the EDS or, without an EDS, those of CiA 301."""
     from skinnode.diagnose.object_dictionary import dump, dump_standard
 
     return list(dump(remote, sheet.eds, tell) if sheet.eds.entries else dump_standard(remote, tell))
@@ -159,7 +159,7 @@ def _note(sheet: DataSheet) -> None:
 
 
 def _sheet_if_any(remote: RemoteOd, eds: Path | None) -> DataSheet:
-    """Return the data sheet of the node.
+    """Return the EDS of the node.
 
     The sheet has no entries for a third-party device without an EDS, or for a node that refuses to identify
     itself; the objects then have only their CiA 301 names.

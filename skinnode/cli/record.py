@@ -84,7 +84,8 @@ def _run(
         check_solvable(patch, plan.solver)
     try:
         with Host.from_config(plan, cancelled=stop.is_set, tap=recorder) as running:
-            _say(as_json, note=f"{counted(len(plan.patches), 'patch', 'patches')} operational; Ctrl-C ends")
+            patches = counted(len(plan.patches), "patch", "patches")
+            _say(as_json, note=f"{patches} operational; press Ctrl-C to stop")
             with running.fields(capacity=1) as fields:
                 _follow(recorder, stop, seconds, as_json, lambda: fields.get(0.0))
             faults, notes = faults_and_notes(running)
@@ -109,7 +110,7 @@ def _listen(
         for link in links:
             tap_link(recorder, link)
         stack.enter_context(Mainline(links))
-        _say(as_json, note="listening; Ctrl-C ends")
+        _say(as_json, note="listening; press Ctrl-C to stop")
         _follow(recorder, stop, seconds, as_json)
     if failures:
         raise failures[0]

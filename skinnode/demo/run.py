@@ -34,7 +34,7 @@ BITRATE_BPS: Final = 1_000_000
 _REDRAW_S: Final = 0.2
 _LINE_S: Final = 1.0
 _LULL_S: Final = 0.004
-"""Time in s without a new field that is taken as the gap between the scans of two SYNCs."""
+"""Time without a new field, s, after which all scans of a SYNC are assumed to have been solved."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -56,7 +56,7 @@ def load_data_sheet(path: Path) -> DataSheet:
 
 
 def data_sheet_of(remote: RemoteOd, path: Path | None) -> DataSheet:
-    """Return the data sheet of a node.
+    """Return the EDS of a node.
 
     Args:
         remote: The node.

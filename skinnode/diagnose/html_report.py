@@ -43,7 +43,7 @@ def as_html(buses: Sequence[BusFacts], groups: Sequence[Group], title: str) -> s
         f"<h1>{escaped(title)}: {counted(len(groups), 'finding')}</h1>",
         f"<p>{escaped(when)}</p>",
         *(_group(group) for group in groups),
-        *([] if groups else ["<p>The checks that were made found no fault.</p>"]),
+        *([] if groups else ["<p>The checks that were run found no faults.</p>"]),
         *(f"<p>Also on the bus: {escaped(line)}</p>" for bus in buses for line in others(bus)),
         *(f"<p>Not judged: {escaped(line)}</p>" for bus in buses for line in not_judged(bus)),
     ]

@@ -53,7 +53,7 @@ _CONFIGURED_BY_OTHERS: Final = (
     "the inhibit time differs from the host's setting",
     "the heartbeat period differs from the hand file",
     "no heartbeat: a loss of the node goes unnoticed",
-    "the patch scans by its own timer",
+    "the patch scans on its own timer",
 )
 _UNEXPLAINED: Final = "^error register 0x|^last: none reported$"
 """Pattern for the evidence of an error report that names no cause."""

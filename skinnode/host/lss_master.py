@@ -274,4 +274,4 @@ class LssMaster:
 def _require_done(answer: bytes, what: str) -> None:
     if answer[1] != LSS_DONE:
         detail = f" (manufacturer code {answer[2]})" if answer[1] == LSS_MANUFACTURER_ERROR else ""
-        raise LssFailed(f"{what}: got error code {answer[1]}{detail}, expected 0 (done)")
+        raise LssFailed(f"{what}: got error code {answer[1]}{detail}, expected 0 (success)")

@@ -27,8 +27,8 @@ RESTART_MEMORY_NS: Final = 5_000_000_000
 """Time after the last restart during which a node counts as restarting in a loop, ns."""
 
 SETTLED_NS: Final = 500_000_000
-"""Time after the last restart in a loop during which a node counts as restarting even if it is operational
-again, ns."""
+"""Time for which a node still counts as restarting after the last restart of a loop, even if it is
+operational again, ns."""
 
 LOOP_RESTARTS: Final = 3
 LOOP_NS: Final = 10_000_000_000

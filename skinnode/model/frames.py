@@ -105,8 +105,8 @@ class FieldFrame:
     """(U,) RMS of the relative residual F/b − 1 over the valid resistances of a wire."""
     stats: SolveStats
     force_n: Float | None = None
-    """(U, N, 3) loads on the skin, N: estimated from the posterior, or computed from the paper's law F = k Δs
-    if a stiffness was given."""
+    """(U, N, 3) loads on the skin in newtons; estimated by the posterior, or computed from the paper's law
+    F = k Δs if a stiffness was given."""
     stamp: ScanStamp | None = None
     """Scan from which the field was computed; None outside a host."""
     method: str = "exact"

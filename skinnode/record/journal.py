@@ -197,7 +197,7 @@ def _event(line: bytes, hand: HandConfig) -> dict[str, Any]:
         case "dropped":
             _whole(event["frames"])
         case "ended":
-            _whole(event.get("frames", 0))  # absent from journals of the first versions
+            _whole(event.get("frames", 0))  # absent from journals of early versions
         case kind if kind in _OF_PATCHES and hand.patch(event["patch"]).bus == event["bus"]:
             if kind == "overtaken":
                 _whole(event["scan"])

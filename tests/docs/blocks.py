@@ -38,7 +38,7 @@ BY_CI, ON_VCAN = "run by .ci/run", "in CI on vcan0"
 PRINTS, PRINTS_EXACTLY = "prints", "prints, to the digit"
 
 _FENCE = re.compile(r'^ *```(\w*)(?: title="([^"]*)")?\n(.*?)^ *```$', flags=re.MULTILINE | re.DOTALL)
-_READY = "Ctrl-C ends"
+_READY = "press Ctrl-C to stop"
 """Printed by a program that runs until Ctrl-C, once it is ready."""
 _LONGEST_S = 60.0
 """Maximum time of a command. Kernels are compiled before."""

@@ -1,4 +1,4 @@
-"""Case EDS-01: the data sheet is consistent with itself, with CiA 301 and with the device's identity."""
+"""Case EDS-01: the EDS is consistent with itself, with CiA 301 and with the device's identity."""
 
 from __future__ import annotations
 

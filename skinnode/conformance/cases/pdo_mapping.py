@@ -283,7 +283,7 @@ def unmappable_transmitted(dut: Dut) -> None:
 @case("PDO-33", "A dummy entry allowed by the EDS can be mapped into an RPDO", "7.5.2.36; CiA 306-1")
 def dummy(dut: Dut) -> None:
     if not dut.eds.dummies:
-        raise NotApplicable("the EDS allows no dummy entry (section DummyUsage)")
+        raise NotApplicable("the EDS does not allow dummy entries (section DummyUsage)")
     bits = {0x1: 1, 0x2: 8, 0x3: 16, 0x4: 32, 0x5: 8, 0x6: 16, 0x7: 32}
     for pdo in _changeable(dut, rpdos(dut)):
         for kind in sorted(dut.eds.dummies & bits.keys()):

@@ -92,9 +92,9 @@ def block_write_heartbeat_crc(dut: Dut) -> None:
         dut.sdo.write_block(HEARTBEAT, 0, b"\x34\x12", crc=True, wrong_crc=True)
     except Aborted as abort:
         if abort.code not in (_CRC, 0x0800_0000):
-            raise Failed("a wrong CRC aborted with 0x05040004", str(abort)) from abort
+            raise Failed("abort 0x05040004 after a wrong CRC", str(abort)) from abort
     else:
-        raise Failed("a wrong CRC aborted with 0x05040004", "the write was confirmed")
+        raise Failed("abort 0x05040004 after a wrong CRC", "the write was confirmed")
     check(dut, HEARTBEAT, 0, 2)
 
 

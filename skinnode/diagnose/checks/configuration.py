@@ -85,7 +85,7 @@ def _check_pdos(bus: BusFacts, patch: PatchFacts) -> Iterator[Finding]:
         yield found("chunks are not event-driven", Sure.CERTAIN, f"transmission type {chunk.kind}", again)
     if running and info.patch.period_ms:
         yield found(
-            "the patch scans by its own timer, not at SYNC",
+            "the patch scans on its own timer, not on SYNC",
             Sure.LIKELY,
             f"period {info.patch.period_ms} ms (0x2021:1)",
             f"write 0: skinnode od {patch.node_id} 2021:1 --write 0; all patches then scan together",

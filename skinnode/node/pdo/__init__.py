@@ -1,4 +1,4 @@
 """Process data objects.
 
-``parameters`` guards and reads the records of a PDO, ``rpdo`` receives, ``tpdo`` transmits.
+``parameters`` reads the records of a PDO and checks writes to them, ``rpdo`` receives, ``tpdo`` transmits.
 """

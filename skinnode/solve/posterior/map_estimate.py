@@ -48,8 +48,8 @@ or two, but more if full steps would cycle."""
 HALVINGS: Final = 6
 """Maximum number of halvings of a Gauss-Newton step."""
 PRIOR_DOUBT: Final = 3.0
-"""Factor applied, in the standard deviation, to the part of σ² that only the prior determines, because the
-load to expect at a location is known only roughly. At 1, the hidden part of a first touch is 5 to 7 standard
+"""Factor on the standard deviation of the component that only the prior determines, because the expected load
+at a location is known only roughly. At 1, the hidden part of a first touch is 5 to 7 standard
 deviations off on one wire in 20 000, and so are dents that a half-space cannot form. At 2, one coordinate in
 12 000 in such dents is 5.6 standard deviations off, and no coordinate of the hard cases exceeds 5."""
 SMOOTH_SHARE: Final = 0.25

@@ -70,7 +70,7 @@ are then as doubtful as near a fold."""
 
 JUMP: Final = 0.2
 """Movement of an electrode between two frames, in clearances, above which the next root may be wrong;
-movements of 0.24 and more were observed to cross folds."""
+movements of 0.24 or more were observed to cross folds."""
 LARGE: Final = 0.03
 """Displacement, in clearances, above which the roughness is checked; folds lie at larger displacements."""
 ROUGH_IN_STREAM: Final = 1.2

@@ -83,7 +83,7 @@ def _evaluate(  # noqa: PLR0913 - arrays of one wire
 
 @njit_part
 def _take_jacobian(raw: Float, a: Float, weight: Float, jt: Float) -> None:
-    """Write the Jacobian of r with respect to the unknowns into ``jt``, given that of F in all coordinates."""
+    """Write the Jacobian of r with respect to the unknowns into ``jt``, given ∂F/∂x for all coordinates."""
     normal_only = jt.shape[0] != raw.shape[0]
     for j in range(jt.shape[0]):
         target, source = jt[j], raw[3 * j + 2 if normal_only else j]

@@ -37,7 +37,7 @@ from skinnode.bench.truth import Press
 from skinnode.model.forward import jacobian, potential_per_m, resistance_ohm
 from skinnode.model.layout import Float, PatchLayout
 from skinnode.model.status import Status
-from skinnode.solve.operators.codes import OPERATORS
+from skinnode.solve.operators.codes import LABELS, OPERATORS
 from skinnode.solve.paths.path import PathResult, solve_path
 from skinnode.solve.paths.step_control import Adaptive, Periodic, Schedule, Uniform, shortest_cycle
 
@@ -52,11 +52,6 @@ FIGURE8: Final = (5, 10, 20, 50)
 FIGURE9: Final = (10, 20, 50, 100)
 FIGURE10: Final = (1e-3, 1e-4, 1e-5, 1e-6)
 RELAXED: Final = 1e-4
-LABELS: Final = {
-    "levenberg_marquardt": "Levenberg-Marquardt",
-    "gauss_newton": "Gauss-Newton",
-    "dogleg": "dogleg",
-}
 UNKNOWNS: Final = 30
 DIFFERENCES: Final = UNKNOWNS + 1
 """Number of calls of F needed to compute F and J by forward differences."""

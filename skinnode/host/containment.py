@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import contextlib
 import logging
-import math
 import threading
 import time
 from collections.abc import Callable
@@ -17,13 +16,9 @@ from dataclasses import dataclass
 from typing import Final
 
 from skinnode.errors import SkinError
+from skinnode.host.retry_pause import Pause
 
 _log = logging.getLogger(__name__)
-
-FIRST_PAUSE_S: Final = 0.1
-LONGEST_PAUSE_S: Final = 1.0
-"""First and longest pause before a failed operation is retried, in s; each pause is twice the previous
-pause."""
 
 _BRIEF_S: Final = 0.001
 _LONGEST_BRIEF_S: Final = 0.02
@@ -39,26 +34,6 @@ def one_line(error: BaseException | None) -> str:
     """Return the type and text of an exception as one line."""
     text = " ".join(str(error).split())
     return f"{type(error).__name__}: {text}" if text else type(error).__name__
-
-
-class Pause:
-    """Sequence of increasing pauses between retries of an operation, s.
-
-    Once the operation has worked for as long as the longest pause, the sequence starts again.
-    """
-
-    def __init__(self, first_s: float = FIRST_PAUSE_S, longest_s: float = LONGEST_PAUSE_S) -> None:
-        self._first_s, self._longest_s = first_s, longest_s
-        self._pause_s = 0.0
-        self._end_s = -math.inf
-
-    def next_s(self) -> float:
-        """Return the length of the pause that starts now, before the next attempt."""
-        now_s = time.monotonic()
-        again = now_s <= self._end_s + self._longest_s
-        self._pause_s = min(2 * self._pause_s, self._longest_s) if again else self._first_s
-        self._end_s = now_s + self._pause_s
-        return self._pause_s
 
 
 @dataclass(frozen=True, slots=True)

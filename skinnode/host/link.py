@@ -13,8 +13,9 @@ from typing import Final, Self
 from skinnode.canopen.indices import SYNC_COB_ID, sdo_response_cob_id
 from skinnode.config import BusConfig
 from skinnode.errors import BusError, CodecError, SkinError
-from skinnode.host.containment import Defects, Pause, keep_on, one_line
+from skinnode.host.containment import Defects, keep_on, one_line
 from skinnode.host.dispatcher import BusStats, Dispatcher, Handler, PortCounters
+from skinnode.host.retry_pause import Pause
 from skinnode.host.sdo_client import RemoteOd, SkinNetwork
 from skinnode.transport import CanPort, Frame, Intake
 

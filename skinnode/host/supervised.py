@@ -8,8 +8,8 @@ from concurrent.futures import Future
 from dataclasses import dataclass, field
 from typing import Final
 
-from skinnode.host.containment import Pause
 from skinnode.host.remote_node import RemoteNode
+from skinnode.host.retry_pause import Pause
 from skinnode.host.scan_solver import ScanSolver
 from skinnode.model.layout import Float
 

@@ -10,6 +10,7 @@ from typer.testing import CliRunner
 
 from skinnode.bench.plots.ratios import draw_solve
 from skinnode.cli.bench import app
+from skinnode.solve.operators.codes import OPERATORS
 
 
 def figures(tmp_path, name: str) -> tuple[str, dict]:
@@ -45,7 +46,7 @@ def test_solve_compares_with_every_peer_at_the_same_accuracy(tmp_path):
     who = [row["who"] for row in data["rows"]]
     for peer in ("root hybr", "root lm", "least_squares trf", "least_squares dogbox", "least_squares lm"):
         assert f"SciPy {peer}" in who
-    assert sum(name.startswith("skinnode") for name in who) == 4
+    assert sum(name.startswith("skinnode") for name in who) == len(OPERATORS) + 1
     for row in data["rows"]:
         if row["us"] is not None:
             assert row["error"] <= data["accuracy"] == 1e-9

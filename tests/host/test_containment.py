@@ -16,12 +16,13 @@ from skinnode.bus_load.timing import BusLoad
 from skinnode.cli._host_report import faults_and_notes
 from skinnode.config import HandConfig, parse_hand
 from skinnode.errors import SkinError
-from skinnode.host import Condition, Host, containment
+from skinnode.host import Condition, Host, containment, retry_pause
 from skinnode.host.code_watch import CodeWatch
-from skinnode.host.containment import Defects, Pause, keep_on
+from skinnode.host.containment import Defects, keep_on
 from skinnode.host.health_watch import HealthWatch
 from skinnode.host.node_monitor import NodeMonitor
 from skinnode.host.remote_node import RemoteNode
+from skinnode.host.retry_pause import Pause
 from skinnode.host.scan_solver import ScanSolver
 from skinnode.host.supervisor import Supervisor
 from skinnode.protocol.assembler import ScanAssembler
@@ -216,7 +217,7 @@ def test_a_patch_that_cannot_be_solved_is_brought_up_anew_ever_more_seldom(
 
     def next_s(pause: Pause) -> float:
         taken = original(pause)
-        if pause._longest_s == containment.LONGEST_PAUSE_S:
+        if pause._longest_s == retry_pause.LONGEST_PAUSE_S:
             pauses.append(taken)
         return taken
 
@@ -364,7 +365,7 @@ def test_pauses_grow_to_a_second_and_begin_anew_after_a_second_of_success(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     now_s = [100.0]
-    monkeypatch.setattr(containment.time, "monotonic", lambda: now_s[0])
+    monkeypatch.setattr(retry_pause.time, "monotonic", lambda: now_s[0])
     pause, pauses = Pause(), []
     for _ in range(6):
         pauses.append(pause.next_s())

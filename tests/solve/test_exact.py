@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 import skinnode as sk
 from skinnode.solve.exact import stream
 from skinnode.solve.exact.tracker import ExactTracker
+from skinnode.solve.operators.codes import OPERATORS
 
 from .press import HI, LO, STEPS, frame_ohm, hertz_press, noisy, quantised
 
@@ -24,7 +25,7 @@ def test_exact_stream_is_followed_exactly(staggered, stream):
         np.testing.assert_allclose(field.displacement_m, moved, atol=1e-9 * staggered.height_m)
 
 
-@pytest.mark.parametrize("operator", ["gauss_newton", "levenberg_marquardt", "dogleg"])
+@pytest.mark.parametrize("operator", OPERATORS)
 def test_noise_and_codes_stay_within_the_reported_deviation(staggered, stream, rest, operator):
     """z = error / deviation has RMS 1, and 95 % of it lies within 1.96."""
     rng = np.random.default_rng(11)

@@ -16,9 +16,9 @@ from scipy.optimize import least_squares
 import skinnode as sk
 from skinnode.solve.linalg.cholesky import cholesky
 from skinnode.solve.posterior import measurement_update as kernels
+from skinnode.solve.posterior.elastic_prior import ElasticPrior
 from skinnode.solve.posterior.map_estimate import PRIOR_DOUBT, SMOOTH_SHARE, MapEstimator
 from skinnode.solve.posterior.observation import Observation
-from skinnode.solve.posterior.prior import ElasticPrior
 from skinnode.solve.wires.problem import PatchProblem
 
 from .press import frame_ohm, hertz_press

@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 
 import skinnode as sk
+from skinnode.solve.operators.codes import OPERATORS
 
 from .press import frame_ohm, hertz_press
-
-OPERATORS = ("gauss_newton", "levenberg_marquardt", "dogleg")
 
 
 @pytest.fixture(scope="module")

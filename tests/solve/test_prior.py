@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 import skinnode as sk
 from skinnode.model.elastic import HertzContact, Rubber, rectangle_compliance
-from skinnode.solve.posterior.prior import MARGIN, SHEAR_SHARE, SLACK, ElasticPrior
+from skinnode.solve.posterior.elastic_prior import MARGIN, SHEAR_SHARE, SLACK, ElasticPrior
 
 
 def flat(wires: int, electrodes: int, name: str = "staggered") -> sk.PatchLayout:

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import skinnode as sk
+from skinnode.solve.operators.codes import OPERATORS
 from skinnode.solve.paths.corrector import Accuracy
 from skinnode.solve.paths.path_tracker import PathTracker
 from skinnode.solve.paths.root_selection import keep_likeliest
@@ -13,8 +14,6 @@ from skinnode.solve.paths.step_control import shortest_cycle
 from skinnode.solve.wires.problem import PatchProblem
 
 from .press import frame_ohm, hertz_press
-
-OPERATORS = ("gauss_newton", "levenberg_marquardt", "dogleg")
 
 
 def staggered(height: float) -> sk.PatchLayout:

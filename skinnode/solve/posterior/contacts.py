@@ -20,9 +20,9 @@ from skinnode.compiled.jit import njit
 from skinnode.model.frames import Contact
 from skinnode.model.layout import Float, PatchLayout
 from skinnode.solve.linalg.vectors import Index
+from skinnode.solve.posterior.elastic_prior import ElasticPrior
 from skinnode.solve.posterior.load_posterior import LoadPosterior
 from skinnode.solve.posterior.map_estimate import PRIOR_DOUBT
-from skinnode.solve.posterior.prior import ElasticPrior
 
 SIGNIFICANT: Final = 5.0
 """Significance, in standard deviations, above which a sum is part of a contact; with 200 sums per frame,

@@ -22,7 +22,7 @@ from skinnode.solve.linalg.cholesky import (
     solve_lower_vector,
 )
 from skinnode.solve.linalg.vectors import Index
-from skinnode.solve.posterior.prior import SLACK, ElasticPrior
+from skinnode.solve.posterior.elastic_prior import SLACK, ElasticPrior
 
 LOCAL_SPREAD: Final = 0.7
 """Standard deviation, in cells, of the Gaussian that spreads the squared loads found over neighbouring cells.

@@ -23,10 +23,10 @@ from skinnode.solve import roots
 from skinnode.solve.linalg.cholesky import cholesky, inverse_diagonal, multiply, solve_lower
 from skinnode.solve.linalg.vectors import Index
 from skinnode.solve.posterior import measurement_update as kernels
+from skinnode.solve.posterior.elastic_prior import ElasticPrior
 from skinnode.solve.posterior.gating import Fit
 from skinnode.solve.posterior.load_prior import LoadPrior
 from skinnode.solve.posterior.observation import Observation, eased
-from skinnode.solve.posterior.prior import ElasticPrior
 from skinnode.solve.wires.problem import PatchProblem
 
 ANNEAL_NOISE: Final = 0.03

@@ -27,11 +27,11 @@ from skinnode.solve.inputs import NOISE_MAX, broadcast_noise, checked_mask, chec
 from skinnode.solve.linalg.vectors import Index
 from skinnode.solve.options import PosteriorArguments, PosteriorOptions, merged
 from skinnode.solve.posterior.contacts import ContactFinder
+from skinnode.solve.posterior.elastic_prior import ElasticPrior
 from skinnode.solve.posterior.gating import Fit, Gate
 from skinnode.solve.posterior.hyperparameters import Hyperparameters
 from skinnode.solve.posterior.map_estimate import MapEstimator
 from skinnode.solve.posterior.observation import Observation, ObservationModel, Readings
-from skinnode.solve.posterior.prior import ElasticPrior
 from skinnode.solve.wires.decode import A_MAX, A_MIN
 from skinnode.solve.wires.problem import PatchProblem
 

@@ -250,7 +250,7 @@ def test_the_likelier_of_two_roots_is_kept_and_neither_of_equals_is_believed(sec
     pitches = (truth / layout.pitch_m).reshape(10, -1)
     doubted = {}
     for weight in (1, -1, 0):
-        tracker = PathTracker(problem, samples * problem.gain, OPERATORS.index("dogleg"))
+        tracker = PathTracker(problem, samples * problem.gain, list(OPERATORS).index("dogleg"))
         sk.Uniform().follow(tracker)
         assert (tracker.end.status == sk.Status.CONVERGED).all()
         tracker.second_tries = second_tries

@@ -27,7 +27,10 @@ WORKERS = 5
 REAL_TIME = "real_time"
 """Marker and group of the tests that count frames in real time and would disturb each other."""
 
-RANKS = {REAL_TIME: 0, None: 2}
+PAGES = "pages"
+"""Group of the pages of docs/: as long as all other real-time tests, but they mostly wait."""
+
+RANKS = {REAL_TIME: 0, PAGES: 1, None: 3}
 """Order of the groups: real time takes longest, and its worker has priority."""
 
 NICE = 3
@@ -49,7 +52,7 @@ def group_of(item: pytest.Item) -> str | None:
 
     Tests that share a fixture of their module are a group, as each worker would make that fixture again."""
     if item.get_closest_marker(REAL_TIME):
-        return REAL_TIME
+        return PAGES if item.path.name == "test_blocks.py" else REAL_TIME
     fixtures = item._fixtureinfo.name2fixturedefs.values()
     return item.path.stem if any(found[-1].scope == "module" for found in fixtures) else None
 
@@ -117,7 +120,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         config.hook.pytest_deselected(items=[item for item in items if item.get_closest_marker("long")])
         items[:] = [item for item in items if not item.get_closest_marker("long")]
     if hasattr(config, "workerinput"):
-        ranks = {item: RANKS.get(group_of(item), 1) for item in items}
+        ranks = {item: RANKS.get(group_of(item), 2) for item in items}
         items.sort(key=ranks.__getitem__)
         groups = {item.nodeid: group for item in items if (group := group_of(item)) is not None}
         Path(config.workerinput[GROUPS]).write_text(json.dumps(groups))

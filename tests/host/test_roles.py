@@ -66,7 +66,7 @@ def test_a_guest_that_may_send_nothing_sends_nothing_and_hears_all(
 ) -> None:  # fmt: skip
     rack = rack_of(crossing_hand)
     file = str(baseline_file(rack, tmp_path))
-    hand = changed(crossing_hand, bus={"role": "guest"}, patch={"baseline": file})
+    hand = changed(crossing_hand, bus={"role": "guest"}, patch={"baseline": file}, sync={"period_ms": 100})
     port = listener_of(hand)
     for name in ("p0", "p1"):
         rack.plug(name)

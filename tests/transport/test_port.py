@@ -7,6 +7,7 @@ import threading
 import time
 import uuid
 from collections.abc import Callable, Iterator
+from types import SimpleNamespace
 
 import can
 import pytest
@@ -239,6 +240,20 @@ def test_two_multicast_groups_are_two_buses(multicast_group: str) -> None:
         ours.send(1, b"")
         assert receive(theirs).can_id == 1
         assert other.recv(0.1) is None
+
+
+def test_a_frame_of_another_group_that_is_delivered_late_is_discarded_too(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A machine that stood still delivered one 28 ms after the kernel had accepted it."""
+    kernel, ours = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
+    with kernel, ours:
+        kernel.send(b"accepted before the change")
+        delayed = SimpleNamespace(sleep=lambda pause_s: kernel.send(b"delivered after it"))
+        monkeypatch.setattr(port_module, "time", delayed)
+        port_module._discard_other_groups(ours)
+        with pytest.raises(BlockingIOError):
+            ours.recv(1, socket.MSG_DONTWAIT)
 
 
 def test_a_port_that_opens_hears_nothing_of_a_busy_group_that_is_not_its_own(multicast_group: str) -> None:

@@ -37,7 +37,6 @@ from skinnode.bench.truth import Press
 from skinnode.model.forward import jacobian, potential_per_m, resistance_ohm
 from skinnode.model.layout import Float, PatchLayout
 from skinnode.model.status import Status
-from skinnode.solve.operators.codes import LABELS, OPERATORS
 from skinnode.solve.paths.path import PathResult, solve_path
 from skinnode.solve.paths.step_control import Adaptive, Periodic, Schedule, Uniform, shortest_cycle
 
@@ -52,6 +51,12 @@ FIGURE8: Final = (5, 10, 20, 50)
 FIGURE9: Final = (10, 20, 50, 100)
 FIGURE10: Final = (1e-3, 1e-4, 1e-5, 1e-6)
 RELAXED: Final = 1e-4
+LABELS: Final = {
+    "levenberg_marquardt": "Levenberg-Marquardt",
+    "gauss_newton": "Gauss-Newton",
+    "dogleg": "dogleg",
+}
+"""The operators in the paper's tables, in the order of their rows."""
 UNKNOWNS: Final = 30
 DIFFERENCES: Final = UNKNOWNS + 1
 """Number of calls of F needed to compute F and J by forward differences."""
@@ -141,7 +146,7 @@ def run(count: int) -> dict[str, Any]:
 
 def _setting(made: list[Experiment]) -> dict[str, Any]:
     operators, ours = (
-        {operator: [_row(made, Uniform(plain=plain), operator, n) for n in STEPS] for operator in OPERATORS}
+        {operator: [_row(made, Uniform(plain=plain), operator, n) for n in STEPS] for operator in LABELS}
         for plain in (True, False)
     )
     first = made[0]
@@ -305,7 +310,7 @@ def _ten_steps() -> list[dict[str, Any]]:
     def alone(operator: str, schedule: Schedule) -> Callable[[], PathResult]:
         return lambda: solve_path(one.layout, chosen, operator=operator, schedule=schedule)
 
-    calls = {f"alone, {LABELS[operator]}": alone(operator, plain) for operator in OPERATORS}
+    calls = {f"alone, {LABELS[operator]}": alone(operator, plain) for operator in LABELS}
     calls["alone, ours"] = alone("dogleg", Uniform())
     calls["in a patch of ten, dogleg"] = lambda: solve_path(layout, patch, schedule=plain)
     times = take_turns(calls, rounds=11)

@@ -1,7 +1,8 @@
 """Conversion of resistances to the codes sent on the wire, and back.
 
 code = round((R/R0 − lo) / (hi − lo) · (2ⁿ − 4)). The codes 0 … 2ⁿ − 4 are measurements. The three codes above
-them are reserved; in ascending order they are over-range, short and open.
+them are reserved; in ascending order they are over-range, short and open. Live streams decode by a compiled
+copy of this formula, ``skinnode.solve.wires.decode``.
 """
 
 from __future__ import annotations

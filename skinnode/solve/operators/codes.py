@@ -11,12 +11,6 @@ from skinnode.model.status import Status
 OPERATORS: Final = {"gauss_newton": 0, "levenberg_marquardt": 1, "dogleg": 2}
 GAUSS_NEWTON: Final = OPERATORS["gauss_newton"]
 LEVENBERG_MARQUARDT: Final = OPERATORS["levenberg_marquardt"]
-LABELS: Final = {
-    "levenberg_marquardt": "Levenberg-Marquardt",
-    "gauss_newton": "Gauss-Newton",
-    "dogleg": "dogleg",
-}
-"""Operators as tables and plots name them, in the order of their rows."""
 
 # Results of a step other than a terminal Status, which is ≥ 0
 TRY: Final = -1

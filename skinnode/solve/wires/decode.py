@@ -1,7 +1,7 @@
 """Compiled conversion of the codes of a scan to the numbers that the solver uses.
 
-``decode`` converts codes to resistances and their standard deviations, and ``scale`` converts resistances to
-a and weights (see ``problem``).
+``decode`` converts codes to resistances, by the formula of :mod:`skinnode.protocol.codes`, and to their
+standard deviations; ``scale`` converts resistances to a and weights (see ``problem``).
 """
 
 from __future__ import annotations

@@ -73,10 +73,12 @@ def test_a_node_that_is_replugged_runs_again_and_the_other_does_not_notice(
         assert host.health("p1").rejoins == 1
         other = stats.patches["p0"]
         numbers = scans(take(undisturbed, other.solved - 10))
-        assert (other.withheld, other.assembler.scans_torn, other.assembler.scans_missed) == (0, 0, 0)
-        # a machine may stand still for a period: then a scan is overtaken, and counted
-        assert other.skipped < other.offered / 10
-        assert numbers[-1] - numbers[0] + 1 - len(numbers) <= other.skipped
+        missed = other.assembler.scans_missed
+        assert (other.withheld, other.assembler.scans_torn) == (0, 0)
+        # if the machine stands still, a scan is overtaken, or the node skips one; both are counted
+        assert missed <= rack.nodes["p0"].overruns
+        assert other.skipped + missed < other.offered / 10
+        assert numbers[-1] - numbers[0] + 1 - len(numbers) <= other.skipped + missed
 
 
 @pytest.mark.parametrize(("command", "booted"), [(0x81, 1), (0x82, 1), (0x80, 0), (0x02, 0)])

@@ -47,6 +47,12 @@ def waiting(hand: HandConfig, **tables: Any) -> HandConfig:
     return parse_hand({**table, "bring_up": {"missing": "wait"}, **tables})
 
 
+def gaps(numbers: list[int]) -> int:
+    """How many scans are missing between the first and the last, which rise."""
+    assert numbers == sorted(numbers)
+    return numbers[-1] - numbers[0] + 1 - len(numbers)
+
+
 @pytest.mark.real_time
 def test_a_node_that_is_replugged_runs_again_and_the_other_does_not_notice(
     crossing_hand: HandConfig, rack_of: Callable[[HandConfig], Rack]
@@ -66,19 +72,19 @@ def test_a_node_that_is_replugged_runs_again_and_the_other_does_not_notice(
         assert first.stamp is not None
         assert first.stamp.t_receive_ns - t_plugged_ns < BACK_S * 1e9
         assert eventually(lambda: runs(host, "p1"))
-        after = take(fields, 10)
-        assert scans(after) == list(range(scans(after)[0], scans(after)[0] + 10))
+        after = scans(take(fields, 10))
         stats = host.stats()
+        # if the machine stands still, a scan is overtaken, or the node skips one; both are counted
+        assert gaps(after) <= stats.patches["p1"].skipped + rack.nodes["p1"].overruns
         assert (stats.nodes["p1"].rejoins, stats.nodes["p0"].rejoins) == (1, 0)
         assert host.health("p1").rejoins == 1
         other = stats.patches["p0"]
         numbers = scans(take(undisturbed, other.solved - 10))
         missed = other.assembler.scans_missed
         assert (other.withheld, other.assembler.scans_torn) == (0, 0)
-        # if the machine stands still, a scan is overtaken, or the node skips one; both are counted
         assert missed <= rack.nodes["p0"].overruns
         assert other.skipped + missed < other.offered / 10
-        assert numbers[-1] - numbers[0] + 1 - len(numbers) <= other.skipped + missed
+        assert gaps(numbers) <= other.skipped + missed
 
 
 @pytest.mark.parametrize(("command", "booted"), [(0x81, 1), (0x82, 1), (0x80, 0), (0x02, 0)])

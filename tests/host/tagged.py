@@ -59,8 +59,8 @@ class Tags:
             if len(tags) > 1:
                 self.mixed.append(f"{stamp.patch} scan {stamp.scan}: readings {tags.tolist()}")
             elif len(tags) and stamp.device_time_us:
-                told = source.at_64us.get(stamp.device_time_us // 64)
-                if told != tags[0]:
+                told = source.at_64us.get(stamp.device_time_us // 64, set())
+                if tags[0] not in told:
                     self.mixed.append(f"{stamp.patch} scan {stamp.scan}: {tags[0]}, summary of {told}")
 
 
@@ -72,7 +72,8 @@ class _Tagged:
         self._rest_ohm = SimulatedPatch(patch.scene, converter_noise=0.0).read(0)
         self._tare_left = 16  # the node's own at power-on
         self.count = 0
-        self.at_64us: dict[int, int] = {}
+        self.at_64us: dict[int, set[int]] = {}
+        """Readings by device time: after a stall of the machine, two may have the same."""
 
     def read(self, t_ns: int) -> Float:
         if self._tare_left:
@@ -80,5 +81,5 @@ class _Tagged:
             return self._rest_ohm
         self.count += 1
         tag = self._offset + self.count % RANGE
-        self.at_64us[(t_ns // 1000 & 0xFFFF_FFFF) // 64] = tag
+        self.at_64us.setdefault((t_ns // 1000 & 0xFFFF_FFFF) // 64, set()).add(tag)
         return self._rest_ohm * (1.0 + tag * STEP)

@@ -151,7 +151,7 @@ def set_link_bitrate(config: BusConfig) -> None:
     """Take the interface down, set its bit rates and bring it up again, with ``ip link``.
 
     Raises:
-        BusError: with the message of ``ip``, if a command fails.
+        BusError: if a command fails, with the error message from ``ip``.
     """
     rates = ["bitrate", str(config.bitrate_bps)]
     if config.fd:

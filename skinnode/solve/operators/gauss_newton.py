@@ -63,7 +63,7 @@ def finite_jacobian(w: Work) -> bool:
 
 @njit_part
 def settled(w: Work, tol_f: float, tol_x: float) -> bool:
-    """Return whether x is a root or minimum, according to the current factors; set ANGLE for a tall system."""
+    """Return whether x is a root or minimum according to the current factors; set ANGLE for a tall system."""
     s = w.s
     small = largest(w.r) <= tol_f
     if w.r.size != w.x.size:

@@ -207,7 +207,7 @@ def _latencies_s(history: Sequence[Snapshot], name: str) -> list[float]:
 
 @functools.lru_cache(maxsize=128)
 def upper_m(layout: LayoutConfig) -> Float:
-    """Return the positions (U, N, 3) at rest in m; a placeholder if only the patch stores its layout."""
+    """Return the rest positions (U, N, 3) in m by the hand file; a layout stored in the patch may differ."""
     return layout.build().upper_m
 
 

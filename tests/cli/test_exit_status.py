@@ -135,19 +135,20 @@ def test_what_runs_until_it_is_told_has_done_its_work(
     folder: Path, multicast_group: str, command: str, number: int
 ) -> None:
     arguments = [multicast_group if word == "MULTICAST GROUP" else word for word in UNTIL_TOLD[command]]
-    with contextlib.ExitStack() as stack:
-        if command in ("host", "monitor"):
-            stack.enter_context(simulated(folder))
-        process = stack.enter_context(start(arguments, folder))
-        assert process.stdout is not None
-        process.stdout.readline()
-        process.stdout.readline()
-        process.send_signal(number)
-        _, err = process.communicate(timeout=30)
-    if not re.fullmatch(r"(fault: \w+: \d+ scans? missed\n)+", err):  # the machine stood still
-        assert (process.returncode, err) == (0, "")
-    else:
-        assert process.returncode == 1
+    for _ in range(3):
+        with contextlib.ExitStack() as stack:
+            if command in ("host", "monitor"):
+                stack.enter_context(simulated(folder))
+            process = stack.enter_context(start(arguments, folder))
+            assert process.stdout is not None
+            process.stdout.readline()
+            process.stdout.readline()
+            process.send_signal(number)
+            _, err = process.communicate(timeout=30)
+        if not re.fullmatch(r"(fault: \w+: \d+ scans? missed\n)+", err):
+            break
+        assert process.returncode == 1  # the machine stood still for a scan: tried again
+    assert (process.returncode, err) == (0, "")
 
 
 WITH_AN_END = {

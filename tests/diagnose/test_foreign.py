@@ -139,12 +139,12 @@ def test_other_objects_are_known_to_the_eds_alone(bus: BusConfig, foreign: objec
 def test_a_dump_without_an_eds_has_what_the_standard_names(bus: BusConfig, foreign: object) -> None:
     done = run(["od", NODE_ID], bus)
     assert done.status == 0
-    told = " ".join(done.stdout.split())
+    printed = " ".join(done.stdout.split())
     for line in (
         "1000:0 Device type UNSIGNED32 ro 983441 (0xF0191)",
         "1018:4 Serial number UNSIGNED32 ro 99",
     ):
-        assert line in told
+        assert line in printed
     assert "2000:0" not in done.stdout
     assert "note: node 16 is not a skinnode patch; to name all its objects, add --eds FILE" in done.stdout
 
@@ -158,13 +158,13 @@ def test_a_dcf_takes_an_eds(bus: BusConfig, foreign: object, tmp_path: Path) -> 
 
 def test_the_doctor_names_it_and_finds_nothing_wrong(bus: BusConfig, foreign: object) -> None:
     done = run(["doctor"], bus)
-    told = " ".join(done.stdout.split())
+    printed = " ".join(done.stdout.split())
     assert (
         "node 16 (valve), not a skinnode patch: device profile 401, vendor 0x00000042, product 0x00000043, "
         "NMT state operational, error register 0x01 (generic)"
-    ) in told
-    assert "no patches, " in told
-    assert "the checks that were run found no faults" in told
+    ) in printed
+    assert "no patches, " in printed
+    assert "the checks that were run found no faults" in printed
     assert done.status == 0
     assert run(["doctor", "--json"], bus).json["others"][0].startswith(f"{bus.channel}: node 16 (valve)")
 
@@ -173,9 +173,9 @@ def test_the_doctor_names_one_that_only_beats(bus: BusConfig) -> None:
     with can.Bus(interface="virtual", channel=bus.channel, ignore_config=True) as other:
         beats = other.send_periodic(can.Message(arbitration_id=0x711, data=[4], is_extended_id=False), 0.05)
         time.sleep(0.1)
-        told = " ".join(run(["doctor"], bus).stdout.split())
+        printed = " ".join(run(["doctor"], bus).stdout.split())
         beats.stop()
-    assert "node 17, not a skinnode patch: NMT state stopped, does not answer SDO requests" in told
+    assert "node 17, not a skinnode patch: NMT state stopped, does not answer SDO requests" in printed
 
 
 def test_scan_says_what_kind_of_device_has_no_name(bus: BusConfig, foreign: canopen.LocalNode) -> None:

@@ -59,9 +59,9 @@ class Tags:
             if len(tags) > 1:
                 self.mixed.append(f"{stamp.patch} scan {stamp.scan}: readings {tags.tolist()}")
             elif len(tags) and stamp.device_time_us:
-                told = source.at_64us.get(stamp.device_time_us // 64, set())
-                if tags[0] not in told:
-                    self.mixed.append(f"{stamp.patch} scan {stamp.scan}: {tags[0]}, summary of {told}")
+                readings = source.at_64us.get(stamp.device_time_us // 64, set())
+                if tags[0] not in readings:
+                    self.mixed.append(f"{stamp.patch} scan {stamp.scan}: {tags[0]}, summary of {readings}")
 
 
 class _Tagged:

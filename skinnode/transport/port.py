@@ -56,8 +56,8 @@ _MULTICAST: Final = "udp_multicast"
 _VIRTUAL: Final = "virtual"
 
 _DELIVERY_S: Final = 0.05
-"""Maximum time that the kernel takes to deliver a frame to all sockets, s; on a virtual machine that stood
-still, 28 ms were observed."""
+"""Time allowed for the kernel to finish delivering a frame, s; an assumption, above the 28 ms for which a
+virtual machine stood still when a frame from another group was received."""
 
 # In a program without logging, python-can's loggers would print warnings on stderr, even about errors that
 # BusError reports.

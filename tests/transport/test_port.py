@@ -245,7 +245,7 @@ def test_two_multicast_groups_are_two_buses(multicast_group: str) -> None:
 def test_a_frame_of_another_group_that_is_delivered_late_is_discarded_too(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """A machine that stood still delivered one 28 ms after the kernel had accepted it."""
+    """The kernel accepted it before the port chose its group, and hands it over afterwards."""
     kernel, ours = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
     with kernel, ours:
         kernel.send(b"accepted before the change")

@@ -12,11 +12,13 @@ __version__ = "0.1.0"
 
 if TYPE_CHECKING:
     from skinnode.host import HandFrame, Host
+    from skinnode.model.data_fault import DataFault, FaultKind, FaultyPart
     from skinnode.model.elastic import Rubber
     from skinnode.model.forward import jacobian, resistance_ohm
     from skinnode.model.frames import Contact, FieldFrame, ResistanceFrame, ScanStamp, SolveStats
     from skinnode.model.layout import PatchLayout
     from skinnode.model.status import Status
+    from skinnode.model.tolerances import Tolerances
     from skinnode.record import Recorder, replay
     from skinnode.solve.operators.system import solve_system
     from skinnode.solve.options import PosteriorOptions, TrackerOptions
@@ -33,11 +35,15 @@ _HOME = {
     "resistance_ohm": "skinnode.model.forward",
     "jacobian": "skinnode.model.forward",
     "Contact": "skinnode.model.frames",
+    "DataFault": "skinnode.model.data_fault",
+    "FaultKind": "skinnode.model.data_fault",
+    "FaultyPart": "skinnode.model.data_fault",
     "FieldFrame": "skinnode.model.frames",
     "ResistanceFrame": "skinnode.model.frames",
     "ScanStamp": "skinnode.model.frames",
     "SolveStats": "skinnode.model.frames",
     "Status": "skinnode.model.status",
+    "Tolerances": "skinnode.model.tolerances",
     "Adaptive": "skinnode.solve.paths.step_control",
     "Periodic": "skinnode.solve.paths.step_control",
     "Uniform": "skinnode.solve.paths.step_control",
@@ -55,6 +61,9 @@ _HOME = {
 __all__ = [
     "Adaptive",
     "Contact",
+    "DataFault",
+    "FaultKind",
+    "FaultyPart",
     "FieldFrame",
     "HandFrame",
     "Host",
@@ -69,6 +78,7 @@ __all__ = [
     "ScanStamp",
     "SolveStats",
     "Status",
+    "Tolerances",
     "Tracker",
     "TrackerOptions",
     "Uniform",

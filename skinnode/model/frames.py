@@ -8,6 +8,7 @@ from typing import Any, Final, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from skinnode.model.data_fault import DataFault
 from skinnode.model.layout import Float
 from skinnode.model.status import Status
 
@@ -87,6 +88,9 @@ class Contact:
     """(2,) shear force along and across the wires, N."""
     shear_force_std_n: Float
     """(2,) standard deviation of the shear force, N."""
+    force_calibrated: bool = False
+    """Whether the forces rest on a calibration of this patch. Without one, their standard deviations also
+    cover the tolerance of the layer's thickness and the support of the layer."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -129,6 +133,19 @@ class FieldFrame:
     """(U, N, 3) standard deviation of the bulk of the errors, without the allowance for the tail, metres;
     None if equal to ``displacement_std_m``."""
 
+    distrust: str | None = None
+    """Why the field is not trusted, in words; empty if it is trusted; None if it has not been assessed."""
+    wires_trusted: NDArray[np.bool_] | None = None
+    """(U,) wires whose own readings passed every test and are complete enough; None if not assessed."""
+    precise: bool = True
+    """Whether the standard deviations are within the limits that the user set (``max_std_m`` and
+    ``max_force_std_n``)."""
+    data_share: Float | None = None
+    """(U, N, 3) how much of each displacement comes from the data of this frame, not from the prior: 1 minus
+    the ratio of the posterior's variance to the prior's; None if all of it does, as in an exact field."""
+    faults: tuple[DataFault, ...] = ()
+    """Readings that failed a test and were left out."""
+
     @property
     def half_width_95_m(self) -> Float:
         """(U, N, 3) half-width of the 95 % interval around the displacement, metres."""
@@ -136,8 +153,13 @@ class FieldFrame:
 
     @property
     def trusted(self) -> bool:
-        """Whether every wire converged."""
-        return all(status is Status.CONVERGED for status in self.status)
+        """Whether data and solution pass every test, the data are complete enough, and the patch is alive.
+
+        ``distrust`` says why not. A field that has not been assessed is trusted if every wire converged.
+        """
+        if self.distrust is None:
+            return all(status is Status.CONVERGED for status in self.status)
+        return not self.distrust
 
 
 _Record = TypeVar("_Record", Contact, FieldFrame)

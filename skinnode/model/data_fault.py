@@ -1,0 +1,61 @@
+"""Faults in the data of a patch: which readings failed a test and were left out of a field."""
+
+from __future__ import annotations
+
+import enum
+from dataclasses import dataclass
+
+
+class FaultyPart(enum.StrEnum):
+    """Part of a patch whose readings are at fault."""
+
+    CROSSING = "crossing"
+    """One pair of an upper and a lower wire."""
+    UPPER = "upper wire"
+    LOWER = "lower wire"
+    PATCH = "patch"
+
+
+class FaultKind(enum.StrEnum):
+    """What is wrong with the readings."""
+
+    CONTRADICTS = "contradicts the other readings"
+    FROZEN = "repeats its codes"
+    OPEN = "open"
+    SHORT = "short"
+    NOISY = "noisy"
+    DRIFTING = "drifting"
+
+
+@dataclass(frozen=True, slots=True)
+class DataFault:
+    """Readings that failed a test and were left out."""
+
+    part: FaultyPart
+    kind: FaultKind
+    upper: int | None = None
+    """Upper wire; None if all upper wires are concerned."""
+    lower: int | None = None
+    """Lower wire; None if all lower wires are concerned."""
+    since: int = 0
+    """Scan in which the fault was first found: the host's scan number, or, without a host, the number of
+    frames since the tracker was reset."""
+    deviations: float = 0.0
+    """Size of the test's statistic, as the number of standard deviations at which a normal variable is
+    equally unlikely; inf if the fault is certain."""
+
+    @property
+    def place(self) -> str:
+        """The part and its numbers, such as ``crossing of upper wire 3 and lower wire 12``."""
+        match self.part:
+            case FaultyPart.CROSSING:
+                return f"crossing of upper wire {self.upper} and lower wire {self.lower}"
+            case FaultyPart.UPPER:
+                return f"upper wire {self.upper}"
+            case FaultyPart.LOWER:
+                return f"lower wire {self.lower}"
+            case FaultyPart.PATCH:
+                return "patch"
+
+    def __str__(self) -> str:
+        return f"{self.place}: {self.kind} since scan {self.since}"

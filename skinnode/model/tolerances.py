@@ -1,0 +1,42 @@
+"""Tolerances to which a patch was made: how far its geometry may differ from its layout."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields
+from typing import Final
+
+
+@dataclass(frozen=True, slots=True)
+class Tolerances:
+    """Standard deviations of the differences between a patch and its layout; 0 means exact.
+
+    Raises:
+        ValueError: If a tolerance is negative, or not below 0.5.
+    """
+
+    placement: float = 0.0
+    """Position of each upper and lower wire along each axis, pitches."""
+    thickness: float = 0.0
+    """Thickness of the layer between the electrodes, as a fraction of the clearance."""
+    electrode_radius: float = 0.0
+    """Radius of the electrodes, which the forward model takes for points, pitches."""
+    gain: float = 0.0
+    """Gain of the front end, as a fraction of the change in each resistance."""
+
+    def __post_init__(self) -> None:
+        for entry in fields(self):
+            value = getattr(self, entry.name)
+            if not (math.isfinite(value) and 0.0 <= value < 0.5):
+                raise ValueError(f"{entry.name}: got {value}, must be from 0 to below 0.5")
+
+    @property
+    def exact(self) -> bool:
+        """Whether every tolerance is 0."""
+        return self == EXACT
+
+
+EXACT: Final = Tolerances()
+"""The patch equals its layout, as a simulated patch does."""
+ORDINARY: Final = Tolerances(placement=0.02, thickness=0.05, electrode_radius=0.05, gain=0.02)
+"""A patch made in a good workshop."""

@@ -127,10 +127,15 @@ UNTIL_TOLD = {
 }
 
 
-@pytest.mark.parametrize(
-    ("command", "number"),
-    [(command, number) for command in UNTIL_TOLD for number in SIGNALS[: 2 if command == "monitor" else 3]],
-)
+def until_told() -> Iterator[object]:
+    """Every command with its signals; the host counts the scans of another process, in real time."""
+    for command in UNTIL_TOLD:
+        marks = [pytest.mark.real_time] if command in ("host", "monitor") else []
+        for number in SIGNALS[: 2 if command == "monitor" else 3]:
+            yield pytest.param(command, number, marks=marks)
+
+
+@pytest.mark.parametrize(("command", "number"), list(until_told()))
 def test_what_runs_until_it_is_told_has_done_its_work(
     folder: Path, multicast_group: str, command: str, number: int
 ) -> None:

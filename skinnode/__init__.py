@@ -16,7 +16,9 @@ if TYPE_CHECKING:
     from skinnode.model.elastic import Rubber
     from skinnode.model.forward import jacobian, resistance_ohm
     from skinnode.model.frames import Contact, FieldFrame, ResistanceFrame, ScanStamp, SolveStats
+    from skinnode.model.hand_contact import HandContact, Wrench
     from skinnode.model.layout import PatchLayout
+    from skinnode.model.pose import Pose
     from skinnode.model.status import Status
     from skinnode.model.tolerances import Tolerances
     from skinnode.record import Recorder, replay
@@ -28,6 +30,7 @@ if TYPE_CHECKING:
     from skinnode.solve.tracker import Tracker
 
 _HOME = {
+    "HandContact": "skinnode.model.hand_contact",
     "HandFrame": "skinnode.host",
     "Host": "skinnode.host",
     "PatchLayout": "skinnode.model.layout",
@@ -42,8 +45,10 @@ _HOME = {
     "ResistanceFrame": "skinnode.model.frames",
     "ScanStamp": "skinnode.model.frames",
     "SolveStats": "skinnode.model.frames",
+    "Pose": "skinnode.model.pose",
     "Status": "skinnode.model.status",
     "Tolerances": "skinnode.model.tolerances",
+    "Wrench": "skinnode.model.hand_contact",
     "Adaptive": "skinnode.solve.paths.step_control",
     "Periodic": "skinnode.solve.paths.step_control",
     "Uniform": "skinnode.solve.paths.step_control",
@@ -65,11 +70,13 @@ __all__ = [
     "FaultKind",
     "FaultyPart",
     "FieldFrame",
+    "HandContact",
     "HandFrame",
     "Host",
     "PatchLayout",
     "PathResult",
     "Periodic",
+    "Pose",
     "Posterior",
     "PosteriorOptions",
     "Recorder",
@@ -82,6 +89,7 @@ __all__ = [
     "Tracker",
     "TrackerOptions",
     "Uniform",
+    "Wrench",
     "__version__",
     "jacobian",
     "replay",

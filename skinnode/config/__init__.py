@@ -2,7 +2,8 @@
 
 ::
 
-    file -> toml_text (values, positions) -> hand, buses, patches, running, simulation (pydantic models)
+    file -> toml_text (values, positions) -> hand, buses, patches, links, running, simulation (pydantic
+    models)
          -> HandConfig, or explain (one-line errors)
 
 :func:`load_hand` reads a file, :func:`parse_hand` validates a table in memory. Both raise
@@ -21,11 +22,11 @@ from skinnode.config.buses import (
     SyncConfig,
 )
 from skinnode.config.hand import HandConfig, load_hand, parse_hand
+from skinnode.config.links import LinkConfig, PoseConfig
 from skinnode.config.patches import (
     CalibrationConfig,
     LayoutConfig,
     PatchConfig,
-    PoseConfig,
     load_layout,
 )
 from skinnode.config.running import Partial, SolverConfig, StreamConfig
@@ -38,6 +39,7 @@ __all__ = [
     "CalibrationConfig",
     "HandConfig",
     "LayoutConfig",
+    "LinkConfig",
     "Missing",
     "OtherFrame",
     "Partial",

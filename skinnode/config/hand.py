@@ -11,6 +11,7 @@ from pydantic import Field, PrivateAttr, ValidationError, model_validator
 from skinnode.canopen.indices import MAX_NODE_ID
 from skinnode.config.buses import BringUpConfig, BusConfig, SyncConfig
 from skinnode.config.explain import first_error, key_path, short
+from skinnode.config.links import LinkConfig
 from skinnode.config.patches import PatchConfig
 from skinnode.config.running import SolverConfig, StreamConfig
 from skinnode.config.simulation import SimulationConfig
@@ -42,6 +43,8 @@ class HandConfig(Table):
         tuple[PatchConfig, ...], Field(min_length=1, strict=False), Allowed("at least one [[patches]]")
     ]
     """Skin patches of the hand."""
+    links: Annotated[tuple[LinkConfig, ...], Field(strict=False)] = ()
+    """Links of the robot that carry patches, with their poses in the hand."""
     sync: SyncConfig = SyncConfig()
     bring_up: BringUpConfig = BringUpConfig()
     solver: SolverConfig = SolverConfig()
@@ -126,8 +129,18 @@ class HandConfig(Table):
         _require_unique("patches", "node_id", [(patch.bus, patch.node_id) for patch in self.patches])
         serials = [object() if patch.serial is None else patch.serial for patch in self.patches]
         _require_unique("patches", "serial", serials)
+        self._check_links()
         self._check_roles()
         return self
+
+    def _check_links(self) -> None:
+        """Check that each link has one entry and carries a patch."""
+        _require_unique("links", "name", [link.name for link in self.links])
+        used = list(dict.fromkeys(patch.link for patch in self.patches if patch.link is not None))
+        for i, link in enumerate(self.links):
+            if link.name not in used:
+                allowed = f"the link of a patch: {', '.join(used)}" if used else "only if patches have a link"
+                raise ConfigError(f"links[{i}].name", link.name, allowed)
 
     def _check_roles(self) -> None:
         """Check for settings that conflict with the role of a bus."""

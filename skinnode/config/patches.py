@@ -9,6 +9,7 @@ from typing import Annotated, Literal
 from pydantic import Field, ValidationError, ValidationInfo, field_validator, model_validator
 
 from skinnode.config.explain import first_error
+from skinnode.config.links import PoseConfig
 from skinnode.config.table import (
     Allowed,
     Count,
@@ -26,7 +27,6 @@ from skinnode.errors import ConfigError
 from skinnode.model.elastic import Rubber
 from skinnode.model.layout import PatchLayout
 from skinnode.model.layout_file import from_electrodes, has_electrodes, impossible, read_npz
-from skinnode.model.pose import Pose
 
 Preset = Literal["aligned", "symmetric", "staggered"]
 Coordinates = Literal["preset", "node"]
@@ -35,11 +35,6 @@ _Resistivity = Annotated[
     float, Field(ge=1e-3, le=1e15, allow_inf_nan=False), Allowed("a number of ohm/m from 1e-3 to 1e15")
 ]
 _RUBBER = Rubber()
-_Metres = Annotated[float, Field(ge=-10, le=10, allow_inf_nan=False), Allowed("a number from -10 to 10")]
-_Angle = Annotated[
-    float, Field(ge=-6.2832, le=6.2832, allow_inf_nan=False), Allowed("a number from -6.2832 to 6.2832")
-]
-_Part = Annotated[float, Field(ge=-1.001, le=1.001, allow_inf_nan=False), Allowed("a number from -1 to 1")]
 _Gain = Annotated[float, Field(ge=0.1, le=10, allow_inf_nan=False), Allowed("a number from 0.1 to 10")]
 
 
@@ -112,44 +107,6 @@ def _preset(name: str, **sizes: float | int | None) -> PatchLayout:
     return PatchLayout.preset(name, **sizes)  # type: ignore[arg-type]
 
 
-class PoseConfig(Table):
-    """Pose of the patch's frame (x along the upper wires, z out of the skin) in the hand's frame."""
-
-    position_m: Annotated[
-        tuple[_Metres, _Metres, _Metres], Field(strict=False), Allowed("three numbers [x, y, z], metres")
-    ] = (0.0, 0.0, 0.0)
-    """Origin of the patch's frame, metres."""
-    quaternion_xyzw: Annotated[
-        tuple[_Part, _Part, _Part, _Part] | None,
-        Field(strict=False),
-        Allowed("four numbers [x, y, z, w] of unit length"),
-    ] = None
-    """Orientation as a unit quaternion, real part last."""
-    rpy_rad: Annotated[
-        tuple[_Angle, _Angle, _Angle] | None,
-        Field(strict=False),
-        Allowed("three numbers [roll, pitch, yaw], radians"),
-    ] = None
-    """Orientation as roll, pitch, yaw about the fixed axes x, y, z, radians, as in URDF."""
-
-    @model_validator(mode="after")
-    def _one_unit_orientation(self) -> PoseConfig:
-        if self.quaternion_xyzw is not None and self.rpy_rad is not None:
-            raise ConfigError("rpy_rad", list(self.rpy_rad), "only without quaternion_xyzw")
-        try:
-            self.build()
-        except ValueError as error:
-            got = list(self.quaternion_xyzw or ())
-            raise ConfigError("quaternion_xyzw", got, f"unit length ({error})") from None
-        return self
-
-    def build(self) -> Pose:
-        """Return the pose in the form that :func:`skinnode.model.pose.positions_in_hand_m` takes."""
-        if self.rpy_rad is not None:
-            return Pose.from_rpy(self.position_m, self.rpy_rad)
-        return Pose(self.position_m, self.quaternion_xyzw or (0.0, 0.0, 0.0, 1.0))
-
-
 class CalibrationConfig(Table):
     """Measured properties of this patch.
 
@@ -186,8 +143,10 @@ class PatchConfig(Table):
     bus: Name = "can0"
     """Name of the bus to which the patch is connected."""
     link: Name | None = None
-    """Name of the robot link that carries the patch, for programs that use a robot model."""
+    """Name of the robot link that carries the patch; None: the patch is fixed to the hand itself."""
     pose: PoseConfig = PoseConfig()
+    """Pose of the patch's frame in the frame of its link or, without a link, of the hand. If the link has no
+    pose of its own (``[[links]]``), the two frames are the same."""
     eds: Annotated[Path | None, Field(strict=False), Allowed("the path of an EDS file")] = None
     """Electronic data sheet (EDS) to check against the wire format of this patch; the path is relative to the
     hand file."""

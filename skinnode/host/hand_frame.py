@@ -1,20 +1,25 @@
-"""Hand frames: the fields of all patches for one SYNC, assembled on the thread that reads them.
+"""Hand frames: the fields and contacts of all patches for one SYNC, assembled on the thread that reads them.
 
 This module starts no threads.
 """
 
 from __future__ import annotations
 
+import functools
 import queue
 import time
 from collections.abc import AsyncIterator, Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from types import TracebackType
+from dataclasses import dataclass, field, replace
+from types import MappingProxyType, TracebackType
 from typing import Final, Self
 
 from skinnode.host.health import SCANS_MISSED, Condition
 from skinnode.host.publish import Subscription, check_timeout
+from skinnode.host.skeleton import Skeleton
+from skinnode.model.distrust import why_not
 from skinnode.model.frames import FieldFrame
+from skinnode.model.hand_contact import HAND, HandContact, Wrench, wrench_of
+from skinnode.model.pose import Pose
 
 LATE: Final = "late"
 """Reason for a missing field: the patch is operational, but its field did not arrive in time."""
@@ -22,9 +27,12 @@ OVERTAKEN: Final = "overtaken"
 """Reason for a missing field: a newer scan from the patch arrived first."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class HandFrame:
-    """The fields of all patches for one SYNC."""
+    """The fields of all patches for one SYNC, and their contacts in the frames of the links and of the hand.
+
+    Contacts and wrenches are computed on first use.
+    """
 
     scan: int
     """Number of this SYNC, counted from the start of the host without wrapping; also the scan number of every
@@ -37,11 +45,98 @@ class HandFrame:
     missing: Mapping[str, str]
     """Why the field of a patch is missing: :data:`LATE`, :data:`OVERTAKEN`, or the condition of the patch,
     such as ``lost``."""
+    skeleton: Skeleton = field(default_factory=Skeleton)
+    """Places of the patches on the robot."""
 
     @property
     def complete(self) -> bool:
         """Whether all patches are present."""
         return not self.missing
+
+    @property
+    def trusted(self) -> bool:
+        """Whether no field is missing and all are trusted."""
+        return not self.missing and all(each.trusted for each in self.fields.values())
+
+    @property
+    def precise(self) -> bool:
+        """Whether no field is missing and the deviations of all are within the limits that the user set."""
+        return not self.missing and all(each.precise for each in self.fields.values())
+
+    @property
+    def distrust(self) -> Mapping[str, str]:
+        """Why patches are not to be trusted, in words, by patch name; empty if the frame is trusted."""
+        reasons = {patch: f"no field: {reason}" for patch, reason in self.missing.items()}
+        return reasons | {name: why_not(each) for name, each in self.fields.items() if not each.trusted}
+
+    @functools.cached_property
+    def contacts(self) -> tuple[HandContact, ...]:
+        """The contacts on all patches in the frame of the hand, largest normal force first."""
+        return tuple(each.moved(self.skeleton.link_pose(each.link)) for each in self._link_contacts)
+
+    def contacts_on(self, link: str) -> tuple[HandContact, ...]:
+        """Return the contacts on the patches of a link in the frame of the link, largest normal force first.
+
+        Args:
+            link: Name of the link; ``hand`` for the patches without a link.
+
+        Raises:
+            ValueError: if the link carries no patch.
+        """
+        if link not in self.wrenches:
+            raise ValueError(f"link: got {link!r}, must be one of {', '.join(map(repr, self.wrenches))}")
+        return tuple(each for each in self._link_contacts if each.link == link)
+
+    @functools.cached_property
+    def wrenches(self) -> Mapping[str, Wrench]:
+        """Force and torque on the skin of each link, by link name, about the origin of the link's frame.
+
+        Each link that carries a patch has an entry, even if nothing touches it. The link of the patches
+        without a link is ``hand``.
+        """
+        patches: dict[str, list[str]] = {}
+        for patch in (*self.fields, *self.missing):
+            patches.setdefault(self.skeleton.mount(patch).link, []).append(patch)
+        return MappingProxyType(
+            {
+                link: wrench_of(
+                    [each for each in self._link_contacts if each.link == link],
+                    link,
+                    trusted=all(patch in self.fields and self.fields[patch].trusted for patch in names),
+                )
+                for link, names in sorted(patches.items())
+            }
+        )
+
+    @functools.cached_property
+    def wrench(self) -> Wrench:
+        """Force and torque on the whole hand, about the origin of the hand's frame."""
+        return wrench_of(self.contacts, HAND, trusted=self.trusted)
+
+    def at(self, link_poses: Mapping[str, Pose]) -> HandFrame:
+        """Return the frame with other poses of the links, for example from the angles of the robot's joints.
+
+        Args:
+            link_poses: Poses in the frame of the hand by link name. Links that are not listed keep their
+                poses; links without patches are ignored.
+
+        Raises:
+            ValueError: if ``hand`` is listed, which is the frame of the hand itself.
+        """
+        if HAND in link_poses:
+            raise ValueError(f"link_poses: got {HAND!r}, must be links that move in the hand")
+        poses = {**self.skeleton.link_poses, **link_poses}
+        return replace(self, skeleton=Skeleton(self.skeleton.mounts, poses))
+
+    @functools.cached_property
+    def _link_contacts(self) -> tuple[HandContact, ...]:
+        """The contacts on all patches, each in the frame of its link, largest normal force first."""
+        found = [
+            HandContact.on_link(contact, patch, self.skeleton.mount(patch), trusted=each.trusted)
+            for patch, each in self.fields.items()
+            for contact in each.contacts
+        ]
+        return tuple(sorted(found, key=lambda contact: -contact.normal_force_n))
 
 
 class HandGatherer:
@@ -57,12 +152,18 @@ class HandGatherer:
         patches: Names of the patches.
         patience_ns: Maximum wait after the first field of a frame.
         condition: Returns the condition of a patch.
+        skeleton: Places of the patches on the robot.
     """
 
     def __init__(
-        self, patches: Sequence[str], patience_ns: int, condition: Callable[[str], Condition]
+        self,
+        patches: Sequence[str],
+        patience_ns: int,
+        condition: Callable[[str], Condition],
+        skeleton: Skeleton | None = None,
     ) -> None:
         self._patches, self._patience_ns, self._condition = tuple(patches), patience_ns, condition
+        self._skeleton = Skeleton() if skeleton is None else skeleton
         self._open: dict[int, dict[str, FieldFrame]] = {}
         self._until_ns: dict[int, int] = {}
         self._newest = dict.fromkeys(self._patches, 0)
@@ -98,7 +199,8 @@ class HandGatherer:
             self._absences[patch] += 1
         stamps = [field.stamp for field in fields.values() if field.stamp is not None]
         t_sync_ns = max(stamp.t_sync_ns for stamp in stamps)
-        return HandFrame(scan, t_sync_ns, fields, {patch: self._reason(patch, scan) for patch in absent})
+        missing = {patch: self._reason(patch, scan) for patch in absent}
+        return HandFrame(scan, t_sync_ns, fields, missing, self._skeleton)
 
     def next_deadline_ns(self) -> int | None:
         """Return the time from which :meth:`next` stops waiting for missing fields; None without a frame."""

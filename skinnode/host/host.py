@@ -24,6 +24,7 @@ from skinnode.host.other_masters import OtherMasterStats
 from skinnode.host.patch_stream import StreamStats
 from skinnode.host.publish import Subscription
 from skinnode.host.served_bus import ServedBus
+from skinnode.host.skeleton import Skeleton
 from skinnode.host.supervised import NodeStats
 from skinnode.host.sync import SyncStats
 from skinnode.host.tap import ContainedTap, HostTap, tap_bus
@@ -202,7 +203,9 @@ class Host:
         patches = [patch.name for patch in self.hand.patches]
         kept = (self.hand.stream.capacity_fields if capacity is None else capacity) * len(patches)
         patience_ns = 2 * self.hand.sync.period_ms * 1_000_000
-        gatherer = HandGatherer(patches, patience_ns, lambda patch: self.health(patch).condition)
+        gatherer = HandGatherer(
+            patches, patience_ns, lambda patch: self.health(patch).condition, Skeleton.of(self.hand)
+        )
         return HandSubscription(self.fields(capacity=kept), gatherer, timeout_s)
 
     def on_field(

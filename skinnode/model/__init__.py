@@ -1,6 +1,8 @@
 """Model of a patch, as values and pure functions.
 
 ``layout`` and ``layout_file`` define the electrodes at rest, ``forward`` and ``kernels`` compute resistances
-from positions, ``elastic`` computes displacements from loads, and ``pose`` transforms vectors and points from
-a patch's frame to the hand's frame. ``frames`` and ``status`` define the inputs and results of a solver.
+from positions, and ``elastic`` computes displacements from loads. ``frames``, ``status`` and ``data_fault``
+define the inputs and results of a solver, ``distrust`` puts into words why a result is not trusted, and
+``tolerances`` defines how far a patch may differ from its layout. ``pose`` and ``hand_contact`` place
+contacts on the links of a robot and in the frame of the hand.
 """

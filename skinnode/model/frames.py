@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from typing import Any, Final, TypeVar
 
 import numpy as np
@@ -70,6 +70,10 @@ class SolveStats:
     """Elapsed time, s."""
 
 
+_FLAT: Final = np.eye(3)
+_FLAT.setflags(write=False)
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Contact:
     """Contact on the skin, with the standard deviation of each value."""
@@ -91,6 +95,9 @@ class Contact:
     force_calibrated: bool = False
     """Whether the forces rest on a calibration of this patch. Without one, their standard deviations also
     cover the tolerance of the layer's thickness and the support of the layer."""
+    axes: Float = field(default_factory=lambda: _FLAT)
+    """(3, 3) unit vectors as rows, in the frame of the layout, at the centre of the contact: along the wire,
+    across the wires and out of the skin. On a flat patch these are x, y and z."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -1,4 +1,4 @@
-"""Pose of a patch on the hand, and conversion of vectors and points to the hand's frame."""
+"""Poses of frames, such as a patch on a link and a link on the hand, and conversion between the frames."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ UNIT_TOLERANCE: Final = 1e-3
 
 @dataclass(frozen=True, slots=True)
 class Pose:
-    """Position and orientation of a patch's frame in the frame of the hand.
+    """Position and orientation of a frame in its parent: of a patch on its link, or of a link on the hand.
 
     The patch's x axis is along its upper wires, and its z axis points out of the skin.
 
     Args:
-        position_m: Origin of the patch's frame, metres.
-        quaternion_xyzw: Orientation of the patch's frame, real part last.
+        position_m: Origin of the frame, in the parent frame, metres.
+        quaternion_xyzw: Orientation of the frame, real part last.
 
     Raises:
         ValueError: If a number is not finite, or the quaternion does not have unit length.
@@ -42,12 +42,12 @@ class Pose:
 
     @classmethod
     def from_rpy(cls, position_m: tuple[float, float, float], rpy_rad: tuple[float, float, float]) -> Self:
-        """Return the pose for roll, pitch and yaw about the fixed axes x, y, z of the hand, in this order.
+        """Return the pose for roll, pitch and yaw about the fixed axes x, y, z of the parent, in this order.
 
         This is the convention of URDF.
 
         Args:
-            position_m: Origin of the patch's frame, metres.
+            position_m: Origin of the frame, metres.
             rpy_rad: Roll, pitch and yaw, radians.
         """
         (sr, sp, sy), (cr, cp, cy) = (
@@ -65,8 +65,8 @@ class Pose:
 
     @property
     def rotation(self) -> Float:
-        """(3, 3) matrix that rotates vectors from the patch's frame to the hand's frame."""
-        x, y, z, w = np.array(self.quaternion_xyzw) / math.hypot(*self.quaternion_xyzw)
+        """(3, 3) matrix that rotates vectors from this frame to its parent."""
+        x, y, z, w = self._unit()
         return np.array(
             [
                 [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
@@ -75,15 +75,43 @@ class Pose:
             ]
         )
 
-    def vectors(self, of_patch: ArrayLike) -> Float:
-        """Convert displacements, forces or normals (..., 3) from the patch's frame to the hand's frame."""
-        turned: Float = np.asarray(of_patch, np.float64) @ self.rotation.T
+    def vectors(self, inner: ArrayLike) -> Float:
+        """Convert displacements, forces or normals (..., 3) from this frame to its parent."""
+        turned: Float = np.asarray(inner, np.float64) @ self.rotation.T
         return turned
 
-    def points_m(self, of_patch_m: ArrayLike) -> Float:
-        """Convert points (..., 3) in metres from the patch's frame to the hand's frame."""
-        points: Float = self.vectors(of_patch_m) + np.array(self.position_m)
+    def points_m(self, inner_m: ArrayLike) -> Float:
+        """Convert points (..., 3) in metres from this frame to its parent."""
+        points: Float = self.vectors(inner_m) + np.array(self.position_m)
         return points
+
+    def __matmul__(self, inner: Pose) -> Pose:
+        """Return the pose in this frame's parent of a frame whose pose in this frame is ``inner``."""
+        x, y, z, w = self._unit()
+        a, b, c, d = inner._unit()
+        x_m, y_m, z_m = self.points_m(inner.position_m).tolist()
+        return Pose(
+            (x_m, y_m, z_m),
+            (
+                w * a + x * d + y * c - z * b,
+                w * b - x * c + y * d + z * a,
+                w * c + x * b - y * a + z * d,
+                w * d - x * a - y * b - z * c,
+            ),
+        )
+
+    def inverse(self) -> Pose:
+        """Return the pose of the parent in this frame."""
+        x, y, z, w = self._unit()
+        back = Pose((0.0, 0.0, 0.0), (-x, -y, -z, w))
+        x_m, y_m, z_m = (-back.vectors(self.position_m)).tolist()
+        return Pose((x_m, y_m, z_m), back.quaternion_xyzw)
+
+    def _unit(self) -> tuple[float, float, float, float]:
+        """Return the quaternion with a length of exactly 1, so that rounding does not accumulate."""
+        length = math.hypot(*self.quaternion_xyzw)
+        x, y, z, w = self.quaternion_xyzw
+        return x / length, y / length, z / length, w / length
 
 
 def positions_in_hand_m(field: FieldFrame, layout: PatchLayout, pose: Pose) -> Float:

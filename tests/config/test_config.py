@@ -94,7 +94,7 @@ NAME = "a string of 1 to 64 printable characters, not all blank"
             ["colour"],
             "red",
             "colour: got an unknown key, allowed: a key of this table: "
-            "name, buses, patches, sync, bring_up, solver, stream, simulation",
+            "name, buses, patches, links, sync, bring_up, solver, stream, simulation",
         ),
         (
             ["sync", "overflow"],
@@ -234,6 +234,18 @@ NAME = "a string of 1 to 64 printable characters, not all blank"
             ["patches", 0, "pose"],
             {"quaternion_xyzw": [0.0, 0.0, 0.0, 1.0], "rpy_rad": [0.0, 0.0, 1.0]},
             "patches[0].pose.rpy_rad: got [0.0, 0.0, 1.0], allowed: only without quaternion_xyzw",
+        ),
+        (["links"], [{"name": "palm"}], "links[0].name: got 'palm', allowed: only if patches have a link"),
+        (
+            ["links"],
+            [{"name": "hand"}],
+            "links[0].name: got 'hand', allowed: "
+            "a name other than 'hand', which is the frame of the hand itself",
+        ),
+        (
+            ["links"],
+            [{"name": "palm", "pose": {"position_m": [0.0, 0.0]}}],
+            "links[0].pose.position_m[2]: got nothing, allowed: three numbers [x, y, z], metres",
         ),
         (
             ["patches", 0, "calibration", "upper_gain"],
@@ -453,3 +465,18 @@ def test_a_guest_says_what_the_master_does() -> None:
         "sync.period_ms: got nothing, allowed: the period of the SYNC on can1, where the host is a guest"
     )
     assert parse_hand(table | {"sync": {"period_ms": 80}}).sync.period_ms == 80
+
+
+def test_a_link_that_no_patch_names_or_that_is_listed_twice() -> None:
+    table = minimal()
+    table["patches"][0]["link"] = "palm_link"
+    table["links"] = [{"name": "palm_lnk"}]
+    with pytest.raises(
+        ConfigError, match=r"^links\[0\].name: got 'palm_lnk', allowed: the link of a patch: palm_l"
+    ):
+        parse_hand(table)
+    table["links"] = [{"name": "palm_link"}, {"name": "palm_link"}]
+    with pytest.raises(
+        ConfigError, match=r"^links\[1\].name: got 'palm_link', allowed: a value that links\[0\]"
+    ):
+        parse_hand(table)

@@ -1,8 +1,9 @@
-"""Hand frames: the fields of one SYNC, who is missing and why, and nobody waits for a patch that is away."""
+"""Hand frames: the fields and contacts of one SYNC, who is missing and why, who is waited for."""
 
 from __future__ import annotations
 
 import asyncio
+import dataclasses
 import itertools
 from collections.abc import Callable
 
@@ -14,7 +15,10 @@ from hypothesis import strategies as st
 from skinnode.config import HandConfig, parse_hand
 from skinnode.host import Condition, HandFrame, Host
 from skinnode.host.hand_frame import LATE, OVERTAKEN, HandGatherer, HandSubscription
-from skinnode.model.frames import FieldFrame, ScanStamp, SolveStats
+from skinnode.host.skeleton import Skeleton
+from skinnode.model.frames import Contact, FieldFrame, ScanStamp, SolveStats
+from skinnode.model.pose import Pose
+from skinnode.model.status import Status
 from skinnode.node import NmtState
 from skinnode.transport import CanPort
 from vcan_sim.fleet import Fleet
@@ -119,6 +123,125 @@ def test_frames_ascend_and_every_field_is_in_its_own_frame_or_late(
     told = sorted((patch, frame.scan) for frame in out for patch in frame.fields)
     assert len(told) + hand.late == len(given_in)
     assert set(told) <= set(given_in)
+
+
+ON_LINKS = {
+    "buses": [{"name": "can0"}],
+    "patches": [
+        {"name": "palm", "node_id": 1},
+        {"name": "pad", "node_id": 2, "link": "distal", "pose": {"position_m": [0.0, 0.0, 0.01]}},
+        {"name": "tip", "node_id": 3, "link": "distal", "pose": {"rpy_rad": [0.0, np.pi / 2, 0.0]}},
+    ],
+    "links": [{"name": "distal", "pose": {"position_m": [0.1, 0.0, 0.0]}}],
+}
+
+
+def pressed(patch: str, newton: float, **changes: object) -> FieldFrame:
+    """A field with one contact at x = 20 mm, y = 0."""
+    contact = Contact(
+        centroid_m=np.array([0.02, 0.0, 0.0]),
+        centroid_std_m=np.full(3, 1e-4),
+        area_m2=1e-4,
+        area_std_m2=1e-5,
+        normal_force_n=newton,
+        normal_force_std_n=0.1,
+        shear_force_n=np.zeros(2),
+        shear_force_std_n=np.full(2, 0.1),
+    )
+    return dataclasses.replace(field(patch, 1), contacts=(contact,), **changes)
+
+
+def frame_of(*fields: FieldFrame, condition: Condition = Condition.OPERATIONAL) -> HandFrame:
+    hand = parse_hand(ON_LINKS)
+    names = [patch.name for patch in hand.patches]
+    gatherer = HandGatherer(names, PATIENCE, lambda patch: condition, Skeleton.of(hand))
+    for each in fields:
+        gatherer.add(each, 0)
+    frame = gatherer.next(PATIENCE)
+    assert frame is not None
+    return frame
+
+
+def test_contacts_of_all_patches_in_the_frame_of_the_hand_and_of_their_link() -> None:
+    frame = frame_of(pressed("palm", 1.0), pressed("pad", 2.0), pressed("tip", 3.0))
+    assert [(c.patch, c.link, c.frame) for c in frame.contacts] == [
+        ("tip", "distal", "hand"),
+        ("pad", "distal", "hand"),
+        ("palm", "hand", "hand"),
+    ]
+    # the tip is turned by a quarter about y: its x axis is the link's −z, its normal the link's x
+    expected_m = [[0.1, 0.0, -0.02], [0.12, 0.0, 0.01], [0.02, 0.0, 0.0]]
+    np.testing.assert_allclose([c.position_m for c in frame.contacts], expected_m, atol=1e-15)
+    np.testing.assert_allclose(frame.contacts[0].force_n, [-3.0, 0.0, 0.0], atol=1e-15)
+    np.testing.assert_allclose(frame.contacts[0].normal, [1.0, 0.0, 0.0], atol=1e-15)
+    tip, pad = frame.contacts_on("distal")
+    np.testing.assert_allclose(
+        [tip.position_m, pad.position_m], [[0.0, 0.0, -0.02], [0.02, 0.0, 0.01]], atol=1e-15
+    )
+    assert tip.frame == "distal"
+    assert [c.patch for c in frame.contacts_on("hand")] == ["palm"]
+
+
+def test_the_wrench_of_each_link_is_about_the_origin_of_its_frame() -> None:
+    frame = frame_of(pressed("palm", 1.0), pressed("pad", 2.0), pressed("tip", 3.0))
+    assert list(frame.wrenches) == ["distal", "hand"]
+    distal = frame.wrenches["distal"]
+    np.testing.assert_allclose(distal.force_n, [-3.0, 0.0, -2.0], atol=1e-15)
+    np.testing.assert_allclose(distal.torque_nm, [0.0, 0.02 * 3.0 + 0.02 * 2.0, 0.0], atol=1e-15)
+    np.testing.assert_allclose(frame.wrench.force_n, [-3.0, 0.0, -3.0], atol=1e-15)
+    # about the hand: the pad's force has a lever of 0.12 m
+    np.testing.assert_allclose(frame.wrench.torque_nm, [0.0, 0.06 + 0.24 + 0.02, 0.0], atol=1e-15)
+    moved = [
+        wrench.moved(Pose((0.1, 0.0, 0.0)) if link == "distal" else Pose())
+        for link, wrench in frame.wrenches.items()
+    ]
+    np.testing.assert_allclose(sum(each.torque_nm for each in moved), frame.wrench.torque_nm, atol=1e-15)
+    np.testing.assert_allclose(sum(each.covariance for each in moved), frame.wrench.covariance)
+
+
+def test_links_move_with_the_joints_and_only_the_frame_of_the_hand_notices() -> None:
+    frame = frame_of(pressed("palm", 1.0), pressed("pad", 2.0))
+    bent = frame.at({"distal": Pose.from_rpy((0.0, 0.0, 0.1), (0.0, 0.0, np.pi)), "thumb": Pose()})
+    np.testing.assert_allclose(bent.contacts[0].position_m, [-0.02, 0.0, 0.11], atol=1e-15)
+    np.testing.assert_allclose(bent.contacts[1].position_m, frame.contacts[1].position_m)
+    np.testing.assert_allclose(frame.contacts[0].position_m, [0.12, 0.0, 0.01], atol=1e-15)
+    np.testing.assert_allclose(bent.wrenches["distal"].torque_nm, frame.wrenches["distal"].torque_nm)
+    assert bent.distrust == frame.distrust
+    with pytest.raises(ValueError, match=r"^link_poses: got 'hand', must be links that move in the hand"):
+        frame.at({"hand": Pose()})
+    with pytest.raises(ValueError, match=r"^link: got 'thumb', must be one of 'distal', 'hand'"):
+        frame.contacts_on("thumb")
+
+
+def test_every_patch_that_is_not_to_be_trusted_says_why() -> None:
+    whole = frame_of(pressed("palm", 1.0), pressed("pad", 2.0), pressed("tip", 3.0))
+    assert (whole.trusted, whole.precise, dict(whole.distrust)) == (True, True, {})
+    frame = frame_of(
+        pressed(
+            "palm", 1.0, status=(Status.CONVERGED, Status.MAX_STEPS, Status.MAX_STEPS, Status.INCONSISTENT)
+        ),
+        pressed("pad", 2.0, distrust="crossing of upper wire 3 and lower wire 12 contradicts"),
+        condition=Condition.LOST,
+    )
+    assert dict(frame.distrust) == {
+        "palm": "not all wires CONVERGED: 2 MAX_STEPS, 1 INCONSISTENT",
+        "pad": "crossing of upper wire 3 and lower wire 12 contradicts",
+        "tip": "no field: lost",
+    }
+    assert not frame.trusted
+    assert not frame.precise
+    assert {c.patch: c.trusted for c in frame.contacts} == {"palm": False, "pad": False}
+
+
+def test_the_wrench_of_a_link_is_trusted_if_all_its_patches_are() -> None:
+    frame = frame_of(pressed("palm", 1.0), pressed("pad", 2.0))  # the tip is missing
+    assert {link: wrench.trusted for link, wrench in frame.wrenches.items()} == {
+        "distal": False,
+        "hand": True,
+    }
+    assert not frame.wrench.trusted
+    imprecise = frame_of(pressed("palm", 1.0), pressed("pad", 2.0, precise=False), pressed("tip", 1.0))
+    assert (imprecise.trusted, imprecise.precise) == (True, False)
 
 
 def take(frames: HandSubscription, count: int) -> list[HandFrame]:

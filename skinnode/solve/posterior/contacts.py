@@ -106,6 +106,8 @@ class ContactFinder:
         # the prior largely determines how a contact's load is distributed over its cells
         std = math.sqrt(PRIOR_DOUBT) * posterior.std(loads, weights)
         spread += self._prior.cell_area_m2 / 6.0  # mean r² of a load that is uniform over its cell
+        away = self._prior.cell_m[region] - centroid
+        middle = region[np.argmin(np.einsum("qi,qi->q", away, away))]
         return Contact(
             centroid_m=centroid,
             centroid_std_m=std[1:4],
@@ -115,6 +117,7 @@ class ContactFinder:
             normal_force_std_n=float(std[0]),
             shear_force_n=shear[:2],
             shear_force_std_n=std[5:],
+            axes=self._prior.frame[middle],
         )
 
 

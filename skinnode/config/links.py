@@ -1,0 +1,76 @@
+"""Poses in a hand file: ``[patches.pose]``, and ``[[links]]``, the links of the robot that carry patches."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from pydantic import Field, field_validator, model_validator
+
+from skinnode.config.table import Allowed, Name, Table
+from skinnode.errors import ConfigError
+from skinnode.model.hand_contact import HAND
+from skinnode.model.pose import Pose
+
+_Metres = Annotated[float, Field(ge=-10, le=10, allow_inf_nan=False), Allowed("a number from -10 to 10")]
+_Angle = Annotated[
+    float, Field(ge=-6.2832, le=6.2832, allow_inf_nan=False), Allowed("a number from -6.2832 to 6.2832")
+]
+_Part = Annotated[float, Field(ge=-1.001, le=1.001, allow_inf_nan=False), Allowed("a number from -1 to 1")]
+
+
+class PoseConfig(Table):
+    """Pose of a frame in its parent.
+
+    The frame of a patch has x along the upper wires, y across them and z out of the skin.
+    """
+
+    position_m: Annotated[
+        tuple[_Metres, _Metres, _Metres], Field(strict=False), Allowed("three numbers [x, y, z], metres")
+    ] = (0.0, 0.0, 0.0)
+    """Origin of the frame, metres."""
+    quaternion_xyzw: Annotated[
+        tuple[_Part, _Part, _Part, _Part] | None,
+        Field(strict=False),
+        Allowed("four numbers [x, y, z, w] of unit length"),
+    ] = None
+    """Orientation as a unit quaternion, real part last."""
+    rpy_rad: Annotated[
+        tuple[_Angle, _Angle, _Angle] | None,
+        Field(strict=False),
+        Allowed("three numbers [roll, pitch, yaw], radians"),
+    ] = None
+    """Orientation as roll, pitch, yaw about the fixed axes x, y, z, radians, as in URDF."""
+
+    @model_validator(mode="after")
+    def _one_unit_orientation(self) -> PoseConfig:
+        if self.quaternion_xyzw is not None and self.rpy_rad is not None:
+            raise ConfigError("rpy_rad", list(self.rpy_rad), "only without quaternion_xyzw")
+        try:
+            self.build()
+        except ValueError as error:
+            got = list(self.quaternion_xyzw or ())
+            raise ConfigError("quaternion_xyzw", got, f"unit length ({error})") from None
+        return self
+
+    def build(self) -> Pose:
+        """Return the pose."""
+        if self.rpy_rad is not None:
+            return Pose.from_rpy(self.position_m, self.rpy_rad)
+        return Pose(self.position_m, self.quaternion_xyzw or (0.0, 0.0, 0.0, 1.0))
+
+
+class LinkConfig(Table):
+    """Link of the robot that carries patches."""
+
+    name: Name
+    """Name of the link, as in ``link`` of its patches."""
+    pose: PoseConfig = PoseConfig()
+    """Pose of the link's frame in the frame of the hand, until the program gives another
+    (``HandFrame.at``)."""
+
+    @field_validator("name")
+    @classmethod
+    def _not_the_hand(cls, value: str) -> str:
+        if value == HAND:
+            raise ValueError(f"a name other than {HAND!r}, which is the frame of the hand itself")
+        return value

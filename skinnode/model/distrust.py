@@ -1,0 +1,22 @@
+"""Words for why a field is not trusted."""
+
+from __future__ import annotations
+
+from collections import Counter
+
+from skinnode.model.frames import FieldFrame
+from skinnode.model.status import Status
+
+
+def why_not(field: FieldFrame) -> str:
+    """Return why a field is not trusted, in words; empty if it is trusted.
+
+    For a field that has not been assessed, the reason is the statuses of its wires.
+    """
+    if field.trusted:
+        return ""
+    if field.distrust:
+        return field.distrust
+    counts = Counter(status for status in field.status if status is not Status.CONVERGED)
+    parts = [f"{count} {status.name}" for status, count in counts.most_common()]
+    return f"not all wires CONVERGED: {', '.join(parts)}"

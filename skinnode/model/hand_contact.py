@@ -1,0 +1,223 @@
+"""Contacts and wrenches in the frame of a link or of the hand, with their covariances.
+
+A contact on a patch acts with the force f on the skin at the point r. In the frame of a link, its wrench is
+the force f and the torque r × f about the origin of the link's frame. To first order, the covariance of the
+wrench follows from those of f and r, whose errors are taken as independent of each other.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass, field, replace
+from typing import Final
+
+import numpy as np
+
+from skinnode.model.frames import Contact
+from skinnode.model.layout import Float
+from skinnode.model.pose import Pose
+
+HAND: Final = "hand"
+"""Name of the hand's own frame, and link of the patches that are fixed to the hand itself."""
+
+
+@dataclass(frozen=True, slots=True)
+class Mount:
+    """Place of a patch on the robot."""
+
+    link: str = HAND
+    """Link that carries the patch."""
+    pose: Pose = field(default_factory=Pose)
+    """Pose of the patch's frame in the frame of its link."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class HandContact:
+    """Contact on a patch of a hand, in the frame of its link or of the hand."""
+
+    patch: str
+    """Name of the patch."""
+    link: str
+    """Link that carries the patch; :data:`HAND` for a patch that is fixed to the hand itself."""
+    frame: str
+    """Frame of the vectors below: :data:`HAND` or the link."""
+    position_m: Float
+    """(3,) centre of the normal load on the skin at rest, metres."""
+    position_covariance_m2: Float
+    """(3, 3) covariance of the position, m²."""
+    normal: Float
+    """(3,) unit vector out of the skin at the contact. An object presses against this direction."""
+    normal_force_n: float
+    """Normal force, N; positive for a press."""
+    normal_force_std_n: float
+    force_n: Float
+    """(3,) force of the object on the skin, normal force and shear together, N."""
+    force_covariance_n2: Float
+    """(3, 3) covariance of the force, N²."""
+    area_m2: float
+    """Contact area, m², as in :class:`~skinnode.Contact`."""
+    area_std_m2: float
+    force_calibrated: bool
+    """Whether the forces rest on a calibration of the patch."""
+    trusted: bool
+    """Whether the field of the patch is trusted."""
+
+    @classmethod
+    def on_link(cls, contact: Contact, patch: str, mount: Mount, *, trusted: bool) -> HandContact:
+        """Return a contact of a patch in the frame of the patch's link.
+
+        Args:
+            contact: The contact, in the frame of the patch.
+            patch: Name of the patch.
+            mount: Place of the patch on the robot.
+            trusted: Whether the patch's field is trusted.
+        """
+        to_link = mount.pose.rotation
+        axes = contact.axes @ to_link.T
+        shear_n, shear_std_n = contact.shear_force_n, contact.shear_force_std_n
+        force_n = np.array([shear_n[0], shear_n[1], -contact.normal_force_n])
+        force_std_n = np.array([shear_std_n[0], shear_std_n[1], contact.normal_force_std_n])
+        return cls(
+            patch=patch,
+            link=mount.link,
+            frame=mount.link,
+            position_m=mount.pose.points_m(contact.centroid_m),
+            position_covariance_m2=(to_link * contact.centroid_std_m**2) @ to_link.T,
+            normal=axes[2],
+            normal_force_n=contact.normal_force_n,
+            normal_force_std_n=contact.normal_force_std_n,
+            force_n=force_n @ axes,
+            force_covariance_n2=(axes.T * force_std_n**2) @ axes,
+            area_m2=contact.area_m2,
+            area_std_m2=contact.area_std_m2,
+            force_calibrated=contact.force_calibrated,
+            trusted=trusted,
+        )
+
+    @property
+    def position_std_m(self) -> Float:
+        """(3,) standard deviation of the position along each axis, metres."""
+        return np.asarray(np.sqrt(np.diag(self.position_covariance_m2)))
+
+    @property
+    def force_std_n(self) -> Float:
+        """(3,) standard deviation of the force along each axis, N."""
+        return np.asarray(np.sqrt(np.diag(self.force_covariance_n2)))
+
+    def moved(self, pose: Pose, frame: str = HAND) -> HandContact:
+        """Return the contact in another frame.
+
+        Args:
+            pose: Pose of this contact's frame in the other frame.
+            frame: Name of the other frame.
+        """
+        turn = pose.rotation
+        return replace(
+            self,
+            frame=frame,
+            position_m=pose.points_m(self.position_m),
+            position_covariance_m2=turn @ self.position_covariance_m2 @ turn.T,
+            normal=turn @ self.normal,
+            force_n=turn @ self.force_n,
+            force_covariance_n2=turn @ self.force_covariance_n2 @ turn.T,
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Wrench:
+    """Force and torque that all contacts on a link, or on the hand, exert on the skin.
+
+    Forces that are too weak to be found as contacts, and the torque of each contact about its own normal, are
+    not included.
+    """
+
+    frame: str
+    """Frame of the vectors; the torque is about its origin."""
+    force_n: Float
+    """(3,) force on the skin, N."""
+    torque_nm: Float
+    """(3,) torque on the skin about the origin of the frame, N m."""
+    covariance: Float
+    """(6, 6) covariance of force and torque, in N², N² m and N² m²."""
+    contacts: int
+    """Number of contacts."""
+    force_calibrated: bool
+    """Whether every force rests on a calibration of its patch; True without contacts."""
+    trusted: bool
+    """Whether the fields of all patches that it covers are present and trusted."""
+
+    @property
+    def force_std_n(self) -> Float:
+        """(3,) standard deviation of the force, N."""
+        return np.asarray(np.sqrt(np.diag(self.covariance)[:3]))
+
+    @property
+    def torque_std_nm(self) -> Float:
+        """(3,) standard deviation of the torque, N m."""
+        return np.asarray(np.sqrt(np.diag(self.covariance)[3:]))
+
+    def moved(self, pose: Pose, frame: str = HAND) -> Wrench:
+        """Return the same wrench in another frame, with the torque about the origin of that frame.
+
+        Args:
+            pose: Pose of this wrench's frame in the other frame.
+            frame: Name of the other frame.
+        """
+        turn, lever = pose.rotation, _cross(np.array(pose.position_m))
+        both = np.zeros((6, 6))
+        both[:3, :3] = both[3:, 3:] = turn
+        both[3:, :3] = lever @ turn
+        force_n = turn @ self.force_n
+        return replace(
+            self,
+            frame=frame,
+            force_n=force_n,
+            torque_nm=turn @ self.torque_nm + lever @ force_n,
+            covariance=both @ self.covariance @ both.T,
+        )
+
+
+def wrench_of(contacts: Iterable[HandContact], frame: str, *, trusted: bool) -> Wrench:
+    """Return the wrench of contacts that are given in the same frame.
+
+    Contacts on different patches have independent errors. The errors of contacts on one patch may be
+    correlated in any way (noise exchanges load between neighbours; the stiffness of the layer scales all of
+    them), so their covariances are combined to a bound that holds for every correlation.
+
+    Args:
+        contacts: The contacts, all in ``frame``.
+        frame: Name of the frame.
+        trusted: Whether the fields of all patches that may contribute are present and trusted.
+    """
+    force_n, torque_nm, covariance = np.zeros(3), np.zeros(3), np.zeros((6, 6))
+    of_patch: dict[str, list[HandContact]] = {}
+    for contact in contacts:
+        of_patch.setdefault(contact.patch, []).append(contact)
+        force_n += contact.force_n
+        torque_nm += np.cross(contact.position_m, contact.force_n)
+    for group in of_patch.values():
+        # (Σ e)(Σ e)ᵀ ≤ Σ e eᵀ / w for weights with Σ w = 1; weights ∝ σ make it exact for a common factor
+        stds = [math.sqrt(float(np.trace(contact.force_covariance_n2))) for contact in group]
+        total = sum(stds)
+        for contact, std in zip(group, stds, strict=True):
+            covariance += _covariance(contact) * (total / std if std > 0 else len(group))
+    found = [contact for group in of_patch.values() for contact in group]
+    calibrated = all(contact.force_calibrated for contact in found)
+    return Wrench(frame, force_n, torque_nm, covariance, len(found), calibrated, trusted)
+
+
+def _covariance(contact: HandContact) -> Float:
+    """Return the covariance (6, 6) of one contact's wrench, to first order."""
+    by_force = np.vstack([np.eye(3), _cross(contact.position_m)])
+    by_position = np.vstack([np.zeros((3, 3)), -_cross(contact.force_n)])
+    return np.asarray(
+        by_force @ contact.force_covariance_n2 @ by_force.T
+        + by_position @ contact.position_covariance_m2 @ by_position.T
+    )
+
+
+def _cross(vector: Float) -> Float:
+    """Return the matrix (3, 3) of the cross product with ``vector`` (3,) from the left."""
+    x, y, z = vector
+    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])

@@ -128,7 +128,9 @@ class Faults:
     deaf: bool = False
     """The node receives nothing because its receiver is stuck."""
     frozen: bool = False
-    """The converter keeps returning the same values."""
+    """The converter keeps returning the same values, and counts no conversions."""
+    uncounted: bool = False
+    """The converter does not count its conversions, so the host must infer from the codes whether it runs."""
     unplugged: bool = False
     """The node is disconnected from the bus and its supply; it boots when the fault ends."""
     wrong_identity: bool = False
@@ -209,6 +211,8 @@ class Injected:
     """Frames that the node missed because it was deaf or unplugged."""
     frozen: int = 0
     """Readings that repeated the previous reading."""
+    uncounted: int = 0
+    """Readings by a converter that does not count its conversions."""
     miswired: int = 0
     """Readings with an open, shorted or noisy wire."""
     unplugged: int = 0

@@ -10,7 +10,7 @@ from typing import Final
 import numpy as np
 
 from skinnode.model.layout import Float, PatchLayout
-from skinnode.node.patch.source import ResistanceSource
+from skinnode.node.patch.source import ResistanceSource, conversions_of
 from skinnode.protocol.device_time import TIME_STEP_US
 from vcan_sim.faults import OF_WIRES
 from vcan_sim.injector import Injector
@@ -56,6 +56,11 @@ class SimulatedPatch:
         self._rest_ohm = self._forward(scene.layout.upper_m)
         self._origin_ns: int | None = None
         self._read_ns: OrderedDict[int, int] = OrderedDict()
+
+    @property
+    def conversions(self) -> int:
+        """Number of conversions of the whole matrix so far: one per reading."""
+        return self.reads
 
     @property
     def started(self) -> bool:
@@ -123,13 +128,21 @@ class FaultyConverter:
     def __init__(self, source: ResistanceSource, injector: Injector, *, booting: Callable[[], bool]) -> None:
         self._source, self._injector, self._booting = source, injector, booting
         self._reading: Float | None = None
+        self._conversions: int | None = None
+
+    @property
+    def conversions(self) -> int | None:
+        """Number of conversions; a frozen converter completes none. None if conversions are not counted."""
+        return None if self._injector.faults.uncounted else self._conversions
 
     def read(self, t_ns: int) -> Float:
         """Return the resistances (U, K) in ohm at ``t_ns``, or the previous reading while frozen."""
+        self._injector.injected.uncounted += self._injector.faults.uncounted
         if self._injector.faults.frozen and self._reading is not None:
             self._injector.injected.frozen += 1
         else:
             self._reading = self._through_wires(self._source.read(t_ns))
+            self._conversions = conversions_of(self._source)
         return self._reading
 
     def _through_wires(self, read: Float) -> Float:

@@ -84,6 +84,7 @@ _KINDS: Final[tuple[dict[str, Any], ...]] = (
     {"silent": True},
     {"deaf": True},
     {"frozen": True},
+    {"frozen": True, "uncounted": True},
     {"unplugged": True},
     {"restart_every_s": 0.7},
     {"emcy_per_s": 200.0},

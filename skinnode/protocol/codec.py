@@ -30,6 +30,7 @@ from skinnode.protocol.self_test import (
 from skinnode.protocol.summary import (
     Summary,
     SummaryFlag,
+    conversion_phase,
     pack_checked_summary,
     pack_summary,
     pack_summary_record,
@@ -57,6 +58,7 @@ __all__ = [
     "check_of_codes",
     "chunk_indexer",
     "chunk_of_code",
+    "conversion_phase",
     "decode",
     "encode",
     "pack_checked_summary",

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skinnode.protocol.codes import Codes
+from skinnode.protocol.summary import conversion_phase
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -40,6 +41,11 @@ class Scan:
     """Time at which the first frame was received."""
     t_last_ns: int
     """Time at which the last frame was received."""
+
+    @property
+    def phase(self) -> int:
+        """Conversion phase, 1 to 3; 0 if the patch does not supply it or the summary was lost."""
+        return conversion_phase(self.flags)
 
     @property
     def empty(self) -> bool:

@@ -35,6 +35,10 @@ class SummaryFlag(enum.IntFlag):
     CHECKED = 0x20
     """Bytes 4 to 7 are u16 device time in steps of 64 µs and u16 scan check. Without this flag, as in patches
     of revision 1.0, these bytes are u32 device time in µs."""
+    CONVERSIONS = 0xC0
+    """Conversion phase, a number of two bits. 0: not supplied. 1, 2, 3: steps from 1 to 2 to 3 to 1 in each
+    scan for which the converter has completed a conversion of the whole matrix since the previous scan. Two
+    successive scans with the same phase therefore hold the same conversion."""
 
 
 class Summary(NamedTuple):
@@ -54,7 +58,22 @@ class Summary(NamedTuple):
     :attr:`SummaryFlag.CHECKED`."""
 
 
+PHASES: Final = 3
+"""Number of conversion phases. A receiver that missed scans learns nothing from the phase of the next scan,
+because the phase may have passed through all its values."""
+_PHASE_SHIFT: Final = 6
+
 _CHECKED: Final = int(SummaryFlag.CHECKED)  # testing an int takes a tenth as long as testing an enum flag
+
+
+def conversion_phase(flags: int) -> int:
+    """Return the conversion phase in the flags of a summary; 0 if the patch does not supply it."""
+    return flags >> _PHASE_SHIFT & 3
+
+
+def conversion_flags(phase: int) -> SummaryFlag:
+    """Return the flags that carry a conversion phase, 0 to 3."""
+    return SummaryFlag(phase << _PHASE_SHIFT)
 
 
 def pack_summary(scan: int, flags: int, chunks: int, device_time_us: int) -> bytes:

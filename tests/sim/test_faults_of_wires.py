@@ -13,7 +13,7 @@ from skinnode.protocol.profile import PatchProfile
 from vcan_sim.faults import NO_FAULTS, Faults, faults_of
 from vcan_sim.faulty_node import FaultyNode
 from vcan_sim.fleet import Fleet
-from vcan_sim.sensor import WIRE_NOISE
+from vcan_sim.sensor import WIRE_NOISE, FaultyConverter
 
 SHAPE = {"upper_wires": 4, "upper_electrodes": 4, "lower_wires": 12, "lower_electrodes": 4}
 HAND = parse_hand(
@@ -90,3 +90,27 @@ def test_what_cannot_be(text: str, line: str) -> None:
     with pytest.raises(ConfigError) as caught:
         fleet.inject(faults_of([text], ["a", "b"])["a"], "a")
     assert str(caught.value) == line
+
+
+class Counting(Steady):
+    def __init__(self, layout: PatchLayout) -> None:
+        super().__init__(layout)
+        self.conversions = 0
+
+    def read(self, t_ns: int) -> Float:
+        self.conversions += 1
+        return super().read(t_ns)
+
+
+def test_a_frozen_converter_counts_no_conversions() -> None:
+    node = node_with(NO_FAULTS)
+    converter = FaultyConverter(
+        Counting(HAND.patches[0].layout.build()), node._injector, booting=lambda: False
+    )
+    counts = []
+    for faults in (NO_FAULTS, Faults(frozen=True), Faults(frozen=True), NO_FAULTS, Faults(uncounted=True)):
+        node.faults = faults
+        converter.read(0)
+        counts.append(converter.conversions)
+    assert counts == [1, 1, 1, 2, None]
+    assert (node.injected.frozen, node.injected.uncounted) == (2, 1)

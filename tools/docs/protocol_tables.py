@@ -205,7 +205,8 @@ def rejected() -> str:
 def _enum_table(kind: type[enum.IntFlag], head: tuple[str, ...], digits: int) -> str:
     docs = md.member_docs(kind)
     return md.table(
-        head, ((md.c_hex(item.value, digits), item.name or "", docs[item.name or ""]) for item in kind)
+        head,
+        ((md.c_hex(item.value, digits), name, docs[name]) for name, item in kind.__members__.items()),
     )
 
 

@@ -8,11 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skinnode.model.layout import Float, require_array
-from skinnode.node.patch.source import ResistanceSource, read_source
+from skinnode.node.patch.source import ResistanceSource, conversions_of, read_source
 from skinnode.node.patch.wire_faults import WireFaults, find_faults
 from skinnode.protocol.chunk import chunk_of_code
 from skinnode.protocol.codes import Codes, CodeScale, encode
 from skinnode.protocol.profile import PatchProfile
+from skinnode.protocol.summary import PHASES
 
 TARE_READS: Final = 16
 """Number of readings averaged for a baseline; its noise, a quarter of that of one reading, adds 3 % to the
@@ -50,6 +51,9 @@ class Acquisition:
         """(U, K) codes of the last scan; all open before the first scan."""
         self.faults = WireFaults.none(profile)
         """Wire faults of the last scan."""
+        self.phase = 0
+        """Conversion phase of the last scan; 0 if the source does not count its conversions."""
+        self._conversions: int | None = None  # of the source, at the last scan
         self._sent: Codes | None = None  # codes last sent, which the host holds; None if unknown
         self._since_full = 0
 
@@ -72,6 +76,12 @@ class Acquisition:
             SourceFailed: if the source returns no valid reading.
         """
         resistance = self._total(t_ns, readings)
+        conversions = conversions_of(self._source)
+        if conversions is None:
+            self.phase = 0
+        elif conversions != self._conversions:
+            self.phase = self.phase % PHASES + 1
+        self._conversions = conversions
         self.codes = encode(resistance / readings, self.baseline_ohm, self.scale)
         self.faults = find_faults(self.codes, self.scale)
 

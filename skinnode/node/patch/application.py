@@ -31,7 +31,7 @@ from skinnode.protocol.codes import Codes
 from skinnode.protocol.command import SendMode
 from skinnode.protocol.scan_check import check_of_codes
 from skinnode.protocol.self_test import SELF_TEST_NEVER_RUN, pack_self_test
-from skinnode.protocol.summary import SummaryFlag
+from skinnode.protocol.summary import SummaryFlag, conversion_flags
 
 
 class PatchApplication:
@@ -187,7 +187,10 @@ class PatchApplication:
             chunks, flags, codes = self._sample(counter, t_ns)
         except SourceFailed:
             chunks, flags, codes = [], SummaryFlag.SOURCE_FAILED, self._acquisition.codes
-        check = check_of_codes(codes, profile) if profile.checked else None
+        check = None
+        if profile.checked:
+            check = check_of_codes(codes, profile)
+            flags |= conversion_flags(self._acquisition.phase)
         self.stream.offer(OutgoingScan(counter, chunks, flags, time_us, check, turns), t_ns)
         if not self.stream.full:
             self._end_overrun(t_ns)

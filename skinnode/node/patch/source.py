@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import operator
 from enum import IntEnum
 from typing import Protocol
 
@@ -9,7 +10,15 @@ from skinnode.model.layout import Float, require_array
 
 
 class ResistanceSource(Protocol):
-    """Source of the resistances between upper and lower wires."""
+    """Source of the resistances between upper and lower wires.
+
+    A source may also have an attribute ``conversions``: the number of conversions of the whole matrix that
+    the converter has completed, an integer of any size. The node reads it after :meth:`read`, and tells the
+    host in each summary whether the number has changed, so that the host detects a stopped converter at once.
+    Without this attribute, or while it is None, the host must infer that from the codes. A source must count
+    in the converter itself, not in :meth:`read`, and only if the converter completes at least one conversion
+    per scan.
+    """
 
     def read(self, t_ns: int) -> Float:
         """Return (U, K) wire-to-wire resistances, ohm: infinite if a wire is open, 0 if it is shorted.
@@ -21,6 +30,21 @@ class ResistanceSource(Protocol):
             t_ns: current time on the monotonic clock, ns.
         """
         ...
+
+
+def conversions_of(source: ResistanceSource) -> int | None:
+    """Return the number of conversions that a source has completed; None if the source does not count.
+
+    Raises:
+        SourceFailed: if the attribute raises an exception or is not an integer.
+    """
+    try:
+        count = getattr(source, "conversions", None)
+        return None if count is None else operator.index(count)
+    except (Exception, SystemExit) as error:  # a source must not end the thread that reads it
+        what = " ".join(str(error).split())
+        text = f"source.conversions: {type(error).__name__}: {what}".rstrip(": ")
+        raise SourceFailed(SourceFault.RAISED, text) from error
 
 
 class SourceFault(IntEnum):

@@ -94,7 +94,7 @@ class PosteriorOptions(EstimateOptions):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class TrackerOptions(EstimateOptions):
-    """Options of :class:`skinnode.Tracker`: those of :class:`EstimateOptions` and five more.
+    """Options of :class:`skinnode.Tracker`: those of :class:`EstimateOptions` and seven more.
 
     The method ``auto`` chooses the posterior if ``drift``, ``model_error`` or ``estimate_noise`` is set,
     since only the posterior supports them.
@@ -106,6 +106,10 @@ class TrackerOptions(EstimateOptions):
             no forces. The posterior computes forces from ``rubber`` instead.
         active_only: Whether to solve only for electrodes that contacts move; exact inverse only.
         codes: Mapping from the codes passed to :meth:`skinnode.Tracker.update_codes` to resistances.
+        max_std_m: Largest standard deviation of a coordinate of a precise field, metres; by default set from
+            the layout and the noise (:mod:`skinnode.solve.precision`).
+        max_force_std_n: Largest standard deviation of a contact's normal force in a precise field, N; by
+            default set from the layout and the rubber, for calibrated forces only.
 
     Raises:
         ValueError: If an option is out of range.
@@ -116,10 +120,15 @@ class TrackerOptions(EstimateOptions):
     stiffness_n_per_m: float | None = None
     active_only: bool = False
     codes: CodeMap | None = None
+    max_std_m: float | None = None
+    max_force_std_n: float | None = None
 
     def __post_init__(self) -> None:
         if self.method not in TRACKER_METHODS:
             raise ValueError(f"method: got {self.method!r}, must be one of {', '.join(TRACKER_METHODS)}")
+        for name, limit in (("max_std_m", self.max_std_m), ("max_force_std_n", self.max_force_std_n)):
+            if limit is not None:
+                require_positive(name, limit)
         super().__post_init__()
 
     def of_posterior(self) -> PosteriorOptions:
@@ -168,6 +177,8 @@ class TrackerArguments(EstimateArguments, total=False):
     stiffness_n_per_m: float | None
     active_only: bool
     codes: CodeMap | None
+    max_std_m: float | None
+    max_force_std_n: float | None
 
 
 _Options = TypeVar("_Options", PosteriorOptions, TrackerOptions)

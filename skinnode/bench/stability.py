@@ -25,7 +25,7 @@ TWIN_SEEDS: Final = 2
 
 
 @contextlib.contextmanager
-def _processes(jobs: int) -> Iterator[ProcessPoolExecutor]:
+def processes(jobs: int) -> Iterator[ProcessPoolExecutor]:
     """Yield a pool of ``jobs`` processes, which are killed if an exception leaves the ``with`` block."""
     spawn = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(jobs, spawn) as pool:
@@ -63,7 +63,7 @@ def run(
         found: Iterable[list[dict[str, Any]]]
         if cases is None and jobs > 1:
             with starting_children():
-                pool = stack.enter_context(_processes(jobs))
+                pool = stack.enter_context(processes(jobs))
                 shares = [pool.submit(_numbered, seeds, only, i) for i in range(len(all_cases()))]
             found = (each.result() for each in shares)
         else:

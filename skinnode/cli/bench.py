@@ -101,6 +101,52 @@ def stability(
 
 
 @app.command()
+def trust(
+    json: JsonFile = None,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of all streams and of the pairs of faults.")] = 1,
+    short: Annotated[
+        bool, typer.Option("--short", help="Run one layout at two noises, and 20 pairs of faults.")
+    ] = False,
+    table: Annotated[
+        bool, typer.Option("--table", help="Measure only the scenes that used to be trusted and wrong.")
+    ] = False,
+    only: Annotated[
+        list[str] | None,
+        typer.Option(metavar="TEXT", help="Run only rows whose section and name contain TEXT; repeatable."),
+    ] = None,
+    hours: Annotated[
+        float, typer.Option(min=0, help="Patch-hours at 100 scans/s to watch for false namings.")
+    ] = 0.1,
+    jobs: Annotated[int, typer.Option(min=1, help="Number of processes that solve streams.")] = 1,
+) -> None:
+    """Solve presses with and without faults: is what a field calls trusted right, and a sound patch trusted?
+
+    Exit status 1 if a target is missed. Sections: healthy, single (faults), pair, hours, table, speed, road.
+    """
+    from skinnode.bench import trust as bench
+    from skinnode.bench.trust_report import lines
+
+    _prepare(json)
+
+    def progress(line: str) -> None:
+        typer.echo(line, err=True)
+
+    wanted = ["table"] if table else (only or [])
+    options = bench.SHORT if short else {"hours": hours}
+    figures = bench.run(seed, only=wanted, jobs=jobs, progress=progress, **options)
+    parts = [part for part in bench.PARTS if part in wanted or not (wanted or short)]
+    figures = bench.with_parts(figures, seed, parts, progress)
+    if not (figures["rows"] or parts):
+        raise ConfigError("--only", ", ".join(wanted), "part of a section and row, such as single: crossing")
+    for line in lines(figures):
+        typer.echo(line)
+    _print_machine(figures)
+    _write(json, figures)
+    if not all(row["reached"] for row in figures["must"]):
+        raise typer.Exit(1)
+
+
+@app.command()
 def accuracy(
     json: JsonFile = None,
     plot: PlotFile = None,

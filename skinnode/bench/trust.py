@@ -1,0 +1,237 @@
+"""``skinnode bench trust``: is every number that a field calls trusted right, and is a sound patch trusted?
+
+::
+
+    loads, faults -> signal (codes and truth) -> solver of the host -> score -> rows, verdicts
+
+Every stream is drawn from the seed and from its own name, so parts of a run can be repeated alone.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+import zlib
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import ExitStack
+from dataclasses import asdict, dataclass
+from typing import Any, Final
+
+import numpy as np
+
+from skinnode.bench import trust_road, trust_speed, trust_table
+from skinnode.bench.stability import processes
+from skinnode.bench.timing import machine
+from skinnode.bench.trust_faults import Fault, singles
+from skinnode.bench.trust_loads import LOADS, draw
+from skinnode.bench.trust_report import part_verdicts, verdicts
+from skinnode.bench.trust_score import Naming, Score, judge
+from skinnode.bench.trust_signal import RATE_HZ, Setting, Timeline, all_settings, make
+from skinnode.bench.trust_solver import fields_of, solve, solver_of
+from skinnode.process.child_processes import starting_children
+from skinnode.text.json_values import plain
+
+PAIRS: Final = 500
+"""Number of pairs of faults."""
+PARTS: Final = ("table", "speed", "road")
+"""Parts beside the streams: the table of scenes, speed against error, faults over a bus."""
+SHORT: Final[dict[str, Any]] = {
+    "pairs": 20,
+    "hours": 0.0,
+    "settings": (Setting("staggered", 0.5, 1e-5), Setting("staggered", 0.5, 1e-4)),
+}
+"""Options of a short run."""
+WATCHED: Final = 4000
+"""Scans of a stream that is watched for false namings: ten touches."""
+QUIET: Final = Timeline(rest=200, press=10, hold=30, slide=40, release=10, after=110)
+"""Phases of a touch in the streams that are watched for false namings."""
+PAIRED: Final = Timeline(rest=9, press=6, hold=7, slide=6, release=4, after=6)
+"""Phases of a stream with two faults; shorter, because there are many."""
+
+
+@dataclass(frozen=True)
+class Item:
+    """A stream to solve."""
+
+    section: str
+    row: str
+    """Row of the report to which the stream belongs."""
+    setting: Setting
+    load: str
+    faults: tuple[str, ...] = ()
+    number: int = 0
+
+    @property
+    def name(self) -> str:
+        """Name from which the stream is drawn."""
+        return f"{self.section} {self.row} {self.setting.name} {self.load} {self.number}"
+
+
+def items(seed: int, *, pairs: int = PAIRS, hours: float = 0.1, settings: Sequence[Setting]) -> list[Item]:
+    """Return every stream of a run.
+
+    Args:
+        seed: Seed of the pairs.
+        pairs: Number of pairs of faults.
+        hours: Patch-hours to watch for false namings.
+        settings: Layouts and noises.
+    """
+    found = [Item("healthy", load, setting, load) for load in LOADS for setting in settings]
+    for i, fault in enumerate(singles()):
+        for j, setting in enumerate(settings):
+            load = LOADS[(i + j + seed) % len(LOADS)]
+            found.append(Item("single", fault.name, setting, load, (fault.name,)))
+    rng = np.random.default_rng([seed, zlib.crc32(b"pairs")])
+    found += [_pair(rng, settings, number) for number in range(pairs)]
+    streams = math.ceil(hours * 3600.0 * RATE_HZ / WATCHED)
+    for number in range(streams):
+        setting = settings[number % len(settings)]
+        found.append(Item("hours", f"{setting.noise:.0e}", setting, "all", number=number))
+    return found
+
+
+def _pair(rng: np.random.Generator, settings: Sequence[Setting], number: int) -> Item:
+    faults = singles()
+    while True:
+        first, second = (faults[i] for i in rng.choice(len(faults), 2, replace=False))
+        if not first.group or first.group != second.group:
+            break
+    setting, load = settings[int(rng.integers(len(settings)))], LOADS[int(rng.integers(len(LOADS)))]
+    return Item("pair", setting.name, setting, load, (first.name, second.name), number)
+
+
+def solve_item(item: Item, seed: int) -> Score:
+    """Solve and score a stream."""
+    rng = np.random.default_rng([seed, zlib.crc32(item.name.encode())])
+    if item.section == "hours":
+        return _watch(item, rng)
+    by_name = {fault.name: fault for fault in singles()}
+    faults: list[Fault] = [by_name[name] for name in item.faults]
+    timeline = PAIRED if item.section == "pair" else Timeline()
+    taken = make(item.setting, draw(item.load, item.setting.layout(), rng), faults, rng, timeline)
+    return judge(taken, fields_of(taken))
+
+
+def _watch(item: Item, rng: np.random.Generator) -> Score:
+    """Score touches in one long stream, and count false namings."""
+    total, known, number = Score(), set[Naming](), 0
+    solver = None
+    for touch in range(WATCHED // QUIET.scans):
+        load = draw(LOADS[(item.number + touch) % len(LOADS)], item.setting.layout(), rng)
+        taken = make(item.setting, load, (), rng, QUIET)
+        solver = solver_of(taken) if solver is None else solver
+        fields = []
+        for codes in taken.codes:
+            fields.append(solve(solver, codes, number))
+            number += 1
+        total.add(judge(taken, fields, known))
+    return total
+
+
+def _solve_all(
+    work: Sequence[Item], seed: int, jobs: int, progress: Callable[[str], object]
+) -> Iterator[tuple[Item, Score]]:
+    with ExitStack() as stack:
+        results: Iterable[Score]
+        if jobs > 1:
+            with starting_children():
+                pool: ProcessPoolExecutor = stack.enter_context(processes(jobs))
+                shares = [pool.submit(solve_item, item, seed) for item in work]
+            results = (share.result() for share in shares)
+        else:
+            results = (solve_item(item, seed) for item in work)
+        start = time.monotonic()
+        for done, (item, score) in enumerate(zip(work, results, strict=True), 1):
+            yield item, score
+            if done % 20 == 0 or done == len(work):
+                progress(f"{done} of {len(work)} streams, {time.monotonic() - start:.0f} s")
+
+
+def run(  # noqa: PLR0913 - options of a command
+    seed: int = 1,
+    *,
+    pairs: int = PAIRS,
+    hours: float = 0.1,
+    only: Sequence[str] = (),
+    settings: Sequence[Setting] | None = None,
+    jobs: int = 1,
+    progress: Callable[[str], object] = lambda line: None,
+) -> dict[str, Any]:
+    """Solve healthy streams, every fault, pairs of faults, and long streams; return figures and verdicts.
+
+    Args:
+        seed: Seed of all streams.
+        pairs: Number of pairs of faults.
+        hours: Patch-hours to watch for false namings.
+        only: Parts of the names of sections or rows to run; default: all.
+        settings: Layouts and noises; default: all.
+        jobs: Number of processes; it does not affect the streams.
+        progress: Called with a line from time to time.
+    """
+    chosen = all_settings() if settings is None else settings
+    work = [
+        item
+        for item in items(seed, pairs=pairs, hours=hours, settings=chosen)
+        if not only or any(part in f"{item.section}: {item.row}" for part in only)
+    ]
+    cells: dict[tuple[str, str], dict[str, Score]] = {}
+    for item, score in _solve_all(work, seed, jobs, progress):
+        cells.setdefault((item.section, item.row), {}).setdefault(item.setting.name, Score()).add(score)
+    rows = [_row(section, row, found) for (section, row), found in cells.items()]
+    return {
+        "benchmark": "trust",
+        "machine": machine(),
+        "seed": seed,
+        "rows": plain(rows),
+        "must": verdicts(rows, chosen) if rows else [],
+    }
+
+
+def with_parts(
+    figures: dict[str, Any], seed: int, parts: Sequence[str], progress: Callable[[str], object]
+) -> dict[str, Any]:
+    """Return the figures with the parts that are not streams of :func:`run`.
+
+    Args:
+        figures: Figures of :func:`run`.
+        seed: Seed of all streams.
+        parts: Some of :data:`PARTS`.
+        progress: Called with a line from time to time.
+    """
+    found = dict(figures)
+    if "table" in parts:
+        found["table"] = []
+        for row in trust_table.rows(seed):
+            found["table"].append(row)
+            progress(f"table: {row['tried']}")
+    if "speed" in parts:
+        progress("speed against error")
+        found["speed"] = trust_speed.rows(seed)
+    if "road" in parts:
+        progress("faults over the bus")
+        found["road"] = plain(trust_road.rows(seed))
+    found["must"] = [*figures["must"], *part_verdicts(found)]
+    return found
+
+
+def _row(section: str, name: str, cells: dict[str, Score]) -> dict[str, Any]:
+    total = Score()
+    for score in cells.values():
+        total.add(score)
+    worst = max(cells, key=lambda setting: (cells[setting].share_beyond, cells[setting].worst))
+    return {
+        "section": section,
+        "row": name,
+        **_figures(total),
+        "worst_setting": worst,
+        "settings": {setting: _figures(score) for setting, score in cells.items()},
+    }
+
+
+def _figures(score: Score) -> dict[str, Any]:
+    shares = ("beyond", "trusted", "after", "named", "contacts", "forces")
+    named = {f"share_{name}": getattr(score, f"share_{name}") for name in shares}
+    counts = asdict(score)
+    del counts["scans_to_name"]
+    return counts | named | {"median_scans": score.median_scans}

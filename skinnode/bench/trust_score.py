@@ -1,0 +1,203 @@
+"""Scores of fields against the truth for ``skinnode bench trust``: what is trusted must be right.
+
+Counts only, so that scores add up over streams and processes.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skinnode.bench.trust_signal import CodeStream
+from skinnode.model.data_fault import DataFault, FaultyPart
+from skinnode.model.frames import FieldFrame
+from skinnode.model.layout import Float
+from skinnode.model.status import Status
+
+LIMIT: Final = 5.0
+"""Maximum error of a trusted coordinate, in reported standard deviations."""
+
+BEYOND: Final = 1e-3
+"""Maximum share of trusted coordinates beyond :data:`LIMIT`."""
+
+Mask = NDArray[np.bool_]
+
+
+@dataclass
+class Score:
+    """Counts over streams."""
+
+    streams: int = 0
+    frames: int = 0
+    trusted: int = 0
+    """Fields that are trusted."""
+    coordinates: int = 0
+    """Coordinates of trusted fields on wires that are trusted."""
+    beyond: int = 0
+    """Such coordinates with an error beyond :data:`LIMIT`."""
+    worst: float = 0.0
+    """Largest error of such a coordinate, in reported standard deviations."""
+    named: int = 0
+    """Streams in which readings of the fault were named."""
+    nameable: int = 0
+    """Streams with readings that a fault changed."""
+    scans_to_name: list[int] = dataclasses.field(default_factory=list)
+    """Scans from the first changed reading to the first right naming, one per stream."""
+    after: int = 0
+    """Fields from the first right naming on."""
+    after_trusted: int = 0
+    """Such fields that are trusted."""
+    false_names: int = 0
+    """Namings of parts whose readings no fault changed; a part that is named twice counts twice."""
+    touches: int = 0
+    """Trusted fields with the load at full depth, or of a patch at rest."""
+    touches_right: int = 0
+    """Such fields with the right number of contacts: one, or none at rest."""
+    forces: int = 0
+    """Trusted fields with one contact whose true force is known."""
+    forces_right: int = 0
+    """Such fields whose normal force is within :data:`LIMIT` deviations."""
+
+    def add(self, other: Score) -> None:
+        """Add the counts of ``other``."""
+        for entry in dataclasses.fields(self):
+            own, its = getattr(self, entry.name), getattr(other, entry.name)
+            setattr(self, entry.name, max(own, its) if entry.name == "worst" else own + its)
+
+    @property
+    def share_beyond(self) -> float:
+        """Share of the trusted coordinates beyond the limit; 0 if none is trusted."""
+        return self.beyond / max(self.coordinates, 1)
+
+    @property
+    def share_trusted(self) -> float:
+        """Share of the fields that are trusted."""
+        return self.trusted / self.frames if self.frames else math.nan
+
+    @property
+    def share_after(self) -> float:
+        """Share of the fields that are trusted from the first right naming on."""
+        return self.after_trusted / self.after if self.after else math.nan
+
+    @property
+    def share_named(self) -> float:
+        """Share of the streams whose fault was named rightly."""
+        return self.named / self.nameable if self.nameable else math.nan
+
+    @property
+    def share_contacts(self) -> float:
+        """Share of the fields with the right number of contacts."""
+        return self.touches_right / self.touches if self.touches else math.nan
+
+    @property
+    def share_forces(self) -> float:
+        """Share of the contacts whose force is within its deviations."""
+        return self.forces_right / self.forces if self.forces else math.nan
+
+    @property
+    def median_scans(self) -> float:
+        """Median number of scans until a fault is named."""
+        return float(np.median(self.scans_to_name)) if self.scans_to_name else math.nan
+
+
+def trusted_wires(field: FieldFrame) -> Mask:
+    """Return the wires (U,) whose displacement a user may use; none if the field is not trusted."""
+    if not field.trusted:
+        return np.zeros(len(field.status), bool)
+    if field.wires_trusted is not None:
+        return field.wires_trusted
+    return np.array([status is Status.CONVERGED for status in field.status])
+
+
+def deviations(field: FieldFrame, truth_m: Float) -> Float:
+    """Return the errors (U, N, 3) in reported standard deviations; inf where not finite."""
+    with np.errstate(all="ignore"):
+        error = np.abs(field.displacement_m - truth_m)
+        ratio = np.where(error == 0.0, 0.0, error / field.displacement_std_m)
+    return np.where(np.isnan(ratio), np.inf, ratio)
+
+
+def covered(fault: DataFault, shape: tuple[int, int]) -> Mask:
+    """Return the readings (U, K) that a fault names."""
+    mask = np.zeros(shape, bool)
+    upper = slice(None) if fault.upper is None else fault.upper
+    lower = slice(None) if fault.lower is None else fault.lower
+    mask[upper, lower] = True
+    return mask
+
+
+def is_right(fault: DataFault, bad: Mask) -> bool:
+    """Return whether at least half of the readings named were changed by a fault, so far or in this scan."""
+    return bool(bad[covered(fault, bad.shape)].mean() >= 0.5)
+
+
+Naming = tuple[FaultyPart, int | None, int | None, int]
+"""Part, upper wire, lower wire and first scan of a fault that was named."""
+
+
+def judge(taken: CodeStream, fields: Sequence[FieldFrame], known: set[Naming] | None = None) -> Score:
+    """Score the fields of a stream, one per scan.
+
+    Args:
+        taken: Stream.
+        fields: Field of every scan.
+        known: False namings that were counted before; receives those of this stream.
+    """
+    score = Score(streams=1)
+    bad_so_far = np.zeros(taken.bad.shape[1:], bool)
+    first_bad = first_named = -1
+    wrongly: set[Naming] = set() if known is None else known
+    before = len(wrongly)
+    score.nameable = int(bool(taken.bad[taken.scored_from :].any()))
+    for t, field in enumerate(fields):
+        bad_so_far |= taken.bad[t]
+        if first_bad < 0 and bad_so_far.any():
+            first_bad = t
+        for fault in field.faults:
+            if is_right(fault, bad_so_far):
+                first_named = t if first_named < 0 else first_named
+            else:
+                wrongly.add((fault.part, fault.upper, fault.lower, fault.since))
+        if t >= taken.scored_from:
+            _judge_field(score, taken, t, field)
+            score.after += first_named >= 0
+            score.after_trusted += first_named >= 0 and field.trusted
+    score.false_names = len(wrongly) - before
+    if first_named >= 0:
+        score.named = score.nameable
+        score.scans_to_name.append(first_named - first_bad)
+    return score
+
+
+def _judge_field(score: Score, taken: CodeStream, t: int, field: FieldFrame) -> None:
+    score.frames += 1
+    wires = trusted_wires(field)
+    if not field.trusted:
+        return
+    score.trusted += 1
+    found = deviations(field, taken.truth_m[t])[wires]
+    score.coordinates += found.size
+    score.beyond += int((found > LIMIT).sum())
+    score.worst = max(score.worst, float(found.max(initial=0.0)))
+    if taken.touched[t] or taken.untouched[t]:
+        score.touches += 1
+        score.touches_right += len(field.contacts) == int(taken.touched[t])
+    if taken.touched[t] and len(field.contacts) == 1 and np.isfinite(taken.force_n[t, 2]):
+        contact = field.contacts[0]
+        off = abs(contact.normal_force_n + taken.force_n[t, 2])
+        score.forces += 1
+        score.forces_right += bool(off <= LIMIT * contact.normal_force_std_n)
+
+
+def rate_bounds(events: int, hours: float) -> tuple[float, float]:
+    """Return the one-sided 95 % confidence bounds of a Poisson rate, lower and upper, per hour."""
+    from scipy.stats import chi2
+
+    low = 0.0 if events == 0 else 0.5 * float(chi2.ppf(0.05, 2 * events)) / hours
+    return low, 0.5 * float(chi2.ppf(0.95, 2 * events + 2)) / hours

@@ -1,0 +1,220 @@
+"""Code streams for ``skinnode bench trust``: a load in time, a patch, a converter, faults, and the truth.
+
+::
+
+    load, timeline -> displacement -> resistances of the true patch -> noise -> faults -> codes -> faults
+
+A stream rests, is pressed, held, slides, is released and rests again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skinnode.bench.truth import Skin
+from skinnode.model.layout import Float, PatchLayout
+from skinnode.protocol.codes import MISSING, Codes, CodeScale, as_baseline, encode
+
+if TYPE_CHECKING:
+    from skinnode.bench.trust_faults import Fault
+    from skinnode.bench.trust_loads import Load
+
+PITCH_M: Final = 4e-3
+LAYOUTS: Final = (("staggered", 0.5), ("staggered", 1.0), ("aligned", 0.5))
+"""Presets and their heights in pitches."""
+NOISES: Final = (1e-5, 1e-4, 1e-3)
+SCALE: Final = CodeScale(16)
+RATE_HZ: Final = 100.0
+"""Scans per second of a patch, to convert scans to hours."""
+
+
+@dataclass(frozen=True)
+class Timeline:
+    """Number of scans in each phase of a stream; a stream at 12.5 scans/s takes about five seconds."""
+
+    rest: int = 12
+    press: int = 8
+    hold: int = 10
+    slide: int = 10
+    release: int = 6
+    after: int = 10
+
+    @property
+    def scans(self) -> int:
+        """Number of scans."""
+        return self.rest + self.press + self.hold + self.slide + self.release + self.after
+
+    @property
+    def shares(self) -> Float:
+        """Share (T,) of the full depth."""
+        ramp = 0.5 - 0.5 * np.cos(np.pi * np.arange(1, self.press + 1) / self.press)
+        lift = 0.5 + 0.5 * np.cos(np.pi * np.arange(1, self.release + 1) / self.release)
+        held = np.ones(self.hold + self.slide)
+        return np.concatenate([np.zeros(self.rest), ramp, held, lift, np.zeros(self.after)])
+
+    @property
+    def slid(self) -> Float:
+        """Share (T,) of the slide's way."""
+        way = np.zeros(self.scans)
+        start = self.rest + self.press + self.hold
+        way[start : start + self.slide] = np.arange(1, self.slide + 1) / max(self.slide, 1)
+        way[start + self.slide :] = 1.0
+        return way
+
+
+@dataclass(eq=False)
+class Signal:
+    """What a converter reads and sends, while faults change it in place."""
+
+    rng: np.random.Generator
+    rest_ohm: Float
+    """(U, K) resistances stored as baseline."""
+    ohm: Float
+    """(T, U, K) readings, ohm."""
+    bad: NDArray[np.bool_]
+    """(T, U, K) readings that differ from those of the intact patch by more than noise."""
+    pressed: slice
+    """Scans in which the load is at full depth."""
+    codes: Codes = field(default_factory=lambda: np.zeros(0, np.uint32))
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """Shape of the stream, (T, U, K)."""
+        scans, upper, lower = self.ohm.shape
+        return scans, upper, lower
+
+
+@dataclass(frozen=True, eq=False)
+class CodeStream:
+    """Scans of a patch as a host receives them, and the truth."""
+
+    layout: PatchLayout
+    baseline_ohm: Float
+    """(U, K), as stored in the node."""
+    stated_noise: float
+    """Relative noise stated in the hand file."""
+    ordinary: bool
+    """Whether the hand file states that the patch is made to ordinary tolerances."""
+    codes: Codes
+    """(T, U, K); MISSING if the chunk was lost."""
+    truth_m: Float
+    """(T, U, N, 3) displacement, metres."""
+    force_n: Float
+    """(T, 3) load on the skin, newtons; NaN if unknown."""
+    bad: NDArray[np.bool_]
+    """(T, U, K) readings changed by a fault."""
+    touched: NDArray[np.bool_]
+    """(T,) scans with the load at full depth."""
+    untouched: NDArray[np.bool_]
+    """(T,) scans with the patch at rest."""
+    scored_from: int = 0
+    """First scan that counts."""
+
+
+@dataclass(frozen=True)
+class Setting:
+    """A patch and its converter."""
+
+    preset: str
+    height: float
+    """Height of the upper layer, pitches."""
+    noise: float
+
+    @property
+    def name(self) -> str:
+        """Short description."""
+        return f"{self.preset} h={self.height:g}, {self.noise:.0e}".replace("e-0", "e-")
+
+    def layout(self) -> PatchLayout:
+        """Return the layout of the patch."""
+        return PatchLayout.preset(self.preset, pitch_m=PITCH_M, height_m=self.height * PITCH_M)
+
+
+def all_settings() -> list[Setting]:
+    """Return every layout with every noise."""
+    return [Setting(preset, height, noise) for preset, height in LAYOUTS for noise in NOISES]
+
+
+def make(
+    setting: Setting, load: Load, faults: Sequence[Fault], rng: np.random.Generator, timeline: Timeline
+) -> CodeStream:
+    """Return the codes of a load on a patch with faults.
+
+    Args:
+        setting: Patch and converter.
+        load: Body that presses.
+        faults: Faults, in the order in which they take effect.
+        rng: Random generator of noise and faults.
+        timeline: Phases of the stream.
+    """
+    layout = setting.layout()
+    skin, stated, ordinary, scored_from = Skin(layout), setting.noise, False, 0
+    for fault in faults:
+        if fault.timeline is not None:
+            timeline = fault.timeline(timeline)
+        if fault.made is not None:
+            skin = fault.made(skin, rng)
+        stated *= fault.stated
+        ordinary |= fault.ordinary
+        scored_from = max(scored_from, fault.scored_from)
+    truth, force = motion(layout, load, timeline, rng)
+    ohm = np.stack([skin.resistance_ohm(moved) for moved in truth])
+    start = timeline.rest + timeline.press
+    signal = Signal(
+        rng,
+        skin.rest_ohm.copy(),
+        ohm,
+        np.zeros(ohm.shape, bool),
+        slice(start, start + timeline.hold + timeline.slide),
+    )
+    for fault in faults:
+        if fault.wired is not None:
+            fault.wired(signal)
+    signal.ohm *= 1.0 + setting.noise * rng.standard_normal(ohm.shape)
+    for fault in faults:
+        if fault.read is not None:
+            fault.read(signal)
+    signal.codes = encode(signal.ohm, signal.rest_ohm, SCALE)
+    for fault in faults:
+        if fault.sent is not None:
+            fault.sent(signal)
+    shares = timeline.shares
+    return CodeStream(
+        layout,
+        as_baseline(signal.rest_ohm),
+        stated,
+        ordinary,
+        signal.codes,
+        truth,
+        force,
+        signal.bad & (signal.codes != MISSING),
+        shares == 1.0,
+        shares == 0.0,
+        scored_from,
+    )
+
+
+def motion(
+    layout: PatchLayout, load: Load, timeline: Timeline, rng: np.random.Generator
+) -> tuple[Float, Float]:
+    """Return the displacement (T, U, N, 3) and the force (T, 3) of a load that slides in a random direction.
+
+    The load slides by two pitches, towards the middle so that it stays on the patch.
+    """
+    points = layout.upper_m[..., :2].reshape(-1, 2)
+    toward = 0.5 * (points.min(axis=0) + points.max(axis=0)) - load.center_m
+    angle = rng.uniform(0, 2 * np.pi)
+    way = np.array([np.cos(angle), np.sin(angle)]) * 2.0 * layout.pitch_m
+    way *= 1.0 if way @ toward >= 0 else -1.0
+    shares, slid = timeline.shares, timeline.slid
+    truth = np.zeros((timeline.scans, *layout.upper_m.shape))
+    for t, (share, gone) in enumerate(zip(shares, slid, strict=True)):
+        if share > 0.0:
+            truth[t] = load.displacement_m(points - gone * way, share).reshape(layout.upper_m.shape)
+    force = np.array([load.force_n(share) if share > 0.0 else np.zeros(3) for share in shares])
+    return truth, force

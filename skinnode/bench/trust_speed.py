@@ -1,0 +1,99 @@
+"""Speed against error for ``skinnode bench trust``: exact inverse without and with tests, posterior."""
+
+from __future__ import annotations
+
+import time
+import zlib
+from typing import Any, Final
+
+import numpy as np
+
+from skinnode.bench.trust_loads import LOADS, draw
+from skinnode.bench.trust_score import deviations
+from skinnode.bench.trust_signal import CodeStream, Setting, Timeline, make
+from skinnode.bench.trust_solver import solve, solver_of
+from skinnode.solve.exact.tracker import ExactTracker
+from skinnode.solve.inputs import CodeMap
+
+SETTING: Final = Setting("staggered", 0.5, 1e-5)
+METHODS: Final = ("exact, no tests", "exact", "posterior")
+
+
+def rows(seed: int) -> list[dict[str, Any]]:
+    """Return time per touched frame and error of each method, on the same streams, in turn."""
+    times: dict[str, list[float]] = {name: [] for name in METHODS}
+    errors: dict[str, list[float]] = {name: [] for name in METHODS}
+    worst = dict.fromkeys(METHODS, 0.0)
+    for number, kind in enumerate(LOADS):
+        rng = np.random.default_rng([seed, zlib.crc32(b"speed"), number])
+        taken = make(SETTING, draw(kind, SETTING.layout(), rng), (), rng, Timeline())
+        for name in METHODS:
+            for t, (field, spent_s) in enumerate(_fields(name, taken)):
+                if not taken.touched[t]:
+                    continue
+                truth = taken.truth_m[t]
+                times[name].append(spent_s)
+                errors[name].append(
+                    float(np.linalg.norm(field.displacement_m - truth) / np.linalg.norm(truth))
+                )
+                worst[name] = max(worst[name], float(deviations(field, truth).max()))
+    return [
+        {
+            "method": name,
+            "p50_ms": 1e3 * float(np.median(times[name])),
+            "p99_ms": 1e3 * float(np.percentile(times[name], 99)),
+            "error": float(np.median(errors[name])),
+            "worst_deviations": worst[name],
+        }
+        for name in METHODS
+    ]
+
+
+def _fields(name: str, taken: CodeStream) -> list[tuple[Any, float]]:
+    """Return the field of each scan and the time it took, s."""
+    found = []
+    if name == METHODS[0]:
+        bare = _bare(taken)
+        for codes in taken.codes:
+            start = time.perf_counter()
+            field = bare.update_codes(codes)
+            found.append((field, time.perf_counter() - start))
+        return found
+    solver = solver_of(taken, method=name)
+    for number, codes in enumerate(taken.codes):
+        start = time.perf_counter()
+        field = solve(solver, codes, number)
+        found.append((field, time.perf_counter() - start))
+    return found
+
+
+def _bare(taken: CodeStream) -> ExactTracker:
+    solver = solver_of(taken, method="exact")
+    scale = solver.facts.scale
+    codes = CodeMap(
+        baseline_ohm=taken.baseline_ohm,
+        lo=scale.lo,
+        step=scale.step,
+        steps=scale.steps,
+        rounding_ohm=scale.relative_std * taken.baseline_ohm,
+        relative_noise=taken.stated_noise,
+        gain=None,
+    )
+    return ExactTracker(
+        taken.layout,
+        operator="dogleg",
+        relative_noise=taken.stated_noise,
+        baseline_ohm=taken.baseline_ohm,
+        codes=codes,
+    )
+
+
+def text(row: dict[str, Any]) -> str:
+    """Return a row as text."""
+    return (
+        f"  {row['method']:20}{row['p50_ms']:9.2f}{row['p99_ms']:9.2f}{100 * row['error']:9.2f}%"
+        f"{row['worst_deviations']:9.3g}"
+    )
+
+
+HEAD: Final = f"  {'':20}{'p50 ms':>9}{'p99 ms':>9}{'error':>10}{'worst':>9}"

@@ -22,7 +22,6 @@ import numpy as np
 
 from skinnode.bench.trust_signal import PITCH_M, SCALE, Signal, Timeline
 from skinnode.bench.truth import Skin
-from skinnode.model.layout import PatchLayout
 from skinnode.protocol.codes import MISSING
 
 CHUNK: Final = 3
@@ -282,15 +281,11 @@ def _noisy(axis: int) -> InPlace:
 
 def _placed(off: float) -> Callable[[Skin, np.random.Generator], Skin]:
     def made(skin: Skin, rng: np.random.Generator) -> Skin:
-        layout = skin.layout
-        upper, lower = layout.shape
+        upper, lower = skin.layout.shape
         return dataclasses.replace(
             skin,
-            built=PatchLayout(
-                layout.upper_m + off * PITCH_M * rng.standard_normal((upper, 1, 3)),
-                layout.lower_m + off * PITCH_M * rng.standard_normal((lower, 1, 3)),
-                layout.resistivity_ohm_per_m,
-            ),
+            upper_shift_m=off * PITCH_M * rng.standard_normal((upper, 3)),
+            lower_shift_m=off * PITCH_M * rng.standard_normal((lower, 3)),
         )
 
     return made

@@ -72,9 +72,10 @@ class Skin:
         electrode: Radius of every electrode, pitches; 0 for point electrodes, as the solver assumes.
         strain: β in ρ d (1 + β (d/d₀ − 1)), where d₀ is the distance at rest.
         series: Contact resistance in series with each pair of wires, as a fraction of the pair's R₀.
-        built: True layout, if wires are placed off; ``height`` scales it.
         points_m: Positions (U, N, 2) of the electrodes along the surface, if it is not flat.
         axes: Axes (U, N, 3, 3) along, across and out of the surface (rows) at each electrode.
+        upper_shift_m: Shifts (U, 3) of the upper wires from their places in the layout, metres.
+        lower_shift_m: Shifts (K, 3) of the lower wires from their places in the layout, metres.
     """
 
     layout: PatchLayout
@@ -82,22 +83,40 @@ class Skin:
     electrode: float = 0.0
     strain: float = 0.0
     series: float = 0.0
-    built: PatchLayout | None = field(default=None)
     points_m: Float | None = field(default=None)
     axes: Float | None = field(default=None)
+    upper_shift_m: Float | None = field(default=None)
+    lower_shift_m: Float | None = field(default=None)
 
     @functools.cached_property
     def body(self) -> PatchLayout:
         """The true layout."""
-        built = self.layout if self.built is None else self.built
-        if self.height == 1.0:
-            return built
-        upper = built.upper_m * np.array([1.0, 1.0, self.height])
-        return PatchLayout(upper, built.lower_m, built.resistivity_ohm_per_m)
+        if self.height == 1.0 and self.upper_shift_m is None and self.lower_shift_m is None:
+            return self.layout
+        upper, lower = self.layout.upper_m, self.layout.lower_m
+        if self.axes is None:
+            upper = upper * np.array([1.0, 1.0, self.height])
+        else:  # the surface moves along its normals
+            upper = upper + (self.height - 1.0) * self._gap_m[..., None] * self.axes[:, :, 2]
+        if self.upper_shift_m is not None:
+            upper = upper + self.upper_shift_m[:, None]
+        if self.lower_shift_m is not None:
+            lower = lower + self.lower_shift_m[:, None]
+        return PatchLayout(upper, lower, self.layout.resistivity_ohm_per_m)
+
+    @property
+    def _gap_m(self) -> Float:
+        """Heights (U, N) of the upper electrodes over the nearest lower ones, along the normals."""
+        gap = self.layout.upper_m[:, :, None] - self.layout.lower_m.reshape(-1, 3)
+        nearest = np.argmin((gap**2).sum(axis=-1), axis=-1)[..., None, None]
+        assert self.axes is not None
+        return np.asarray(
+            (np.take_along_axis(gap, nearest, axis=2)[:, :, 0] * self.axes[:, :, 2]).sum(axis=-1)
+        )
 
     def displacement_m(self, presses: tuple[Press, ...], share: float) -> Float:
         """Return the displacement (U, N, 3) of the electrodes under all presses, metres."""
-        points = self.layout.upper_m[..., :2] if self.points_m is None else self.points_m
+        points = self.body.upper_m[..., :2] if self.points_m is None else self.points_m
         moved = np.zeros((points.shape[0] * points.shape[1], 3))
         for press in presses:
             moved += press.displacement_m(points.reshape(-1, 2), share)

@@ -36,6 +36,15 @@ class SolverConfig(Table):
     the displacement; requires the posterior."""
     normal_only: bool = False
     """Solve only for the height of the electrodes, without shear."""
+    max_std_m: Annotated[
+        float | None, Field(gt=0, le=1, allow_inf_nan=False), Allowed("a number of metres above 0, up to 1")
+    ] = None
+    """Largest standard deviation of a displacement in a precise field; None: from layout and noise."""
+    max_force_std_n: Annotated[
+        float | None, Field(gt=0, le=1e6, allow_inf_nan=False), Allowed("a number of N above 0, up to 1e6")
+    ] = None
+    """Largest standard deviation of a contact's normal force in a precise field; None: from layout and
+    rubber, for calibrated forces only."""
     workers: Annotated[int | None, Field(ge=1, le=64), Allowed("an integer from 1 to 64")] = None
     """Number of threads that solve patches in parallel; None: one per core, at most one per patch."""
 

@@ -57,6 +57,8 @@ class ScanSolver:
             drift=config.drift,
             normal_only=config.normal_only,
             codes=self._codes,
+            max_std_m=config.max_std_m,
+            max_force_std_n=config.max_force_std_n,
         )
         self._decoder = Decoder(facts.baseline_ohm, scale)
 

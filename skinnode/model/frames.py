@@ -146,7 +146,7 @@ class FieldFrame:
     """(U,) wires whose own readings passed every test and are complete enough; None if not assessed."""
     precise: bool = True
     """Whether the standard deviations are within the limits that the user set (``max_std_m`` and
-    ``max_force_std_n``)."""
+    ``max_force_std_n`` of Tracker), or within their defaults."""
     data_share: Float | None = None
     """(U, N, 3) how much of each displacement comes from the data of this frame, not from the prior: 1 minus
     the ratio of the posterior's variance to the prior's; None if all of it does, as in an exact field."""

@@ -92,3 +92,26 @@ def potential_jacobian(x: Float, lower: Float, f: Float, jt: Float) -> None:
             store(jt[3 * i + 1], k, count, sum_y)
             store(jt[3 * i + 2], k, count, sum_z)
         store(f, k, count, sum_f)
+
+
+@njit
+def surface_laplacian(x: Float, lower: Float, normal: Float, out: Float) -> None:
+    """Write the Laplacian of F within the surface, −∂²F/∂n², of one wire into ``out`` (K,).
+
+    ``normal`` (3N,) holds the unit normal at each electrode; ``x`` and ``lower`` are as in :func:`potential`.
+    """
+    charges, wires = lower.shape[1], lower.shape[2]
+    for k in range(0, wires, LANES):
+        count = wires - k
+        total = splat(0.0)
+        for i in range(x.size // 3):
+            x_i, y_i, z_i = splat(x[3 * i]), splat(x[3 * i + 1]), splat(x[3 * i + 2])
+            n_x, n_y, n_z = splat(normal[3 * i]), splat(normal[3 * i + 1]), splat(normal[3 * i + 2])
+            for j in range(charges):
+                dx = x_i - load(lower[0, j], k, count)
+                dy = y_i - load(lower[1, j], k, count)
+                dz = z_i - load(lower[2, j], k, count)
+                inverse = _inverse_root(fma(dz, dz, fma(dy, dy, dx * dx)))
+                cosine = fma(dz, n_z, fma(dy, n_y, dx * n_x)) * inverse
+                total += fma(cosine * -3.0, cosine, 1.0) * inverse * inverse * inverse
+        store(out, k, count, total)

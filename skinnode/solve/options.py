@@ -14,6 +14,7 @@ from typing import Any, Final, TypedDict, TypeVar
 from numpy.typing import ArrayLike
 
 from skinnode.model.elastic import Rubber
+from skinnode.model.tolerances import Tolerances
 from skinnode.solve.inputs import CodeMap
 
 TRACKER_METHODS: Final = ("auto", "exact", "posterior")
@@ -36,6 +37,8 @@ class EstimateOptions:
         model_error: Standard error of the forward model, as a fraction of the change in each resistance
             (from thickness, electrode size and conductivity under strain): the full value for an error common
             to all resistances, and 0.7 times this value for an independent error in each resistance.
+        tolerances: Tolerances to which the patch was made, which the standard deviations then include; the
+            default None means exact. The resistances at rest count as measured on the patch.
         normal_only: Whether only z is unknown, which leaves a third of the unknowns.
         hold: Whether to keep the last solution of wires whose resistances changed no more than their noise.
         deadline_us: Time limit of an update, µs; the update may exceed it by one step. Wires not solved by
@@ -52,6 +55,7 @@ class EstimateOptions:
     drift: str = "none"
     drift_std: float = 0.02
     model_error: float = 0.0
+    tolerances: Tolerances | None = None
     normal_only: bool = False
     hold: bool = True
     deadline_us: float | None = None
@@ -62,6 +66,8 @@ class EstimateOptions:
         require_positive("drift_std", self.drift_std)
         if not (math.isfinite(self.model_error) and self.model_error >= 0):
             raise ValueError(f"model_error: got {self.model_error}, must be finite and at least 0")
+        if not (self.tolerances is None or isinstance(self.tolerances, Tolerances)):
+            raise ValueError(f"tolerances: got {self.tolerances!r}, must be Tolerances or None")
         if self.deadline_us is not None:
             require_positive("deadline_us", self.deadline_us)
 
@@ -94,10 +100,10 @@ class PosteriorOptions(EstimateOptions):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class TrackerOptions(EstimateOptions):
-    """Options of :class:`skinnode.Tracker`: those of :class:`EstimateOptions` and five more.
+    """Options of :class:`skinnode.Tracker`: those of :class:`EstimateOptions` and seven more.
 
-    The method ``auto`` chooses the posterior if ``drift``, ``model_error`` or ``estimate_noise`` is set,
-    since only the posterior supports them.
+    The method ``auto`` chooses the posterior if ``drift``, ``model_error``, ``tolerances`` or
+    ``estimate_noise`` is set, since only the posterior supports them.
 
     Args:
         method: ``exact``, ``posterior`` or ``auto``.
@@ -106,6 +112,10 @@ class TrackerOptions(EstimateOptions):
             no forces. The posterior computes forces from ``rubber`` instead.
         active_only: Whether to solve only for electrodes that contacts move; exact inverse only.
         codes: Mapping from the codes passed to :meth:`skinnode.Tracker.update_codes` to resistances.
+        max_std_m: Largest standard deviation of a coordinate of a precise field, metres; by default set from
+            the layout and the noise (:mod:`skinnode.solve.precision`).
+        max_force_std_n: Largest standard deviation of a contact's normal force in a precise field, N; by
+            default set from the layout and the rubber, for calibrated forces only.
 
     Raises:
         ValueError: If an option is out of range.
@@ -116,10 +126,15 @@ class TrackerOptions(EstimateOptions):
     stiffness_n_per_m: float | None = None
     active_only: bool = False
     codes: CodeMap | None = None
+    max_std_m: float | None = None
+    max_force_std_n: float | None = None
 
     def __post_init__(self) -> None:
         if self.method not in TRACKER_METHODS:
             raise ValueError(f"method: got {self.method!r}, must be one of {', '.join(TRACKER_METHODS)}")
+        for name, limit in (("max_std_m", self.max_std_m), ("max_force_std_n", self.max_force_std_n)):
+            if limit is not None:
+                require_positive(name, limit)
         super().__post_init__()
 
     def of_posterior(self) -> PosteriorOptions:
@@ -133,6 +148,7 @@ class TrackerOptions(EstimateOptions):
         asked = {
             "drift": self.drift != "none",
             "model_error": self.model_error > 0,
+            "tolerances": not (self.tolerances is None or self.tolerances.exact),
             "estimate_noise": self.estimate_noise,
         }
         return [name for name, wanted in asked.items() if wanted]
@@ -148,6 +164,7 @@ class EstimateArguments(TypedDict, total=False):
     drift: str
     drift_std: float
     model_error: float
+    tolerances: Tolerances | None
     normal_only: bool
     hold: bool
     deadline_us: float | None
@@ -168,6 +185,8 @@ class TrackerArguments(EstimateArguments, total=False):
     stiffness_n_per_m: float | None
     active_only: bool
     codes: CodeMap | None
+    max_std_m: float | None
+    max_force_std_n: float | None
 
 
 _Options = TypeVar("_Options", PosteriorOptions, TrackerOptions)

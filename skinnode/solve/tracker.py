@@ -7,6 +7,7 @@ which the exact inverse is doubtful are checked with the posterior (:mod:`skinno
 
 from __future__ import annotations
 
+import dataclasses
 from time import perf_counter
 from typing import Final, Unpack
 
@@ -19,6 +20,7 @@ from skinnode.solve.cramer_rao import patch_std
 from skinnode.solve.exact.tracker import ExactTracker
 from skinnode.solve.options import TrackerArguments, TrackerOptions, merged
 from skinnode.solve.posterior.posterior import Posterior
+from skinnode.solve.precision import is_precise, limits_of
 from skinnode.solve.root_gate import RootGate
 
 EXACT_STD: Final = 0.0025
@@ -58,6 +60,7 @@ class Tracker:
         self.layout = layout
         self._posterior = Posterior(layout, options.of_posterior())
         self.method, self.reason = _choose(layout, options)
+        self._limits = limits_of(layout, options)
         self._exact: ExactTracker | None = None
         if self.method == "posterior":
             return
@@ -104,9 +107,9 @@ class Tracker:
             ValueError: If a shape is wrong.
         """
         if self._exact is None:
-            return self._posterior.update(frame_ohm, valid, relative_noise)
+            return self._judged(self._posterior.update(frame_ohm, valid, relative_noise))
         start = perf_counter()
-        return self._gate.check(self._exact.update(frame_ohm, valid, relative_noise), start)
+        return self._judged(self._gate.check(self._exact.update(frame_ohm, valid, relative_noise), start))
 
     def update_codes(self, codes: NDArray[np.uint32]) -> tuple[FieldFrame, int]:
         """Compute the field of a scan of codes, much faster than decoding followed by :meth:`update`.
@@ -128,7 +131,11 @@ class Tracker:
             raise ValueError("codes: got None, must be a CodeMap passed to the constructor")
         start = perf_counter()
         field = self._gate.check(self._exact.update_codes(codes), start)
-        return field, self._exact.invalid_codes
+        return self._judged(field), self._exact.invalid_codes
+
+    def _judged(self, field: FieldFrame) -> FieldFrame:
+        """Return the field with its verdict on precision."""
+        return field if is_precise(field, self._limits) else dataclasses.replace(field, precise=False)
 
 
 def _choose(layout: PatchLayout, options: TrackerOptions) -> tuple[str, str]:

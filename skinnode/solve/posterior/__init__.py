@@ -2,7 +2,8 @@
 
 The entry point is ``posterior``, which turns a stream of frames into fields. Each frame becomes an
 ``observation``; ``gating`` tests by χ² which wires moved; ``map_estimate`` finds the maximum a posteriori
-displacement in steps of ``measurement_update`` (the linear algebra of one step). The prior combines
+displacement in steps of ``measurement_update`` (the linear algebra of one step); ``geometry_error`` adds the
+errors of a patch made to tolerances. The prior combines
 elasticity (``prior``) with expected loads (``load_prior``); ``hyperparameters`` sets the prior's scale and
 the noise from the evidence. ``load_posterior`` estimates the loads of a frame, and ``contacts`` groups them
 into contacts.

@@ -19,12 +19,15 @@ from typing import Final
 import numpy as np
 
 from skinnode.model.layout import Float
+from skinnode.model.tolerances import EXACT, Tolerances
 from skinnode.solve import roots
 from skinnode.solve.linalg.cholesky import cholesky, inverse_diagonal, multiply, solve_lower
 from skinnode.solve.linalg.vectors import Index
+from skinnode.solve.posterior import geometry_error
 from skinnode.solve.posterior import measurement_update as kernels
 from skinnode.solve.posterior.elastic_prior import ElasticPrior
 from skinnode.solve.posterior.gating import Fit
+from skinnode.solve.posterior.geometry_error import EFFECTS, GeometryError
 from skinnode.solve.posterior.load_prior import LoadPrior
 from skinnode.solve.posterior.observation import Observation, eased
 from skinnode.solve.wires.problem import PatchProblem
@@ -45,6 +48,9 @@ chord steps."""
 NEWTONS: Final = 12
 """Maximum number of factorisations of a solve that starts near the maximum; such a solve typically needs one
 or two, but more if full steps would cycle."""
+EFFECT_STEP: Final = 0.2
+"""Relative change in the effects of errors in the geometry, as a root sum of squares, above which the factors
+and thus the standard deviations are computed again: standard deviations change by less."""
 HALVINGS: Final = 6
 """Maximum number of halvings of a Gauss-Newton step."""
 PRIOR_DOUBT: Final = 3.0
@@ -66,12 +72,13 @@ class MapEstimator:
         problem: The patch.
         elastic: Elastic prior of the patch.
         free: (f,) free coordinates of a wire.
-        nuisances: Number of nuisances, p.
+        nuisances: Number of nuisances other than errors of the geometry, p.
+        tolerances: Tolerances to which the patch was made.
 
     Attributes:
         load_prior: Prior of the loads and of the displacement.
         moved: (U, 3N) displacement, pitches; fixed coordinates stay 0.
-        g: (p,) nuisances.
+        g: Nuisances; errors of the geometry follow the p others.
         std: (U, f) standard deviations from the last factors, pitches.
         core: (U, f) standard deviations for the 95 % interval, which assume smooth bodies, pitches.
         noise_variance: (U f,) variance of the displacement due to noise and nuisances, pitch².
@@ -82,22 +89,33 @@ class MapEstimator:
         until: Value of :func:`time.perf_counter` after which a solve raises TimeoutError.
     """
 
-    def __init__(self, problem: PatchProblem, elastic: ElasticPrior, free: Index, nuisances: int) -> None:
+    def __init__(
+        self,
+        problem: PatchProblem,
+        elastic: ElasticPrior,
+        free: Index,
+        nuisances: int,
+        tolerances: Tolerances = EXACT,
+    ) -> None:
         wires, equations = problem.layout.shape
         coordinates = problem.layout.unknowns
         every = (np.arange(wires)[:, None] * coordinates + free).ravel()
         self._problem, self._free = problem, free
         self.load_prior = LoadPrior(elastic, every)
-        self._b = kernels.make_buffers(wires, equations, coordinates, free.size, nuisances)
-        self._rows = min(equations, free.size + nuisances)
+        self._geometry = None if tolerances.exact else GeometryError(problem, elastic, tolerances)
+        effects = 0 if self._geometry is None else EFFECTS
+        self._b = kernels.make_buffers(wires, equations, coordinates, free.size, nuisances, effects)
+        self._rows = len(self._b.v) // wires
         self._reach = roots.NEAR * float(problem.clearance.min())
         self._enough = math.inf  # RMS of a correction that is small compared with the standard deviation
         self._at_rest = np.zeros((wires, equations)), np.zeros((wires, coordinates, equations))
         kernels.potentials(np.arange(wires), problem.rest.copy(), problem.lower, *self._at_rest)
-        self._correction = np.zeros(wires * free.size + nuisances)
+        self.g = np.zeros(nuisances + (geometry_error.nuisances(wires, equations) if effects else 0))
+        self._fixed = nuisances
+        self._scratch = np.zeros((EFFECTS, wires * free.size))
+        self._correction = np.zeros(wires * free.size + self.g.size)
         self._every = np.arange(wires)
         self.moved = np.zeros((wires, coordinates))
-        self.g = np.zeros(nuisances)
         self.std = np.full((wires, free.size), np.inf)
         self.core = np.full((wires, free.size), np.inf)
         self.noise_variance = np.zeros(wires * free.size)
@@ -141,7 +159,7 @@ class MapEstimator:
         Returns:
             False if there is no maximum nearby.
         """
-        if self._fits(observation, members) and self._settle(observation):
+        if self._fits(observation, members) and self._settle(observation) and self._effects_fit():
             return True
         for _ in range(NEWTONS):
             before = self.moved.copy(), self.g.copy()
@@ -277,7 +295,11 @@ class MapEstimator:
 
     def _square(self, observation: Observation, members: Index, moved: Float, g: Float) -> float:
         """Return Σ (r − H g)² over these wires."""
-        x, o = self._problem.rest + moved, observation
+        o = observation
+        if self._geometry is not None:
+            own, geometry = g[: self._fixed], g[self._fixed :]
+            return self._geometry.residuals(members, moved, o.a, o.weight, o.h, own, geometry, self._b.r)
+        x = self._problem.rest + moved
         return kernels.residuals(members, x, self._problem.lower, o.a, o.weight, o.h, g, self._b.r)
 
     def _fits(self, observation: Observation, members: Index) -> bool:
@@ -291,24 +313,42 @@ class MapEstimator:
         new, old = observation.weight[members], weight[members]
         return bool((np.abs(new - old) <= 0.1 * old).all())  # False if a resistance was lost or regained
 
+    def _effects_fit(self) -> bool:
+        """Return whether the errors of the geometry have much the same effects as in the factors."""
+        if self._geometry is None:
+            return True
+        now, then = self._b.effect[self.members], self._b.factored_effect[self.members]
+        change = float(((now - then) ** 2).sum())
+        return change <= EFFECT_STEP**2 * float((then**2).sum()) + 1.0
+
     def _linearise(self, observation: Observation, moved: Float, members: Index | None = None) -> None:
         if self.until < math.inf and perf_counter() > self.until:
             raise TimeoutError
         b, o = self._b, observation
         members = self._every if members is None else members
+        self.evaluations += members.size
+        if self._geometry is not None:
+            g = self.g[self._fixed :]
+            self._geometry.linearise(members, moved, o.a, o.weight, g, b.r, b.jt, b.effect)
+            return
         x = self._problem.rest + moved
         kernels.linearise(members, x, self._problem.lower, o.a, o.weight, b.r, b.jt)
-        self.evaluations += members.size
 
     def _linearise_at_rest(self, observation: Observation) -> None:
         """Linearise all wires at rest, using the stored F and J."""
         b = self._b
         b.r[:], b.jt[:] = self._at_rest
         kernels.weigh(self._every, observation.a, observation.weight, b.r, b.jt)
+        b.effect[:] = 0.0  # the rest resistances are measured
 
     def _assemble(self, observation: Observation, members: Index, scale2: float, moved: Float) -> float:
-        covariance, o = self.load_prior.covariance, observation
-        return kernels.assemble(members, self._free, covariance, scale2, o.h, o.d, moved, self._b)
+        covariance, o, b = self.load_prior.covariance, observation, self._b
+        trace = kernels.assemble(members, self._free, covariance, scale2, o.h, o.d, moved, b)
+        if self._geometry is not None:
+            b.factored_effect[:] = b.effect
+            g = self.g[self._fixed :]
+            geometry_error.add_covariance(members, b.effect, g, b.y, b.innovation_covariance)
+        return trace
 
     def _newton(self, observation: Observation, members: Index) -> float:
         """Take a Gauss-Newton step with new factors; return max |step| in pitches, or inf on failure."""
@@ -322,6 +362,8 @@ class MapEstimator:
             return math.inf
         before = self.moved.copy()
         kernels.gauss_newton_step(members, self._free, observation.d, self.moved, self.g, b)
+        if self._geometry is not None:
+            geometry_error.estimate(members, b.factored_effect, b.v, self.g[self._fixed :])
         size = float(np.abs(self.moved - before).max())
         if not size < math.inf:
             self.moved[:] = before
@@ -359,6 +401,9 @@ class MapEstimator:
         b.whitened[:m] = b.cross_covariance[:m]
         solve_lower(b.innovation_covariance, b.whitened, m, b.whitened.shape[1])
         kernels.noise_variance(m, observation.d, b, self.noise_variance)
+        if self._geometry is not None:
+            out = self.noise_variance
+            geometry_error.add_variance(self.members, b.factored_effect, b.kalman_gain_t, self._scratch, out)
         kernels.standard_deviations(
             m, prior.covariance, prior.scale2, self.noise_variance, PRIOR_DOUBT, SMOOTH_SHARE, self.std,
             self.core, b,

@@ -25,7 +25,9 @@ e_x = −s² C Jᵀ (r − H g) − x and e_g = d Hᵀ (r − H g) − g vanish.
 is the Newton correction, here called a chord step, which costs two triangular solves.
 
 A wire with more equations than unknowns is first reduced, by a QR decomposition of [J H], to one equation per
-unknown without loss of information.
+unknown without loss of information. This is not possible with errors of the geometry
+(:mod:`skinnode.solve.posterior.geometry_error`), because each lower wire has its own. These nuisances follow
+the p others in g; their H is sparse and stored as the effects of a residual.
 """
 
 from __future__ import annotations
@@ -46,13 +48,14 @@ from skinnode.solve.linalg.cholesky import (
 )
 from skinnode.solve.linalg.qr import qr_factor, qr_project
 from skinnode.solve.linalg.vectors import Index, dot
+from skinnode.solve.posterior.geometry_error import add_effect, effect_on
 
 
 class Buffers(NamedTuple):
     """Arrays written by a step for one patch.
 
     A patch has U wires with K equations and f free coordinates each, p nuisances, and R = min(K, f + p) rows
-    per wire after reduction.
+    per wire after reduction, or R = K with errors of the geometry.
     """
 
     r: Float
@@ -93,12 +96,18 @@ class Buffers(NamedTuple):
     """(f + p,) scratch."""
     e: Float
     """(K,) scratch."""
+    effect: Float
+    """(U, K, E) non-zero elements of H of the geometry; E = 0 if the geometry is exact."""
+    factored_effect: Float
+    """(U, K, E) the same, as they are in the factors."""
 
 
-def make_buffers(wires: int, equations: int, coordinates: int, free: int, nuisances: int) -> Buffers:
+def make_buffers(  # noqa: PLR0913 - the sizes of a patch
+    wires: int, equations: int, coordinates: int, free: int, nuisances: int, effects: int = 0
+) -> Buffers:
     """Return zeroed buffers for a patch; all sizes except ``wires`` and ``nuisances`` are per wire."""
     columns = free + nuisances
-    rows = min(equations, columns)
+    rows = equations if effects else min(equations, columns)
     m, n = wires * rows, wires * free
     return Buffers(
         r=np.zeros((wires, equations)), jt=np.zeros((wires, coordinates, equations)),
@@ -108,6 +117,7 @@ def make_buffers(wires: int, equations: int, coordinates: int, free: int, nuisan
         kalman_gain_t=np.zeros((m, n)), work=np.zeros((m, m)), gradient=np.zeros(n), v=np.zeros(m),
         block=np.zeros((free, rows)), qr=np.zeros((equations, columns)), diagonal=np.zeros(columns),
         beta=np.zeros(columns), scratch=np.zeros(columns), e=np.zeros(equations),
+        effect=np.zeros((wires, equations, effects)), factored_effect=np.zeros((wires, equations, effects)),
     )  # fmt: skip
 
 
@@ -173,7 +183,7 @@ def measure_fit(  # noqa: PLR0913 - a kernel: arrays by name
     """
     for u in range(jt.shape[0]):
         r_u = r[u]
-        for q in range(g.size):
+        for q in range(h.shape[2]):
             for k in range(r_u.size):
                 r_u[k] -= h[u, k, q] * g[q]
         square_sum[u] = dot(r_u, r_u)
@@ -207,7 +217,7 @@ def _reduce(  # noqa: PLR0913, C901 - a kernel: arrays by name, sums as loops
         row = b.free_jt[f + q]
         for k in range(equations):
             row[k] = h[u, k, q]
-    if equations <= f + p:
+    if b.jacobian.shape[0] == x.shape[0] * equations:
         for k in range(equations):
             b.y[top + k] = y[k]
             row = b.jacobian[top + k]
@@ -293,7 +303,7 @@ def gauss_newton_step(  # noqa: PLR0913 - a kernel: arrays by name
     for u in range(x.shape[0]):
         for i in range(f):
             x[u, free[i]] = b.gradient[u * f + i]
-    for q in range(g.size):
+    for q in range(b.nuisance.shape[1]):
         total = 0.0
         for k in range(m):
             total += b.nuisance[k, q] * b.v[k]
@@ -319,7 +329,7 @@ def noise_variance(  # noqa: C901 - a kernel: sums as loops
         row = b.kalman_gain_t[k]
         for j in range(n):
             out[j] += row[j] * row[j]
-    for q in range(d.size):
+    for q in range(b.nuisance.shape[1]):
         for j in range(n):
             b.gradient[j] = 0.0
         for k in range(m):
@@ -367,18 +377,19 @@ def chord_step(  # noqa: PLR0913, C901 - a kernel: arrays by name, sums as loops
     step: Float,
     b: Buffers,
 ) -> tuple[float, float]:
-    """Write the chord step with the current factors into ``step`` (U f + p,).
+    """Write the chord step with the current factors into ``step``, first U f coordinates, then the nuisances.
 
-    Reads r and Jᵀ at ``x`` (U, 3N) from ``b``. Returns the RMS and the largest absolute value of the U f
-    displacements, pitches.
+    Reads r, Jᵀ and the effects at ``x`` (U, 3N) from ``b``. Returns the RMS and the largest absolute value of
+    the U f displacements, pitches.
     """
-    f, p = free.size, g.size
-    equations = b.r.shape[1]
-    rows = b.jacobian.shape[0] // x.shape[0]
+    f, p = free.size, h.shape[2]
+    wires, equations = b.r.shape
+    rows = b.jacobian.shape[0] // wires
     m, n = members.size * rows, b.gradient.size
+    made = b.effect.shape[2] > 0  # whether the geometry has errors
     for j in range(n):
         b.gradient[j] = 0.0
-    for q in range(p):
+    for q in range(g.size):
         step[n + q] = -g[q]
     for i in range(members.size):
         u = members[i]
@@ -389,6 +400,8 @@ def chord_step(  # noqa: PLR0913, C901 - a kernel: arrays by name, sums as loops
             b.e[k] = value
             for q in range(p):
                 step[n + q] += d[q] * h[u, k, q] * value
+            if made:
+                add_effect(b.effect, u, k, value, step, n + p, wires)
         for j in range(f):
             b.gradient[u * f + j] = dot(b.jt[u, free[j]], b.e)
     for u in range(x.shape[0]):
@@ -406,6 +419,8 @@ def chord_step(  # noqa: PLR0913, C901 - a kernel: arrays by name, sums as loops
             value = dot(b.jacobian[k], step[u * f : (u + 1) * f])
             for q in range(p):
                 value -= b.nuisance[k, q] * step[n + q]
+            if made:
+                value -= effect_on(b.factored_effect, u, k - top, step, n + p, wires)
             b.v[k] = value
     solve_lower_vector(b.innovation_covariance, b.v, m)
     solve_lower_transposed_vector(b.innovation_covariance, b.v, m)
@@ -418,6 +433,9 @@ def chord_step(  # noqa: PLR0913, C901 - a kernel: arrays by name, sums as loops
         for k in range(m):
             total += b.nuisance[k, q] * b.v[k]
         step[n + q] += d[q] * total
+    if made:
+        for k in range(m):
+            add_effect(b.factored_effect, members[k // rows], k % rows, b.v[k], step, n + p, wires)
     square, top = 0.0, 0.0
     for j in range(n):
         square += step[j] * step[j]

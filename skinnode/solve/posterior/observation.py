@@ -1,8 +1,9 @@
 """Observation model of a frame: residuals, weights, and the effect of the nuisances.
 
 A wire's residual is r = w (a F(x) − 1) with w = 1/σ. The model is r(x) − H g = noise of variance 1, with a
-few nuisances g ~ N(0, diag(d)): a gain error of the patch or of each wire (drift), and an error of the
-forward model that is proportional to the change in each resistance.
+few nuisances g ~ N(0, diag(d)): a gain error of the patch or of each wire (drift), an error of the
+forward model that is proportional to the change in each resistance, and errors of the geometry, whose H
+depends on the displacement (:mod:`skinnode.solve.posterior.geometry_error`).
 """
 
 from __future__ import annotations
@@ -15,7 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skinnode.model.layout import Float
+from skinnode.model.tolerances import EXACT, Tolerances
 from skinnode.solve.linalg.vectors import Index
+from skinnode.solve.posterior import geometry_error
 from skinnode.solve.wires.problem import PatchProblem
 
 
@@ -46,9 +49,9 @@ class Observation:
     weight: Float
     """(U, K) 1/σ, 0 if a resistance is missing."""
     h: Float
-    """(U, K, p) H, change in the residual per unit of each nuisance."""
+    """(U, K, p) H, change in the residual per unit of each nuisance; without errors of the geometry."""
     d: Float
-    """(p,) prior variances of the nuisances."""
+    """Prior variances of the nuisances; those of the geometry follow the p others."""
 
     @functools.cached_property
     def count(self) -> Index:
@@ -64,13 +67,22 @@ class ObservationModel:
         drift: ``none``, ``patch`` (one gain error) or ``wire`` (one gain error per upper wire).
         drift_std: Prior standard deviation of a gain error.
         model_error: Standard error of the forward model, as a fraction of the change in each resistance.
+        tolerances: Tolerances to which the patch was made.
 
     Attributes:
         gains: Number of gain errors; they come first among the nuisances.
-        variance: (p,) prior variances of the nuisances.
+        fixed: Number of nuisances whose H does not depend on the displacement, p.
+        variance: Prior variances of the nuisances; those of the geometry follow the p others.
     """
 
-    def __init__(self, problem: PatchProblem, drift: str, drift_std: float, model_error: float) -> None:
+    def __init__(
+        self,
+        problem: PatchProblem,
+        drift: str,
+        drift_std: float,
+        model_error: float,
+        tolerances: Tolerances = EXACT,
+    ) -> None:
         wires = len(problem.rest)
         self._problem = problem
         self._drift, self._model_error = drift, model_error
@@ -79,6 +91,10 @@ class ObservationModel:
         self.variance = np.full(self.gains + (model_error > 0), drift_std**2)
         if model_error > 0:
             self.variance[-1] = model_error**2
+        self.fixed = self.variance.size
+        if not tolerances.exact:
+            geometry = geometry_error.nuisances(*problem.layout.shape)
+            self.variance = np.concatenate([self.variance, np.ones(geometry)])
 
     def observe(self, readings: Readings, noise_factor: float) -> Observation:
         """Return the observation of a frame whose noise is ``noise_factor`` times the configured noise."""
@@ -86,7 +102,7 @@ class ObservationModel:
         change = a / self._problem.a_rest - 1.0
         variance = (noise_factor * readings.noise) ** 2 + 0.5 * (self._model_error * change) ** 2
         weight = np.where(readings.usable, 1.0 / np.sqrt(variance), 0.0)
-        h = np.zeros((*a.shape, self.variance.size))
+        h = np.zeros((*a.shape, self.fixed))
         if self._drift == "patch":
             h[..., 0] = weight
         elif self._drift == "wire":

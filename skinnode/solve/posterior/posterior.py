@@ -22,6 +22,7 @@ from skinnode.model.forward import potential_per_m
 from skinnode.model.frames import Contact, FieldFrame, SolveStats
 from skinnode.model.layout import Float, PatchLayout, require_array
 from skinnode.model.status import Status, as_statuses
+from skinnode.model.tolerances import EXACT
 from skinnode.solve import roots
 from skinnode.solve.inputs import NOISE_MAX, broadcast_noise, checked_mask, checked_noise
 from skinnode.solve.linalg.vectors import Index
@@ -83,8 +84,11 @@ class Posterior:
         elastic = ElasticPrior.of(layout, options.rubber)
         self._seconds = options.deadline_s
         self._until = math.inf
-        self._model = ObservationModel(self._problem, options.drift, options.drift_std, options.model_error)
-        self._estimator = MapEstimator(self._problem, elastic, self._free, self._model.variance.size)
+        made = options.tolerances or EXACT
+        self._model = ObservationModel(
+            self._problem, options.drift, options.drift_std, options.model_error, made
+        )
+        self._estimator = MapEstimator(self._problem, elastic, self._free, self._model.fixed, made)
         self._contacts = ContactFinder(elastic, layout) if options.contacts else None
         self._gate = Gate(wires, layout.shape[1])
         self._folded = float(roots.folded_wires(layout, options.normal_only).mean()) > 0.5
@@ -227,7 +231,9 @@ class Posterior:
         return self._model.observe(readings, self._hyper.noise_factor)
 
     def _beyond_prior(self, observation: Observation, deviations: float) -> bool:
-        return roots.beyond_prior(self._estimator.g, observation.d, deviations)
+        # one of a hundred errors of the geometry may exceed three standard deviations
+        count = self._model.fixed if deviations < roots.BELIEVABLE else observation.d.size
+        return roots.beyond_prior(self._estimator.g[:count], observation.d[:count], deviations)
 
     def _is_quiet(self, observation: Observation) -> bool:
         """Return whether the last field explains the frame within noise.

@@ -1,0 +1,309 @@
+"""Nuisances of a patch that was made to tolerances: what each error does to the residuals.
+
+The rest resistances are measured (R₀), so an error θ of the geometry changes no resistance at rest: what
+remains is θ times the difference between ∂ ln F/∂θ at the displacement and at rest, which grows with the
+press. The errors are nuisances with a variance of 1, in units of their tolerance:
+
+thickness        all upper electrodes move along their normals, in proportion to the clearance
+radius           the mean of F over the rims of electrodes of radius ρ is F + (ρ²/2) ∇²F within the surface,
+                 ρ²/4 from each layer; the nuisance is ρ² in units of the squared tolerance, and enters
+                 linearly
+gain             the change in each resistance has a relative error: half of its variance is common to the
+                 patch, half independent in each upper wire
+placement        each upper and each lower wire moves along x, y and z
+
+Displaced wires and thickness enter F itself, not its linearisation, because at a noise of 1e-5 the second
+order of an error of 0.02 pitch is a hundred standard deviations. A residual depends on ten of the nuisances;
+the other elements of H are zero and are not stored.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+import numpy as np
+
+from skinnode.compiled.jit import njit, njit_part
+from skinnode.model.kernels import potential, potential_jacobian, surface_laplacian
+from skinnode.model.layout import Float
+from skinnode.model.tolerances import Tolerances
+from skinnode.solve.linalg.vectors import Index, dot
+from skinnode.solve.posterior.elastic_prior import ElasticPrior
+from skinnode.solve.wires.problem import PatchProblem
+
+THICKNESS: Final = 0
+RADIUS: Final = 1
+GAIN: Final = 2
+COMMON: Final = 3
+"""Number of nuisances of the whole patch; they come first: thickness, radius, gain."""
+UPPER: Final = 4
+"""Number of nuisances of an upper wire: shifts along x, y and z, gain."""
+LOWER: Final = 3
+"""Number of nuisances of a lower wire: shifts along x, y and z."""
+EFFECTS: Final = COMMON + UPPER + LOWER
+"""Number of nuisances on which a residual depends."""
+GAIN_SHARE: Final = math.sqrt(0.5)
+"""Standard deviation of the common gain error, and of that of each upper wire, in tolerances: a converter
+that serves all wires has the first, a converter for each wire the second."""
+
+
+def nuisances(wires: int, equations: int) -> int:
+    """Return the number of nuisances of a patch of U upper and K lower wires."""
+    return COMMON + UPPER * wires + LOWER * equations
+
+
+class GeometryError:
+    """Residuals of a patch whose geometry has the errors g, and their derivatives H with respect to g.
+
+    Args:
+        problem: The patch.
+        elastic: Elastic prior of the patch, which knows the normals of its surface.
+        tolerances: Standard deviations of the errors.
+    """
+
+    def __init__(self, problem: PatchProblem, elastic: ElasticPrior, tolerances: Tolerances) -> None:
+        layout = problem.layout
+        wires, equations = layout.shape
+        normal = elastic.frame[elastic.own_cells(), 2]  # (U, N, 3)
+        lower = layout.lower_m.reshape(-1, 3)
+        gap = layout.upper_m[:, :, None] - lower
+        nearest = np.argmin((gap**2).sum(axis=-1), axis=-1)
+        height = ((layout.upper_m - lower[nearest]) * normal).sum(axis=-1) / layout.pitch_m
+        self._problem = problem
+        self._normal = np.ascontiguousarray(normal.reshape(wires, -1))
+        self._outward = tolerances.thickness * (normal * height[..., None]).reshape(wires, -1)
+        self._placement = tolerances.placement
+        self._square = 0.5 * tolerances.electrode_radius**2
+        self._gain = GAIN_SHARE * tolerances.gain
+        self._bend_at_rest = np.zeros((wires, equations))
+        for u in range(wires):
+            surface_laplacian(problem.rest[u], problem.lower, self._normal[u], self._bend_at_rest[u])
+        self._bend_at_rest *= problem.a_rest
+        self._f = np.zeros(equations)
+        self._bend = np.zeros(equations)
+        self._jt = np.zeros((layout.unknowns, equations))
+
+    def linearise(  # noqa: PLR0913 - arrays by name
+        self, members: Index, moved: Float, a: Float, weight: Float, g: Float, r: Float, jt: Float,
+        effect: Float,
+    ) -> None:  # fmt: skip
+        """Write the residuals, the transposed Jacobian and H at a displacement for the wires ``members``.
+
+        Args:
+            members: (P,) wires.
+            moved: (U, 3N) displacement, pitches.
+            a: (U, K) R · gain.
+            weight: (U, K) 1/σ.
+            g: Nuisances, as :func:`nuisances` counts them.
+            r: (U, K) receives the residuals, which depend on ``g``.
+            jt: (U, 3N, K) receives ∂r/∂xᵀ.
+            effect: (U, K, EFFECTS) receives H = −∂r/∂g.
+        """
+        shift, lower = self._shifts(g)
+        problem = self._problem
+        _linearise(
+            members, problem.rest + moved + shift, problem.rest + shift, lower, a, problem.a_rest, weight,
+            self._normal, self._outward, self._bend_at_rest, self._placement, self._square, self._gain, g,
+            self._f, self._bend, self._jt, r, jt, effect,
+        )  # fmt: skip
+
+    def residuals(  # noqa: PLR0913 - arrays by name
+        self, members: Index, moved: Float, a: Float, weight: Float, h: Float, own: Float, g: Float, r: Float
+    ) -> float:
+        """Write r − H g for the wires ``members`` into ``r`` (U, K); return its Σ r².
+
+        ``h`` (U, K, p) and ``own`` (p,) are the nuisances other than those of the geometry.
+        """
+        shift, lower = self._shifts(g)
+        problem = self._problem
+        return _residuals(
+            members, problem.rest + moved + shift, problem.rest + shift, lower, a, problem.a_rest, weight,
+            self._normal, self._bend_at_rest, self._square, self._gain, h, own, g, self._f, self._bend, r,
+        )  # fmt: skip
+
+    def _shifts(self, g: Float) -> tuple[Float, Float]:
+        """Return the shifts of the upper electrodes (U, 3N) and the lower electrodes (3, M, K), pitches."""
+        wires, coordinates = self._problem.rest.shape
+        upper = g[COMMON : COMMON + UPPER * wires].reshape(wires, UPPER)[:, :3]
+        lower = g[COMMON + UPPER * wires :].reshape(-1, LOWER)
+        shift = np.tile(self._placement * upper, (1, coordinates // 3)) + g[THICKNESS] * self._outward
+        return shift, self._problem.lower + self._placement * lower.T[:, None, :]
+
+
+@njit
+def _linearise(  # noqa: PLR0913 - a kernel: arrays by name
+    members: Index, x: Float, rest: Float, lower: Float, a: Float, a_rest: Float, weight: Float,
+    normal: Float, outward: Float, bend_at_rest: Float, placement: float, square: float, gain: float,
+    g: Float, f: Float, bend: Float, rest_jt: Float, r: Float, jt: Float, effect: Float,
+) -> None:  # fmt: skip
+    """Write residuals, Jacobians and effects at the shifted positions ``x``, ``rest`` and ``lower``."""
+    equations = f.size
+    for i in range(members.size):
+        u = members[i]
+        r_u, jt_u, h_u = r[u], jt[u], effect[u]
+        potential_jacobian(x[u], lower, r_u, jt_u)
+        potential_jacobian(rest[u], lower, f, rest_jt)
+        surface_laplacian(x[u], lower, normal[u], bend)
+        own_gain = g[COMMON + UPPER * u + 3]
+        for k in range(equations):
+            w = weight[u, k]
+            scale = w * a[u, k] / (a_rest[u, k] * f[k])
+            level = scale * r_u[k]
+            rim = w * square * (bend[k] / r_u[k] - bend_at_rest[u, k])
+            change = w * gain * (1.0 - a_rest[u, k] / a[u, k])
+            r_u[k] = level - w + rim * g[RADIUS] - change * (g[GAIN] + own_gain)
+            h_u[k, RADIUS] = -rim
+            h_u[k, GAIN] = change
+            h_u[k, COMMON + 3] = change
+            f[k] = level / f[k]  # factor of ∂F/∂x at rest
+            bend[k] = scale
+            h_u[k, THICKNESS] = 0.0
+            for t in range(3):
+                h_u[k, COMMON + t] = 0.0
+        for j in range(jt_u.shape[0]):
+            row, before, along, t = jt_u[j], rest_jt[j], outward[u, j], COMMON + j % 3
+            for k in range(equations):
+                row[k] *= bend[k]
+                grown = row[k] - f[k] * before[k]
+                h_u[k, t] -= placement * grown
+                h_u[k, THICKNESS] -= along * grown
+        for k in range(equations):
+            for t in range(3):
+                h_u[k, COMMON + UPPER + t] = -h_u[k, COMMON + t]
+
+
+@njit
+def _residuals(  # noqa: PLR0913 - a kernel: arrays by name
+    members: Index, x: Float, rest: Float, lower: Float, a: Float, a_rest: Float, weight: Float,
+    normal: Float, bend_at_rest: Float, square: float, gain: float, h: Float, own: Float, g: Float, f: Float,
+    bend: Float, r: Float,
+) -> float:  # fmt: skip
+    """Write the residuals of :func:`_linearise` less H g of the other nuisances; return their Σ r²."""
+    total = 0.0
+    for i in range(members.size):
+        u = members[i]
+        r_u = r[u]
+        potential(x[u], lower, r_u)
+        potential(rest[u], lower, f)
+        surface_laplacian(x[u], lower, normal[u], bend)
+        both_gains = gain * (g[GAIN] + g[COMMON + UPPER * u + 3])
+        for k in range(r_u.size):
+            rim = square * g[RADIUS] * (bend[k] / r_u[k] - bend_at_rest[u, k])
+            change = 1.0 - a_rest[u, k] / a[u, k]
+            off = a[u, k] / (a_rest[u, k] * f[k]) * r_u[k] - 1.0
+            r_u[k] = weight[u, k] * (off + rim - both_gains * change)
+            for q in range(own.size):
+                r_u[k] -= h[u, k, q] * own[q]
+        total += dot(r_u, r_u)
+    return total
+
+
+@njit_part
+def effect_on(  # noqa: PLR0913 - a kernel
+    effect: Float, u: int, k: int, g: Float, first: int, wires: int
+) -> float:
+    """Return H g of one residual; the nuisances of the geometry begin at ``g[first]``."""
+    total, row = 0.0, effect[u, k]
+    upper, lower = first + COMMON + UPPER * u, first + COMMON + UPPER * wires + LOWER * k
+    for q in range(COMMON):
+        total += row[q] * g[first + q]
+    for q in range(UPPER):
+        total += row[COMMON + q] * g[upper + q]
+    for q in range(LOWER):
+        total += row[COMMON + UPPER + q] * g[lower + q]
+    return total
+
+
+@njit_part
+def add_effect(  # noqa: PLR0913 - a kernel
+    effect: Float, u: int, k: int, value: float, g: Float, first: int, wires: int
+) -> None:
+    """Add Hᵀ times ``value`` of one residual to ``g``, in which they begin at ``g[first]``."""
+    row = effect[u, k]
+    upper, lower = first + COMMON + UPPER * u, first + COMMON + UPPER * wires + LOWER * k
+    for q in range(COMMON):
+        g[first + q] += value * row[q]
+    for q in range(UPPER):
+        g[upper + q] += value * row[COMMON + q]
+    for q in range(LOWER):
+        g[lower + q] += value * row[COMMON + UPPER + q]
+
+
+@njit_part
+def _product(first: Float, second: Float, start: int, stop: int) -> float:
+    """Return the sum of products of two residuals' effects from ``start`` to ``stop``."""
+    total = 0.0
+    for q in range(start, stop):
+        total += first[q] * second[q]
+    return total
+
+
+@njit
+def add_covariance(members: Index, effect: Float, g: Float, y: Float, s: Float) -> None:
+    """Add H Hᵀ of the wires ``members`` to the upper triangle of ``s``, and −H g to ``y``.
+
+    ``g`` holds the nuisances of the geometry only. Two residuals of one upper wire share its nuisances, two
+    of one lower wire the latter's, and all share the common nuisances.
+    """
+    wires, equations = effect.shape[0], effect.shape[1]
+    for j in range(members.size):
+        v = members[j]
+        for k in range(equations):
+            y[j * equations + k] -= effect_on(effect, v, k, g, 0, wires)
+        for i in range(j + 1):
+            u = members[i]
+            for k in range(equations):
+                own, row = effect[u, k], s[i * equations + k]
+                shared = COMMON + UPPER if i == j else COMMON
+                for m in range(k if i == j else 0, equations):
+                    row[j * equations + m] += _product(own, effect[v, m], 0, shared)
+                row[j * equations + k] += _product(own, effect[v, k], COMMON + UPPER, EFFECTS)
+
+
+@njit
+def estimate(members: Index, effect: Float, v: Float, g: Float) -> None:
+    """Write −Hᵀ ``v`` into ``g``, the nuisances of the geometry, given v = S⁻¹ y."""
+    wires, equations = effect.shape[0], effect.shape[1]
+    for q in range(g.size):
+        g[q] = 0.0
+    for i in range(members.size):
+        for k in range(equations):
+            add_effect(effect, members[i], k, -v[i * equations + k], g, 0, wires)
+
+
+@njit
+def add_variance(  # noqa: C901 - a kernel: sums as loops
+    members: Index, effect: Float, gain_t: Float, work: Float, out: Float
+) -> None:
+    """Add diag(K H Hᵀ Kᵀ) to ``out`` (n,), given Kᵀ as ``gain_t`` (m, n); ``work`` (EFFECTS, n) is free."""
+    equations, n = effect.shape[1], out.size
+    for j in range(COMMON * n):
+        work[j // n, j % n] = 0.0
+    for i in range(members.size):
+        for t in range(COMMON, COMMON + UPPER):
+            for j in range(n):
+                work[t, j] = 0.0
+        for k in range(equations):
+            row, own = gain_t[i * equations + k], effect[members[i], k]
+            for t in range(COMMON + UPPER):
+                for j in range(n):
+                    work[t, j] += own[t] * row[j]
+        for t in range(COMMON, COMMON + UPPER):
+            for j in range(n):
+                out[j] += work[t, j] * work[t, j]
+    for t in range(COMMON):
+        for j in range(n):
+            out[j] += work[t, j] * work[t, j]
+    for k in range(equations):
+        for t in range(LOWER):
+            for j in range(n):
+                work[t, j] = 0.0
+        for i in range(members.size):
+            row, own = gain_t[i * equations + k], effect[members[i], k]
+            for t in range(LOWER):
+                for j in range(n):
+                    work[t, j] += own[COMMON + UPPER + t] * row[j]
+        for t in range(LOWER):
+            for j in range(n):
+                out[j] += work[t, j] * work[t, j]

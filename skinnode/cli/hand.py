@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -15,6 +17,7 @@ if TYPE_CHECKING:
 
     from skinnode.bus_load.plan import BusPlan
     from skinnode.config import HandConfig
+    from skinnode.host.limitations import Limitation
 
 app = typer.Typer(
     help="Check or create a hand file, compute its bus load, or print the JSON Schema.", no_args_is_help=True
@@ -26,17 +29,19 @@ def check(
     hand: Annotated[Path, typer.Argument(help="The hand to check.", metavar="HAND.toml")],
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON instead of tables.")] = False,
 ) -> None:
-    """Validate a hand file and the files it names, and compute the load of its buses.
+    """Validate a hand file and the files it names, compute the load of its buses, and list its limitations.
 
     For each bus the command prints the planned load, once with every frame at its maximum length and once
     with random data; the worst-case time from SYNC to the end of each patch's summary, also as a fraction of
-    the SYNC period; and the longest wait of each frame in `others`. No bus is opened. Exit status 1 if the
-    load of a bus exceeds its max_load, 2 if the file cannot be used.
+    the SYNC period; and the longest wait of each frame in `others`. Notes say what the hand will not
+    deliver, such as shear or positions in the frame of the hand. No bus is opened. Exit status 1 if the load
+    of a bus exceeds its max_load, 2 if the file cannot be used.
     """
     from skinnode.bus_load.plan import plan_of, require_room
     from skinnode.config import load_hand
     from skinnode.errors import BusLoadError, ConfigError
     from skinnode.host.hand_files import check_files
+    from skinnode.host.limitations import limitations
     from skinnode.transport.port import allowed_interfaces, is_interface
 
     config = load_hand(hand)
@@ -51,11 +56,18 @@ def check(
             require_room(config, plan)
         except BusLoadError as error:
             refused.append(str(error))
+    limits = limitations(config)
     if as_json:
-        report = {"hand": config.name, "buses": [_facts(plan) for plan in plans], "refused": refused}
+        report = {
+            "hand": config.name,
+            "buses": [_facts(plan) for plan in plans],
+            "refused": refused,
+            "notes": [asdict(limit) for limit in limits],
+        }
         typer.echo(json.dumps(report, indent=2))
     else:
         _print(config, plans)
+        _print_notes(config, limits)
     for line in refused:
         typer.echo(f"error: {line}", err=True)
     if refused:
@@ -113,6 +125,15 @@ def _print(config: HandConfig, plans: tuple[BusPlan, ...]) -> None:
             out.print(_other_table(plan))
         for line in _remarks(plan):
             out.print(line)
+
+
+def _print_notes(config: HandConfig, limits: Sequence[Limitation]) -> None:
+    if limits:
+        typer.echo()
+    for limit in limits:
+        every = len(limit.patches) == len(config.patches) > 1
+        whose = "all patches" if every else ", ".join(limit.patches)
+        typer.echo(f"note: {whose}: {limit.text} ({limit.key})")
 
 
 def _headline(plan: BusPlan) -> str:

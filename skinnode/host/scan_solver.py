@@ -12,9 +12,11 @@ from skinnode.errors import ConfigError
 from skinnode.host.node_facts import NodeFacts
 from skinnode.model.forward import resistance_ohm
 from skinnode.model.frames import FieldFrame, ResistanceFrame, ScanStamp, sealed
+from skinnode.model.layout import Float
 from skinnode.protocol.codes import Decoder, as_baseline
 from skinnode.protocol.scan import Scan
 from skinnode.solve.inputs import CodeMap
+from skinnode.solve.options import TrackerOptions
 from skinnode.solve.tracker import Tracker
 
 
@@ -44,22 +46,10 @@ class ScanSolver:
             relative_noise=facts.config.relative_noise,
             gain=gain,
         )
-        self._tracker = Tracker(
-            facts.layout,
-            method=config.method,
-            operator=config.operator,
-            relative_noise=facts.config.relative_noise,
-            baseline_ohm=facts.baseline_ohm,
-            stiffness_n_per_m=calibration.stiffness_n_per_m or config.stiffness_n_per_m,
-            rubber=calibration.rubber,
-            deadline_us=config.deadline_us,
-            estimate_noise=config.estimate_noise,
-            drift=config.drift,
-            normal_only=config.normal_only,
-            codes=self._codes,
-            max_std_m=config.max_std_m,
-            max_force_std_n=config.max_force_std_n,
+        options = tracker_options(
+            facts.config, config, relative_noise=facts.config.relative_noise, baseline_ohm=facts.baseline_ohm
         )
+        self._tracker = Tracker(facts.layout, options, codes=self._codes)
         self._decoder = Decoder(facts.baseline_ohm, scale)
 
     def decode(self, scan: Scan, stamp: ScanStamp) -> ResistanceFrame:
@@ -84,6 +74,34 @@ class ScanSolver:
             field, invalid = self._tracker.update_codes(scan.codes)
         contacts = tuple(sealed(contact) for contact in field.contacts)
         return sealed(field, contacts=contacts, stamp=stamp.solved_at(self._clock())), invalid
+
+
+def tracker_options(
+    patch: PatchConfig, config: SolverConfig, *, relative_noise: float, baseline_ohm: Float | None = None
+) -> TrackerOptions:
+    """Return the options of the tracker of a patch.
+
+    Args:
+        patch: The patch.
+        config: Settings for the solver.
+        relative_noise: Relative standard deviation of R.
+        baseline_ohm: (U, K) resistances at rest, ohm; None if they are not known yet.
+    """
+    calibration = patch.calibration
+    return TrackerOptions(
+        method=config.method,
+        operator=config.operator,
+        relative_noise=relative_noise,
+        baseline_ohm=baseline_ohm,
+        stiffness_n_per_m=calibration.stiffness_n_per_m or config.stiffness_n_per_m,
+        rubber=calibration.rubber,
+        deadline_us=config.deadline_us,
+        estimate_noise=config.estimate_noise,
+        drift=config.drift,
+        normal_only=config.normal_only,
+        max_std_m=config.max_std_m,
+        max_force_std_n=config.max_force_std_n,
+    )
 
 
 def check_solvable(patch: PatchConfig, config: SolverConfig) -> None:

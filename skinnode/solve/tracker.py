@@ -59,7 +59,7 @@ class Tracker:
         self.options = options = merged(TrackerOptions, options, arguments)
         self.layout = layout
         self._posterior = Posterior(layout, options.of_posterior())
-        self.method, self.reason = _choose(layout, options)
+        self.method, self.reason = choose_method(layout, options)
         self._limits = limits_of(layout, options)
         self._exact: ExactTracker | None = None
         if self.method == "posterior":
@@ -138,8 +138,12 @@ class Tracker:
         return field if is_precise(field, self._limits) else dataclasses.replace(field, precise=False)
 
 
-def _choose(layout: PatchLayout, options: TrackerOptions) -> tuple[str, str]:
-    """Return the method and the reason for it."""
+def choose_method(layout: PatchLayout, options: TrackerOptions) -> tuple[str, str]:
+    """Return the method of a tracker, ``exact`` or ``posterior``, and the reason for it.
+
+    Raises:
+        ValueError: If the method requested does not support an option.
+    """
     nuisances, normal_only = options.nuisances, options.normal_only
     if options.method != "auto":
         if options.method == "exact" and nuisances:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
 import pytest
 from typer.testing import CliRunner, Result
 
+import skinnode as sk
 from skinnode.bus_load.plan import check_plan
 from skinnode.cli.main import app
 from skinnode.config import HandConfig, load_hand, parse_hand
@@ -194,3 +196,73 @@ def test_every_key_is_described() -> None:
     ]
     assert bare == []
     assert set(tables["properties"]) == set(HandConfig.model_fields)
+
+
+def notes(folder: Path, text: str) -> list[dict[str, Any]]:
+    """Notes of `hand check` on a hand of one or more patches; each is also a line for a person."""
+    path = folder / "hand.toml"
+    path.write_text(f'[[buses]]\nname = "can0"\n[sync]\nperiod_ms = 400\n{text}')
+    found = command("check", str(path), "--json")
+    assert found.exit_code == 0, found.output
+    listed: list[dict[str, Any]] = json.loads(found.stdout)["notes"]
+    lines = [line for line in command("check", str(path)).stdout.splitlines() if line.startswith("note: ")]
+    assert len(lines) == len(listed)
+    for note, line in zip(listed, lines, strict=True):  # a time is measured anew
+        assert re.sub(r"\d+", "#", note["text"]) in re.sub(r"\d+", "#", line)
+    return listed
+
+
+PALM = '[[patches]]\nname = "palm"\nnode_id = 1\n'
+TIP = '[[patches]]\nname = "tip"\nnode_id = 2\n'
+PLACED = "pose = { position_m = [0.0, 0.0, 0.01] }\n"
+
+
+def said(listed: list[dict[str, Any]], key: str) -> dict[str, str]:
+    """Text by patches of the notes on one key."""
+    return {", ".join(note["patches"]): note["text"] for note in listed if note["key"] == key}
+
+
+def test_a_hand_whose_displacements_come_from_the_prior_says_so(tmp_path: Path) -> None:
+    thick = 'layout = { preset = "aligned", height_m = 4e-3 }\n'
+    few = "layout = { lower_wires = 20 }\n"
+    listed = notes(tmp_path, PALM + thick + TIP + few)
+    by_layout = said(listed, "patches.layout")
+    assert "the resistances alone give ± 225% of the clearance" in by_layout["palm"]
+    assert "20 lower wires for 30 unknowns per upper wire" in by_layout["tip"]
+    assert not said(notes(tmp_path, PALM), "patches.layout")
+
+
+def test_the_exact_inverse_where_it_is_useless(tmp_path: Path) -> None:
+    thick = 'layout = { preset = "aligned", height_m = 4e-3 }\n'
+    solver = '[solver]\nmethod = "exact"\n'
+    assert "which is useless" in said(notes(tmp_path, solver + PALM + thick), "solver.method")["palm"]
+    assert not said(notes(tmp_path, solver + PALM), "solver.method")
+
+
+def test_where_contacts_cannot_be_placed(tmp_path: Path) -> None:
+    listed = notes(tmp_path, PALM + TIP)
+    assert said(listed, "patches.pose") == {
+        "palm, tip": "no pose: contacts are in the frame of the patch itself"
+    }
+    listed = notes(tmp_path, PALM + PLACED + TIP + PLACED + 'link = "distal"\n')
+    assert not said(listed, "patches.pose")
+    assert "'distal' has no pose in the hand" in said(listed, "links")["tip"]
+    linked = '[[links]]\nname = "distal"\n'
+    assert not said(notes(tmp_path, PALM + PLACED + TIP + PLACED + 'link = "distal"\n' + linked), "links")
+
+
+def test_what_the_solver_leaves_out_or_cannot_reach(tmp_path: Path) -> None:
+    listed = notes(tmp_path, "[solver]\nnormal_only = true\nmax_std_m = 1e-9\n" + PALM + PLACED)
+    assert said(listed, "solver.normal_only") == {"palm": "no shear, neither displacement nor force"}
+    assert "no field will be precise" in said(listed, "solver.max_std_m")["palm"]
+    roomy = notes(tmp_path, "[solver]\nmax_std_m = 1e-4\n" + PALM + PLACED)
+    assert not said(roomy, "solver.max_std_m")
+    assert not said(roomy, "solver.normal_only")
+
+
+@pytest.mark.parametrize(("deadline_us", "met"), [(100, False), (10_000_000, True)])
+def test_a_deadline_that_a_new_touch_cannot_meet(tmp_path: Path, deadline_us: int, met: bool) -> None:
+    sk.Posterior(sk.PatchLayout.preset("staggered"))  # the deadline is checked with compiled kernels only
+    listed = said(notes(tmp_path, f"[solver]\ndeadline_us = {deadline_us}\n" + PALM), "solver.deadline_us")
+    assert bool(listed) is not met
+    assert met or f"longer than the deadline of {deadline_us} µs" in listed["palm"]

@@ -1,0 +1,107 @@
+"""Limitations of a hand: what its hand file, layouts and noise keep it from delivering.
+
+A limitation is not an error. ``skinnode hand check`` lists them, so that nobody waits for a result that this
+hand cannot give.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Final
+
+from skinnode.compiled.jit import is_cold
+from skinnode.config import HandConfig, PatchConfig, SolverConfig
+from skinnode.host.scan_solver import tracker_options
+from skinnode.model.layout import PatchLayout
+from skinnode.protocol.codes import CodeScale
+from skinnode.solve.cramer_rao import patch_std
+from skinnode.solve.options import TrackerOptions
+from skinnode.solve.posterior.posterior import Posterior
+from skinnode.solve.tracker import choose_method
+from skinnode.solve.wires.problem import PatchProblem
+
+BY_PRIOR: Final = 0.3
+"""Standard deviation of the exact inverse at rest, in clearances, above which the displacement comes mostly
+from the neighbours and the elasticity: presses seldom indent the layer by more."""
+
+
+_BY_PRIOR: Final = "neighbours and elasticity fill the gap (see data_share)"
+
+
+@dataclass(frozen=True, slots=True)
+class Limitation:
+    """Something that patches of a hand will not deliver."""
+
+    patches: tuple[str, ...]
+    """Names of the patches."""
+    key: str
+    """Key of the hand file that could change it."""
+    text: str
+    """What is missing, and why."""
+
+
+def limitations(hand: HandConfig) -> list[Limitation]:
+    """Return the limitations of a hand; patches with the same limitation share an entry.
+
+    Nothing is compiled. The deadline is checked only if the kernels have been compiled before.
+    """
+    patches: dict[tuple[str, str], list[str]] = {}
+    for patch in hand.patches:
+        for key, text in (*_of_results(patch, hand.solver), *_of_place(patch, hand)):
+            patches.setdefault((key, text), []).append(patch.name)
+    return [Limitation(tuple(names), key, text) for (key, text), names in patches.items()]
+
+
+def _of_results(patch: PatchConfig, solver: SolverConfig) -> Iterator[tuple[str, str]]:
+    """Yield what the solver cannot compute for a patch."""
+    layout = patch.layout.build()
+    noise = math.hypot(patch.relative_noise, CodeScale(patch.code_bits).relative_std)
+    options = tracker_options(patch, solver, relative_noise=noise)
+    method, _ = choose_method(layout, options)
+    unknowns = layout.unknowns // (3 if solver.normal_only else 1)
+    enough = layout.shape[1] >= unknowns
+    share = patch_std(layout, noise, solver.normal_only) if enough else math.inf
+    if not enough:
+        text = f"{layout.shape[1]} lower wires for {unknowns} unknowns per upper wire: {_BY_PRIOR}"
+        yield "patches.layout", text
+    elif share > BY_PRIOR and method == "posterior":
+        alone = f"at a noise of {noise:.0e} the resistances alone give ± {share:.0%} of the clearance"
+        yield "patches.layout", f"{alone}: {_BY_PRIOR}"
+    elif share > BY_PRIOR:
+        yield (
+            "solver.method",
+            f"at a noise of {noise:.0e} the exact inverse gives ± {share:.0%} of the clearance, which is "
+            'useless; method = "auto" uses the posterior',
+        )
+    if solver.normal_only:
+        yield "solver.normal_only", "no shear, neither displacement nor force"
+    reached_m = share * float(PatchProblem.of(layout).clearance.min()) * layout.pitch_m
+    if solver.max_std_m is not None and method == "exact" and solver.max_std_m < reached_m:
+        text = f"no field will be precise: at rest the standard deviation is already {1e6 * reached_m:.2g} µm"
+        yield "solver.max_std_m", text
+    if solver.deadline_us is not None:
+        yield from _of_deadline(layout, options, solver.deadline_us)
+
+
+def _of_deadline(layout: PatchLayout, options: TrackerOptions, deadline_us: int) -> Iterator[tuple[str, str]]:
+    if is_cold("gauss_newton_step"):
+        yield "solver.deadline_us", "deadline not checked, because the kernels have not been compiled yet"
+        return
+    needed_us = 1e6 * Posterior(layout, options.of_posterior()).from_rest_s
+    if needed_us > deadline_us:
+        yield (
+            "solver.deadline_us",
+            f"a new touch takes the posterior {needed_us:.0f} µs or more on this machine, longer than the "
+            f"deadline of {deadline_us} µs: its first fields will not be trusted",
+        )
+
+
+def _of_place(patch: PatchConfig, hand: HandConfig) -> Iterator[tuple[str, str]]:
+    """Yield the frames in which the contacts of a patch are not available."""
+    if "pose" not in patch.model_fields_set:
+        yield "patches.pose", "no pose: contacts are in the frame of the patch itself"
+    if patch.link is not None and patch.link not in [link.name for link in hand.links]:
+        text = f"link {patch.link!r} has no pose in the hand: the program has to give it (HandFrame.at)"
+        yield "links", text

@@ -65,13 +65,7 @@ class ScanSolver:
         Returns:
             The stamped field, with read-only arrays, and the number of codes that are not measurements.
         """
-        if self._tracker.method == "posterior":
-            frame, codes = self.decode(scan, stamp), self._codes
-            noise = np.hypot(codes.relative_noise, codes.rounding_ohm / frame.resistance_ohm)
-            field = self._tracker.update(frame.resistance_ohm, frame.valid, noise)
-            invalid = frame.valid.size - int(np.count_nonzero(frame.valid))
-        else:
-            field, invalid = self._tracker.update_codes(scan.codes)
+        field, invalid = self._tracker.update_codes(scan.codes)
         contacts = tuple(sealed(contact) for contact in field.contacts)
         return sealed(field, contacts=contacts, stamp=stamp.solved_at(self._clock())), invalid
 

@@ -133,7 +133,8 @@ class FieldFrame:
     gain: Float | None = None
     """(U,) estimated gain error of each wire's resistances, as a fraction; None if no drift is estimated."""
     noise_factor: float = 1.0
-    """Ratio of the estimated noise to the configured noise; 1 if the noise is not estimated."""
+    """Ratio of the estimated noise to the configured noise; exactly 1 while the stream does not contradict
+    the configured noise. With codes, the noise is that before the converter."""
     held: NDArray[np.bool_] | None = None
     """(U,) wires not solved because their movement did not exceed the noise of the frame."""
     core_std_m: Float | None = None

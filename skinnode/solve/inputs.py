@@ -33,6 +33,13 @@ class CodeMap:
     gain: Float | None = None
     """(U, K) or (U, 1) gain of the front end; None for a gain of 1."""
 
+    def decode(self, codes: NDArray[np.uint32]) -> tuple[Float, NDArray[np.bool_]]:
+        """Return the resistances (U, K) in ohm, NaN for an invalid code, and the mask of the valid codes."""
+        valid = (codes <= self.steps) & (self.baseline_ohm > 0) & (self.baseline_ohm < np.inf)
+        ohm = (self.lo + codes * self.step) * self.baseline_ohm
+        ohm = ohm if self.gain is None else ohm * self.gain
+        return np.where(valid, ohm, np.nan), valid
+
 
 def broadcast_noise(relative_noise: ArrayLike, layout: PatchLayout) -> Float:
     """Return the relative noise as an array (U, K).

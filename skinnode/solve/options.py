@@ -31,6 +31,8 @@ class EstimateOptions:
         rubber: Material of the skin. Forces are proportional to its modulus; the displacement does not depend
             on it.
         estimate_noise: Whether to estimate a scale factor for ``relative_noise`` from the data.
+        follow_noise: Whether to scale ``relative_noise`` once the stream shows that it is wrong by more than
+            half (:mod:`skinnode.solve.noise_estimate`); not in effect together with ``estimate_noise``.
         drift: Gain errors to estimate: ``patch`` for one gain common to all resistances, ``wire`` for one
             gain per upper wire, or ``none``.
         drift_std: Prior standard deviation of a gain error, as a fraction.
@@ -52,6 +54,7 @@ class EstimateOptions:
     baseline_ohm: ArrayLike | None = None
     rubber: Rubber | None = None
     estimate_noise: bool = False
+    follow_noise: bool = True
     drift: str = "none"
     drift_std: float = 0.02
     model_error: float = 0.0
@@ -161,6 +164,7 @@ class EstimateArguments(TypedDict, total=False):
     baseline_ohm: ArrayLike | None
     rubber: Rubber | None
     estimate_noise: bool
+    follow_noise: bool
     drift: str
     drift_std: float
     model_error: float

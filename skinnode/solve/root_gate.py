@@ -65,9 +65,8 @@ class RootGate:
         self._apart = np.zeros((len(problem.rest), 1, 1))  # m, uncertainty left by the confirmation
         self._any_apart = False
         self._blind = roots.blind_wires(layout, options.normal_only)
-        self._folded = roots.folded_wires(layout, options.normal_only)
-        if roots.nonlinear_in_noise(layout, options.relative_noise, options.normal_only):
-            self._folded = np.ones_like(self._folded)
+        self._options = options
+        self._folded = self._folded_with(1.0)
         its = exact.arrays
         whitening = np.array(Smoothness(problem).whitening, order="C")
         self._root_check = RootCheck(
@@ -86,6 +85,19 @@ class RootGate:
             rough_limit=roots.ROUGH_IN_STREAM / problem.step_limit,
         )
         self._doubtful()  # compiles the kernel before a stream starts
+
+    def _folded_with(self, noise_factor: float) -> Mask:
+        """Return the wires (U,) with doubtful roots at this multiple of the stated noise."""
+        layout, normal_only = self._exact.layout, self._options.normal_only
+        noise = np.multiply(noise_factor, self._options.relative_noise)
+        if roots.nonlinear_in_noise(layout, noise, normal_only):
+            return np.ones(layout.shape[0], np.bool_)
+        return roots.folded_wires(layout, normal_only)
+
+    def set_noise(self, factor: float) -> None:
+        """Take the noise for ``factor`` times the stated noise from now on."""
+        self._folded[:] = self._folded_with(factor)
+        self._root_check.folded[:] = self._folded
 
     def reset(self) -> None:
         """Discard the state of the stream."""

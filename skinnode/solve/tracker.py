@@ -3,6 +3,10 @@
 ``exact`` inverts each wire separately, as the paper does; ``posterior`` estimates the whole patch with an
 elastic prior. ``auto`` chooses the exact inverse if it is accurate enough at the converter's noise. Wires on
 which the exact inverse is doubtful are checked with the posterior (:mod:`skinnode.solve.root_gate`).
+
+If the stream shows that its noise is not as stated, the stated noise is scaled
+(:mod:`skinnode.solve.noise_estimate`); ``auto`` then changes from the exact inverse to the posterior if the
+noise is too large for it, and back when the noise falls again. Either change starts from rest.
 """
 
 from __future__ import annotations
@@ -18,6 +22,8 @@ from skinnode.model.frames import FieldFrame
 from skinnode.model.layout import PatchLayout
 from skinnode.solve.cramer_rao import patch_std
 from skinnode.solve.exact.tracker import ExactTracker
+from skinnode.solve.inputs import checked_codes
+from skinnode.solve.noise_estimate import NoiseEstimate
 from skinnode.solve.options import TrackerArguments, TrackerOptions, merged
 from skinnode.solve.posterior.posterior import Posterior
 from skinnode.solve.precision import is_precise, limits_of
@@ -43,7 +49,7 @@ class Tracker:
     Attributes:
         layout: The patch.
         options: Options in effect.
-        method: Method in use, ``exact`` or ``posterior``.
+        method: Method in use, ``exact`` or ``posterior``; ``auto`` may change it during a stream.
         reason: Short reason for the choice of method.
 
     Raises:
@@ -58,12 +64,16 @@ class Tracker:
     ) -> None:
         self.options = options = merged(TrackerOptions, options, arguments)
         self.layout = layout
-        self._posterior = Posterior(layout, options.of_posterior())
-        self.method, self.reason = choose_method(layout, options)
+        self.method, self.reason = self._chosen = choose_method(layout, options)
         self._limits = limits_of(layout, options)
         self._exact: ExactTracker | None = None
         if self.method == "posterior":
+            self._posterior = Posterior(layout, options.of_posterior())
             return
+        # the posterior that checks roots sees some frames only, with the noise that the exact tracker found
+        self._posterior = Posterior(layout, dataclasses.replace(options.of_posterior(), follow_noise=False))
+        self._noise = NoiseEstimate(layout.shape) if options.follow_noise else None
+        self._factor = 1.0  # noise factor to which the method and the gate were adapted
         self._exact = ExactTracker(
             layout,
             operator=options.operator,
@@ -75,6 +85,7 @@ class Tracker:
             normal_only=options.normal_only,
             active_only=options.active_only,
             codes=options.codes,
+            noise_estimate=self._noise,
         )
         self._gate = RootGate(self._exact, self._posterior, options)
         self.reset()
@@ -82,9 +93,13 @@ class Tracker:
     def reset(self) -> None:
         """Discard the state of the stream: the next frame is solved from the rest position."""
         self._posterior.reset()
-        if self._exact is not None:
-            self._exact.reset()
-            self._gate.reset()
+        if self._exact is None:
+            return
+        self._exact.reset()
+        self._gate.reset()
+        if self._noise is not None:
+            self._noise.reset()
+        self._follow_noise()
 
     def update(
         self, frame_ohm: ArrayLike, valid: ArrayLike | None = None, relative_noise: ArrayLike | None = None
@@ -106,10 +121,13 @@ class Tracker:
         Raises:
             ValueError: If a shape is wrong.
         """
-        if self._exact is None:
-            return self._judged(self._posterior.update(frame_ohm, valid, relative_noise))
         start = perf_counter()
-        return self._judged(self._gate.check(self._exact.update(frame_ohm, valid, relative_noise), start))
+        if self._exact is None or self.method == "posterior":
+            field = self._posterior.update(frame_ohm, valid, relative_noise)
+        else:
+            field = self._gate.check(self._exact.update(frame_ohm, valid, relative_noise), start)
+        self._follow_noise()
+        return self._judged(field)
 
     def update_codes(self, codes: NDArray[np.uint32]) -> tuple[FieldFrame, int]:
         """Compute the field of a scan of codes, much faster than decoding followed by :meth:`update`.
@@ -122,20 +140,51 @@ class Tracker:
             codes.
 
         Raises:
-            ValueError: If the shape or type is wrong, the tracker was created without ``codes``,
-                or its :attr:`method` is ``posterior``.
+            ValueError: If the shape or type is wrong, or the tracker was created without ``codes``.
         """
-        if self._exact is None:
-            raise ValueError("method: got 'posterior', must be exact to accept codes")
-        if self.options.codes is None:
+        start, meaning = perf_counter(), self.options.codes
+        if meaning is None:
             raise ValueError("codes: got None, must be a CodeMap passed to the constructor")
-        start = perf_counter()
-        field = self._gate.check(self._exact.update_codes(codes), start)
-        return self._judged(field), self._exact.invalid_codes
+        if self._exact is None or self.method == "posterior":
+            ohm, valid = meaning.decode(checked_codes(codes, self.layout))
+            noise, rounding_ohm = meaning.relative_noise, meaning.rounding_ohm
+            field = self._posterior.update(ohm, valid, noise, rounding_ohm)
+            invalid = valid.size - int(np.count_nonzero(valid))
+        else:
+            field = self._gate.check(self._exact.update_codes(codes), start)
+            invalid = self._exact.invalid_codes
+        self._follow_noise()
+        return self._judged(field), invalid
 
     def _judged(self, field: FieldFrame) -> FieldFrame:
         """Return the field with its verdict on precision."""
         return field if is_precise(field, self._limits) else dataclasses.replace(field, precise=False)
+
+    def _follow_noise(self) -> None:
+        """Adapt method and gate of an exact tracker if the estimated noise has changed."""
+        if self._exact is not None and self._noise is not None and self._noise.factor != self._factor:
+            self._adapt(self._noise)
+
+    def _adapt(self, noise: NoiseEstimate) -> None:
+        """Choose the method and set the gate for the estimated noise."""
+        assert self._exact is not None
+        self._factor = noise.factor
+        self._gate.set_noise(noise.factor)
+        method, reason = self._chosen
+        if self.options.method == "auto" and noise.factor != 1.0:
+            actual = np.multiply(noise.factor, self.options.relative_noise)
+            method, reason = choose_method(
+                self.layout, dataclasses.replace(self.options, relative_noise=actual)
+            )
+            reason = f"the noise is {noise.factor:.2g} times the stated noise; {reason}"
+        changed, self.method, self.reason = method != self.method, method, reason
+        if changed and method == "posterior":
+            self._posterior.reset()
+            self._posterior.noise_estimate = noise
+        elif changed:
+            self._posterior.noise_estimate = None
+            self._exact.reset()
+            self._gate.reset()
 
 
 def choose_method(layout: PatchLayout, options: TrackerOptions) -> tuple[str, str]:

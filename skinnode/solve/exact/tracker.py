@@ -26,10 +26,12 @@ from skinnode.solve.exact.leave_out import LeftOut
 from skinnode.solve.exact.recover import recover_lost
 from skinnode.solve.exact.stream import FRAME_STEPS, Frame, StreamState
 from skinnode.solve.inputs import CodeMap, broadcast_noise, checked_codes, checked_mask, checked_noise
+from skinnode.solve.noise_estimate import NoiseEstimate
 from skinnode.solve.operators import codes as op
 from skinnode.solve.operators.system import operator_code
 from skinnode.solve.wires import arrays as wires
 from skinnode.solve.wires import patch_solver as stage
+from skinnode.solve.wires.arrays import NOISE
 from skinnode.solve.wires.problem import PatchProblem
 from skinnode.solve.wires.solve_wires import COVARIANCE_UNITS
 from skinnode.solve.wires.stages import DEADLINE
@@ -60,6 +62,7 @@ class ExactTracker:
         normal_only: Whether only z is unknown.
         active_only: Whether to solve only for electrodes that contacts move.
         codes: Mapping from the codes passed to :meth:`update_codes` to resistances.
+        noise_estimate: Estimate of the stream's noise, which scales the stated noise; the owner resets it.
 
     The constructor compiles the kernels. Raises ValueError if an argument has the wrong shape or is out of
     range.
@@ -78,6 +81,7 @@ class ExactTracker:
         normal_only: bool = False,
         active_only: bool = False,
         codes: CodeMap | None = None,
+        noise_estimate: NoiseEstimate | None = None,
     ) -> None:
         for name, value in (("stiffness_n_per_m", stiffness_n_per_m), ("deadline_us", deadline_us)):
             if value is not None and not (math.isfinite(value) and value > 0):
@@ -104,13 +108,17 @@ class ExactTracker:
         self._left_out = LeftOut(self._stream, active_only)
         self.arrays = self._stream.arrays
         """Arrays of the stream and of the current frame."""
+        self._code_noise = np.zeros(layout.shape)
         if codes is not None:
             self.arrays.set_codes(codes)
+            self._code_noise[:] = codes.relative_noise
+        self._noise_estimate: NoiseEstimate | None = None
         self.invalid_codes = 0
         """Number of invalid codes in the latest scan."""
         self.reset()
         self.update(problem.a_rest / problem.gain)  # compiles the kernels before a stream starts
         self.reset()
+        self._noise_estimate = noise_estimate
 
     def reset(self) -> None:
         """Discard the state of the stream: the next frame is solved from the rest position."""
@@ -143,6 +151,11 @@ class ExactTracker:
             self._noise if relative_noise is None else broadcast_noise(relative_noise, self.layout)
         )
         arrays.valid[:] = True if valid is None else checked_mask(valid, self.layout)
+        estimate = self._noise_estimate
+        if estimate is not None:
+            estimate.see(arrays.ohm, arrays.noise, valid=None if valid is None else arrays.valid)
+            if estimate.factor != 1.0:
+                arrays.noise *= estimate.factor
         return self._advance(stage.SCALE, start)
 
     def update_codes(self, codes: NDArray[np.uint32]) -> FieldFrame:
@@ -152,8 +165,14 @@ class ExactTracker:
         codes. Raises ValueError if ``codes`` has the wrong shape or is not uint32.
         """
         start = perf_counter()
-        self.arrays.codes[:] = checked_codes(codes, self.layout)
-        return self._advance(stage.DECODE | stage.SCALE, start)
+        arrays, estimate = self.arrays, self._noise_estimate
+        arrays.codes[:] = checked_codes(codes, self.layout)
+        if estimate is None:
+            return self._advance(stage.DECODE | stage.SCALE, start)
+        arrays.code_map[NOISE] = self._code_noise[0, 0] * estimate.factor
+        field = self._advance(stage.DECODE | stage.SCALE, start)
+        estimate.see(arrays.ohm, self._code_noise, arrays.rounding_ohm)  # for the next frame
+        return field
 
     def _advance(self, stages: int, start: float) -> FieldFrame:
         """Run ``stages`` on the frame in :attr:`arrays`, solve it and return its field."""
@@ -194,6 +213,7 @@ class ExactTracker:
             stats=SolveStats(evaluations, jacobians, steps, perf_counter() - start),
             force_n=None if self.stiffness_n_per_m is None else self.stiffness_n_per_m * displacement,
             held=arrays.held.copy(),
+            noise_factor=1.0 if self._noise_estimate is None else self._noise_estimate.factor,
         )
 
     def _call_stages(self, stages: int, sigma: float, units: float) -> tuple[float, int]:

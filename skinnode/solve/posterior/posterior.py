@@ -26,6 +26,7 @@ from skinnode.model.tolerances import EXACT
 from skinnode.solve import roots
 from skinnode.solve.inputs import NOISE_MAX, broadcast_noise, checked_mask, checked_noise
 from skinnode.solve.linalg.vectors import Index
+from skinnode.solve.noise_estimate import NoiseEstimate
 from skinnode.solve.options import PosteriorArguments, PosteriorOptions, merged
 from skinnode.solve.posterior.contacts import ContactFinder
 from skinnode.solve.posterior.elastic_prior import ElasticPrior
@@ -64,6 +65,8 @@ class Posterior:
         layout: The patch.
         options: Options in effect.
         from_rest_s: Minimum time to solve a touched frame from rest, s; 0 without a deadline.
+        noise_estimate: Estimate of the stream's noise, which scales the stated noise; None if the noise is
+            taken as stated.
 
     Raises:
         ValueError: If an option has the wrong shape or is out of range.
@@ -97,6 +100,7 @@ class Posterior:
         scale2 = None if options.scale_m is None else (options.scale_m / layout.pitch_m) ** 2
         height = float(np.median(self._problem.clearance))
         self._hyper = Hyperparameters(self._estimator, height, scale2, options.estimate_noise)
+        self.noise_estimate: NoiseEstimate | None = None
         self.reset()
         self._warm_up()
         self.reset()
@@ -106,6 +110,8 @@ class Posterior:
             at_rest = self._observe(Readings(a, np.ones_like(a), np.ones_like(a, bool)))
             self.from_rest_s = LEAST_STEPS * self._estimator.step_s(at_rest)
             self.reset()
+        if options.follow_noise and not options.estimate_noise:
+            self.noise_estimate = NoiseEstimate(layout.shape)
 
     def _warm_up(self) -> None:
         """Solve a touched frame so that the first touch in a stream does not wait for the compiler."""
@@ -122,6 +128,8 @@ class Posterior:
     def reset(self) -> None:
         """Discard the state of the stream: the next frame is solved from the rest position."""
         wires = self.layout.shape[0]
+        if self.noise_estimate is not None:
+            self.noise_estimate.reset()
         self._hyper.reset()
         self._gate.reset()
         self._members: Index = np.arange(0)
@@ -137,7 +145,11 @@ class Posterior:
         self._seen = np.zeros(self.layout.shape, bool)  # resistances used for the trusted field
 
     def update(
-        self, frame_ohm: ArrayLike, valid: ArrayLike | None = None, relative_noise: ArrayLike | None = None
+        self,
+        frame_ohm: ArrayLike,
+        valid: ArrayLike | None = None,
+        relative_noise: ArrayLike | None = None,
+        rounding_ohm: Float | None = None,
     ) -> FieldFrame:
         """Estimate the displacement field, loads and contacts of one frame.
 
@@ -152,6 +164,8 @@ class Posterior:
             valid: (U, K) bool, False if a chunk or wire is missing; default all True.
             relative_noise: Noise of this frame only, a number or (U, K). Resistances whose noise is not
                 positive and finite are ignored.
+            rounding_ohm: (U, K) standard deviation of the rounding to codes, ohm, in addition to
+                ``relative_noise``.
 
         Returns:
             The field, with one status per wire.
@@ -160,7 +174,7 @@ class Posterior:
             ValueError: If a shape is wrong.
         """
         start = perf_counter()
-        readings = self._readings(frame_ohm, valid, relative_noise)
+        readings = self._readings(frame_ohm, valid, relative_noise, rounding_ohm)
         estimator = self._estimator
         estimator.evaluations = estimator.factorisations = 0
         estimator.until = min(start + self._seconds, self._until)
@@ -214,17 +228,30 @@ class Posterior:
     # -- one frame -------------------------------------------------------------------------------------
 
     def _readings(
-        self, frame_ohm: ArrayLike, valid: ArrayLike | None, relative_noise: ArrayLike | None
+        self,
+        frame_ohm: ArrayLike,
+        valid: ArrayLike | None,
+        relative_noise: ArrayLike | None,
+        rounding_ohm: Float | None,
     ) -> Readings:
         frame = require_array("frame_ohm", frame_ohm, self.layout.shape, finite=False)
         noise = self._noise if relative_noise is None else broadcast_noise(relative_noise, self.layout)
-        with np.errstate(over="ignore", invalid="ignore"):
+        mask = None if valid is None else checked_mask(valid, self.layout)
+        estimate = self.noise_estimate
+        if estimate is not None:
+            if estimate.see(frame, noise, rounding_ohm, mask):
+                self._seen = np.zeros_like(self._seen)  # the trusted field has the former deviations
+            if estimate.factor != 1.0:
+                noise = estimate.factor * noise
+        with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
             a = frame * self._problem.gain
+            if rounding_ohm is not None:
+                noise = np.hypot(noise, rounding_ohm / frame)
         known = (noise > 0) & (noise < NOISE_MAX)
         noise = np.where(known, np.maximum(noise, self._noise_least), 1.0)
         usable = known & (a > A_MIN) & (a < A_MAX)
-        if valid is not None:
-            usable &= checked_mask(valid, self.layout)
+        if mask is not None:
+            usable &= mask
         return Readings(np.where(usable, a, self._problem.a_rest), noise, usable)
 
     def _observe(self, readings: Readings) -> Observation:
@@ -412,5 +439,7 @@ class Posterior:
             by_prior=np.asarray(~used.any(axis=1)),
             contacts=self._contacts_found if self._known else (),
             gain=np.broadcast_to(gains, len(held)).copy() if self._model.gains else None,
-            noise_factor=self._hyper.noise_factor,
+            noise_factor=self._hyper.noise_factor
+            if self.noise_estimate is None
+            else self.noise_estimate.factor,
         )

@@ -29,6 +29,9 @@ STATUS, EVALUATIONS, STEPS, BRANCH, HELD, SPARE, TURN, REPORT = range(8)
 # the χ² of the residual at the end of a solve, with SPARE (equations minus unknowns) degrees of freedom.
 RESIDUAL, OPTIMALITY, ERROR_ESTIMATE, CHI2, MEASURES = range(5)
 
+# Entry of a code map: relative noise before the converter
+NOISE: Final = 3
+
 # Actions for a wire
 LEAVE: Final = 0
 SOLVE: Final = 1

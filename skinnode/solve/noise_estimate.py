@@ -1,0 +1,264 @@
+"""Estimate of the actual noise of a stream, relative to the stated noise, without solving anything.
+
+Frames are taken in blocks of four. Four values of a reading give two contrasts that do not depend on its
+level and slope, and that independent noise makes independent and equally strong:
+
+quadratic  (r₀ − r₁ − r₂ + r₃) / 2
+cubic      (r₀ − 3 r₁ + 3 r₂ − r₃) / √20
+
+A block counts only if it contains noise and nothing else. Motion of the skin is slow, so its quadratic
+contrast is stronger than its cubic one; a step or a lost scan has unequal contrasts too. Motion also moves
+neighbouring readings together, whereas their noise has independent signs. A robust mean over the readings
+(Huber, Robust Statistics, 1981, proposal 2) keeps a few bad readings or a touch of a few wires out of the
+level of a block, and the median over the last blocks keeps a bad block out of the estimate.
+
+Readings that repeat exactly say nothing: the converter may be quiet, or it may be frozen. If the rounding to
+codes is known, the estimate concerns the noise before the converter, and the rounding error stays as it is.
+Where most codes repeat, and the others change by a single code, the noise is at most half a code, and half a
+code is taken.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skinnode.compiled.jit import njit, njit_part
+from skinnode.model.layout import Float
+
+BLOCK: Final = 4
+"""Number of frames in a block: the smallest number that gives two contrasts."""
+WINDOW: Final = 12
+"""Number of blocks in the estimate, 48 frames."""
+LEAST_BLOCKS: Final = 5
+"""Minimum number of blocks in the estimate: 20 frames."""
+REPEATED: Final = 0.15
+"""Maximum share of repeated readings in a block that counts. With noise of half a code, a tenth of the
+readings repeat in all four frames; with less noise, the variance of the codes no longer is the sum of the
+variances of noise and rounding."""
+ALIVE: Final = 4
+"""Minimum number of readings that change by a single code where most repeat; a frozen converter has none."""
+SAME: Final = 1e-14
+"""Contrast, as a fraction of the reading, up to which a reading counts as repeated: rounding of float64."""
+DEVIATIONS: Final = 4.0
+"""Number of standard deviations that chance may contribute to a decision: one block in 16,000."""
+DEPARTED: Final = math.log(1.5)
+"""Logarithm of the ratio between estimated and stated noise above which the estimate is used. Below it,
+results stay those of the stated noise to the last bit."""
+RETURNED: Final = math.log(1.25)
+"""Logarithm of the same ratio below which the stated noise is used again."""
+STEP: Final = math.log(1.15)
+"""Logarithm of the change in an estimate in use that triggers an update; every update solves the frame
+again."""
+UNEQUAL: Final = 0.3
+"""Largest mean logarithm of the ratio between the powers of the two contrasts. Motion that makes up this much
+raises the estimate by 8 %; noise of half a code, whose contrasts take few values, stays below 0.15."""
+LEAST: Final = 1.0 / 30.0
+"""Smallest estimated ratio."""
+
+_CLIP: Final = 1.0
+"""Square, in units of the variance, at which Huber's proposal 2 clips; with it, a noisy lower and a noisy
+upper wire, 13 % of the readings, raise the estimate by 20 %."""
+_CLIPPED_MEAN: Final = 0.5160585
+"""Mean of min(z², 1) for a normal z: 1 − 2 φ(1)."""
+_STD: Final = 2.03
+"""Standard deviation of ln(variance) found in one value, by the influence function of the estimate; 1.41 for
+the mean square."""
+_ITERATIONS: Final = 30
+"""Maximum number of Newton steps; 4 to 8 are needed."""
+_ONE_CODE: Final = 12.5
+"""Square of a contrast of readings that differ by one code, in units of the variance of rounding, and a
+margin."""
+_HALF_A_CODE: Final = 4.0
+"""Variance of the sum of a noise of half a code and of rounding, in units of the latter."""
+_CUBIC: Final = 1.0 / math.sqrt(20.0)
+
+
+@njit_part
+def _variance(squares: Float, count: int) -> float:
+    """Return the robust mean of ``count`` squares of normal values: mean(min(x, v)) = E[min(z², 1)] v."""
+    total = 0.0
+    for i in range(count):
+        total += squares[i]
+    v = total / (count * _CLIPPED_MEAN)
+    for _ in range(_ITERATIONS):
+        within, clipped = 0.0, 0
+        limit = _CLIP * v
+        for i in range(count):
+            if squares[i] < limit:
+                within += squares[i]
+            else:
+                clipped += 1
+        slope = count * _CLIPPED_MEAN - clipped
+        if not slope > 0.0:
+            return 0.0
+        found = within / slope
+        if abs(found - v) <= 1e-3 * v:
+            return found
+        v = found
+    return v
+
+
+@njit_part
+def _contrasts(
+    frames: Float, noise: Float, rounding_ohm: Float, quadratic: Float, cubic: Float
+) -> tuple[int, int, int, float, float, float]:
+    """Write the squared contrasts of the readings that changed, relative to their stated variances.
+
+    The arguments are those of :func:`assess_block`. Returns the number of readings that changed and of those
+    that repeated; the sum of the products of neighbouring signs and their number; the share of the stated
+    variance that is not due to rounding; and the largest square in units of the variance of rounding.
+    """
+    count, silent, pairs, signs, share, largest = 0, 0, 0, 0.0, 0.0, 0.0
+    for u in range(frames.shape[1]):
+        q_before, c_before = 0.0, 0.0
+        for k in range(frames.shape[2]):
+            r0, r1, r2, r3 = frames[0, u, k], frames[1, u, k], frames[2, u, k], frames[3, u, k]
+            mean = 0.25 * r0 + 0.25 * r1 + 0.25 * r2 + 0.25 * r3
+            own, coded = (mean * noise[u, k]) ** 2, rounding_ohm[u, k] ** 2
+            q, c = 0.0, 0.0
+            if min(r0, r1, r2, r3) > 0.0 and 0.0 < own + coded < math.inf:
+                q = 0.5 * (r0 - r1 - r2 + r3)
+                c = _CUBIC * (r0 - 3.0 * r1 + 3.0 * r2 - r3)
+                if max(abs(q), abs(c)) > SAME * mean:
+                    quadratic[count], cubic[count] = q * q / (own + coded), c * c / (own + coded)
+                    count += 1
+                    share += own / (own + coded)
+                    largest = max(largest, max(q * q, c * c) / coded)
+                    pairs += (q_before * q != 0.0) + (c_before * c != 0.0)
+                    signs += np.sign(q_before * q) + np.sign(c_before * c)
+                else:
+                    silent, q, c = silent + 1, 0.0, 0.0
+            q_before, c_before = q, c
+    return count, silent, pairs, signs, share / max(count, 1), largest
+
+
+@njit
+def assess_block(
+    frames: Float, noise: Float, rounding_ohm: Float, quadratic: Float, cubic: Float
+) -> tuple[int, float, float, float]:
+    """Return what a block shows of its noise.
+
+    Args:
+        frames: (4, U, K) resistances, ohm; NaN if not valid.
+        noise: (U, K) stated relative standard deviation, without rounding to codes.
+        rounding_ohm: (U, K) standard deviation of the rounding to codes, ohm; 0 if unknown.
+        quadratic: (U K,) workspace.
+        cubic: (U K,) workspace.
+
+    Returns:
+        The number of readings, or 0 if the block does not count; the variances of the quadratic and of the
+        cubic contrast, relative to the stated variance; and the share of the stated variance that is not due
+        to rounding.
+    """
+    none = 0, 0.0, 0.0, 0.0
+    count, silent, pairs, signs, share, largest = _contrasts(frames, noise, rounding_ohm, quadratic, cubic)
+    if count == 0:
+        return none
+    if silent > REPEATED * (count + silent):
+        most = _HALF_A_CODE * (1.0 - share)
+        if largest > _ONE_CODE or count < ALIVE or most >= 1.0:
+            return none
+        return count, most, most, share
+    if abs(signs) > DEVIATIONS * math.sqrt(pairs):
+        return none
+    slow, fast = _variance(quadratic, count), _variance(cubic, count)
+    if not (0.0 < slow < math.inf and 0.0 < fast < math.inf):
+        return none
+    if abs(math.log(slow / fast)) > DEVIATIONS * _STD * math.sqrt(2.0 / count):
+        return none
+    return count, slow, fast, share
+
+
+class NoiseEstimate:
+    """Ratio of actual to stated noise of one stream. Do not share an instance between owners.
+
+    Args:
+        shape: (U, K) of the frames.
+
+    Attributes:
+        factor: Factor to apply to the stated noise; exactly 1 while the stream does not contradict it. If the
+            rounding to codes is known, the factor applies to the noise before the converter.
+        relative_std: Relative standard deviation of the estimated ratio; inf before the first estimate.
+    """
+
+    def __init__(self, shape: tuple[int, int]) -> None:
+        self._frames = np.full((BLOCK, *shape), np.nan)
+        self._noise, self._rounding_ohm = np.ones(shape), np.zeros(shape)
+        self._work = np.empty((2, shape[0] * shape[1]))
+        self.reset()
+        self._assess()  # compile now, not in the stream
+
+    def reset(self) -> None:
+        """Discard the state of the stream."""
+        self.factor, self.relative_std = 1.0, math.inf
+        self._next = 0
+        self._blocks: list[tuple[int, float, float, float]] = []
+
+    def see(
+        self,
+        ohm: Float,
+        noise: Float,
+        rounding_ohm: Float | None = None,
+        valid: NDArray[np.bool_] | None = None,
+    ) -> bool:
+        """Take the next frame; return whether :attr:`factor` changed.
+
+        Args:
+            ohm: (U, K) resistances, ohm.
+            noise: (U, K) stated relative standard deviation, without rounding if ``rounding_ohm`` is given.
+            rounding_ohm: (U, K) standard deviation of the rounding to codes, ohm.
+            valid: (U, K) bool, False if a reading is missing; default all True.
+        """
+        frame = self._frames[self._next]
+        frame[:] = ohm
+        if valid is not None:
+            frame[~valid] = np.nan
+        self._next += 1
+        if self._next < BLOCK:
+            return False
+        self._next = 0
+        before = self.factor
+        self._noise[:] = noise
+        self._rounding_ohm[:] = 0.0 if rounding_ohm is None else rounding_ohm
+        self._assess()
+        return self.factor != before
+
+    def _assess(self) -> None:
+        count, slow, fast, share = assess_block(
+            self._frames, self._noise, self._rounding_ohm, self._work[0], self._work[1]
+        )
+        if not count:
+            return
+        blocks = self._blocks
+        blocks.append((count, 0.25 * math.log(slow * fast), math.log(slow / fast), share))
+        del blocks[:-WINDOW]
+        if len(blocks) >= LEAST_BLOCKS:
+            self._decide()
+
+    def _decide(self) -> None:
+        """Set :attr:`factor` from the last blocks."""
+        blocks = self._blocks
+        values = sum(block[0] for block in blocks)
+        unequal = math.fsum(block[2] for block in blocks) / len(blocks)
+        if abs(unequal) > UNEQUAL + DEVIATIONS * _STD * math.sqrt(2.0 / values):
+            return
+        levels = sorted(block[1] for block in blocks)
+        level = 0.5 * (levels[(len(levels) - 1) // 2] + levels[len(levels) // 2])
+        # of a mean of logarithms of standard deviations, with the efficiency of a median of blocks
+        std = 1.25 * 0.5 * _STD / math.sqrt(2.0 * values)
+        self.relative_std = std
+        if self.factor == 1.0:
+            if abs(level) <= DEPARTED + DEVIATIONS * std:
+                return
+        elif abs(level) < RETURNED:
+            self.factor = 1.0
+            return
+        share = blocks[-1][3]
+        own = (math.exp(2.0 * level) - (1.0 - share)) / share if share > 0.0 else 0.0
+        found = max(math.sqrt(max(own, 0.0)), LEAST)
+        if self.factor == 1.0 or abs(math.log(found / self.factor)) > STEP + DEVIATIONS * std:
+            self.factor = found

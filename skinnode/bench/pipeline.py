@@ -142,6 +142,7 @@ def _hand(  # noqa: PLR0913 - the properties in which hands differ
                     "bus": f"can{i // PATCHES_A_BUS}",
                     "node_id": 1 + i % PATCHES_A_BUS,
                     "baseline": str(baseline),
+                    "tolerances": "exact",
                 }
                 for i in range(buses * PATCHES_A_BUS)
             ],

@@ -224,8 +224,9 @@ def _hand() -> HandConfig:
     buses = [
         {"name": f"can{i}", "channel": f"soak-{uuid.uuid4().hex}", "heartbeat_node_id": 1} for i in range(2)
     ]
+    made: dict[str, Any] = {"layout": small, "tolerances": "exact"}
     patches = [
-        {"name": f"p{i}", "node_id": 5 + i, "serial": 1 + i, "bus": f"can{i % 2}", "layout": small}
+        {"name": f"p{i}", "node_id": 5 + i, "serial": 1 + i, "bus": f"can{i % 2}", **made}
         for i in range(_PATCHES)
     ]
     beat = {"heartbeat_ms": 100}

@@ -278,4 +278,5 @@ name = "patch{i}"
 # link = "palm_link"              # name of the link in the robot model
 # pose = {{ position_m = [0.0, 0.0, 0.0], rpy_rad = [0.0, 0.0, 0.0] }}
 layout = {{ preset = "staggered", pitch_m = 4e-3, height_m = 2e-3, upper_wires = 10, upper_electrodes = 10 }}
+tolerances = "ordinary"           # how exactly the patch was made; "exact" for a simulated patch
 """

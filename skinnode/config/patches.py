@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import functools
+from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Final, Literal
 
 from pydantic import Field, ValidationError, ValidationInfo, field_validator, model_validator
 
@@ -27,6 +28,7 @@ from skinnode.errors import ConfigError
 from skinnode.model.elastic import Rubber
 from skinnode.model.layout import PatchLayout
 from skinnode.model.layout_file import from_electrodes, has_electrodes, impossible, read_npz
+from skinnode.model.tolerances import EXACT, ORDINARY, Tolerances
 
 Preset = Literal["aligned", "symmetric", "staggered"]
 Coordinates = Literal["preset", "node"]
@@ -36,6 +38,11 @@ _Resistivity = Annotated[
 ]
 _RUBBER = Rubber()
 _Gain = Annotated[float, Field(ge=0.1, le=10, allow_inf_nan=False), Allowed("a number from 0.1 to 10")]
+_Tolerance = Annotated[
+    float, Field(ge=0, lt=0.5, allow_inf_nan=False), Allowed("a number of at least 0 and below 0.5")
+]
+_NAMED_TOLERANCES: Final = {"ordinary": ORDINARY, "exact": EXACT}
+_TOLERANCES: Final = '"ordinary", "exact" or a table of numbers'
 
 
 class LayoutConfig(Table):
@@ -133,6 +140,43 @@ class CalibrationConfig(Table):
         return Rubber(self.young_pa, self.poisson)
 
 
+class TolerancesConfig(Table):
+    """Tolerances to which the patch was made, which the reported standard deviations include.
+
+    The text `"ordinary"` stands for the defaults below, `"exact"` for a patch that equals its layout, such as
+    a simulated patch. Only the posterior can include tolerances: with them, the method `auto` is the
+    posterior, and the method `exact` reports standard deviations of an exact patch.
+    """
+
+    placement: _Tolerance = ORDINARY.placement
+    """Standard deviation of the position of each upper and lower wire along each axis, pitches."""
+    thickness: _Tolerance = ORDINARY.thickness
+    """Standard deviation of the thickness between the electrodes, relative to the clearance."""
+    electrode_radius: _Tolerance = ORDINARY.electrode_radius
+    """Radius of the electrodes, which the forward model takes for points, pitches."""
+    gain: _Tolerance = ORDINARY.gain
+    """Standard deviation of the gain of the front end, as a fraction of the change in each resistance."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _named(cls, value: Any) -> Any:
+        if not isinstance(value, str):
+            return value
+        if value not in _NAMED_TOLERANCES:
+            raise ConfigError("", value, _TOLERANCES)
+        return asdict(_NAMED_TOLERANCES[value])
+
+    def build(self) -> Tolerances:
+        """Return the tolerances in the form that the solvers take."""
+        return Tolerances(**self.model_dump())
+
+
+def _or_named(schema: dict[str, Any]) -> None:
+    """Let the JSON Schema of the key ``tolerances`` allow the named tolerances."""
+    named = {"type": "string", "enum": list(_NAMED_TOLERANCES)}
+    schema["anyOf"] = [named, {"$ref": schema.pop("$ref")}]
+
+
 class PatchConfig(Table):
     """Skin patch: identity on the bus, geometry and calibration."""
 
@@ -167,6 +211,12 @@ class PatchConfig(Table):
     """File with the resistances at rest, ohm: one line per upper wire, one number per lower wire.
     None: the host reads them from the node."""
     calibration: CalibrationConfig = CalibrationConfig()
+    tolerances: Annotated[TolerancesConfig, Field(json_schema_extra=_or_named), Allowed(_TOLERANCES)] = (
+        TolerancesConfig()
+    )
+    """Tolerances to which the patch was made: `"ordinary"`, the default, for a patch made in a good workshop,
+    `"exact"` for a simulated patch, or a table of numbers. The values of the calibration do not concern the
+    geometry, so they do not replace tolerances."""
 
     @field_validator("eds", "baseline")
     @classmethod

@@ -13,6 +13,7 @@ from contextlib import contextmanager, suppress
 from multiprocessing.connection import Connection
 
 from skinnode.config import HandConfig
+from skinnode.config.patches import TolerancesConfig
 from skinnode.errors import SkinError
 from skinnode.process.child_processes import starting_children
 
@@ -20,8 +21,11 @@ from skinnode.process.child_processes import starting_children
 def on_simulated_buses(hand: HandConfig) -> HandConfig:
     """Return a copy of the hand on unused virtual buses between processes on this machine.
 
-    Simulated nodes must not appear on a bus with real nodes.
+    Simulated nodes must not appear on a bus with real nodes. Simulated patches equal their layouts, so the
+    tolerances of the real patches do not apply.
     """
+    exact = TolerancesConfig.model_validate("exact")
+    patches = tuple(patch.model_copy(update={"tolerances": exact}) for patch in hand.patches)
     groups = random.sample(range(1 << 16), len(hand.buses))
     buses = tuple(
         bus.model_copy(
@@ -33,7 +37,7 @@ def on_simulated_buses(hand: HandConfig) -> HandConfig:
         )
         for bus, group in zip(hand.buses, groups, strict=True)
     )
-    return hand.model_copy(update={"buses": buses})
+    return hand.model_copy(update={"buses": buses, "patches": patches})
 
 
 @contextmanager

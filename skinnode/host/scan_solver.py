@@ -89,6 +89,8 @@ def tracker_options(
         baseline_ohm=baseline_ohm,
         stiffness_n_per_m=calibration.stiffness_n_per_m or config.stiffness_n_per_m,
         rubber=calibration.rubber,
+        # the exact inverse cannot include tolerances
+        tolerances=None if config.method == "exact" else patch.tolerances.build(),
         deadline_us=config.deadline_us,
         estimate_noise=config.estimate_noise,
         drift=config.drift,
@@ -108,7 +110,8 @@ def check_solvable(patch: PatchConfig, config: SolverConfig) -> None:
     """
     layout = patch.layout.build()
     try:
-        Tracker(layout, method=config.method, operator=config.operator).update(
+        made = tracker_options(patch, config, relative_noise=patch.relative_noise).tolerances
+        Tracker(layout, method=config.method, operator=config.operator, tolerances=made).update(
             resistance_ohm(layout, layout.upper_m)
         )
     except ValueError as error:

@@ -68,7 +68,7 @@ def folder(tmp_path: Path, multicast_group: str) -> Path:
     sizes = "upper_wires = 2, upper_electrodes = 2, lower_wires = 6, lower_electrodes = 2"
     (tmp_path / "hand.toml").write_text(
         f'[[buses]]\nname = "can0"\ninterface = "udp_multicast"\nchannel = "{multicast_group}"\n'
-        f'[sync]\nperiod_ms = 250\n[[patches]]\nname = "thumb"\nnode_id = 5\n'
+        f'[sync]\nperiod_ms = 250\n[[patches]]\nname = "thumb"\nnode_id = 5\ntolerances = "exact"\n'
         f'layout = {{ preset = "staggered", {sizes} }}\n'
     )
     return tmp_path

@@ -80,7 +80,7 @@ class Place:
             'name = "[bold]<script>alert(1)</script>"\n[[buses]]\nname = "[red]"\n'
             f'interface = "{interface}"\n'
             f'channel = "{channel}"\n[[patches]]\nname = "[blink]<script>alert(1)</script>"\nbus = "[red]"\n'
-            f'node_id = 5\nlayout = {{ preset = "staggered", {sizes} }}\n',
+            f'node_id = 5\ntolerances = "exact"\nlayout = {{ preset = "staggered", {sizes} }}\n',
         )
 
     def broken_hand(self) -> str:

@@ -215,6 +215,7 @@ def notes(folder: Path, text: str) -> list[dict[str, Any]]:
 PALM = '[[patches]]\nname = "palm"\nnode_id = 1\n'
 TIP = '[[patches]]\nname = "tip"\nnode_id = 2\n'
 PLACED = "pose = { position_m = [0.0, 0.0, 0.01] }\n"
+EXACT = 'tolerances = "exact"\n'
 
 
 def said(listed: list[dict[str, Any]], key: str) -> dict[str, str]:
@@ -252,10 +253,10 @@ def test_where_contacts_cannot_be_placed(tmp_path: Path) -> None:
 
 
 def test_what_the_solver_leaves_out_or_cannot_reach(tmp_path: Path) -> None:
-    listed = notes(tmp_path, "[solver]\nnormal_only = true\nmax_std_m = 1e-9\n" + PALM + PLACED)
+    listed = notes(tmp_path, "[solver]\nnormal_only = true\nmax_std_m = 1e-9\n" + PALM + PLACED + EXACT)
     assert said(listed, "solver.normal_only") == {"palm": "no shear, neither displacement nor force"}
     assert "no field will be precise" in said(listed, "solver.max_std_m")["palm"]
-    roomy = notes(tmp_path, "[solver]\nmax_std_m = 1e-4\n" + PALM + PLACED)
+    roomy = notes(tmp_path, "[solver]\nmax_std_m = 1e-4\n" + PALM + PLACED + EXACT)
     assert not said(roomy, "solver.max_std_m")
     assert not said(roomy, "solver.normal_only")
 

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import copy
+import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +14,7 @@ import pytest
 from skinnode.config import BusConfig, load_hand, parse_hand
 from skinnode.errors import ConfigError
 from skinnode.model.layout import PatchLayout
+from skinnode.model.tolerances import EXACT, ORDINARY, Tolerances
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "hand.toml"
 FD_EXAMPLE = EXAMPLE.with_name("hand-fd.toml")
@@ -70,11 +73,34 @@ def test_example_says_the_defaults() -> None:
     assert [patch.layout.build().layout_hash for patch in spare.patches] == [
         patch.layout.build().layout_hash for patch in hand.patches
     ]
-    assert [patch.model_dump(exclude={"layout"}) for patch in spare.patches] == [
-        patch.model_dump(exclude={"layout"}) for patch in spare_patches
+    assert {patch.tolerances.build() for patch in hand.patches} == {EXACT}  # as its comment says
+    others = {"layout", "tolerances"}
+    assert [patch.model_dump(exclude=others) for patch in spare.patches] == [
+        patch.model_dump(exclude=others) for patch in spare_patches
     ]
     for part in ("buses", "sync", "solver", "simulation"):
         assert getattr(spare, part) == getattr(hand, part)
+
+
+@pytest.mark.parametrize(
+    ("value", "expected"),
+    [
+        (None, ORDINARY),
+        ("ordinary", ORDINARY),
+        ("exact", EXACT),
+        ({"placement": 0.01}, replace(ORDINARY, placement=0.01)),
+        ({"placement": 0, "thickness": 0, "electrode_radius": 0, "gain": 0}, EXACT),
+    ],
+)
+def test_tolerances_are_ordinary_exact_or_numbers(value: Any, expected: Tolerances) -> None:
+    """Also after the hand has been written to a recording and read again."""
+    table = minimal()
+    if value is not None:
+        table["patches"][0]["tolerances"] = value
+    hand = parse_hand(table)
+    assert hand.patches[0].tolerances.build() == expected
+    again = parse_hand(json.loads(hand.model_dump_json()))
+    assert again.patches[0].tolerances.build() == expected
 
 
 NAME = "a string of 1 to 64 printable characters, not all blank"
@@ -88,7 +114,7 @@ NAME = "a string of 1 to 64 printable characters, not all blank"
             3,
             "patches[1].nodeid: got an unknown key, allowed: a key of this table "
             "(did you mean node_id?): name, node_id, bus, link, pose, eds, layout, code_bits, "
-            "serial, relative_noise, baseline, calibration",
+            "serial, relative_noise, baseline, calibration, tolerances",
         ),
         (
             ["colour"],
@@ -157,6 +183,25 @@ NAME = "a string of 1 to 64 printable characters, not all blank"
             "patches[0].layout.lower_wires: got 255, allowed: an integer from 1 to 254",
         ),
         (["patches", 0, "layout"], "flat", "patches[0].layout: got 'flat', allowed: a table"),
+        *(
+            (
+                ["patches", 0, "tolerances"],
+                wrong,
+                f'patches[0].tolerances: got {wrong!r}, allowed: "ordinary", "exact" or a table of numbers',
+            )
+            for wrong in ("Exact", 0.02, ["exact"])
+        ),
+        (
+            ["patches", 0, "tolerances"],
+            {"placement": 0.5},
+            "patches[0].tolerances.placement: got 0.5, allowed: a number of at least 0 and below 0.5",
+        ),
+        (
+            ["patches", 0, "tolerances"],
+            {"thicknes": 0.1},
+            "patches[0].tolerances.thicknes: got an unknown key, allowed: a key of this table "
+            "(did you mean thickness?): placement, thickness, electrode_radius, gain",
+        ),
         (["patches", 0], 7, "patches[0]: got 7, allowed: a table"),
         (["patches"], [], "patches: got [], allowed: at least one [[patches]]"),
         (["buses"], [], "buses: got [], allowed: at least one [[buses]]"),

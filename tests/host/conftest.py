@@ -39,7 +39,10 @@ def make_hand() -> Callable[..., HandConfig]:
 
     def make(patches: int = 2, **tables: object) -> HandConfig:
         bus = {"name": "can0", "interface": "virtual", "channel": uuid.uuid4().hex[:8]}
-        listed = [{"name": f"p{i}", "node_id": 5 + i, "layout": SMALL} for i in range(patches)]
+        listed = [
+            {"name": f"p{i}", "node_id": 5 + i, "layout": SMALL, "tolerances": "exact"}
+            for i in range(patches)
+        ]
         return parse_hand({"buses": [bus], "patches": listed, "sync": {"period_ms": 25}, **tables})
 
     return make

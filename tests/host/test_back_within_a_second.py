@@ -180,6 +180,7 @@ def hand_on(*buses: dict[str, Any], patches: int, period_ms: int) -> HandConfig:
             "node_id": 5 + i,
             "bus": buses[i % len(buses)]["name"],
             "layout": SMALL,
+            "tolerances": "exact",
             "serial": i,
         }
         for i in range(patches)

@@ -211,7 +211,7 @@ def test_identity_differs(
 
 
 def test_serial_number_differs(make_hand: Callable[..., HandConfig]) -> None:
-    patches = [{"name": "p0", "node_id": 5, "layout": SMALL, "serial": 7}]
+    patches = [{"name": "p0", "node_id": 5, "layout": SMALL, "tolerances": "exact", "serial": 7}]
     hand = parse_hand({**make_hand(patches=1).model_dump(mode="json"), "patches": patches})
     assert str(failure_of(hand, lambda port: node(port, 5, serial=8))) == (
         "node 5: patch 'p0' on can0: serial number: got 8, expected 7 as in the hand file"

@@ -290,7 +290,8 @@ def test_a_bus_whose_receiving_is_defective_is_opened_again(
 
     table = make_hand().model_dump(mode="json")
     table["buses"] = [{"name": f"can{i}", "channel": f"{table['buses'][0]['channel']}-{i}"} for i in range(2)]
-    table["patches"] = [{"name": f"p{i}", "node_id": 5, "bus": f"can{i}", "layout": SMALL} for i in range(2)]
+    made = {"layout": SMALL, "tolerances": "exact"}
+    table["patches"] = [{"name": f"p{i}", "node_id": 5, "bus": f"can{i}", **made} for i in range(2)]
     hand = parse_hand(table)
     rack = rack_of(hand)
     for name in ("p0", "p1"):

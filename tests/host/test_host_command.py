@@ -54,11 +54,13 @@ period_ms = 200
 [[patches]]
 name = "thumb"
 node_id = 11
+tolerances = "exact"
 layout = {layout}
 
 [[patches]]
 name = "index"
 node_id = 12
+tolerances = "exact"
 layout = {layout}
 """
 LAYOUT = "{ " + ", ".join(f"{key} = {value}" for key, value in SMALL.items()) + " }"

@@ -165,7 +165,8 @@ def four(make_hand: Callable[..., HandConfig]) -> HandConfig:
     channel = table["buses"][0]["channel"]
     table["buses"] = [{"name": f"can{i}", "channel": f"{channel}-{i}"} for i in range(2)]
     table["patches"] = [
-        {"name": f"p{i}", "node_id": 5 + i % 2, "bus": f"can{i // 2}", "layout": SMALL} for i in range(4)
+        {"name": f"p{i}", "node_id": 5 + i % 2, "bus": f"can{i // 2}", "layout": SMALL, "tolerances": "exact"}
+        for i in range(4)
     ]
     table["sync"]["period_ms"] = 50
     table["bring_up"]["heartbeat_ms"] = 500  # nobody is lost because the machine is busy

@@ -229,7 +229,8 @@ def test_bus_that_fails_is_opened_again_and_the_stream_goes_on(
 def test_two_buses_one_sync(make_hand: Callable[..., HandConfig]) -> None:
     table = make_hand().model_dump(mode="json")
     table["buses"] = [{"name": f"can{i}", "channel": f"{table['buses'][0]['channel']}-{i}"} for i in range(2)]
-    table["patches"] = [{"name": f"p{i}", "node_id": 5, "bus": f"can{i}", "layout": SMALL} for i in range(2)]
+    made = {"layout": SMALL, "tolerances": "exact"}
+    table["patches"] = [{"name": f"p{i}", "node_id": 5, "bus": f"can{i}", **made} for i in range(2)]
     hand = parse_hand(table)
     with Fleet(hand), Host.from_config(hand) as host:
         fields = take(host.fields(timeout_s=10), 10)
@@ -253,6 +254,7 @@ def test_fields_over_can_fd_are_those_of_a_classic_bus(code_bits: int) -> None:
             "node_id": 5,
             "bus": bus["name"],
             "layout": size,
+            "tolerances": "exact",
             "code_bits": code_bits,
         }
         for bus in buses

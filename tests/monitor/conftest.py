@@ -40,7 +40,9 @@ def nothing_left_running() -> Iterator[None]:
 def a_hand(patches: int = 2, bus: dict[str, object] | None = None, **tables: object) -> HandConfig:
     """Patches p0, p1 … of 4 × 4 electrodes with node-IDs from 5 on, on a virtual bus of their own."""
     own = {"name": "can0", "interface": "virtual", "channel": uuid.uuid4().hex[:8], **(bus or {})}
-    listed = [{"name": f"p{i}", "node_id": 5 + i, "layout": SMALL} for i in range(patches)]
+    listed = [
+        {"name": f"p{i}", "node_id": 5 + i, "layout": SMALL, "tolerances": "exact"} for i in range(patches)
+    ]
     return parse_hand({"buses": [own], "patches": listed, "sync": {"period_ms": 50}, **tables})
 
 
@@ -142,6 +144,7 @@ def write_hand(folder: Path, hand: HandConfig) -> Path:
     text += f"[sync]\nperiod_ms = {hand.sync.period_ms}\n"
     for patch in hand.patches:
         text += f'[[patches]]\nname = "{patch.name}"\nnode_id = {patch.node_id}\nlayout = {LAYOUT}\n'
+        text += 'tolerances = "exact"\n'
     path = folder / "hand.toml"
     path.write_text(text)
     return path

@@ -32,7 +32,7 @@ PATIENCE_S = 20.0
 
 def hand_on(bus: BusConfig) -> HandConfig:
     table = {"name": "can0", "interface": bus.interface, "channel": bus.channel}
-    patches = [{"name": f"p{i}", "node_id": 5 + i, "layout": SMALL} for i in range(2)]
+    patches = [{"name": f"p{i}", "node_id": 5 + i, "layout": SMALL, "tolerances": "exact"} for i in range(2)]
     return parse_hand({"buses": [table], "patches": patches, "sync": {"period_ms": 50}})
 
 

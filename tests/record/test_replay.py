@@ -36,7 +36,7 @@ T_NS = 1_790_000_000_000_000_000
 
 def a_hand() -> HandConfig:
     bus = {"name": "can0", "interface": "virtual", "channel": uuid.uuid4().hex[:8]}
-    patches = [{"name": f"p{i}", "node_id": 5 + i, "layout": SMALL} for i in range(2)]
+    patches = [{"name": f"p{i}", "node_id": 5 + i, "layout": SMALL, "tolerances": "exact"} for i in range(2)]
     return parse_hand({"buses": [bus], "patches": patches, "sync": {"period_ms": 25}})
 
 
@@ -257,6 +257,7 @@ def test_contacts_and_forces_are_in_the_json_of_host_and_replay(tmp_path: Path) 
         f'[[buses]]\nname = "can0"\ninterface = "virtual"\nchannel = "{uuid.uuid4().hex}"\n'
         '[sync]\nperiod_ms = 25\n[solver]\nmethod = "posterior"\n[simulation]\ncycle_s = 2.0\n'
         f'[[patches]]\nname = "p0"\nnode_id = 5\nlayout = {{ preset = "staggered", {sizes} }}\n'
+        'tolerances = "exact"\n'
     )
     hand = load_hand(file)
     live: dict[int, FieldFrame] = {}

@@ -23,10 +23,12 @@ channel = "{channel}"
 [[patches]]
 name = "thumb"
 node_id = 3
+tolerances = "exact"
 
 [[patches]]
 name = "index"
 node_id = 4
+tolerances = "exact"
 """
 
 

@@ -40,13 +40,16 @@ method = "{method}"
 [[patches]]
 name = "palm"
 node_id = 5
+{tolerances}
 layout = {{ preset = "staggered", {sizes} }}
 
 [[patches]]
 name = "thumb"
 node_id = 6
+{tolerances}
 layout = {{ preset = "aligned", {sizes} }}
 """
+TOLERANCES = 'tolerances = "exact"' if hasattr(sk, "Tolerances") else ""  # older commits do not know the key
 SIZES = "upper_wires = 6, upper_electrodes = 4, lower_wires = 12, lower_electrodes = 6"
 RECORDINGS = {
     "plain": ("auto", []),
@@ -123,7 +126,7 @@ def record(folder: Path, name: str) -> None:
     method, faults = RECORDINGS[name]
     group = f"239.74.{random.randrange(256)}.{random.randrange(1, 255)}"
     hand = folder / f"{name}.toml"
-    hand.write_text(HAND.format(group=group, method=method, sizes=SIZES), "utf-8")
+    hand.write_text(HAND.format(group=group, method=method, sizes=SIZES, tolerances=TOLERANCES), "utf-8")
     run = [sys.executable, "-c", "import sys; from {0} import main; sys.exit(main())"]
     simulator = [*run[:2], run[2].format("vcan_sim.cli"), str(hand), *faults]
     recorder = [

@@ -184,6 +184,7 @@ class Second:
 
 def _patch(running: Host, name: str, before: HostStats, now: HostStats) -> dict[str, object]:
     from skinnode.cli._contacts import contact_tables
+    from skinnode.host.trust_report import trust_table
 
     new, old, field = now.patches[name], before.patches[name], running.latest(name)
     health = running.health(name)
@@ -196,7 +197,7 @@ def _patch(running: Host, name: str, before: HostStats, now: HostStats) -> dict[
         "corrupt": new.assembler.scans_corrupt,
         "missed": new.assembler.scans_missed,
         "chunks_lost": new.assembler.chunks_lost,
-        "trusted": field.trusted if field is not None else None,
+        **trust_table(field),
         "scan": field.stamp.scan if field is not None and field.stamp is not None else None,
         **_deepest(field),
         "contacts": contact_tables(field),
@@ -255,12 +256,20 @@ def _patch_text(name: str, facts: Mapping[str, object]) -> str:
         std = f" ± {std_m * 1e6:.1f}" if isinstance(std_m, float) else ""
         deepest = f"  deepest {deepest_m * 1e6:.1f}{std} µm"
     worst = "".join(f"  {facts[key]} {key}" for key in ("torn", "corrupt", "missed", "skipped") if facts[key])
-    trust = "  untrusted" if facts["trusted"] is False else ""
+    trust = f"  untrusted: {facts['distrust']}" if facts["trusted"] is False else _doubts(facts)
     why = f" ({facts['reason']})" if facts["reason"] else ""
     return (
         f"{name} {facts['condition']}{why}  {facts['solved']} fields{deepest}{trust}"
         f"{worst and '  in all' + worst}"
     )
+
+
+def _doubts(facts: Mapping[str, object]) -> str:
+    """Return what a user of a trusted field should know: its precision, and the readings left out."""
+    doubts, faults = "  imprecise" if facts["precise"] is False else "", facts["data_faults"]
+    if isinstance(faults, list) and faults:
+        doubts += f"  {counted(len(faults), 'fault')} of its readings left out"
+    return doubts
 
 
 class JsonReport:

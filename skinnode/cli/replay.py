@@ -66,6 +66,7 @@ def replay(
 def field_table(field: FieldFrame) -> dict[str, Any]:
     """Return a field as JSON, with numbers at full precision."""
     from skinnode.cli._contacts import contact_tables
+    from skinnode.host.trust_report import trust_table
 
     stamp = field.stamp
     assert stamp is not None
@@ -74,7 +75,7 @@ def field_table(field: FieldFrame) -> dict[str, Any]:
         "scan": stamp.scan,
         "t_sync_ns": stamp.t_sync_ns,
         "t_receive_ns": stamp.t_receive_ns,
-        "trusted": field.trusted,
+        **trust_table(field),
         "method": field.method,
         "displacement_m": field.displacement_m.tolist(),
         "contacts": contact_tables(field),

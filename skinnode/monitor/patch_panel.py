@@ -132,7 +132,11 @@ def _health(patch: PatchView, theme: Theme, width: int) -> Line:
     if patch.words:
         return pad([Segment(f" {patch.condition}: {patch.words[0]}", style)], width, theme)
     if patch.depth_m is not None and not patch.trusted:
-        return pad([Segment(" not trusted", theme.note)], width, theme)
+        return pad([Segment(f" not trusted: {patch.distrust}", theme.note)], width, theme)
+    if not patch.precise:
+        return pad([Segment(" not precise", theme.note)], width, theme)
+    if patch.data_faults:
+        return pad([Segment(f" left out: {patch.data_faults[0]}", theme.note)], width, theme)
     if width < 14 and patch.level == "good":
         return pad([Segment(f" {patch.rate_hz:.1f}/s", style)], width, theme)
     rate = [Segment(f"{patch.rate_hz:.1f}/s", theme.dim)] if width >= 18 else []
@@ -211,7 +215,15 @@ def facts(patch: PatchView, theme: Theme, width: int) -> list[Line]:
         fact("deepest", f"{1e6 * patch.depth_m:.1f}{std} µm")
         fact("shear", shear_text(patch.shear_m) or "none")
         trust = "trusted" if patch.trusted else "not trusted"
-        fact("field", f"{patch.method}, {trust}", theme.text if patch.trusted else theme.note)
+        precise = "precise" if patch.precise else "not precise"
+        good = patch.trusted and patch.precise
+        fact("field", f"{patch.method}, {trust}, {precise}", theme.text if good else theme.note)
+        if patch.distrust:
+            fact("because", patch.distrust, theme.note)
+        if patch.data_share is not None:
+            fact("data", f"{patch.data_share:.0%} of the depth is from the data")
+    for fault in patch.data_faults:
+        fact("left out", str(fault), theme.note)
     fact("scans", f"{patch.rate_hz:.1f}/s, newest {patch.scan}" if patch.scan is not None else "none yet")
     if patch.latency_s is not None and patch.latency_max_s is not None:
         fact("latency", f"{1e3 * patch.latency_s:.1f} ms, worst {1e3 * patch.latency_max_s:.1f}")

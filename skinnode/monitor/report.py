@@ -9,6 +9,7 @@ from typing import Any, Final
 
 from skinnode.host.accounting import losses_of_stream
 from skinnode.host.health import Condition, PatchHealth
+from skinnode.host.trust_report import fault_table
 from skinnode.monitor.source import Source
 from skinnode.monitor.touches import Touch
 from skinnode.monitor.view_model import History, PatchView, View
@@ -146,6 +147,10 @@ def _patch_json(patch: PatchView) -> dict[str, Any]:
         "latency_max_s": patch.latency_max_s,
         "scan": patch.scan,
         "trusted": patch.trusted,
+        "distrust": patch.distrust,
+        "precise": patch.precise,
+        "deepest_data_share": patch.data_share,
+        "data_faults": [fault_table(fault) for fault in patch.data_faults],
         "torn": counts.scans_torn,
         "corrupt": counts.scans_corrupt,
         "missed": counts.scans_missed,

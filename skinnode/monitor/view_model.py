@@ -18,6 +18,9 @@ from skinnode.host.dispatcher import BusStats
 from skinnode.host.events import HealthEvent
 from skinnode.host.health import BusHealth, Condition, PatchHealth
 from skinnode.host.patch_stream import StreamStats
+from skinnode.host.trust_report import deepest_data_share
+from skinnode.model.data_fault import DataFault
+from skinnode.model.distrust import why_not
 from skinnode.model.layout import Float
 from skinnode.monitor.field_map import Surface, mean_shear_m, surface_of
 from skinnode.monitor.source import Snapshot
@@ -49,6 +52,13 @@ class PatchView:
     latency_max_s: float | None
     scan: int | None
     trusted: bool
+    distrust: str
+    """Why the newest field is not trusted; empty if it is, or if there is no field."""
+    precise: bool
+    data_share: float | None
+    """Share of the data in the depth of the deepest electrode; None without a field."""
+    data_faults: tuple[DataFault, ...]
+    """Readings left out of the newest field."""
     method: str
     surface: Surface | None
     depth_m: float | None
@@ -184,6 +194,10 @@ def _patch_view(patch: PatchConfig, history: Sequence[Snapshot], elapsed_s: floa
         latency_max_s=max(latencies, default=None),
         scan=None if field is None or field.stamp is None else field.stamp.scan,
         trusted=field is not None and field.trusted,
+        distrust="" if field is None else why_not(field),
+        precise=field is None or field.precise,
+        data_share=None if field is None else deepest_data_share(field),
+        data_faults=() if field is None else field.faults,
         method="" if field is None else field.method,
         surface=surface,
         depth_m=depth_m,

@@ -1,14 +1,15 @@
 """Precision of a field: whether its standard deviations are within the limits that the user set.
 
-The default limit of the displacement follows from the layout and the noise: :data:`MULTIPLE` times the
-standard deviation of the exact inverse at rest, but at most :data:`MOST` clearances. A healthy patch stays
-within it. A patch that has lost readings, or that is noisier than stated, does not.
+The default limit of the displacement follows from the layout, the noise and the tolerances: :data:`MULTIPLE`
+times the standard deviation of the exact inverse at rest, a part for the tolerances, and at most :data:`MOST`
+clearances. A healthy patch stays within it. A patch that has lost readings, or that is noisier than stated,
+does not.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from typing import Final
 
 import numpy as np
@@ -16,6 +17,7 @@ import numpy as np
 from skinnode.model.elastic import Rubber
 from skinnode.model.frames import FieldFrame
 from skinnode.model.layout import PatchLayout
+from skinnode.model.tolerances import ORDINARY, Tolerances
 from skinnode.solve.cramer_rao import patch_std
 from skinnode.solve.options import TrackerOptions
 from skinnode.solve.wires.problem import PatchProblem
@@ -28,6 +30,10 @@ MOST: Final = 0.3
 """Limit of a standard deviation, clearances, on layouts and at noises that leave the displacement to the
 prior. In the same measurement, only thick patches (h = 1) at a noise of 1e-3 exceeded it: in 5 of 66 fields
 on `staggered`, in 20 of 66 on `aligned`."""
+TOLERANCE_SHARE: Final = 0.06
+"""Part of the limit for a patch made to the ordinary tolerances, clearances; proportional to the largest
+tolerance. In the same presses, these tolerances made standard deviations of up to 0.024 clearances at
+noises of 3e-6 and 1e-5."""
 FORCE_SHARE: Final = 0.3
 """Limit of a normal force's standard deviation, as a share of the modulus times clearance times pitch. In the
 same measurement it was at most 0.1 of it; presses of 50 % half outside the patch reach 0.26."""
@@ -59,7 +65,10 @@ def limits_of(layout: PatchLayout, options: TrackerOptions) -> PrecisionLimits:
         return PrecisionLimits(std_m, force_std_n, force_std_n)
     clearance_m = float(PatchProblem.of(layout).clearance.min()) * layout.pitch_m
     if std_m is None:
-        std_m = clearance_m * min(MULTIPLE * _at_rest(layout, options), MOST)
+        share = math.hypot(
+            MULTIPLE * _at_rest(layout, options), TOLERANCE_SHARE * _looseness(options.tolerances)
+        )
+        std_m = clearance_m * min(share, MOST)
     if force_std_n is not None:
         return PrecisionLimits(std_m, force_std_n, force_std_n)
     modulus_pa = (options.rubber or Rubber()).contact_modulus_pa
@@ -88,3 +97,11 @@ def _at_rest(layout: PatchLayout, options: TrackerOptions) -> float:
         rounding = codes.rounding_ohm[measured] / codes.baseline_ohm[measured]
         noise = np.hypot(noise, math.sqrt(float((rounding**2).mean())) if rounding.size else 0.0)
     return patch_std(layout, noise, options.normal_only)
+
+
+def _looseness(tolerances: Tolerances | None) -> float:
+    """Return the largest tolerance, relative to the ordinary one; 0 for an exact patch."""
+    if tolerances is None:
+        return 0.0
+    ordinary = astuple(ORDINARY)
+    return max(own / usual for own, usual in zip(astuple(tolerances), ordinary, strict=True))

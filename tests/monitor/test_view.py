@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import re
 import time
@@ -12,6 +13,7 @@ import numpy as np
 import pytest
 
 from skinnode.host import Host
+from skinnode.model.data_fault import DataFault, FaultKind, FaultyPart
 from skinnode.model.frames import FieldFrame, SolveStats
 from skinnode.model.layout import PatchLayout
 from skinnode.model.status import Status
@@ -21,7 +23,7 @@ from skinnode.monitor.report import FaultBook, as_json
 from skinnode.monitor.screen import screen
 from skinnode.monitor.source import HostSource, ReplaySource
 from skinnode.monitor.theme import Paint, UiState, theme_for
-from skinnode.monitor.view_model import History, View
+from skinnode.monitor.view_model import History, PatchView, View
 from skinnode.record import Recorder, replay
 from vcan_sim.faults import Faults
 from vcan_sim.fleet import Fleet
@@ -274,3 +276,37 @@ def test_a_recording_is_shown_as_it_was_and_cannot_be_tared(tmp_path: Path) -> N
     assert view.patch("p0").stream.solved >= live
     assert view.patch("p0").surface is not None
     assert faults.lines == []
+
+
+def test_a_field_that_is_not_to_be_trusted_says_why_on_its_tile_and_alone() -> None:
+    hand = a_hand(1, sync={"period_ms": 50}, simulation={"depth": 0.0})
+    with Fleet(hand), Host.from_config(hand) as host, HostSource(host) as source:
+        history = History(hand)
+        view = history.add(source.snapshot())
+        while view.patches[0].depth_m is None:
+            time.sleep(0.02)
+            view = history.add(source.snapshot())
+    fault = DataFault(FaultyPart.LOWER, FaultKind.CONTRADICTS, lower=7, since=90)
+    sound = dataclasses.replace(view.patches[0], condition="operational", level="good", words=())
+    doubtful = dataclasses.replace(
+        sound, trusted=False, distrust="half of its readings are lost", data_share=0.25, data_faults=(fault,)
+    )
+
+    def shown(patch: PatchView, *, zoomed: bool) -> str:
+        ui = UiState("hand", "p0", zoomed=zoomed)
+        return as_text(
+            screen(
+                dataclasses.replace(view, patches=(patch,)), Paint(theme_for("none"), ui, 1e-4), [], 200, 50
+            )
+        )
+
+    tile = shown(doubtful, zoomed=False)
+    assert "not trusted: half of its readings are lost" in tile
+    alone = re.sub(r"\s+", " ", shown(doubtful, zoomed=True))
+    assert "not trusted, precise" in alone
+    assert "half of its readings are lost" in alone
+    assert "25% of the depth is from the data" in alone
+    assert "lower wire 7" in alone
+    assert "not precise" in shown(dataclasses.replace(sound, precise=False), zoomed=False)
+    assert "left out: lower wire 7" in shown(dataclasses.replace(sound, data_faults=(fault,)), zoomed=False)
+    assert "trusted, precise" in shown(sound, zoomed=True)

@@ -46,6 +46,19 @@ def test_a_healthy_patch_at_its_stated_noise_is_precise(skin: Skin, noise: float
     assert [field.precise for field in stream(skin, noise, tracker)] == [True] * 5
 
 
+def test_a_patch_made_to_ordinary_tolerances_is_precise() -> None:
+    skin = skin_of()
+    tracker = sk.Tracker(
+        skin.layout,
+        relative_noise=3e-6,
+        baseline_ohm=skin.rest_ohm,
+        tolerances=sk.Tolerances(placement=0.02, thickness=0.05, electrode_radius=0.05, gain=0.02),
+    )
+    assert [field.precise for field in stream(skin, 3e-6, tracker)] == [True] * 5
+    exact = limits_of(skin.layout, sk.TrackerOptions(relative_noise=3e-6))
+    assert limits_of(skin.layout, tracker.options).std_m > 5 * exact.std_m
+
+
 @pytest.mark.parametrize("method", ["exact", "posterior"])
 def test_a_patch_that_lost_two_fifths_of_its_readings_is_not(method: str) -> None:
     skin = skin_of()

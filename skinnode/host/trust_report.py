@@ -1,0 +1,54 @@
+"""What a field says about itself, for reports and JSON: trust, precision, share of the data, faults."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from skinnode.model.data_fault import DataFault
+from skinnode.model.distrust import why_not
+from skinnode.model.frames import FieldFrame
+from skinnode.text.json_values import plain
+
+
+def trust_table(field: FieldFrame | None) -> dict[str, Any]:
+    """Return what a field says about itself; every value is None if there is no field.
+
+    ``deepest_data_share`` is the share of the data in the depth of the deepest electrode; it is 1 if the
+    field does not depend on a prior.
+    """
+    if field is None:
+        return dict.fromkeys(("trusted", "distrust", "precise", "deepest_data_share", "data_faults"))
+    table: dict[str, Any] = plain(
+        {
+            "trusted": field.trusted,
+            "distrust": why_not(field),
+            "precise": field.precise,
+            "deepest_data_share": deepest_data_share(field),
+            "data_faults": [fault_table(fault) for fault in field.faults],
+        }
+    )
+    return table
+
+
+def deepest_data_share(field: FieldFrame) -> float:
+    """Return how much of the depth of the deepest electrode comes from the data; 1 means all of it."""
+    if field.data_share is None:
+        return 1.0
+    return float(field.data_share[..., 2].flat[int(np.argmin(field.displacement_m[..., 2]))])
+
+
+def fault_table(fault: DataFault) -> dict[str, Any]:
+    """Return a fault for JSON; infinite deviations are None."""
+    table: dict[str, Any] = plain(
+        {
+            "part": str(fault.part),
+            "kind": str(fault.kind),
+            "upper": fault.upper,
+            "lower": fault.lower,
+            "since": fault.since,
+            "deviations": float(fault.deviations),
+        }
+    )
+    return table

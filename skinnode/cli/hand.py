@@ -258,6 +258,11 @@ name = "hand"
 [sync]
 period_ms = {period_ms}                    # each SYNC starts one scan of every patch: {rate} per second
 
+[solver]
+method = "auto"                   # every field has contacts with forces: field.contacts, HandFrame.contacts
+# max_std_m = 20e-6               # field.precise: largest standard deviation of a displacement, in metres,
+# max_force_std_n = 0.1           # and of a contact's normal force; without them, what a sound patch reaches
+
 [stream]
 partial = "pass"                  # incomplete scans: pass them on with a mask, or "withhold"
 """
@@ -275,8 +280,8 @@ _NEW_PATCH = """
 name = "patch{i}"
 {bus}node_id = {i}
 # serial = 12345                  # expected number; LSS uses it to find a node that has no node-ID
-# link = "palm_link"              # name of the link in the robot model
-# pose = {{ position_m = [0.0, 0.0, 0.0], rpy_rad = [0.0, 0.0, 0.0] }}
+# link = "palm_link"              # link of the robot that carries the patch; without it, the hand itself
+# pose = {{ position_m = [0.0, 0.0, 0.0], rpy_rad = [0.0, 0.0, 0.0] }}   # in the frame of the link
 layout = {{ preset = "staggered", pitch_m = 4e-3, height_m = 2e-3, upper_wires = 10, upper_electrodes = 10 }}
 tolerances = "ordinary"           # how exactly the patch was made; "exact" for a simulated patch
 """

@@ -75,6 +75,12 @@ def _of_results(patch: PatchConfig, solver: SolverConfig) -> Iterator[tuple[str,
             f"at a noise of {noise:.0e} the exact inverse gives ± {share:.0%} of the clearance, which is "
             'useless; method = "auto" uses the posterior',
         )
+    if method == "exact" and not patch.tolerances.build().exact:
+        yield (
+            "solver.method",
+            "the exact inverse cannot include the tolerances of the patch: its deviations hold only for "
+            'a patch that equals its layout; method = "auto" uses the posterior',
+        )
     if solver.normal_only:
         yield "solver.normal_only", "no shear, neither displacement nor force"
     reached_m = share * float(PatchProblem.of(layout).clearance.min()) * layout.pitch_m

@@ -236,8 +236,10 @@ def test_a_hand_whose_displacements_come_from_the_prior_says_so(tmp_path: Path) 
 def test_the_exact_inverse_where_it_is_useless(tmp_path: Path) -> None:
     thick = 'layout = { preset = "aligned", height_m = 4e-3 }\n'
     solver = '[solver]\nmethod = "exact"\n'
-    assert "which is useless" in said(notes(tmp_path, solver + PALM + thick), "solver.method")["palm"]
-    assert not said(notes(tmp_path, solver + PALM), "solver.method")
+    assert "which is useless" in said(notes(tmp_path, solver + PALM + thick + EXACT), "solver.method")["palm"]
+    assert "cannot include the tolerances" in said(notes(tmp_path, solver + PALM), "solver.method")["palm"]
+    assert not said(notes(tmp_path, solver + PALM + EXACT), "solver.method")
+    assert not said(notes(tmp_path, PALM), "solver.method")
 
 
 def test_where_contacts_cannot_be_placed(tmp_path: Path) -> None:

@@ -280,7 +280,7 @@ _NEW_PATCH = """
 name = "patch{i}"
 {bus}node_id = {i}
 # serial = 12345                  # expected number; LSS uses it to find a node that has no node-ID
-# link = "palm_link"              # link of the robot that carries the patch; without it, the hand itself
+# link = "palm_link"              # name of the robot link that carries the patch; without: the hand itself
 # pose = {{ position_m = [0.0, 0.0, 0.0], rpy_rad = [0.0, 0.0, 0.0] }}   # in the frame of the link
 layout = {{ preset = "staggered", pitch_m = 4e-3, height_m = 2e-3, upper_wires = 10, upper_electrodes = 10 }}
 tolerances = "ordinary"           # how exactly the patch was made; "exact" for a simulated patch

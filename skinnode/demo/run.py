@@ -23,6 +23,7 @@ from skinnode.demo.plot import PatchTrace
 from skinnode.demo.view import BusView, PatchView, panels_in, render
 from skinnode.host import Host
 from skinnode.host.patch_stream import StreamStats
+from skinnode.model.distrust import why_not
 from skinnode.model.frames import FieldFrame
 from skinnode.model.layout import Float
 from skinnode.process.garbage_collection import responsive_threads, without_long_collections
@@ -53,6 +54,8 @@ class PatchReport:
     latency_p50_ms: float
     latency_p99_ms: float
     score: Score
+    distrust: str = ""
+    """Why the newest field that was not trusted was not; empty if all were."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,6 +96,8 @@ class _Watch:
     """Time, true depth, RMS error and RMS reported standard deviation of each scan."""
     deepest: tuple[float, Float, Float] | None = None
     newest: FieldFrame | None = None
+    distrust: str = ""
+    """Why the newest field that was not trusted was not."""
 
     def take(self, frame: FieldFrame, true_upper_m: Float, t_start_ns: int) -> None:
         stamp = frame.stamp
@@ -102,6 +107,7 @@ class _Watch:
         depth_m = float(-truth[..., 2].min())
         reported_m = float(np.sqrt(np.mean(frame.displacement_std_m**2)))
         self.newest = frame
+        self.distrust = why_not(frame) or self.distrust
         self.arrivals_s.append(stamp.t_solved_ns * 1e-9)
         self.latency_ms.append((stamp.t_solved_ns - stamp.t_receive_ns) * 1e-6)
         self.history.append(((stamp.t_receive_ns - t_start_ns) * 1e-9, depth_m, error_m, reported_m))
@@ -124,6 +130,7 @@ class _Watch:
             error_m=self.history[-1][2] if self.history else math.nan,
             rate_hz=self.rate_hz,
             torn=torn,
+            distrust="" if frame is None else why_not(frame),
         )
 
     def trace(self) -> PatchTrace | None:
@@ -247,6 +254,7 @@ def play(hand: HandConfig, seconds: float, console: Console) -> Run:
             latency_p50_ms=_percentile(watch.latency_ms, 50),
             latency_p99_ms=_percentile(watch.latency_ms, 99),
             score=watch.scorer.score(),
+            distrust=watch.distrust,
         )
         for name, watch in watches.items()
     )
@@ -304,10 +312,11 @@ def _faults(rows: Sequence[PatchReport], lost: int) -> tuple[str, ...]:
             found.append(f"{row.patch}: no scan solved")
         elif not row.score.within_uncertainty:
             score = row.score
+            why = f" ({row.distrust})" if row.distrust else ""
             found.append(
                 f"{row.patch}: error {1e6 * score.error_rms_m:.2f} µm RMS, "
                 f"{score.worst_deviations:.1f} standard deviations at worst, "
-                f"{score.untrusted} scans not converged; "
+                f"{score.untrusted} scans not trusted{why}; "
                 f"reported ± {1e6 * score.reported_rms_m:.2f} µm"
             )
     return tuple(found)

@@ -37,6 +37,8 @@ class PatchView:
     """RMS error of the newest field."""
     rate_hz: float
     torn: int
+    distrust: str = ""
+    """Why the newest field is not trusted; empty if it is."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,11 +93,12 @@ def _patch_panel(patch: PatchView, full_scale_m: float) -> Panel:
     rows.add_row("shear", shear)
     rows.add_row("err RMS", _micro(patch.error_m))
     rows.add_row("rate", f"{patch.rate_hz:.1f} Hz")
-    good = patch.health == "operational" and patch.torn == 0
+    rows.add_row("trusted", "no" if patch.distrust else "yes" if patch.displacement_m is not None else "-")
+    good = patch.health == "operational" and patch.torn == 0 and not patch.distrust
     return Panel(
         Group(HeightMap(surface, full_scale_m), rows),
         title=Text(patch.name),
-        subtitle=Text(patch.health, "green" if good else "red"),
+        subtitle=Text("not trusted" if patch.distrust else patch.health, "green" if good else "red"),
         width=MAP_SIZE + 4,
         border_style="dim" if good else "red",
     )
@@ -103,7 +106,7 @@ def _patch_panel(patch: PatchView, full_scale_m: float) -> Panel:
 
 def panels_in(columns: int, lines: int) -> int:
     """Return the number of patches that fit on a terminal of the given size."""
-    across, down = columns // (MAP_SIZE + 4), (lines - 4) // (MAP_SIZE // 2 + 7)
+    across, down = columns // (MAP_SIZE + 4), (lines - 4) // (MAP_SIZE // 2 + 8)
     return max(1, across) * max(1, down)
 
 
@@ -136,4 +139,7 @@ def render(
     panels = Columns([_patch_panel(p, full_scale_m) for p in patches[:room]], padding=(0, 0))
     if len(patches) > room:
         line.append(f"   and {len(patches) - room} more patches", style="dim")
-    return Group(panels, line, timing)
+    doubts = [f" {patch.name} not trusted: {patch.distrust}" for patch in patches if patch.distrust]
+    return Group(
+        panels, line, timing, *(Text(each, "red", no_wrap=True, overflow="ellipsis") for each in doubts[:1])
+    )

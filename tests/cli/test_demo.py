@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import io
 import json
 import subprocess
@@ -110,11 +111,13 @@ def test_the_view_shows_names_health_and_losses_in_80_columns() -> None:
         for name in ("palm", "thumb", "index", "middle")
     ]
     patches[1] = PatchView("thumb", "lost", None, float("nan"), float("nan"), 0.0, 3)
+    patches[2] = dataclasses.replace(patches[2], distrust="half of its readings are lost")
     console = Console(file=io.StringIO(), width=80, height=24)
     console.print(render(patches, BusView(3.2, 8.0, 0.63, 13000, 17, 1.2, 2.4), 2e-4))
     lines = console.file.getvalue().splitlines()  # type: ignore[attr-defined]  # it is the StringIO above
     assert max(map(len, lines)) <= 80
     assert len(lines) < 24
     text = "\n".join(lines)
-    for expected in ("palm", "lost 17", "lost ─", "120.0 µm", "→ 10 µm", "63 %", "p99 2.4"):
+    assert "index not trusted: half of its readings are lost" in text
+    for expected in ("palm", "lost 17", "lost ─", "120.0 µm", "→ 10 µm", "63 %", "p99 2.4", "not trusted ─"):
         assert expected in text

@@ -170,11 +170,12 @@ def test_a_misspelt_interface_is_found(tmp_path: Path) -> None:
 
 def test_comments_of_a_new_file_are_keys() -> None:
     text = command("new", "--patches", "1").stdout
-    said = text.replace("# serial", "serial").replace("# link", "link").replace("# pose", "pose")
+    said = re.sub(r"^# (\w+ = )", r"\1", text, flags=re.MULTILINE)
     import tomllib
 
     hand = parse_hand(tomllib.loads(said))
     assert (hand.patches[0].serial, hand.patches[0].link) == (12345, "palm_link")
+    assert (hand.solver.max_std_m, hand.solver.max_force_std_n) == (20e-6, 0.1)
 
 
 def test_schema_is_the_one_that_is_shipped() -> None:

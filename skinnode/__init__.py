@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from skinnode.model.status import Status
     from skinnode.model.tolerances import Tolerances
     from skinnode.record import Recorder, replay
+    from skinnode.solve.operators.result import PointKind
     from skinnode.solve.operators.system import solve_system
     from skinnode.solve.options import PosteriorOptions, TrackerOptions
     from skinnode.solve.paths.path import PathResult, solve_path
@@ -58,6 +59,7 @@ _HOME = {
     "solve_path": "skinnode.solve.paths.path",
     "Posterior": "skinnode.solve.posterior.posterior",
     "PosteriorOptions": "skinnode.solve.options",
+    "PointKind": "skinnode.solve.operators.result",
     "solve_system": "skinnode.solve.operators.system",
     "Tracker": "skinnode.solve.tracker",
     "TrackerOptions": "skinnode.solve.options",
@@ -76,6 +78,7 @@ __all__ = [
     "PatchLayout",
     "PathResult",
     "Periodic",
+    "PointKind",
     "Pose",
     "Posterior",
     "PosteriorOptions",

@@ -11,8 +11,8 @@ Gauss-Newton accepts every step in full; Levenberg-Marquardt and dogleg accept a
 For a square system, CONVERGED means a root: max|r| ≤ tol_f *and* a simplified Newton correction
 ‖J⁻¹ r₊‖∞ ≤ tol_x · max(1, ‖x‖∞) with the current factors. If rounding keeps r above tol_f, an r within the
 rounding error of J·x counts as zero. For a tall system, CONVERGED means a minimum: ‖P r‖ ≤ tol_f ‖r‖, with P
-the projection onto the range of J, and the same condition on the correction. A stationary point of a square
-system with r ≠ 0 is ILL_CONDITIONED, because J is singular there.
+the projection onto the range of J, and the same condition on the correction; ``minimum`` tells minima from
+saddles. A stationary point of a square system with r ≠ 0 is ILL_CONDITIONED, because J is singular there.
 """
 
 from __future__ import annotations

@@ -2,13 +2,29 @@
 
 from __future__ import annotations
 
+import enum
 from dataclasses import dataclass
 
 from skinnode.model.frames import SolveStats
 from skinnode.model.layout import Float
 from skinnode.model.status import Status
 
-__all__ = ["Solution", "SolveStats", "Status"]
+__all__ = ["PointKind", "Solution", "SolveStats", "Status"]
+
+
+class PointKind(enum.Enum):
+    """Kind of the point at which ``solve_system`` stopped."""
+
+    ROOT = "root"
+    """r is zero to within ``tol_f`` or the rounding of x."""
+    MINIMUM = "minimum"
+    """‖r‖ has an isolated minimum above zero: Jᵀr is zero, and the Hessian of ½ ‖r‖² is positive definite."""
+    FLAT = "flat"
+    """Jᵀr is zero and r is not, but x is not determined: ‖r‖ does not change in some direction."""
+    SADDLE = "saddle"
+    """Jᵀr is zero and r is not, but ‖r‖ decreases in some direction."""
+    UNFINISHED = "unfinished"
+    """Neither r nor Jᵀr is zero."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -18,11 +34,15 @@ class Solution:
     x: Float
     """(n,) best iterate."""
     status: Status
+    """CONVERGED at a root and, if there are more equations than unknowns, at a minimum. ILL_CONDITIONED at a
+    minimum of a square system, which is no root, and wherever x is not determined by the equations."""
+    kind: PointKind
+    """Root, minimum, or neither."""
     residual_norm: float
     """‖r‖₂ at ``x``."""
     optimality: float
     """First-order optimality ‖Jᵀr‖∞ at ``x``."""
     error_estimate: float
-    """Estimate of max |x − x*|: the remaining Newton correction plus the effect of rounding F, amplified
-    by the condition number of J; inf if no root or minimum was found."""
+    """Estimate of max |x − x*|: the remaining Newton correction plus the effect of rounding x, amplified by
+    the condition number of J or, at a minimum, of the Hessian; inf unless CONVERGED."""
     stats: SolveStats

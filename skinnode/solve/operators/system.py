@@ -1,4 +1,11 @@
-"""Solver for any square or tall system F(x) = 0, with the same operators as for the skin."""
+"""Solver for any square or tall system F(x) = 0, with the same operators as for the skin.
+
+Levenberg-Marquardt and dogleg make up to three attempts from the same start, which differ in their trust
+region: Moré's column scaling with a radius of 100 ‖D x₀‖, as in MINPACK, then D = I with a radius of ‖x₀‖,
+then of a tenth of it. No scaling is best for every system: column scaling suits unknowns of different units,
+but a column that was large near the start confines all later steps. Therefore the attempts take turns of 100,
+200, 400, … steps until one ends at a root or minimum.
+"""
 
 from __future__ import annotations
 
@@ -6,6 +13,7 @@ import math
 import numbers
 import time
 from collections.abc import Callable
+from typing import Final
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -14,10 +22,17 @@ from skinnode.model.frames import SolveStats
 from skinnode.model.layout import Float, require_array
 from skinnode.model.status import Status
 from skinnode.solve.operators import codes as op
-from skinnode.solve.operators.loop import advance, final_error
-from skinnode.solve.operators.loop import start as start_solve
-from skinnode.solve.operators.result import Solution
-from skinnode.solve.operators.work import workspace
+from skinnode.solve.operators.attempt import Attempt, System
+from skinnode.solve.operators.minimum import Point
+from skinnode.solve.operators.result import PointKind, Solution
+
+TURN: Final = 100
+"""Steps of an attempt's first turn, doubled at each later turn. On 46 problems of Moré, Garbow & Hillstrom,
+from three starts each, column scaling alone converges on 90, and within 100 steps on 79 (dogleg) or 72
+(Levenberg-Marquardt)."""
+RADII: Final = (1.0, 0.1)
+"""Initial trust radii of the attempts with D = I, relative to ‖x₀‖. On the same problems, dogleg converges on
+93 or 99, Levenberg-Marquardt on 102 or 101, and with each radius where it does not with the other."""
 
 
 def operator_code(name: str) -> int:
@@ -43,7 +58,7 @@ def solve_system(  # noqa: PLR0913 - keyword arguments of the public interface
     operator: str = "dogleg",
     tol_f: float = 1e-12,
     tol_x: float = 1e-12,
-    max_steps: int = 1000,
+    max_steps: int = 2000,
 ) -> Solution:
     """Solve residual(x) = 0, or minimise ‖residual(x)‖₂ if there are more equations than unknowns.
 
@@ -54,12 +69,15 @@ def solve_system(  # noqa: PLR0913 - keyword arguments of the public interface
         operator: ``dogleg``, ``levenberg_marquardt`` or ``gauss_newton``.
         tol_f: Largest |r| at a root; at a minimum, largest fraction of r in the range of J.
         tol_x: Largest remaining correction, relative to max(1, max|x|).
-        max_steps: Maximum number of trial steps, including rejected steps.
+        max_steps: Maximum number of trial steps of all attempts together, including rejected steps.
 
     Returns:
-        The best iterate with its status, which is ``INVALID_START`` if there are fewer equations than
-        unknowns, or if the residual or Jacobian is not finite at ``x0``. For the meaning of CONVERGED, see
-        :mod:`skinnode.solve.operators.loop`.
+        The best iterate with its status and kind. CONVERGED means a root or, if there are more equations
+        than unknowns, an isolated minimum of ‖r‖; ``kind`` says which. A minimum of a square system with
+        r ≠ 0 is no solution, and ILL_CONDITIONED, because J is singular there; so is every point that the
+        equations do not determine. INVALID_START means fewer equations than unknowns, or a residual or
+        Jacobian that is not finite at ``x0``. Testing a minimum takes 2 n Jacobians or more; ``stats``
+        counts them.
 
     Raises:
         ValueError: If an argument is out of range, or an argument or returned array has the wrong shape. A
@@ -67,48 +85,43 @@ def solve_system(  # noqa: PLR0913 - keyword arguments of the public interface
     """
     code = operator_code(operator)
     require_tolerances(tol_f, tol_x, max_steps)
-    start = time.perf_counter()
+    begin = time.perf_counter()
     x = require_array("x0", x0, ("n",))
-    n = x.size
-    first = require_array("residual(x0)", residual(x.copy()), ("m",), finite=False)
-    m = first.size
-    w = workspace(n, m)
-    w.x[:], w.r[:] = x, first
-    evaluations, jacobians, steps = 1, 0, 0
-
-    def refresh_jacobian() -> None:
-        w.jt[:] = require_array("jacobian(x)", jacobian(w.x.copy()), (m, n), finite=False).T
-
-    if m >= n:
-        refresh_jacobian()
-        jacobians += 1
-    went = start_solve(w)
-    if went == op.TRY:
-        went = op.REJECTED if np.isfinite(w.jt).all() else op.INVALID_START
-    while went < 0:
-        went = advance(code, w, went, tol_f, tol_x)
-        if went == op.ACCEPTED:
-            refresh_jacobian()
-            jacobians += 1
-        elif went == op.TRY:
-            if steps >= max_steps:
-                went = op.MAX_STEPS
-                break
-            steps += 1
-            evaluations += 1
-            w.r_trial[:] = require_array("residual(x)", residual(w.trial.copy()), (m,), finite=False)
-    error = math.inf
-    if went == op.CONVERGED:
-        share = final_error(w, np.empty((n, m)))
-        error = share * max(1.0, float(np.abs(w.x).max()))
-        if not share <= (op.ROOT_SHARE if m == n else op.MINIMUM_SHARE):
-            went = op.ILL_CONDITIONED
+    system = System(residual, jacobian, x)
+    wide = system.m < system.n
+    start = Point(x, system.first, np.zeros((system.m, system.n)) if wide else system.jacobian(x))
+    best = _solve(code, system, start, tol_f, tol_x, int(max_steps))
+    at, invalid = best.at, best.went == op.INVALID_START
     with np.errstate(all="ignore"):
         return Solution(
-            x=w.x.copy(),
-            status=Status(went),
-            residual_norm=float(np.linalg.norm(w.r)),
-            optimality=float(np.abs(w.jt @ w.r).max()) if went != op.INVALID_START else math.nan,
-            error_estimate=error,
-            stats=SolveStats(evaluations, jacobians, steps, time.perf_counter() - start),
+            x=at.x,
+            status=Status(best.went if best.went >= 0 else op.MAX_STEPS),
+            kind=best.kind,
+            residual_norm=float(np.linalg.norm(at.r)),
+            optimality=math.nan if invalid else float(np.abs(at.j.T @ at.r).max()),
+            error_estimate=best.error if best.went == op.CONVERGED else math.inf,
+            stats=SolveStats(system.evaluations, system.jacobians, system.steps, time.perf_counter() - begin),
         )
+
+
+def _solve(  # noqa: PLR0913 - the arguments of solve_system
+    code: int, system: System, start: Point, tol_f: float, tol_x: float, max_steps: int
+) -> Attempt:
+    """Let the attempts take turns until one decides; return it, else that with the smallest residual."""
+    attempts = [Attempt(code, system, start, 0.0)]
+    size = float(np.linalg.norm(start.x)) or 1.0
+    later = [] if code == op.GAUSS_NEWTON else [-size * radius for radius in RADII]
+    turn = TURN if later else max_steps
+    while system.steps < max_steps and not all(each.ended for each in attempts):
+        for number in range(1 + len(RADII)):
+            if number >= len(attempts) and later:
+                attempts.append(Attempt(code, system, start, later.pop(0)))
+            if number < len(attempts) and not attempts[number].ended:
+                attempts[number].run(min(turn, max_steps - system.steps), tol_f, tol_x)
+                if attempts[number].decided:
+                    return attempts[number]
+        turn *= 2
+    best = min(attempts, key=lambda each: each.norm)
+    if best.kind is PointKind.UNFINISHED:
+        best.settle(tol_x, max_steps - system.steps)
+    return best

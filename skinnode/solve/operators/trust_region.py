@@ -53,8 +53,18 @@ def slope_of(w: Work) -> float:
 
 @njit_part
 def measure_newton(w: Work) -> None:
-    """Update D and the length of the Newton step; set the initial radius."""
+    """Update D and the length of the Newton step; set the initial radius.
+
+    A negative LIMIT selects D = I, with −LIMIT as the initial radius.
+    """
     n, s = w.x.size, w.s
+    if s[LIMIT] < 0.0:
+        for j in range(n):
+            w.scale[j] = 1.0
+        if s[RADIUS] < 0.0:
+            s[RADIUS] = -s[LIMIT]
+        s[NEWTON_LENGTH] = weighted_norm(w.scale, w.newton) if w.flag[SINGULAR] == 0 else math.inf
+        return
     for j in range(n):
         w.scale[j] = max(w.scale[j], math.sqrt(dot(w.jt[j], w.jt[j])))
         if w.scale[j] == 0.0:

@@ -2,7 +2,8 @@
 
 The symbols are those of the paper: r is the residual (m,), J its Jacobian (m, n), stored transposed, and lam
 the Levenberg-Marquardt parameter. The trust region is ‖D s‖ ≤ radius, where D is the running maximum of the
-column norms of J (Moré 1978), so that the units of the unknowns do not matter.
+column norms of J (Moré 1978), so that the units of the unknowns do not matter, or, for a second attempt of
+``solve_system``, the identity.
 """
 
 from __future__ import annotations

@@ -1,0 +1,144 @@
+"""One attempt of ``solve_system``: an operator with its trust region, from the start to a judged point.
+
+The compiled loop stops at roots and near stationary points of ‖r‖. Decided here is what its CONVERGED leaves
+open: whether the equations determine x, and whether a stationary point with r ≠ 0 is a minimum.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Final
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from skinnode.model.layout import Float, require_array
+from skinnode.solve.operators import codes as op
+from skinnode.solve.operators.loop import advance, final_error
+from skinnode.solve.operators.loop import start as start_solve
+from skinnode.solve.operators.minimum import CURVED, Point, settle
+from skinnode.solve.operators.result import PointKind
+from skinnode.solve.operators.work import LIMIT, NORM, workspace
+
+NEAR: Final = 1e-2
+"""Largest cosine between r and a column of J from which Newton's method is tried for a minimum before the
+operator has converged. If r is large, the operators' own steps converge linearly (Brown & Dennis: 454
+steps)."""
+
+
+class System:
+    """The caller's functions; counts their calls and checks their arrays."""
+
+    def __init__(
+        self, residual: Callable[[Float], ArrayLike], jacobian: Callable[[Float], ArrayLike], x0: Float
+    ) -> None:
+        self._residual, self._jacobian = residual, jacobian
+        self.n, self.evaluations, self.jacobians = x0.size, 1, 0
+        self.first = require_array("residual(x0)", residual(x0.copy()), ("m",), finite=False)
+        self.m = self.first.size
+
+    def residual(self, x: Float) -> Float:
+        """Return r (m,) at x. Raises ValueError if the caller's function returns another shape."""
+        self.evaluations += 1
+        return require_array("residual(x)", self._residual(x.copy()), (self.m,), finite=False)
+
+    def jacobian(self, x: Float) -> Float:
+        """Return J (m, n) at x. Raises ValueError if the caller's function returns another shape."""
+        self.jacobians += 1
+        return require_array("jacobian(x)", self._jacobian(x.copy()), (self.m, self.n), finite=False)
+
+    @property
+    def steps(self) -> int:
+        """Trial points so far: every evaluation of r after the first."""
+        return self.evaluations - 1
+
+
+class Attempt:
+    """A solve that can pause after any number of steps.
+
+    ``limit`` is the initial trust radius: 0 for Moré's column scaling and radius, −radius for D = I.
+    """
+
+    def __init__(self, code: int, system: System, start: Point, limit: float) -> None:
+        self._code, self._system = code, system
+        self.kind, self.error = PointKind.UNFINISHED, math.inf
+        self._settled: Point | None = None
+        w = self._w = workspace(system.n, system.m)
+        w.x[:], w.r[:], w.jt[:], w.s[LIMIT] = start.x, start.r, start.j.T, limit
+        self.went = start_solve(w)
+        if self.went == op.TRY:
+            self.went = op.REJECTED if np.isfinite(w.jt).all() else op.INVALID_START
+
+    @property
+    def at(self) -> Point:
+        """The best iterate."""
+        return self._settled or Point(self._w.x.copy(), self._w.r.copy(), self._w.jt.T.copy())
+
+    @property
+    def norm(self) -> float:
+        """‖r‖₂ at the best iterate."""
+        return float(self._w.s[NORM])
+
+    @property
+    def ended(self) -> bool:
+        """Whether the attempt has a status."""
+        return self.went >= 0
+
+    @property
+    def decided(self) -> bool:
+        """Whether other attempts are useless: x is a root or minimum, or not determined."""
+        return self.went in (op.CONVERGED, op.INVALID_START) or self.kind in (PointKind.ROOT, PointKind.FLAT)
+
+    def run(self, steps: int, tol_f: float, tol_x: float) -> None:
+        """Take at most this many steps; at the end of the solve, or near a minimum, judge the point."""
+        w, system, left = self._w, self._system, steps
+        while not self.ended:
+            if self.went == op.TRY:
+                if left == 0:
+                    break
+                left -= 1
+                w.r_trial[:] = system.residual(w.trial)
+            self.went = advance(self._code, w, self.went, tol_f, tol_x)
+            if self.went == op.ACCEPTED:
+                w.jt[:] = system.jacobian(w.x).T
+        if self.went == op.INVALID_START:
+            return
+        if self._is_root(tol_f):
+            self.kind = PointKind.ROOT
+        elif system.m > system.n:
+            self.settle(tol_x, left)
+
+    def _is_root(self, tol_f: float) -> bool:
+        """Return whether the ended solve reached r = 0; estimate the error, and refuse an undetermined x."""
+        w, system = self._w, self._system
+        square = system.m == system.n
+        if self.went == op.CONVERGED:
+            share = final_error(w, np.empty((system.n, system.m)))
+            self.error = share * max(1.0, float(np.abs(w.x).max()))
+            if share <= (op.ROOT_SHARE if square else op.MINIMUM_SHARE):
+                return square or self.at.is_root(tol_f)
+            self.went = op.ILL_CONDITIONED
+        return self.ended and float(np.abs(w.r).max()) <= tol_f
+
+    def settle(self, tol_x: float, steps: int) -> None:
+        """If a minimum of ‖r‖ is near, go there by Newton's method; tell minima, flats and saddles apart."""
+        at, system, converged = self.at, self._system, self.went == op.CONVERGED
+        if converged:
+            self.went = op.ILL_CONDITIONED
+        if not at.cosine <= NEAR:
+            return
+        settled = settle(system.residual, system.jacobian, at, tol_x, steps)
+        minimum = settled.error <= op.MINIMUM_SHARE * max(1.0, float(np.abs(settled.at.x).max()))
+        if minimum:
+            self.error = settled.error
+        elif converged and settled.at is at:
+            # Rounding hides the curvature along a very flat valley, but J has full rank there
+            minimum = abs(settled.lowest) <= CURVED
+        if minimum:
+            self._settled, self.kind = settled.at, PointKind.MINIMUM
+            self.went = op.CONVERGED if system.m > system.n else op.ILL_CONDITIONED
+        elif self.ended:
+            self._settled = settled.at
+            if settled.at.cosine <= op.STATIONARY and not math.isnan(settled.lowest):
+                self.kind = PointKind.FLAT if settled.lowest > -CURVED else PointKind.SADDLE

@@ -1,0 +1,148 @@
+"""Second-order test of a stationary point of ‖r‖, and Newton's method for a minimum with r ≠ 0.
+
+The Hessian of ½ ‖r‖² is JᵀJ + S, S = Σ_k r_k ∇²r_k, with S from central differences of Jᵀr at constant r.
+With D the column norms of J and J D⁻¹ = U Σ Vᵀ, it is D V (Σ² + C) Vᵀ D, C = Vᵀ D⁻¹ S D⁻¹ V, so JᵀJ is never
+formed. Row and column k of Σ² + C are divided by √(σ_k² + ν), with ν the rounding error of C. The smallest
+eigenvalue that remains is 1 at a minimum with r = 0, and at most about 0 at a saddle or in a flat direction.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from skinnode.model.layout import Float
+from skinnode.solve.operators.codes import EPS, STATIONARY
+
+DIFFERENCE: Final = EPS ** (1 / 3)
+"""Step of a central difference, relative to the coordinate: truncation and rounding errors are equal."""
+NOISE: Final = EPS ** (2 / 3)
+"""Relative rounding error of a central difference with this step."""
+CURVED: Final = 0.05
+"""Smallest scaled eigenvalue of the Hessian that counts as positive. On the problems of Moré, Garbow &
+Hillstrom, LOWS."""
+CONTRACTION: Final = 0.5
+"""Largest ratio of successive Newton steps that counts as convergence."""
+NEWTON_STEPS: Final = 8
+"""Maximum Newton steps to a minimum, twice the number that quadratic convergence takes from a 1 % error."""
+
+
+@dataclass(frozen=True)
+class Point:
+    """A point with its residual and Jacobian."""
+
+    x: Float
+    r: Float
+    j: Float
+
+    @property
+    def norm(self) -> float:
+        """‖r‖₂."""
+        return float(np.linalg.norm(self.r))
+
+    @property
+    def cosine(self) -> float:
+        """Largest cosine of the angle between r and a column of J; 0 if both are zero."""
+        below = column_norms(self.j) * self.norm
+        share = np.divide(np.abs(self.j.T @ self.r), below, out=np.zeros(below.size), where=below > 0)
+        return float(share.max())
+
+    @property
+    def rounding(self) -> Float:
+        """(m,) effect on r of rounding x."""
+        return np.asarray(EPS * (np.abs(self.j) @ np.abs(self.x)))
+
+    def is_root(self, tol_f: float) -> bool:
+        """Return whether every |r_k| is at most ``tol_f`` or four times the effect of rounding x."""
+        return bool((np.abs(self.r) <= np.maximum(tol_f, 4.0 * self.rounding)).all())
+
+
+@dataclass(frozen=True)
+class Curvature:
+    """The Hessian at a point, reduced to a verdict and a step."""
+
+    lowest: float
+    """Smallest scaled eigenvalue; about 0 if a direction is flat, NaN if a number overflowed."""
+    step: Float
+    """(n,) Newton step for Jᵀr = 0."""
+    error: float
+    """Effect of rounding r, J and x on the minimum, max |δx|."""
+
+    @property
+    def positive(self) -> bool:
+        """Whether the Hessian is positive definite."""
+        return self.lowest > CURVED
+
+
+def column_norms(j: Float) -> Float:
+    """Return the Euclidean norms (n,) of the columns of J."""
+    return np.asarray(np.sqrt((j * j).sum(axis=0)))
+
+
+def curvature(jacobian: Callable[[Float], Float], at: Point) -> Curvature:
+    """Return the Hessian at a point, from 2n Jacobians."""
+    n = at.x.size
+    d = column_norms(at.j)
+    d[d == 0.0] = 1.0
+    reach = at.norm / d  # the move of one coordinate that changes r by its own norm
+    size = np.maximum(np.abs(at.x), np.minimum(reach, 1.0))
+    s = np.empty((n, n))
+    for k in range(n):
+        ends = np.stack([at.x, at.x])
+        ends[:, k] += (DIFFERENCE * size[k], -DIFFERENCE * size[k])
+        s[k] = (jacobian(ends[0]) - jacobian(ends[1])).T @ at.r / (ends[0, k] - ends[1, k])
+    s = 0.5 * (s + s.T) / np.outer(d, d)
+    if not (np.isfinite(s).all() and np.isfinite(at.j).all()):
+        return Curvature(math.nan, np.zeros(n), math.inf)
+    u, sigma, vt = np.linalg.svd(at.j / d, full_matrices=False)
+    c = vt @ s @ vt.T
+    noise = NOISE * float(np.abs(c).max() + (reach / size).max()) + (n * EPS * sigma[0]) ** 2
+    share = 1.0 / np.sqrt(sigma**2 + noise)
+    bend, q = np.linalg.eigh(np.diag((sigma * share) ** 2) + c * np.outer(share, share))
+    if not bend[0] > CURVED:
+        return Curvature(float(bend[0]), np.zeros(n), math.inf)
+    half = (q.T * share) @ vt / d
+    inverse = (half.T / bend) @ half  # of the Hessian
+    pseudo = (half.T / bend) @ (q.T * (share * sigma)) @ u.T  # the inverse of the Hessian times Jᵀ
+    rounded = np.abs(pseudo) @ at.rounding + EPS * (np.abs(inverse) @ (np.abs(at.j).T @ np.abs(at.r)))
+    return Curvature(float(bend[0]), -pseudo @ at.r, float((rounded + EPS * np.abs(at.x)).max()))
+
+
+@dataclass(frozen=True)
+class Settled:
+    """Outcome of :func:`settle`."""
+
+    at: Point
+    lowest: float
+    """Smallest scaled eigenvalue of the Hessian at the point; NaN if a number overflowed."""
+    error: float
+    """Estimate of max |x − x*|; inf unless Jᵀr is zero and the Hessian positive definite."""
+
+
+def settle(
+    residual: Callable[[Float], Float],
+    jacobian: Callable[[Float], Float],
+    at: Point,
+    tol_x: float,
+    max_steps: int,
+) -> Settled:
+    """Take Newton steps for Jᵀr = 0 while they contract and ‖r‖ does not grow; judge the last point."""
+    before = math.inf
+    for left in range(min(NEWTON_STEPS, max_steps), -1, -1):
+        bent = curvature(jacobian, at)
+        size = float(np.abs(bent.step).max())
+        reached = size <= max(tol_x * max(1.0, float(np.abs(at.x).max())), bent.error)
+        if not bent.positive or reached or left == 0 or not size <= CONTRACTION * before:
+            break
+        x = at.x + bent.step
+        r = residual(x)
+        if not float(np.linalg.norm(r)) <= at.norm * (1.0 + STATIONARY):
+            break
+        before, at = size, Point(x, r, jacobian(x))
+    # A step that does not contract any more is rounding if Jᵀr is as small as rounding makes it
+    known = bent.positive and (reached or at.cosine <= STATIONARY)
+    return Settled(at, bent.lowest, size + bent.error if known else math.inf)

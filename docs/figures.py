@@ -3,8 +3,8 @@
     .venv/bin/skinnode bench path --json out/path.json --plot out/path.png
     .venv/bin/python docs/figures.py out
 
-The folder holds some of {kernel,solve,path,accuracy,stability}.json and .png; a table without a file stays as
-it is. ``wrong_models.txt`` is the output of docs/wrong_models.py.
+The folder holds some of {kernel,solve,systems,path,accuracy,stability}.json and .png; a table without a file
+stays as it is. ``wrong_models.txt`` is the output of docs/wrong_models.py.
 """
 
 from __future__ import annotations
@@ -58,6 +58,25 @@ def solve(figures: dict[str, Any]) -> str:
         for row in figures["rows"]
     ]
     return f"{machine(figures)}\n\n" + table(["who", "µs per wire", "ratio", "error", "tolerance"], rows)
+
+
+def systems(figures: dict[str, Any]) -> str:
+    """Problems of the literature, and what each solver says of them."""
+    rows = []
+    for row in figures["rows"]:
+        solved = [
+            str(each) for kind in ("square", "tall") for each in (row[kind] or ["-"] * len(row["square"]))
+        ]
+        calls = " / ".join(str(each) for each in row["calls"])
+        rows.append([row["who"], *solved, str(row["false"]), str(row["unclaimed"]), calls])
+    of = figures["of"]
+    head = [
+        "solver",
+        *(f"square, × {factor}" for factor in (1, 10, 100)),
+        *(f"tall, × {factor}" for factor in (1, 10, 100)),
+        *("falsely claimed", "solved, not claimed", "calls of r / J"),
+    ]
+    return f"{machine(figures)} {of['square']} square and {of['tall']} tall problems.\n\n" + table(head, rows)
 
 
 def path(figures: dict[str, Any]) -> str:
@@ -303,6 +322,7 @@ def exact_data(figures: dict[str, Any]) -> str:
 MADE: dict[str, dict[str, Callable[[dict[str, Any]], str]]] = {
     "kernel": {"kernel": kernel},
     "solve": {"solve": solve},
+    "systems": {"systems": systems},
     "path": {"path": path, "step control": step_control},
     "accuracy": {
         "front": front,

@@ -15,8 +15,6 @@ from skinnode.bench.trust_signal import RATE_HZ, Setting
 SECTIONS: Final = ("healthy", "single", "pair", "hours")
 HEALTHY: Final = 0.99
 """Minimum share of trusted fields without a fault, at a noise of 1e-5 and 1e-4."""
-NAMED: Final = 0.95
-"""Minimum share of trusted fields with one fault, once it is named."""
 FALSE_PER_HOUR: Final = 0.1
 """Maximum number of false namings per patch-hour."""
 
@@ -52,7 +50,7 @@ def verdicts(rows: Sequence[dict[str, Any]], settings: Sequence[Setting]) -> lis
     if named:
         after = _sum(named, "after")
         share = _sum(named, "after_trusted") / after if after else 0.0
-        found.append(_must("trusted fields with one fault, once named", share, NAMED, least=True))
+        found.append(_must("trusted fields with one fault, once named", share, trust_table.NAMED, least=True))
     if by_section["hours"]:
         found.append(_false_namings(by_section["hours"]))
     return found

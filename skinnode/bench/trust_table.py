@@ -29,6 +29,8 @@ from skinnode.solve.paths.step_control import Uniform
 
 FINE: Final = Setting("staggered", 0.5, 1e-5)
 COARSE: Final = Setting("staggered", 0.5, 1e-4)
+NAMED: Final = 0.95
+"""Minimum share of trusted fields with one faulty wire or crossing, once it is named."""
 BRIEF: Final = Timeline(rest=4, press=5, hold=6, slide=0, release=0, after=0)
 """Phases of a stream whose contacts are counted."""
 BLUNT_M: Final = 100e-6
@@ -100,10 +102,10 @@ def _with_fault(name: str, setting: Setting, count: int = 4) -> Callable[[int], 
         named = f"named in {total.named} of {total.nameable} streams"
         if total.scans_to_name:
             named += f", after {total.median_scans:g} scans"
-        text = (
-            f"{trusted} of {fields} trusted, {wrong} of them beyond 5 deviations, up to {worst:.3g}; {named}"
-        )
-        return text, total.share_beyond <= BEYOND
+        text = f"{trusted} of {fields} trusted, {wrong} of them beyond 5 deviations, up to {worst:.3g}"
+        goes_on = total.share_after if total.after else trusted / max(fields, 1)
+        is_good = total.share_beyond <= BEYOND and (goes_on >= NAMED or not fault.local)
+        return f"{text}; {named}", is_good
 
     return measure
 
@@ -205,10 +207,8 @@ def _placed(off: float) -> Callable[[int], tuple[str, bool]]:
             errors.append(np.linalg.norm(field.displacement_m - truth) / np.linalg.norm(truth))
             trusted += field.trusted
             worst = max(worst, float(deviations(field, truth).max()))
-        text = (
-            f"error {100 * np.median(errors):.0f} %, up to {worst:.3g} deviations off, {trusted} of 8 trusted"
-        )
-        return text, total.share_beyond <= BEYOND
+        text = f"error {100 * np.median(errors):.0f} %, up to {worst:.3g} deviations off"
+        return f"{text}, {trusted} of 8 trusted", total.share_beyond <= BEYOND
 
     return measure
 

@@ -6,7 +6,8 @@
  4 a press between two frames                11 repeated presses and releases
  5 an electrode almost touching              12 curved layouts, N = 1, K < 3N, K > 3N
  6 noise and code widths                     13 the wrong model
- 7 open, shorted, missing, saturated
+ 7 open, shorted, missing, saturated         14 wrong data that nothing marks
+15 patches made to ordinary tolerances       16 the whole patch pressed
 
 A case consists of the patch as the solver knows it, the options that an informed user would set and, for
 every seed, a stream of frames with the truth.
@@ -20,8 +21,9 @@ from typing import Final
 
 import numpy as np
 
-from skinnode.bench.truth import Converter, Press, Skin, Stream, random_press, stream
+from skinnode.bench.truth import Converter, Load, Press, Skin, Stream, random_press, stream
 from skinnode.model.layout import Float, PatchLayout
+from skinnode.model.tolerances import Tolerances
 
 PATHS: Final = ("path gauss_newton", "path levenberg_marquardt", "path dogleg", "path adaptive")
 TRACKERS: Final = ("exact", "posterior", "auto")
@@ -53,6 +55,8 @@ class Case:
     """Number of stream frames per tracker frame; a path uses all frames."""
     model_error: float = 0.0
     """Relative error that the user expects the model to make in predicting the change in R."""
+    tolerances: Tolerances | None = None
+    """Tolerances that the user states."""
 
 
 def preset(name: str, height: float) -> PatchLayout:
@@ -78,7 +82,7 @@ def pressing(  # noqa: PLR0913 - one argument per way to change a stream
     *,
     spoil: Callable[[np.random.Generator, Stream, Skin], Stream] | None = None,
     gain: Callable[[np.random.Generator, int], Float] | None = None,
-    presses: Callable[[np.random.Generator], tuple[Press, ...]] | None = None,
+    presses: Callable[[np.random.Generator], tuple[Load, ...]] | None = None,
 ) -> Callable[[np.random.Generator], Stream]:
     """Return a function that makes the stream of one random press.
 
@@ -94,7 +98,8 @@ def pressing(  # noqa: PLR0913 - one argument per way to change a stream
     """
 
     def make(rng: np.random.Generator) -> Stream:
-        found = (random_press(rng, skin.layout, depth),) if presses is None else presses(rng)
+        drawn: tuple[Load, ...] = (random_press(rng, skin.layout, depth),)
+        found = drawn if presses is None else presses(rng)
         taken = stream(skin, found, shares, converter, rng, None if gain is None else gain(rng, len(shares)))
         return taken if spoil is None else spoil(rng, taken, skin)
 
@@ -103,6 +108,8 @@ def pressing(  # noqa: PLR0913 - one argument per way to change a stream
 
 def all_cases() -> list[Case]:
     """Return every case, in the order of the module docstring's list."""
+    from skinnode.bench.fault_cases import fault_cases  # it imports this module
+
     return [
         *_symmetric_and_thick(),
         *_deep(),
@@ -114,6 +121,7 @@ def all_cases() -> list[Case]:
         *_contacts(),
         *_shapes(),
         *_wrong_models(),
+        *fault_cases(),
     ]
 
 

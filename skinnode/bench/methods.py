@@ -72,6 +72,8 @@ def solver_of(case: Case, name: str) -> Tracker | Posterior:
         common |= {"drift": case.drift, "drift_std": DRIFT}
     if case.model_error:
         common["model_error"] = case.model_error
+    if case.tolerances is not None:
+        common["tolerances"] = case.tolerances
     if name == "posterior":
         return Posterior(case.skin.layout, **common)
     return Tracker(case.skin.layout, method="auto", **common)

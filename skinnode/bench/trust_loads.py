@@ -12,11 +12,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Final, Protocol
+from typing import Final
 
 import numpy as np
 
-from skinnode.bench.truth import RUBBER, Press
+from skinnode.bench.truth import RUBBER, Load, Press
 from skinnode.model.layout import Float, PatchLayout
 
 LOADS: Final = ("sphere", "punch", "ridge", "dent", "edge", "whole patch")
@@ -33,24 +33,6 @@ WAVE_MAX: Final = 60.0
 """Largest wave number, in inverse contact radii: Hertz's pressure has 1e-4 of its weight beyond."""
 
 _UNKNOWN: Final = np.full(3, np.nan)
-
-
-class Load(Protocol):
-    """A body that presses on the skin, to a share of its full depth."""
-
-    @property
-    def center_m(self) -> tuple[float, float]:
-        """Centre (x, y) of the load at the start, metres."""
-
-    @property
-    def depth_m(self) -> float:
-        """Full depth, metres."""
-
-    def displacement_m(self, points_m: Float, share: float) -> Float:
-        """Return the displacement (P, 3) of surface points (P, 2), metres."""
-
-    def force_n(self, share: float) -> Float:
-        """Return the load (3,) on the rubber, newtons; NaN if the body does not determine it."""
 
 
 @dataclass(frozen=True)
@@ -187,31 +169,6 @@ class Plate:
 
 
 @dataclass(frozen=True)
-class Sphere:
-    """A rigid sphere (Hertz)."""
-
-    press: Press
-
-    @property
-    def center_m(self) -> tuple[float, float]:
-        """Centre of the contact."""
-        return self.press.center_m
-
-    @property
-    def depth_m(self) -> float:
-        """Full depth."""
-        return self.press.depth_m
-
-    def displacement_m(self, points_m: Float, share: float) -> Float:
-        """Return Hertz's displacement."""
-        return self.press.displacement_m(points_m, share)
-
-    def force_n(self, share: float) -> Float:
-        """Return Hertz's force and the shear."""
-        return self.press.force_n(share)
-
-
-@dataclass(frozen=True)
 class Bonded:
     """Hertz's pressure on a layer of incompressible rubber that is bonded to a rigid base.
 
@@ -297,4 +254,4 @@ def draw(kind: str, layout: PatchLayout, rng: np.random.Generator, depth: float 
         center = (float(border[0]), center[1]) if side % 2 else (center[0], float(border[1]))
     elif kind != "sphere":
         raise ValueError(f"kind: got {kind!r}, must be one of {', '.join(LOADS)}")
-    return Sphere(Press(center, (1.5 + 2.0 * size) * pitch, sunk, traction))
+    return Press(center, (1.5 + 2.0 * size) * pitch, sunk, traction)

@@ -16,13 +16,12 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from skinnode.bench.truth import Skin
+from skinnode.bench.truth import Load, Skin
 from skinnode.model.layout import Float, PatchLayout
 from skinnode.protocol.codes import MISSING, Codes, CodeScale, as_baseline, encode
 
 if TYPE_CHECKING:
     from skinnode.bench.trust_faults import Fault
-    from skinnode.bench.trust_loads import Load
 
 PITCH_M: Final = 4e-3
 LAYOUTS: Final = (("staggered", 0.5), ("staggered", 1.0), ("aligned", 0.5))

@@ -15,11 +15,11 @@ from typing import Any, Final
 import numpy as np
 
 from skinnode.bench.trust_faults import Fault, singles, some_bits
-from skinnode.bench.trust_loads import Bonded, Load, draw
+from skinnode.bench.trust_loads import Bonded, draw
 from skinnode.bench.trust_score import BEYOND, LIMIT, Score, deviations, judge, trusted_wires
 from skinnode.bench.trust_signal import PITCH_M, CodeStream, Setting, Timeline, make
 from skinnode.bench.trust_solver import fields_of, solver_of
-from skinnode.bench.truth import Converter, Skin, random_press, stream
+from skinnode.bench.truth import Converter, Load, Skin, random_press, stream
 from skinnode.config import PatchConfig, parse_hand
 from skinnode.model.frames import FieldFrame
 from skinnode.model.layout import PatchLayout

@@ -12,7 +12,7 @@ from __future__ import annotations
 import functools
 import math
 from dataclasses import dataclass, field
-from typing import Final, Literal
+from typing import Final, Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +26,24 @@ EXACT_NOISE: Final = 1e-9
 """Relative noise passed to a tracker for noiseless data; determines the tolerance of the solve."""
 RING: Final = 4
 """Number of points on the rim of a finite electrode, giving 16 distances per pair of electrodes."""
+
+
+class Load(Protocol):
+    """A body that presses on the skin, to a share of its full depth."""
+
+    @property
+    def center_m(self) -> tuple[float, float]:
+        """Centre (x, y) of the load at the start, metres."""
+
+    @property
+    def depth_m(self) -> float:
+        """Full depth, metres."""
+
+    def displacement_m(self, points_m: Float, share: float) -> Float:
+        """Return the displacement (P, 3) of surface points (P, 2), metres."""
+
+    def force_n(self, share: float) -> Float:
+        """Return the load (3,) on the rubber, newtons; NaN if the body does not determine it."""
 
 
 @dataclass(frozen=True)
@@ -114,7 +132,7 @@ class Skin:
             (np.take_along_axis(gap, nearest, axis=2)[:, :, 0] * self.axes[:, :, 2]).sum(axis=-1)
         )
 
-    def displacement_m(self, presses: tuple[Press, ...], share: float) -> Float:
+    def displacement_m(self, presses: tuple[Load, ...], share: float) -> Float:
         """Return the displacement (U, N, 3) of the electrodes under all presses, metres."""
         points = self.body.upper_m[..., :2] if self.points_m is None else self.points_m
         moved = np.zeros((points.shape[0] * points.shape[1], 3))
@@ -247,7 +265,7 @@ class Stream:
     """(T, U, N, 3), true displacement in metres; NaN in frames that no skin can produce."""
     force_n: Float
     """(T, 3), sum of all loads in newtons; NaN in the same frames as ``truth_m``."""
-    presses: tuple[Press, ...] = ()
+    presses: tuple[Load, ...] = ()
 
     def every(self, stride: int) -> Stream:
         """Return every ``stride``-th frame, beginning with the first."""
@@ -263,7 +281,7 @@ class Stream:
 
 def stream(  # noqa: PLR0913 - the parts of a stream
     skin: Skin,
-    presses: tuple[Press, ...],
+    presses: tuple[Load, ...],
     shares: Float,
     converter: Converter,
     rng: np.random.Generator,

@@ -95,7 +95,10 @@ def _hand(patches: int, seed: int) -> HandConfig:
     return parse_hand(
         {
             "buses": buses,
-            "patches": [{"name": f"p{i}", "node_id": 5 + i, "bus": f"can{i}"} for i in range(patches)],
+            "patches": [
+                {"name": f"p{i}", "node_id": 5 + i, "bus": f"can{i}", "tolerances": "exact"}
+                for i in range(patches)
+            ],
             "sync": {"period_ms": PERIOD_MS},
             "simulation": {"seed": seed, "cycle_s": 3.0},
         }

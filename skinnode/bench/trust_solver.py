@@ -28,9 +28,10 @@ def solver_of(taken: CodeStream, config: PatchConfig | None = None, **options: A
         **options: Keys of ``[solver]`` in a hand file.
     """
     layout = taken.layout
-    stated: dict[str, Any] = {"relative_noise": taken.stated_noise}
-    if "tolerances" in PatchConfig.model_fields:
-        stated["tolerances"] = "ordinary" if taken.ordinary else "exact"
+    stated: dict[str, Any] = {
+        "relative_noise": taken.stated_noise,
+        "tolerances": "ordinary" if taken.ordinary else "exact",
+    }
     facts = NodeFacts(
         config=PatchConfig(name="patch", node_id=5, **stated) if config is None else config,
         layout=layout,

@@ -108,8 +108,6 @@ def pressing(  # noqa: PLR0913 - one argument per way to change a stream
 
 def all_cases() -> list[Case]:
     """Return every case, in the order of the module docstring's list."""
-    from skinnode.bench.fault_cases import fault_cases  # it imports this module
-
     return [
         *_symmetric_and_thick(),
         *_deep(),
@@ -121,7 +119,6 @@ def all_cases() -> list[Case]:
         *_contacts(),
         *_shapes(),
         *_wrong_models(),
-        *fault_cases(),
     ]
 
 

@@ -9,6 +9,7 @@ Every stream is drawn from the seed and from its own name, so parts of a run can
 
 from __future__ import annotations
 
+import json
 import math
 import time
 import zlib
@@ -16,6 +17,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
@@ -129,23 +131,59 @@ def _watch(item: Item, rng: np.random.Generator) -> Score:
     return total
 
 
+class Kept:
+    """Scores of streams already solved, in a file with a line per stream; without a file nothing is kept.
+
+    Args:
+        path: File to append to; None for none.
+        seed: Seed of the run; lines with another seed are ignored.
+    """
+
+    def __init__(self, path: Path | None, seed: int) -> None:
+        self._path, self._seed = path, seed
+        self.scores: dict[str, Score] = {}
+        if path is None or not path.exists():
+            return
+        for line in path.read_text(encoding="utf-8").splitlines():
+            kept = json.loads(line)
+            if kept["seed"] == seed:
+                self.scores[kept["stream"]] = Score(**kept["score"])
+
+    def keep(self, item: Item, score: Score) -> None:
+        """Append a score."""
+        if self._path is not None:
+            line = json.dumps({"seed": self._seed, "stream": item.name, "score": asdict(score)})
+            with self._path.open("a", encoding="utf-8") as file:
+                file.write(line + "\n")
+
+    def forget(self) -> None:
+        """Remove the file."""
+        if self._path is not None:
+            self._path.unlink(missing_ok=True)
+
+
 def _solve_all(
-    work: Sequence[Item], seed: int, jobs: int, progress: Callable[[str], object]
+    work: Sequence[Item], seed: int, jobs: int, progress: Callable[[str], object], kept: Kept
 ) -> Iterator[tuple[Item, Score]]:
+    todo = [item for item in work if item.name not in kept.scores]
+    for item in work:
+        if item.name in kept.scores:
+            yield item, kept.scores[item.name]
     with ExitStack() as stack:
         results: Iterable[Score]
         if jobs > 1:
             with starting_children():
                 pool: ProcessPoolExecutor = stack.enter_context(processes(jobs))
-                shares = [pool.submit(solve_item, item, seed) for item in work]
+                shares = [pool.submit(solve_item, item, seed) for item in todo]
             results = (share.result() for share in shares)
         else:
-            results = (solve_item(item, seed) for item in work)
+            results = (solve_item(item, seed) for item in todo)
         start = time.monotonic()
-        for done, (item, score) in enumerate(zip(work, results, strict=True), 1):
+        for done, (item, score) in enumerate(zip(todo, results, strict=True), 1):
+            kept.keep(item, score)
             yield item, score
-            if done % 20 == 0 or done == len(work):
-                progress(f"{done} of {len(work)} streams, {time.monotonic() - start:.0f} s")
+            if done % 20 == 0 or done == len(todo):
+                progress(f"{done} of {len(todo)} streams, {time.monotonic() - start:.0f} s")
 
 
 def run(  # noqa: PLR0913 - options of a command
@@ -157,6 +195,7 @@ def run(  # noqa: PLR0913 - options of a command
     settings: Sequence[Setting] | None = None,
     jobs: int = 1,
     progress: Callable[[str], object] = lambda line: None,
+    kept: Path | None = None,
 ) -> dict[str, Any]:
     """Solve healthy streams, every fault, pairs of faults, and long streams; return figures and verdicts.
 
@@ -168,6 +207,7 @@ def run(  # noqa: PLR0913 - options of a command
         settings: Layouts and noises; default: all.
         jobs: Number of processes; it does not affect the streams.
         progress: Called with a line from time to time.
+        kept: File that keeps the score of each stream until the run is complete; a run continues from it.
     """
     chosen = all_settings() if settings is None else settings
     work = [
@@ -175,9 +215,11 @@ def run(  # noqa: PLR0913 - options of a command
         for item in items(seed, pairs=pairs, hours=hours, settings=chosen)
         if not only or any(part in f"{item.section}: {item.row}" for part in only)
     ]
-    cells: dict[tuple[str, str], dict[str, Score]] = {}
-    for item, score in _solve_all(work, seed, jobs, progress):
-        cells.setdefault((item.section, item.row), {}).setdefault(item.setting.name, Score()).add(score)
+    cells: dict[tuple[str, str], dict[str, Score]] = {(item.section, item.row): {} for item in work}
+    before = Kept(kept, seed)
+    for item, score in _solve_all(work, seed, jobs, progress, before):
+        cells[item.section, item.row].setdefault(item.setting.name, Score()).add(score)
+    before.forget()
     rows = [_row(section, row, found) for (section, row), found in cells.items()]
     return {
         "benchmark": "trust",

@@ -118,6 +118,9 @@ def trust(
         float, typer.Option(min=0, help="Patch-hours at 100 scans/s to watch for false namings.")
     ] = 0.1,
     jobs: Annotated[int, typer.Option(min=1, help="Number of processes that solve streams.")] = 1,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Continue an interrupted run with the same --json and --seed.")
+    ] = False,
 ) -> None:
     """Solve presses with and without faults: is what a field calls trusted right, and a sound patch trusted?
 
@@ -131,9 +134,12 @@ def trust(
     def progress(line: str) -> None:
         typer.echo(line, err=True)
 
+    kept = None if json is None else json.with_name(json.name + ".streams")
+    if kept is not None and not resume:
+        kept.unlink(missing_ok=True)
     wanted = ["table"] if table else (only or [])
     options = bench.SHORT if short else {"hours": hours}
-    figures = bench.run(seed, only=wanted, jobs=jobs, progress=progress, **options)
+    figures = bench.run(seed, only=wanted, jobs=jobs, progress=progress, kept=kept, **options)
     parts = [part for part in bench.PARTS if part in wanted or not (wanted or short)]
     figures = bench.with_parts(figures, seed, parts, progress)
     if not (figures["rows"] or parts):

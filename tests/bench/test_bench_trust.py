@@ -348,3 +348,25 @@ def test_a_missed_target_ends_with_status_1(monkeypatch, tmp_path) -> None:
 def test_a_row_that_does_not_exist_is_refused(monkeypatch) -> None:
     result = CliRunner().invoke(app, ["trust", "--only", "no such row"])
     assert result.exit_code != 0
+
+
+def test_an_interrupted_run_continues_where_it_stopped(monkeypatch, tmp_path) -> None:
+    file, solved = tmp_path / "figures.json", []
+
+    def solve(item: _bench_trust.Item, seed: int) -> Score:
+        if len(solved) == 4:
+            raise KeyboardInterrupt
+        solved.append(item.name)
+        return Score(frames=len(solved), trusted=len(solved), coordinates=300)
+
+    monkeypatch.setattr(_bench_trust, "solve_item", solve)
+    command = ["trust", "--short", "--only", "healthy", "--json", str(file)]
+    assert CliRunner().invoke(app, command).exit_code != 0
+    assert len(solved) == 4
+    solved.append("")
+    result = CliRunner().invoke(app, [*command, "--resume"])
+    assert result.exit_code == 0, result.output
+    figures = json.loads(file.read_text(encoding="utf-8"))
+    assert len(set(solved)) == len(solved) == 13  # each stream once
+    assert sum(row["frames"] for row in figures["rows"]) == sum(range(1, 5)) + sum(range(6, 14))
+    assert [path.name for path in tmp_path.iterdir()] == ["figures.json"]

@@ -230,7 +230,15 @@ class RootGate:
             ),
             force_n=force,
             by_prior=replaced,
+            data_share=_mixed_share(estimate, replaced),
         )
+
+
+def _mixed_share(estimate: FieldFrame, replaced: Mask) -> Float | None:
+    """Return the share of the data: that of the posterior for ``replaced`` (U,), 1 for all other wires."""
+    if estimate.data_share is None or not replaced.any():
+        return None
+    return np.where(replaced[:, None, None], estimate.data_share, 1.0)
 
 
 def _selected(status: tuple[Status, ...], changed: Mask, replaced: Mask) -> tuple[Status, ...]:

@@ -29,6 +29,7 @@ from skinnode.solve.linalg.vectors import Index
 from skinnode.solve.noise_estimate import NoiseEstimate
 from skinnode.solve.options import PosteriorArguments, PosteriorOptions, merged
 from skinnode.solve.posterior.contacts import ContactFinder
+from skinnode.solve.posterior.data_share import data_share
 from skinnode.solve.posterior.elastic_prior import ElasticPrior
 from skinnode.solve.posterior.gating import Fit, Gate
 from skinnode.solve.posterior.hyperparameters import Hyperparameters
@@ -408,6 +409,13 @@ class Posterior:
 
     # -- the field -------------------------------------------------------------------------------------
 
+    def _data_share(self) -> Float:
+        """Return the share of the data in each coordinate, (U, 3N); 0 for coordinates that are not free."""
+        prior, share = self._estimator.load_prior, np.zeros_like(self._trusted)
+        variance = prior.scale2 * prior.covariance.diagonal()
+        share[:, self._free] = data_share(self._estimator.std, self._estimator.core, variance)
+        return share
+
     def _field(
         self, observation: Observation, status: NDArray[np.int64], held: Mask, start: float
     ) -> FieldFrame:
@@ -437,6 +445,7 @@ class Posterior:
             held=held,
             method="posterior",
             by_prior=np.asarray(~used.any(axis=1)),
+            data_share=self._data_share().reshape(displacement.shape),
             contacts=self._contacts_found if self._known else (),
             gain=np.broadcast_to(gains, len(held)).copy() if self._model.gains else None,
             noise_factor=self._hyper.noise_factor

@@ -139,6 +139,10 @@ def test_a_step_into_nowhere_is_taken_back():
 
 
 def test_starts_that_cannot_be_used():
+    far = sk.solve_system(
+        lambda x: np.array([np.inf, 1.0, x[0]]), lambda x: np.array([[0.0], [0.0], [1.0]]), [1.0]
+    )
+    assert far.status is sk.Status.INVALID_START
     wide = sk.solve_system(lambda x: x[:1], lambda x: np.eye(1, 2), [1.0, 2.0])
     assert wide.status is sk.Status.INVALID_START
     nowhere = sk.solve_system(lambda x: x * np.nan, lambda x: np.eye(2), [1.0, 2.0])

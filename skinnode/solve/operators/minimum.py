@@ -24,7 +24,8 @@ NOISE: Final = EPS ** (2 / 3)
 """Relative rounding error of a central difference with this step."""
 CURVED: Final = 0.05
 """Smallest scaled eigenvalue of the Hessian that counts as positive. On the problems of Moré, Garbow &
-Hillstrom, LOWS."""
+Hillstrom, it is at most 2e-6 at flat points and at least 0.38 at isolated minima, except 0.003 at Watson's
+with n = 12, where rounding hides the curvature."""
 CONTRACTION: Final = 0.5
 """Largest ratio of successive Newton steps that counts as convergence."""
 NEWTON_STEPS: Final = 8
@@ -47,9 +48,10 @@ class Point:
     @property
     def cosine(self) -> float:
         """Largest cosine of the angle between r and a column of J; 0 if both are zero."""
-        below = column_norms(self.j) * self.norm
-        share = np.divide(np.abs(self.j.T @ self.r), below, out=np.zeros(below.size), where=below > 0)
-        return float(share.max())
+        with np.errstate(all="ignore"):
+            below = column_norms(self.j) * self.norm
+            share = np.divide(np.abs(self.j.T @ self.r), below, out=np.zeros(below.size), where=below > 0)
+            return float(share.max())
 
     @property
     def rounding(self) -> Float:
@@ -94,8 +96,11 @@ def curvature(jacobian: Callable[[Float], Float], at: Point) -> Curvature:
     for k in range(n):
         ends = np.stack([at.x, at.x])
         ends[:, k] += (DIFFERENCE * size[k], -DIFFERENCE * size[k])
-        s[k] = (jacobian(ends[0]) - jacobian(ends[1])).T @ at.r / (ends[0, k] - ends[1, k])
-    s = 0.5 * (s + s.T) / np.outer(d, d)
+        ahead, behind = jacobian(ends[0]), jacobian(ends[1])
+        with np.errstate(all="ignore"):
+            s[k] = (ahead - behind).T @ at.r / (ends[0, k] - ends[1, k])
+    with np.errstate(all="ignore"):
+        s = 0.5 * (s + s.T) / np.outer(d, d)
     if not (np.isfinite(s).all() and np.isfinite(at.j).all()):
         return Curvature(math.nan, np.zeros(n), math.inf)
     u, sigma, vt = np.linalg.svd(at.j / d, full_matrices=False)

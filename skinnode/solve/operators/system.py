@@ -112,7 +112,7 @@ def _solve(  # noqa: PLR0913 - the arguments of solve_system
     size = float(np.linalg.norm(start.x)) or 1.0
     later = [] if code == op.GAUSS_NEWTON else [-size * radius for radius in RADII]
     turn = TURN if later else max_steps
-    while system.steps < max_steps and not all(each.ended for each in attempts):
+    while not all(each.ended for each in attempts):
         for number in range(1 + len(RADII)):
             if number >= len(attempts) and later:
                 attempts.append(Attempt(code, system, start, later.pop(0)))
@@ -120,8 +120,15 @@ def _solve(  # noqa: PLR0913 - the arguments of solve_system
                 attempts[number].run(min(turn, max_steps - system.steps), tol_f, tol_x)
                 if attempts[number].decided:
                     return attempts[number]
+            if system.steps >= max_steps:
+                return _best(attempts, tol_x, 0)
         turn *= 2
+    return _best(attempts, tol_x, max_steps - system.steps)
+
+
+def _best(attempts: list[Attempt], tol_x: float, steps: int) -> Attempt:
+    """Return the attempt with the smallest residual, its point judged."""
     best = min(attempts, key=lambda each: each.norm)
-    if best.kind is PointKind.UNFINISHED:
-        best.settle(tol_x, max_steps - system.steps)
+    if best.kind is PointKind.UNFINISHED and best.went != op.INVALID_START:
+        best.settle(tol_x, steps)
     return best

@@ -74,6 +74,9 @@ def faults_and_notes(running: Host) -> tuple[list[str], list[str]]:
         patch_faults, patch_notes = _patch_faults_and_notes(running.health(name), stream, first_scans_due)
         faults += [f"{name}: {text}" for text in patch_faults]
         notes += [f"{name}: {text}" for text in patch_notes]
+        noise = _noise(running, name)
+        if noise:
+            notes.append(f"{name}: {noise}")
     for name, defects in stats.defects.items():
         if defects.count:
             defect = f"{counted(defects.count, 'defect')} in the host, most recent: {defects.newest}"
@@ -121,6 +124,15 @@ def _patch_faults_and_notes(
             f"(EMCY 0x8110{'' if slow_still else ', since cleared'})"
         )
     return [*faults, *losses.values()], notes
+
+
+def _noise(running: Host, name: str) -> str:
+    """Return how far the noise differs from the hand file, or an empty string."""
+    field = running.latest(name)
+    if field is None or field.noise_factor == 1.0:
+        return ""
+    stated = next(patch.relative_noise for patch in running.hand.patches if patch.name == name)
+    return f"noise is {field.noise_factor * stated:.1e}, relative_noise in the hand file is {stated:.1e}"
 
 
 def reason(health: PatchHealth, before: str = "") -> str:
@@ -198,6 +210,7 @@ def _patch(running: Host, name: str, before: HostStats, now: HostStats) -> dict[
         "missed": new.assembler.scans_missed,
         "chunks_lost": new.assembler.chunks_lost,
         **trust_table(field),
+        "noise_factor": field.noise_factor if field is not None else None,
         "scan": field.stamp.scan if field is not None and field.stamp is not None else None,
         **_deepest(field),
         "contacts": contact_tables(field),
@@ -257,6 +270,8 @@ def _patch_text(name: str, facts: Mapping[str, object]) -> str:
         deepest = f"  deepest {deepest_m * 1e6:.1f}{std} µm"
     worst = "".join(f"  {facts[key]} {key}" for key in ("torn", "corrupt", "missed", "skipped") if facts[key])
     trust = f"  untrusted: {facts['distrust']}" if facts["trusted"] is False else _doubts(facts)
+    if facts["noise_factor"] not in (None, 1.0):
+        trust += f"  noise {facts['noise_factor']:.2g} times as stated"
     why = f" ({facts['reason']})" if facts["reason"] else ""
     return (
         f"{name} {facts['condition']}{why}  {facts['solved']} fields{deepest}{trust}"

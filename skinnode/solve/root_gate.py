@@ -124,7 +124,8 @@ class RootGate:
                     self._posterior.reset()  # anneal from rest; tracking a wrong root would confirm it
                 its = self._exact.arrays
                 self._posterior.stop_at(until)
-                noise = np.maximum(its.noise, roots.REFEREE_NOISE)
+                # noise that is not positive stays so: its resistance is not usable for the posterior either
+                noise = np.where(its.noise > 0.0, np.maximum(its.noise, roots.REFEREE_NOISE), its.noise)
                 estimate = self._posterior.update(its.ohm.copy(), its.valid.copy(), noise)
                 if Status.DEADLINE in estimate.status:
                     self._pause = PAUSE

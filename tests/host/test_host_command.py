@@ -413,3 +413,17 @@ def test_the_emergency_of_a_faulty_patch_is_said(tmp_path: Path, capsys: pytest.
     emergency = "EMCY 0x5000 wire open or shorted: upper wire open 2"
     assert f"fault: thumb: faulty at the end: {emergency}" in said
     assert f"thumb faulty ({emergency})  " in said  # in the lines of each second, too
+
+
+def test_noise_that_is_not_as_in_the_hand_file_is_reported(make_hand: Callable[..., HandConfig]) -> None:
+    hand = make_hand(1, simulation={"converter_noise": 1e-4, "depth": 0})
+    with Fleet(hand), Host.from_config(hand) as host:
+
+        def report() -> list[str]:
+            return [note for note in faults_and_notes(host)[1] if note.startswith("p0: noise is ")]
+
+        assert eventually(lambda: bool(report()))
+        found = re.fullmatch(r"p0: noise is (\S+), relative_noise in the hand file is 3.0e-06", report()[0])
+        assert found is not None
+        assert float(found[1]) == pytest.approx(1e-4, rel=0.4)
+        assert not any("noise" in fault for fault in faults_and_notes(host)[0])

@@ -22,9 +22,9 @@ def data_share(std: Float, core: Float, prior_variance: Float) -> Float:
     Returns:
         (U, f) shares from 0 to 1.
     """
-    with np.errstate(invalid="ignore", divide="ignore"):
+    with np.errstate(invalid="ignore"):
         square = std * std
         unseen = (square - core * core) / (PRIOR_DOUBT - SMOOTH_SHARE)
-        variance = square - (PRIOR_DOUBT - 1.0) * unseen
-        share = 1.0 - variance / prior_variance.reshape(std.shape)
-    return np.asarray(np.clip(np.nan_to_num(share, nan=0.0, neginf=0.0), 0.0, 1.0))
+        share = 1.0 - (square - (PRIOR_DOUBT - 1.0) * unseen) / prior_variance.reshape(std.shape)
+        share[~(share > 0.0)] = 0.0
+    return np.asarray(np.minimum(share, 1.0, out=share))

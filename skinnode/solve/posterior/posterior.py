@@ -134,6 +134,7 @@ class Posterior:
         self._hyper.reset()
         self._gate.reset()
         self._members: Index = np.arange(0)
+        self._share = np.zeros_like(self._estimator.moved)
         self._trusted = np.zeros_like(self._estimator.moved)  # last accepted field; its nuisances follow
         self._trusted_g = np.zeros_like(self._estimator.g)
         self._contacts_found: tuple[Contact, ...] = ()
@@ -428,6 +429,8 @@ class Posterior:
                 each[:, self._free] = np.maximum(each[:, self._free], 0.5 * self._overlooked)
         if self._contacts is not None and self._known and not held.all():
             self._force, self._contacts_found = self._contacts.find(self._hyper.loads)
+        if not held.all():
+            self._share = self._data_share()
         used = observation.weight > 0
         r = estimator.residuals(observation, self._trusted) / np.where(used, observation.weight, np.inf)
         rms = np.sqrt((r**2).sum(axis=1) / np.maximum(used.sum(axis=1), 1))
@@ -445,7 +448,7 @@ class Posterior:
             held=held,
             method="posterior",
             by_prior=np.asarray(~used.any(axis=1)),
-            data_share=self._data_share().reshape(displacement.shape),
+            data_share=self._share.reshape(displacement.shape),
             contacts=self._contacts_found if self._known else (),
             gain=np.broadcast_to(gains, len(held)).copy() if self._model.gains else None,
             noise_factor=self._hyper.noise_factor

@@ -95,10 +95,11 @@ def potential_jacobian(x: Float, lower: Float, f: Float, jt: Float) -> None:
 
 
 @njit
-def surface_laplacian(x: Float, lower: Float, normal: Float, out: Float) -> None:
+def surface_laplacian(x: Float, lower: Float, normal: Float, out: Float, slope_t: Float) -> None:
     """Write the Laplacian of F within the surface, −∂²F/∂n², of one wire into ``out`` (K,).
 
     ``normal`` (3N,) holds the unit normal at each electrode; ``x`` and ``lower`` are as in :func:`potential`.
+    ``slope_t`` (3N, K) receives the transposed derivative of the Laplacian with respect to ``x``.
     """
     charges, wires = lower.shape[1], lower.shape[2]
     for k in range(0, wires, LANES):
@@ -107,11 +108,21 @@ def surface_laplacian(x: Float, lower: Float, normal: Float, out: Float) -> None
         for i in range(x.size // 3):
             x_i, y_i, z_i = splat(x[3 * i]), splat(x[3 * i + 1]), splat(x[3 * i + 2])
             n_x, n_y, n_z = splat(normal[3 * i]), splat(normal[3 * i + 1]), splat(normal[3 * i + 2])
+            sum_x, sum_y, sum_z, sum_n = splat(0.0), splat(0.0), splat(0.0), splat(0.0)
             for j in range(charges):
                 dx = x_i - load(lower[0, j], k, count)
                 dy = y_i - load(lower[1, j], k, count)
                 dz = z_i - load(lower[2, j], k, count)
                 inverse = _inverse_root(fma(dz, dz, fma(dy, dy, dx * dx)))
                 cosine = fma(dz, n_z, fma(dy, n_y, dx * n_x)) * inverse
-                total += fma(cosine * -3.0, cosine, 1.0) * inverse * inverse * inverse
+                cubed = inverse * inverse * inverse
+                total += fma(cosine * -3.0, cosine, 1.0) * cubed
+                radial = fma(cosine * 15.0, cosine, -3.0) * cubed * inverse * inverse
+                sum_x = fma(dx, radial, sum_x)
+                sum_y = fma(dy, radial, sum_y)
+                sum_z = fma(dz, radial, sum_z)
+                sum_n = fma(cosine * -6.0, cubed * inverse, sum_n)
+            store(slope_t[3 * i], k, count, fma(n_x, sum_n, sum_x))
+            store(slope_t[3 * i + 1], k, count, fma(n_y, sum_n, sum_y))
+            store(slope_t[3 * i + 2], k, count, fma(n_z, sum_n, sum_z))
         store(out, k, count, total)

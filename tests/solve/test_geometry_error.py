@@ -120,7 +120,7 @@ def test_the_effects_are_derivatives_of_the_residuals():
     wires, equations = SMALL.shape
     rng = np.random.default_rng(2)
     g = rng.normal(size=geometry.nuisances(wires, equations))
-    g[geometry.RADIUS] = 0.0  # how its effect depends on the other errors is neglected
+    g[geometry.RADIUS] = 0.5
     moved = press_m(SMALL)
     a = readings(SMALL, made(SMALL, ORDINARY, g), moved, np.zeros((wires, 1)))
     _, jt, effect = linearised(SMALL, ORDINARY, moved, g, a)

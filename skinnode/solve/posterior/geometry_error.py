@@ -6,8 +6,7 @@ press. The errors are nuisances with a variance of 1, in units of their toleranc
 
 thickness        all upper electrodes move along their normals, in proportion to the clearance
 radius           the mean of F over the rims of electrodes of radius ρ is F + (ρ²/2) ∇²F within the surface,
-                 ρ²/4 from each layer; the nuisance is ρ² in units of the squared tolerance, and enters
-                 linearly
+                 ρ²/4 from each layer; the nuisance is ρ² in units of the squared tolerance
 gain             the change in each resistance has a relative error: half of its variance is common to the
                  patch, half independent in each upper wire
 placement        each upper and each lower wire moves along x, y and z
@@ -76,13 +75,14 @@ class GeometryError:
         self._placement = tolerances.placement
         self._square = 0.5 * tolerances.electrode_radius**2
         self._gain = GAIN_SHARE * tolerances.gain
+        self._f, self._rims, self._bend = np.zeros((3, equations))
+        self._jt, self._bend_jt = np.zeros((2, layout.unknowns, equations))
         self._bend_at_rest = np.zeros((wires, equations))
         for u in range(wires):
-            surface_laplacian(problem.rest[u], problem.lower, self._normal[u], self._bend_at_rest[u])
+            surface_laplacian(
+                problem.rest[u], problem.lower, self._normal[u], self._bend_at_rest[u], self._bend_jt
+            )
         self._bend_at_rest *= problem.a_rest
-        self._f = np.zeros(equations)
-        self._bend = np.zeros(equations)
-        self._jt = np.zeros((layout.unknowns, equations))
 
     def linearise(  # noqa: PLR0913 - arrays by name
         self, members: Index, moved: Float, a: Float, weight: Float, g: Float, r: Float, jt: Float,
@@ -105,7 +105,7 @@ class GeometryError:
         _linearise(
             members, problem.rest + moved + shift, problem.rest + shift, lower, a, problem.a_rest, weight,
             self._normal, self._outward, self._bend_at_rest, self._placement, self._square, self._gain, g,
-            self._f, self._bend, self._jt, r, jt, effect,
+            self._f, self._jt, self._rims, self._bend, self._bend_jt, r, jt, effect,
         )  # fmt: skip
 
     def residuals(  # noqa: PLR0913 - arrays by name
@@ -119,7 +119,8 @@ class GeometryError:
         problem = self._problem
         return _residuals(
             members, problem.rest + moved + shift, problem.rest + shift, lower, a, problem.a_rest, weight,
-            self._normal, self._bend_at_rest, self._square, self._gain, h, own, g, self._f, self._bend, r,
+            self._normal, self._bend_at_rest, self._square, self._gain, h, own, g, self._f, self._bend,
+            self._bend_jt, r,
         )  # fmt: skip
 
     def _shifts(self, g: Float) -> tuple[Float, Float]:
@@ -135,7 +136,8 @@ class GeometryError:
 def _linearise(  # noqa: PLR0913 - a kernel: arrays by name
     members: Index, x: Float, rest: Float, lower: Float, a: Float, a_rest: Float, weight: Float,
     normal: Float, outward: Float, bend_at_rest: Float, placement: float, square: float, gain: float,
-    g: Float, f: Float, bend: Float, rest_jt: Float, r: Float, jt: Float, effect: Float,
+    g: Float, f: Float, rest_jt: Float, rims: Float, bend: Float, bend_jt: Float, r: Float, jt: Float,
+    effect: Float,
 ) -> None:  # fmt: skip
     """Write residuals, Jacobians and effects at the shifted positions ``x``, ``rest`` and ``lower``."""
     equations = f.size
@@ -144,27 +146,30 @@ def _linearise(  # noqa: PLR0913 - a kernel: arrays by name
         r_u, jt_u, h_u = r[u], jt[u], effect[u]
         potential_jacobian(x[u], lower, r_u, jt_u)
         potential_jacobian(rest[u], lower, f, rest_jt)
-        surface_laplacian(x[u], lower, normal[u], bend)
+        surface_laplacian(x[u], lower, normal[u], bend, bend_jt)
         own_gain = g[COMMON + UPPER * u + 3]
         for k in range(equations):
             w = weight[u, k]
             scale = w * a[u, k] / (a_rest[u, k] * f[k])
             level = scale * r_u[k]
-            rim = w * square * (bend[k] / r_u[k] - bend_at_rest[u, k])
+            inverse = 1.0 / r_u[k]
+            rim = w * square * (bend[k] * inverse - bend_at_rest[u, k])
             change = w * gain * (1.0 - a_rest[u, k] / a[u, k])
             r_u[k] = level - w + rim * g[RADIUS] - change * (g[GAIN] + own_gain)
             h_u[k, RADIUS] = -rim
             h_u[k, GAIN] = change
             h_u[k, COMMON + 3] = change
             f[k] = level / f[k]  # factor of ∂F/∂x at rest
-            bend[k] = scale
+            rims[k] = w * square * g[RADIUS] * inverse
+            bend[k] = scale - rims[k] * bend[k] * inverse
             h_u[k, THICKNESS] = 0.0
             for t in range(3):
                 h_u[k, COMMON + t] = 0.0
         for j in range(jt_u.shape[0]):
             row, before, along, t = jt_u[j], rest_jt[j], outward[u, j], COMMON + j % 3
+            curve = bend_jt[j]
             for k in range(equations):
-                row[k] *= bend[k]
+                row[k] = bend[k] * row[k] + rims[k] * curve[k]
                 grown = row[k] - f[k] * before[k]
                 h_u[k, t] -= placement * grown
                 h_u[k, THICKNESS] -= along * grown
@@ -177,7 +182,7 @@ def _linearise(  # noqa: PLR0913 - a kernel: arrays by name
 def _residuals(  # noqa: PLR0913 - a kernel: arrays by name
     members: Index, x: Float, rest: Float, lower: Float, a: Float, a_rest: Float, weight: Float,
     normal: Float, bend_at_rest: Float, square: float, gain: float, h: Float, own: Float, g: Float, f: Float,
-    bend: Float, r: Float,
+    bend: Float, bend_jt: Float, r: Float,
 ) -> float:  # fmt: skip
     """Write the residuals of :func:`_linearise` less H g of the other nuisances; return their Σ r²."""
     total = 0.0
@@ -186,7 +191,7 @@ def _residuals(  # noqa: PLR0913 - a kernel: arrays by name
         r_u = r[u]
         potential(x[u], lower, r_u)
         potential(rest[u], lower, f)
-        surface_laplacian(x[u], lower, normal[u], bend)
+        surface_laplacian(x[u], lower, normal[u], bend, bend_jt)
         both_gains = gain * (g[GAIN] + g[COMMON + UPPER * u + 3])
         for k in range(r_u.size):
             rim = square * g[RADIUS] * (bend[k] / r_u[k] - bend_at_rest[u, k])

@@ -203,6 +203,7 @@ def _patch(running: Host, name: str, before: HostStats, now: HostStats) -> dict[
     return {
         "condition": str(health.condition),
         "reason": reason(health) or health.reason or None,
+        "alive": str(health.alive),
         "solved": new.solved - old.solved,
         "skipped": new.skipped,
         "torn": new.assembler.scans_torn,

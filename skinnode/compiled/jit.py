@@ -35,6 +35,7 @@ _KERNEL_FILES = (
     "solve/*.py",
     "solve/*/*.py",
     "bus_load/stuffing.py",
+    "host/code_runs.py",
 )
 
 

@@ -67,6 +67,11 @@ class ScanFacts:
     stated_noise: float
     """Relative noise of the converter, from the hand file."""
     stats: AssemblerStats
+    conversions: int | None = None
+    """Number of scans that hold a new conversion, of those that can be compared with the scan before; None if
+    the patch does not count its conversions."""
+    repeated: int = 0
+    """Number of scans that repeat the conversion of the scan before."""
 
     @property
     def scans(self) -> int:

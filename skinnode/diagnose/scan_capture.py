@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
@@ -95,6 +96,7 @@ class ScanCapture:
         last_ns = np.array([scan.t_last_ns for scan, _ in scans], dtype=np.float64)
         sync_ns = np.array([np.nan if sync is None else float(sync) for _, sync in scans])
         device = [-1 if scan.device_time_us is None else scan.device_time_us for scan, _ in scans]
+        conversions, repeated = _conversions([scan for scan, _ in scans])
         return ScanFacts(
             ratio=np.where(valid, scale.lo + codes * scale.step, np.nan),
             n_open=(codes == scale.open).sum(axis=0),
@@ -107,6 +109,8 @@ class ScanCapture:
             step=scale.step,
             stated_noise=stated_noise,
             stats=patch.assembler.stats,
+            conversions=conversions,
+            repeated=repeated,
         )
 
     def _sync_ns(self, scan: Scan) -> int | None:
@@ -117,6 +121,17 @@ class ScanCapture:
             if t_ns <= scan.t_first_ns and number in (scan.counter, 0):
                 return t_ns
         return None
+
+
+def _conversions(scans: Sequence[Scan]) -> tuple[int | None, int]:
+    """Return the numbers of scans with a new and with a repeated conversion; None, 0 without a phase."""
+    pairs = [
+        (before.phase, scan.phase)
+        for before, scan in itertools.pairwise(scans)
+        if scan.scan == before.scan + 1 and before.phase and scan.phase
+    ]
+    repeated = sum(before == now for before, now in pairs)
+    return (len(pairs) - repeated if pairs else None), repeated
 
 
 class _Patch:

@@ -12,7 +12,10 @@ from typing import Final
 
 from skinnode.canopen.emergency import register_text
 from skinnode.canopen.nmt import STATE_NAMES, NmtState
-from skinnode.host.code_watch import WireFault
+from skinnode.host.patch_life import Alive
+from skinnode.host.wire_faults import WireFault
+from skinnode.model.data_fault import DataFault
+from skinnode.model.frames import FieldFrame
 from skinnode.transport.bus_state import BusState
 
 _log = logging.getLogger(__name__)
@@ -43,7 +46,7 @@ class Condition(enum.StrEnum):
     that restarted once, or that is operational again and has not restarted for 0.5 s, is given the condition
     that fits its current state."""
     FROZEN = "frozen"
-    """Scans arrive, but always with the same values: see :mod:`skinnode.host.code_watch`."""
+    """Scans arrive, but their converter has stopped: see :mod:`skinnode.host.patch_life`."""
     FAULTY = "faulty"
     """The node's error register is not zero, or serving the patch raised an exception
     (:attr:`PatchHealth.defect`)."""
@@ -86,6 +89,12 @@ class PatchHealth:
     nodes share a node-ID."""
     wires: tuple[WireFault, ...] = ()
     """Wires that are open, shorted, noisy or drifting."""
+    alive: Alive = Alive.CANNOT_TELL
+    """Whether the converter is running. No means that the condition is frozen."""
+    life: str = ""
+    """Why the converter is not known to be running, in words; empty if it is."""
+    faults: tuple[DataFault, ...] = ()
+    """Faults in the data of the newest field: which parts, since when, how sure."""
     defect: str | None = None
     """The host's failed operation and its exception, until the patch has been brought up again."""
     slow_overruns: int = 0
@@ -100,10 +109,10 @@ class PatchHealth:
 
     @property
     def reason(self) -> str:
-        """Why the patch is not operational, in one line; empty if it is operational."""
+        """Why the patch is not operational, or not known to be alive, in one line; empty if it is both."""
         match self.condition:
             case Condition.OPERATIONAL:
-                return ""
+                return self.life
             case Condition.REFUSED:
                 return self.refusal or "refused"
             case Condition.NEVER_SEEN:
@@ -121,7 +130,7 @@ class PatchHealth:
             case Condition.STALE:
                 return self._staleness()
             case Condition.FROZEN:
-                return f"node {self.node_id} sends the same codes in every scan"
+                return f"node {self.node_id} is frozen: {self.life or 'its codes do not change'}"
 
     def _with_complaint(self, text: str) -> str:
         return f"{text}; {self.complaint}" if self.complaint else text
@@ -139,6 +148,11 @@ class PatchHealth:
         if self.last_emergency is None:
             return register
         return f"{register}; newest emergency 0x{self.last_emergency:04X} {self.emergency_text}"
+
+
+def faults_of(field: FieldFrame | None) -> tuple[DataFault, ...]:
+    """Return the faults in the data of a field; none if there is no field."""
+    return () if field is None else field.faults
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,6 +11,7 @@ from typing import Final, Self
 from skinnode.host.containment import Defects, DefectStats, keep_on
 from skinnode.host.events import Events, HealthEvent
 from skinnode.host.health import BusHealth, PatchHealth
+from skinnode.model.data_fault import DataFault, FaultKind, FaultyPart
 from skinnode.text.words import counted
 
 _CHECK_S: Final = 0.05
@@ -41,6 +42,10 @@ _BUS_COUNTERS: Final = {
     "other_masters": ("command of another master", "commands of another master"),
 }
 """Counters of :class:`BusHealth`, likewise."""
+
+
+def _is_frozen_part(fault: DataFault) -> bool:
+    return fault.kind is FaultKind.FROZEN and fault.part is not FaultyPart.PATCH
 
 
 class HealthWatch:
@@ -135,7 +140,19 @@ class HealthWatch:
             self._publish(name, fault.state.value, f"{fault.side} wire {fault.number} is {fault.state}")
         for fault in sorted({*before.wires} - {*now.wires}):
             self._publish(name, "well", f"{fault.side} wire {fault.number} is no longer {fault.state}")
+        self._compare_frozen_parts(name, before, now)
         self._compare_counters(name, before, now, _PATCH_COUNTERS)
+
+    def _compare_frozen_parts(self, name: str, before: PatchHealth, now: PatchHealth) -> None:
+        """Publish which wires and crossings are left out because they are frozen, and which no longer are."""
+        was, are = (
+            {each.place: each for each in health.faults if _is_frozen_part(each)} for health in (before, now)
+        )
+        for place in are.keys() - was.keys():
+            sure = f"{are[place].deviations:.0f} deviations"
+            self._publish(name, "left out", f"{place} repeats its codes and is left out ({sure})")
+        for place in was.keys() - are.keys():
+            self._publish(name, "readmitted", f"{place} no longer repeats its codes")
 
     def _compare_counters(
         self, name: str, before: object, now: object, counters: Mapping[str, tuple[str, str]]

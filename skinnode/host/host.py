@@ -17,7 +17,7 @@ from skinnode.host.containment import DefectStats
 from skinnode.host.dispatcher import BusStats
 from skinnode.host.events import CAPACITY_EVENTS, EventSubscription
 from skinnode.host.hand_frame import HandGatherer, HandSubscription
-from skinnode.host.health import BusHealth, PatchHealth
+from skinnode.host.health import BusHealth, PatchHealth, faults_of
 from skinnode.host.health_watch import HealthWatch
 from skinnode.host.lifecycle import HostParts, StartOptions, never, running_parts
 from skinnode.host.other_masters import OtherMasterStats
@@ -246,13 +246,14 @@ class Host:
             KeyError: if there is no such patch.
         """
         node = self._nodes[patch]
-        return node.monitor.health(
+        health = node.monitor.health(
             time.monotonic_ns(),
             node.heartbeat_s,
             self.hand.sync.period_s,
             node.stream.stats().assembler.conflicts,
             node.stream.t_passed_ns,
         )
+        return replace(health, faults=faults_of(self._publisher.latest(patch)))
 
     def bus_health(self, bus: str) -> BusHealth:
         """Return the health of a bus.

@@ -20,6 +20,7 @@ from skinnode.host.health import (
     PatchHealth,
     condition_of,
 )
+from skinnode.host.patch_life import Alive
 
 _log = logging.getLogger(__name__)
 
@@ -187,6 +188,8 @@ class NodeMonitor:
         settled = (
             in_a_loop and self.nmt_state == NmtState.OPERATIONAL and now_ns - self._restarts[-1] > SETTLED_NS
         )
+        watch = self._watch
+        alive, words = (Alive.CANNOT_TELL, "") if watch is None else (watch.alive, watch.words)
         facts = Evidence(
             nmt_state=self.nmt_state,
             late_heartbeats=None if heartbeat_age_s is None else heartbeat_age_s / heartbeat_s,
@@ -194,7 +197,7 @@ class NodeMonitor:
             restarting=in_a_loop and not settled,
             error_register=self._error_register,
             refused=self.refusal is not None,
-            frozen=self._watch is not None and self._watch.frozen,
+            frozen=alive is Alive.NO,
             defective=self.defect is not None,
         )
         condition = condition_of(facts)
@@ -219,7 +222,9 @@ class NodeMonitor:
             restarts_in_a_loop=in_a_loop,
             duplicate_id=self._beats_too_often(now_ns, heartbeat_s),
             conflicts=conflicts,
-            wires=() if self._watch is None else self._watch.wires,
+            wires=() if watch is None else watch.wires,
+            alive=alive,
+            life=words,
             defect=self.defect,
             complaint=self.complaint,
             withheld=condition is Condition.STALE

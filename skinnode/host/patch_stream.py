@@ -17,6 +17,7 @@ from typing import Final, Protocol
 
 from skinnode.config import Partial
 from skinnode.errors import SkinError
+from skinnode.host.code_watch import FAULTLESS, Verdict
 from skinnode.host.containment import Defects, one_line
 from skinnode.host.publish import Publisher
 from skinnode.host.scan_solver import ScanSolver
@@ -32,6 +33,7 @@ _log = logging.getLogger(__name__)
 
 _BASELINE_CHANGED: Final = int(SummaryFlag.BASELINE_CHANGED)
 
+_EVER_NS: Final = 2**63
 WATCH_AFTER_NS: Final = 5_000_000
 """Delay after the last frame of a scan before its codes are evaluated for faults. Fields have priority
 because programs wait for them, and the fields of all patches for one SYNC are due at the same time."""
@@ -85,6 +87,11 @@ def _ignore(scan: Scan) -> None:
     """Ignore a scan."""
 
 
+def _find_nothing(scan: Scan, number: int) -> Verdict:
+    """Find no fault in a scan."""
+    return FAULTLESS
+
+
 @dataclass(frozen=True, slots=True)
 class StreamOutput:
     """Destination of a stream's scans, fields and exceptions."""
@@ -103,6 +110,9 @@ class StreamOptions:
     """Returns the newest SYNC with the given counter."""
     on_scan: Callable[[Scan], None] = _ignore
     """Called immediately with each assembled scan."""
+    judge: Callable[[Scan, int], Verdict] = _find_nothing
+    """Called with each assembled scan and its number before the scan is solved. All earlier scans have been
+    passed to ``watch`` by then, so a replay comes to the same verdicts as the host."""
     watch: Callable[[Scan], None] = _ignore
     """Called with each assembled scan after a delay of :data:`WATCH_AFTER_NS`."""
     partial: Partial = "pass"
@@ -130,7 +140,7 @@ class PatchStream:
         self._workers, self._publisher, self._defects = output.workers, output.publisher, output.defects
         assembler.on_discarded = self._doubt
         self._unwatched: deque[tuple[int, Scan]] = deque()
-        self._box: deque[tuple[Scan, ScanStamp, ScanSolver]] = deque()  # holds one scan; thread-safe
+        self._box: deque[tuple[Scan, ScanStamp, ScanSolver, Verdict]] = deque()  # holds one scan; thread-safe
         self._token: deque[None] = deque([None])
         self.tap: StreamTap | None = None
         self._left_out: list[int] = []
@@ -165,8 +175,7 @@ class PatchStream:
 
     def poll(self, t_ns: int) -> None:
         """End a scan that has waited long enough for missing frames; evaluate earlier scans for faults."""
-        while self._unwatched and t_ns >= self._unwatched[0][0]:
-            self._options.watch(self._unwatched.popleft()[1])
+        self._watch_until(t_ns)
         deadline_ns = self._assembler.next_deadline_ns()
         if deadline_ns is None or t_ns < deadline_ns:
             return
@@ -175,6 +184,11 @@ class PatchStream:
         scan = self._assembler.poll(t_ns)
         if scan is not None:  # None if the scan was discarded
             self._offer(scan)
+
+    def _watch_until(self, t_ns: int) -> None:
+        """Evaluate the scans that are due at ``t_ns`` for faults."""
+        while self._unwatched and t_ns >= self._unwatched[0][0]:
+            self._options.watch(self._unwatched.popleft()[1])
 
     def withhold(self) -> int:
         """Stop passing scans on, including the scan being assembled. Returns ``withholdings``."""
@@ -229,6 +243,10 @@ class PatchStream:
 
     def _offer(self, scan: Scan) -> None:
         self._options.on_scan(scan)
+        tick = self._options.tick(scan.counter)
+        number = scan.scan if tick is None else tick.number
+        self._watch_until(_EVER_NS)
+        verdict = self._options.judge(scan, number)
         self._unwatched.append((scan.t_last_ns + WATCH_AFTER_NS, scan))
         if scan.flags & _BASELINE_CHANGED:  # this scan is the first with the new baseline
             self.withhold()
@@ -240,10 +258,9 @@ class PatchStream:
             return
         if not scan.empty:
             self.t_passed_ns = scan.t_last_ns
-        tick = self._options.tick(scan.counter)
         stamp = ScanStamp(
             patch=self._patch,
-            scan=scan.scan if tick is None else tick.number,
+            scan=number,
             counter=scan.counter,
             device_time_us=scan.device_time_us or 0,  # None if the summary was lost
             t_sync_ns=0 if tick is None else tick.t_ns,
@@ -257,10 +274,10 @@ class PatchStream:
         if self._is_left_out(stamp.t_receive_ns):
             return
         with contextlib.suppress(IndexError):
-            _, older, _ = self._box.popleft()
+            _, older, _, _ = self._box.popleft()
             if self.tap is not None:
                 self.tap.overtaken(self._patch, older.scan, older.t_receive_ns)
-        self._box.append((scan, stamp, solver))
+        self._box.append((scan, stamp, solver, verdict))
         self._call_worker()
 
     def leave_out(self, times_ns: Sequence[int], within_ns: int) -> None:
@@ -308,13 +325,14 @@ class PatchStream:
     def _solve_next(self) -> None:
         self._taken += 1  # before the scan leaves the box, so that the counters always include it
         try:
-            scan, stamp, solver = self._box.popleft()
+            scan, stamp, solver, verdict = self._box.popleft()
         except IndexError:  # the stream was closed
             self._taken -= 1
             return
         self._solving = stamp.scan
         try:
-            field, invalid = solver.solve(scan, stamp)
+            field, invalid = solver.solve(verdict.admitted(scan), stamp)
+            field = verdict.applied(field)
         except Exception:
             self._failed += 1
             raise

@@ -102,6 +102,7 @@ def receive_patch(
     options = StreamOptions(
         tick=ticks.find,
         on_scan=on_scan,
+        judge=watch.judge,
         watch=watch.on_scan,
         partial=hand.stream.partial,
         under_way=dispatcher.config.role == "guest",

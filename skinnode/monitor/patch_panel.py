@@ -247,6 +247,8 @@ def facts(patch: PatchView, theme: Theme, width: int) -> list[Line]:
     fact("EMCY", f"{health.emergencies}{last}", theme.note if health.emergencies else theme.text)
     wires = ", ".join(f"{fault.side} {fault.number} {fault.state}" for fault in health.wires)
     fact("wires", wires or "all well", theme.bad if wires else theme.good)
+    if health.life:
+        fact("converter", health.life, theme.note)
     return lines
 
 

@@ -141,6 +141,7 @@ def _patch_json(patch: PatchView) -> dict[str, Any]:
             {"side": fault.side, "number": fault.number, "state": str(fault.state)}
             for fault in patch.health.wires
         ],
+        "alive": str(patch.health.alive),
         "emergencies": patch.health.emergencies,
         "rate_hz": round(patch.rate_hz, 2),
         "latency_s": patch.latency_s,

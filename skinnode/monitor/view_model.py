@@ -19,7 +19,7 @@ from skinnode.host.events import HealthEvent
 from skinnode.host.health import BusHealth, Condition, PatchHealth
 from skinnode.host.patch_stream import StreamStats
 from skinnode.host.trust_report import deepest_data_share
-from skinnode.model.data_fault import DataFault
+from skinnode.model.data_fault import DataFault, FaultKind, FaultyPart
 from skinnode.model.distrust import why_not
 from skinnode.model.layout import Float
 from skinnode.monitor.field_map import Surface, mean_shear_m, surface_of
@@ -259,6 +259,11 @@ def _faults(health: PatchHealth) -> list[str]:
     if health.restarts_in_a_loop:
         words.append("restarts in a loop: check its supply and watchdog")
     words += [f"{fault.side} wire {fault.number} {fault.state}" for fault in health.wires]
+    words += [
+        f"{fault.place} {fault.kind}"
+        for fault in health.faults
+        if fault.part is not FaultyPart.PATCH and fault.kind not in (FaultKind.OPEN, FaultKind.SHORT)
+    ]
     if health.error_register:
         words.append(health.emergency_text or f"error: {register_text(health.error_register)}")
     return words
@@ -309,9 +314,9 @@ def _bus_view(
 def log_line(event: HealthEvent, wall_minus_mono_ns: int) -> LogLine:
     """Return an event as a line of the event log."""
     level: Level = "bad"
-    if event.what in ("operational", "well", "back", "rejoins", "baselines"):
+    if event.what in ("operational", "well", "back", "rejoins", "baselines", "readmitted"):
         level = "good"
-    elif event.what in ("booting", "boot_ups", "foreign", "noisy", "drifting"):
+    elif event.what in ("booting", "boot_ups", "foreign", "noisy", "drifting", "left out"):
         level = "note"
     return LogLine(time_of_day(event.t_ns + wall_minus_mono_ns), event.subject, event.text, level)
 

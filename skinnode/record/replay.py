@@ -15,6 +15,7 @@ from __future__ import annotations
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -23,7 +24,7 @@ from skinnode.config import BusConfig
 from skinnode.errors import ConfigError
 from skinnode.host.containment import Defects
 from skinnode.host.dispatcher import BusStats, Dispatcher, PortCounters
-from skinnode.host.health import PatchHealth
+from skinnode.host.health import PatchHealth, faults_of
 from skinnode.host.patch_stream import StreamOutput, StreamStats
 from skinnode.host.publish import Publisher
 from skinnode.host.reception import PatchReception, receive_bus, receive_patch
@@ -177,7 +178,8 @@ class Replay:
     def health(self, patch: str) -> PatchHealth:
         """Return the health of a patch at this point in the replay. Raises KeyError for an unknown patch."""
         heard = self._buses[self.hand.patch(patch).bus].patches[patch]
-        return heard.monitor.health(self._now_ns, self.hand.bring_up.heartbeat_s, self.hand.sync.period_s)
+        health = heard.monitor.health(self._now_ns, self.hand.bring_up.heartbeat_s, self.hand.sync.period_s)
+        return replace(health, faults=faults_of(self._publisher.latest(patch)))
 
     def bus_stats(self) -> dict[str, BusStats]:
         """Return the counters of each bus."""

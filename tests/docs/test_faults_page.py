@@ -14,8 +14,8 @@ import skinnode.diagnose
 from skinnode.canopen.emergency import EmcyCode
 from skinnode.diagnose.root_causes import RULES
 from skinnode.host import health_watch
-from skinnode.host.code_watch import WireState
 from skinnode.host.health import BusHealth, Condition, PatchHealth
+from skinnode.host.wire_faults import WireState
 
 from .blocks import DOCS
 

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from skinnode.config import SimulationConfig
-from skinnode.host.code_watch import CodeWatch, WireFault, WireState
+from skinnode.host.code_watch import CodeWatch, Verdict
+from skinnode.host.patch_life import Alive
+from skinnode.host.wire_faults import WireFault, WireState
+from skinnode.model.data_fault import DataFault, FaultKind, FaultyPart
 from skinnode.model.layout import Float, PatchLayout
-from skinnode.protocol.codes import CodeScale, encode
+from skinnode.protocol.codes import MISSING, CodeScale, encode
 from skinnode.protocol.scan import Scan
 from skinnode.protocol.summary import SummaryFlag
 from vcan_sim.scene import Scene
@@ -16,53 +21,125 @@ from vcan_sim.sensor import SimulatedPatch
 
 SHAPE = (4, 12)
 NOISE = 3e-6
+PERIOD_NS = 12_500_000
 REST = np.full(SHAPE, 1000.0)
 
 
-def scan_of(codes: np.ndarray, scale: CodeScale, flags: int = 0) -> Scan:
+def scan_of(codes: np.ndarray, scale: CodeScale, flags: int = 0, number: int = 1) -> Scan:
     return Scan(
         codes=codes,
         valid=codes <= scale.steps,
         counter=1,
-        scan=1,
+        scan=number,
         complete=True,
         chunks_expected=1,
         chunks_received=1,
         device_time_us=0,
         flags=flags,
-        t_first_ns=0,
-        t_last_ns=0,
+        t_first_ns=number * PERIOD_NS,
+        t_last_ns=number * PERIOD_NS,
     )
 
 
 class Patch:
     """A patch at rest with a converter of ``noise``, watched by a host that believes in NOISE."""
 
-    def __init__(self, noise: float = NOISE, bits: int = 16) -> None:
+    def __init__(self, noise: float = NOISE, bits: int = 16, stated: float = NOISE) -> None:
         self.scale = CodeScale(bits)
-        self.watch = CodeWatch(self.scale, NOISE)
+        self.watch = CodeWatch(self.scale, stated)
+        self.number = 0
         self._random = np.random.default_rng(7)
         self._noise = noise
 
     def read(self, ohm: Float = REST) -> np.ndarray:
-        noisy = ohm * (1.0 + self._noise * self._random.standard_normal(SHAPE))
-        return encode(noisy, REST, self.scale)
+        noisy = ohm * (1.0 + self._noise * self._random.standard_normal(ohm.shape))
+        return encode(noisy, np.full(ohm.shape, 1000.0), self.scale)
 
-    def see(self, codes: np.ndarray, flags: int = 0) -> None:
-        self.watch.on_scan(scan_of(codes, self.scale, flags))
+    def see(self, codes: np.ndarray, flags: int = 0) -> Verdict:
+        self.number += 1
+        scan = scan_of(codes, self.scale, flags, self.number)
+        verdict = self.watch.judge(scan)
+        self.watch.on_scan(scan)
+        return verdict
 
 
-@pytest.mark.parametrize("bits", [16, 24])
-def test_frozen_after_noise_was_seen(bits: int) -> None:
-    patch = Patch(bits=bits)
+PRESSED = 1000.0 * np.random.default_rng(2).uniform(0.8, 0.95, (10, 30))
+
+
+@pytest.mark.parametrize(
+    ("bits", "noise", "ohm"), [(24, 3e-6, REST), (16, 3e-6, PRESSED), (16, 1e-5, REST), (16, 1e-4, REST)]
+)
+def test_frozen_after_noise_was_seen(bits: int, noise: float, ohm: Float) -> None:
+    patch = Patch(noise, bits, stated=noise)
+    for _ in range(200):
+        assert patch.see(patch.read(ohm)).faults == ()
+    assert patch.watch.alive is Alive.YES
+    stuck = patch.read(ohm)
+    first = next(scan for scan in range(2000) if patch.see(stuck).distrust)
+    assert first < 1000
+    verdict = patch.see(stuck)
+    assert patch.watch.frozen
+    assert f"its codes have not changed for {first + 1} scans" == verdict.distrust
+    (fault,) = verdict.faults
+    assert (fault.part, fault.kind, fault.since) == (FaultyPart.PATCH, FaultKind.FROZEN, 201 + first)
+    assert 5.0 < fault.deviations < 100.0
+    assert patch.see(patch.read(ohm * 1.01)).faults == ()
+    assert not patch.watch.frozen
+
+
+def test_quiet_patch_at_rest_that_says_nothing() -> None:
+    """At rest every code is in the middle of its step: what is live at 2e-6 looks as what is frozen."""
+    patch = Patch()
     for _ in range(200):
         patch.see(patch.read())
-        assert not patch.watch.frozen
     stuck = patch.read()
-    for _ in range(300):
-        patch.see(stuck)
-    assert patch.watch.frozen
+    for _ in range(5000):
+        assert patch.see(stuck).faults == ()
+        assert patch.watch.alive is not Alive.NO
+    assert patch.watch.alive is Alive.CANNOT_TELL
+    assert patch.watch.words == "cannot tell whether its converter runs: no code has changed for 63 s"
     patch.see(patch.read(REST * 1.01))
+    assert (patch.watch.alive, patch.watch.words) == (Alive.YES, "")
+
+
+def test_phase_proves_life_and_death_of_the_quietest_patch() -> None:
+    patch = Patch(noise=0.0)
+    phase = 1
+    for _ in range(300):
+        phase = phase % 3 + 1
+        assert patch.see(patch.read(), phase << 6).faults == ()
+    assert patch.watch.alive is Alive.YES
+    verdict = patch.see(patch.read(), phase << 6)
+    assert verdict.distrust == "its converter has completed no conversion for 1 scan"
+    assert verdict.faults == (DataFault(FaultyPart.PATCH, FaultKind.FROZEN, since=301, deviations=np.inf),)
+    assert patch.watch.alive is Alive.YES  # a scan late
+    for _ in range(2):
+        patch.see(patch.read(), phase << 6)
+    assert patch.watch.alive is Alive.NO
+    assert patch.see(patch.read(), (phase % 3 + 1) << 6).faults == ()
+    assert patch.watch.alive is Alive.YES
+
+
+def test_equal_phase_after_lost_scans_or_a_lost_summary_says_nothing() -> None:
+    patch = Patch(noise=0.0)
+    for phase in (1, 2, 3):
+        patch.see(patch.read(), phase << 6)
+    for missed in (1, 2, 3, 5, 240):
+        patch.number += missed
+        assert patch.see(patch.read(), 3 << 6).faults == ()
+    patch.number += 1
+    lost = replace(scan_of(patch.read(), patch.scale, 0, patch.number), device_time_us=None)
+    assert patch.watch.judge(lost).faults == ()
+    assert patch.see(patch.read(), 3 << 6).faults == ()
+    assert patch.watch.alive is Alive.CANNOT_TELL  # the newest proof is seconds old
+
+
+def test_failed_source_is_not_frozen() -> None:
+    patch = Patch(noise=0.0)
+    missing = np.full(SHAPE, MISSING, np.uint32)
+    patch.see(patch.read(), 1 << 6)
+    for _ in range(5):
+        assert patch.see(missing, 1 << 6 | SummaryFlag.SOURCE_FAILED).faults == ()
     assert not patch.watch.frozen
 
 
@@ -158,6 +235,6 @@ def test_nothing_is_wrong_with_a_patch_that_is_pressed_or_left_alone(
                 patch.start(0)
             for k in range(600):
                 codes = encode(patch.read(k * 25_000_000), rest_ohm, scale)
-                watch.on_scan(scan_of(codes, scale))
-                assert not watch.frozen
+                assert watch.judge(scan_of(codes, scale, 0, k)).faults == ()
+                watch.on_scan(scan_of(codes, scale, 0, k))
                 assert watch.wires == ()

@@ -13,11 +13,11 @@ import pytest
 
 from skinnode.host import events as events_module
 from skinnode.host import health_watch as watch_module
-from skinnode.host.code_watch import WireFault, WireState
 from skinnode.host.containment import Defects
 from skinnode.host.events import Events, EventSubscription, HealthEvent
 from skinnode.host.health import BusHealth, Condition, PatchHealth
 from skinnode.host.health_watch import HealthWatch
+from skinnode.host.wire_faults import WireFault, WireState
 from skinnode.transport.bus_state import BusState
 
 PATCH = PatchHealth(

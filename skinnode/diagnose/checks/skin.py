@@ -185,7 +185,16 @@ def _check_frozen(patch: PatchFacts, scans: ScanFacts) -> Iterator[Finding]:
             "its sampling has stopped: reset the node",
         )
     known, still = _still(scans)
-    if _shows(scans) and known.any() and still.sum() > _MANY * known.sum():
+    if scans.repeated >= LEAST_SCANS and not scans.conversions:
+        yield Finding(
+            "wires",
+            patch.name,
+            "the values are frozen",
+            Sure.CERTAIN,
+            f"its converter completed no conversion in {scans.repeated} successive scans",
+            "the converter has stopped: switch the patch off and on",
+        )
+    elif _shows(scans) and known.any() and still.sum() > _MANY * known.sum():
         yield Finding(
             "wires",
             patch.name,
@@ -198,7 +207,12 @@ def _check_frozen(patch: PatchFacts, scans: ScanFacts) -> Iterator[Finding]:
 
 
 def may_be_frozen(scans: ScanFacts) -> bool:
-    """Return whether all codes are constant but the stated noise is too small for this to prove a defect."""
+    """Return whether all codes are constant but the stated noise is too small for this to prove a defect.
+
+    A patch that counts its conversions leaves no doubt.
+    """
+    if scans.conversions is not None:
+        return False
     known, still = _still(scans)
     return scans.scans >= LEAST_SCANS and not _shows(scans) and bool(known.any() and (still == known).all())
 

@@ -1,0 +1,179 @@
+"""Name the frozen wires and crossings of a live patch, so that its fields are solved without them.
+
+**Movement.** A crossing is frozen if its code repeats exactly while all four neighbours move the same way by
+at least ``CROSSING_LEAD`` codes. A wire is frozen if all its codes repeat while the neighbours of at least
+``LEADS`` of its crossings, on the wires next to it, move by ``WIRE_LEAD`` codes. This holds for the quietest
+converter. In 696 simulated presses of live patches (two layouts, layers of 0.3 to 1 pitch, depths of 2 to
+50 %, friction of 0 to 0.8, noise of 0 to 3e-6, 16-bit codes), a value that happened to stay within one code
+reached leads of 75 codes at a crossing and 16 at a wire. An indentation by 10 % moves codes by thousands.
+
+**Noise.** A part is also frozen if a live converter would repeat its codes so often with a probability of at
+most :data:`~skinnode.host.patch_life.FALSE_ALARM`, at a tenth of the stated noise or at half of the noise
+that recent windows have shown, while three quarters of the other crossings have not repeated for a quarter
+as long. The last condition excludes converters that are quieter than assumed, because all their crossings
+repeat.
+
+A part is readmitted as soon as one of its codes changes.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skinnode.host.code_runs import (
+    ACROSS,
+    ALONG,
+    CROSSING,
+    LAST,
+    LEADS,
+    LEAST_RUN,
+    LOWER,
+    NAMED,
+    RUN,
+    STEPS,
+    UPPER,
+)
+from skinnode.host.code_runs import CROSSING_LEAD as _CROSSING_LEAD
+from skinnode.host.code_runs import WIRE_LEAD as _WIRE_LEAD
+from skinnode.host.patch_life import FALSE_ALARM, QUIETER
+from skinnode.host.repeat_odds import deviations_of, log_stay
+from skinnode.model.data_fault import DataFault, FaultKind, FaultyPart
+from skinnode.protocol.codes import CodeScale
+
+CROSSING_LEAD: Final = 512
+"""Minimum lead of a frozen crossing, codes: seven times the largest of a live crossing in 696 presses."""
+WIRE_LEAD: Final = 64
+"""Minimum lead of ``LEADS`` crossings of a frozen wire, codes: four times the largest of a live wire."""
+_NEVER: Final = 2**62
+_OTHERS: Final = 0.75
+"""Minimum fraction of the other crossings that must not have repeated for a quarter as long."""
+
+
+class FrozenParts:
+    """Wires and crossings of one patch that are frozen. Owned by the mainline.
+
+    Args:
+        scale: Scale of the codes.
+        relative_noise: Converter noise stated in the hand file, as a fraction of the resistance.
+        state: State of the runs (:mod:`skinnode.host.code_runs`); this object writes the plane of named
+            crossings.
+    """
+
+    def __init__(self, scale: CodeScale, relative_noise: float, state: NDArray[np.int64]) -> None:
+        self._scale, self._stated, self._state = scale, relative_noise / scale.step, state
+        self._log_stay = 0.0
+        self.faults: tuple[DataFault, ...] = ()
+        self.left_out: NDArray[np.bool_] | None = None
+        """(U, K) crossings to leave out; None if there are none."""
+        self.limits = np.zeros(7, np.int64)
+        self.limits[STEPS] = scale.steps
+        self.limits[_WIRE_LEAD], self.limits[_CROSSING_LEAD] = WIRE_LEAD, CROSSING_LEAD
+        self.assume_noise(0.0, 0)
+
+    def assume_noise(self, measured: float, least: int) -> None:
+        """Set the limits of the runs.
+
+        Args:
+            measured: Noise that recent windows have shown, codes; 0 if none.
+            least: Smallest code, which has the least noise because noise is proportional to the resistance.
+        """
+        ratio = max(self._scale.lo + least * self._scale.step, self._scale.step)
+        self._log_stay = log_stay(ratio * max(self._stated / QUIETER, 0.5 * measured))
+        rows, columns = self._state.shape[1:]
+        for limit, codes in ((UPPER, columns), (LOWER, rows), (CROSSING, 1)):
+            evidence = -self._log_stay * codes
+            needed = -math.log(FALSE_ALARM) / evidence if evidence > 0.0 else math.inf
+            self.limits[limit] = max(LEAST_RUN, math.ceil(needed)) if needed < _NEVER else _NEVER
+
+    def release(self) -> None:
+        """Readmit the parts of which a code has changed."""
+        alive = (self._state[NAMED] != 0) & (self._state[RUN] == 0)
+        self._set([fault for fault in self.faults if not alive[_place(fault)].any()])
+
+    def name(self, scan: int) -> None:
+        """Name the parts that are frozen now.
+
+        Args:
+            scan: Number of the scan.
+        """
+        last, run, named = self._state[LAST], self._state[RUN], self._state[NAMED] != 0
+        known = (last >= 0) & (last <= self._scale.steps) & ~named
+        found = list(self.faults)
+        for side, part, lead in ((0, FaultyPart.UPPER, ACROSS), (1, FaultyPart.LOWER, ALONG)):
+            for number in range(self._state.shape[1 + side]):
+                at = (number, slice(None)) if side == 0 else (slice(None), number)
+                log_p = self._wire(known, run, np.abs(self._state[lead]), at, (UPPER, LOWER)[side])
+                if log_p is not None:
+                    found = [each for each in found if not _lies_on(each, part, number)]
+                    found.append(_fault(part, number, scan, log_p))
+        taken = np.zeros(known.shape, np.bool_)
+        for fault in found:
+            taken[_place(fault)] = True
+        found += self._crossings(known & ~taken, run, scan)
+        self._set(found)
+
+    def _wire(
+        self, known: NDArray[np.bool_], run: NDArray[np.int64], lead: NDArray[np.int64], at: Any, limit: int
+    ) -> float | None:
+        """Return the logarithm of the probability that a wire is live; None if it is not frozen."""
+        here = known[at]
+        if not here.any() or (least := int(run[at][here].min())) < LEAST_RUN:
+            return None
+        leads = lead[at][here]
+        leads = leads[leads >= WIRE_LEAD]
+        moved = -float(np.log(leads).sum()) if leads.size >= LEADS else 0.0
+        still = least * int(here.sum()) * self._log_stay
+        enough = least >= self.limits[limit] and self._others_change(known, run, at, least)
+        if not (leads.size >= LEADS or enough):
+            return None
+        return min(moved, still if enough else 0.0)
+
+    def _crossings(self, known: NDArray[np.bool_], run: NDArray[np.int64], scan: int) -> Iterator[DataFault]:
+        along, across = self._state[ALONG], self._state[ACROSS]
+        together = np.where(along * across > 0, np.minimum(np.abs(along), np.abs(across)), 0)
+        moved = known & (run >= LEAST_RUN) & (together >= CROSSING_LEAD)
+        still = known & (run >= self.limits[CROSSING])
+        for u, k in np.argwhere(moved | still).tolist():
+            log_p = -2.0 * math.log(together[u, k]) if moved[u, k] else 0.0
+            if still[u, k] and self._others_change(known, run, (u, k), int(run[u, k])):
+                log_p = min(log_p, int(run[u, k]) * self._log_stay)
+            if log_p < 0.0:
+                sure = deviations_of(log_p)
+                yield DataFault(FaultyPart.CROSSING, FaultKind.FROZEN, u, k, since=scan, deviations=sure)
+
+    def _others_change(self, known: NDArray[np.bool_], run: NDArray[np.int64], at: Any, least: int) -> bool:
+        others = known.copy()
+        others[at] = False
+        return bool(others.any() and (4 * run[others] < least).mean() >= _OTHERS)
+
+    def _set(self, faults: list[DataFault]) -> None:
+        self.faults = tuple(faults)
+        mask = np.zeros(self._state.shape[1:], np.bool_)
+        for fault in faults:
+            mask[_place(fault)] = True
+        self._state[NAMED] = mask
+        self.left_out = mask if faults else None
+
+
+def _place(fault: DataFault) -> Any:
+    """Return the index of a fault's crossings."""
+    return (
+        slice(None) if fault.upper is None else fault.upper,
+        slice(None) if fault.lower is None else fault.lower,
+    )
+
+
+def _lies_on(fault: DataFault, part: FaultyPart, number: int) -> bool:
+    """Return whether a fault is a crossing of this wire."""
+    wire = fault.upper if part is FaultyPart.UPPER else fault.lower
+    return fault.part is FaultyPart.CROSSING and wire == number
+
+
+def _fault(part: FaultyPart, number: int, scan: int, log_p: float) -> DataFault:
+    wire = {"upper" if part is FaultyPart.UPPER else "lower": number}
+    return DataFault(part, FaultKind.FROZEN, since=scan, deviations=deviations_of(log_p), **wire)

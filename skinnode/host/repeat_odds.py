@@ -1,0 +1,61 @@
+"""Probability that a live converter repeats its codes, given its noise and the width of a code.
+
+A reading falls into the same code again with a probability of at most 2Φ(1/2σ) − 1, where σ is the noise in
+codes; a true value in the middle of a step attains it. Skin at rest after a tare is exactly there. Under a
+press, each crossing has its own value, and where it lies within a step is as good as random. The probability
+that n + 1 readings of one crossing all fall into the same code is then E max(0, 1 − σ R), where R is the
+range of n + 1 standard normal variables: much less than the bound, even for a quiet converter.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from typing import Final
+
+_EDGES: Final = 0.1
+"""Largest σ for which σ R stays below 1 for every run that matters, so that E max(0, 1 − σ R) = 1 − σ E R;
+larger noise is treated as this."""
+
+
+def log_stay(sigma: float) -> float:
+    """Return the logarithm of the largest probability that a code repeats.
+
+    Args:
+        sigma: Standard deviation of the noise, codes.
+    """
+    if sigma <= 0.0:
+        return 0.0
+    leaves = math.erfc(0.5 / (sigma * math.sqrt(2.0)))
+    return math.log1p(-leaves) if leaves < 1.0 else -math.inf
+
+
+def log_stay_anywhere(sigma: float, run: int) -> float:
+    """Return the logarithm of the probability that a code repeats ``run`` times, at a random place in a step.
+
+    Args:
+        sigma: Standard deviation of the noise, codes.
+        run: Number of repetitions.
+    """
+    return math.log1p(-min(sigma, _EDGES) * _mean_range(run + 1))
+
+
+@functools.lru_cache(maxsize=256)
+def _mean_range(count: int) -> float:
+    """Return the mean range of ``count`` standard normal variables: ∫ 1 − Φⁿ − (1 − Φ)ⁿ."""
+    step = 0.02
+    total = 0.0
+    for i in range(-450, 451):
+        below = 0.5 * math.erfc(-i * step / math.sqrt(2.0))
+        total += 1.0 - below**count - (1.0 - below) ** count
+    return min(total * step, 0.999 / _EDGES)
+
+
+def deviations_of(log_p: float) -> float:
+    """Return the number of standard deviations that a normal variable exceeds with probability exp(log_p)."""
+    if log_p > -1.0:
+        return 0.0
+    z = math.sqrt(-2.0 * log_p)
+    for _ in range(4):  # z² = -2 ln p - ln 2π - 2 ln z, for the tail φ(z)/z
+        z = math.sqrt(max(-2.0 * log_p - math.log(2.0 * math.pi) - 2.0 * math.log(max(z, 1.0)), 0.0))
+    return z

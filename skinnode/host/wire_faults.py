@@ -1,0 +1,46 @@
+"""Faults of wires as health reports them, and the wires that their codes mark as open or shorted."""
+
+from __future__ import annotations
+
+import enum
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skinnode.protocol.codes import CodeScale
+
+
+class WireState(enum.StrEnum):
+    """Fault of a wire."""
+
+    OPEN = "open"
+    SHORT = "short"
+    NOISY = "noisy"
+    DRIFTING = "drifting"
+
+
+@dataclass(frozen=True, slots=True, order=True)
+class WireFault:
+    """A wire and its fault."""
+
+    side: str
+    """``upper`` or ``lower``."""
+    number: int
+    state: WireState
+
+
+def broken_wires(codes: NDArray[Any], scale: CodeScale) -> tuple[WireFault, ...]:
+    """Return the wires whose crossings are all open, or all shorted.
+
+    Args:
+        codes: (U, K) codes.
+        scale: Scale of the codes.
+    """
+    found = []
+    for state, code in ((WireState.OPEN, scale.open), (WireState.SHORT, scale.short)):
+        is_so = codes == code
+        for side, axis in (("upper", 1), ("lower", 0)):
+            found += [WireFault(side, int(i), state) for i in np.flatnonzero(is_so.all(axis=axis))]
+    return tuple(sorted(found))

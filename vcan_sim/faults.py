@@ -37,6 +37,7 @@ _SHARES: Final = (
     *OF_SCANS,
     "sync_lost",
     "long",
+    "flipped",
     *dict.fromkeys((*LOST_OUT.values(), *LOST_IN.values())),
 )
 OF_WIRES: Final = (
@@ -46,7 +47,14 @@ OF_WIRES: Final = (
     "shorted_lower",
     "noisy_upper",
     "noisy_lower",
+    "frozen_upper",
+    "frozen_lower",
+    "stuck_upper",
+    "stuck_lower",
+    "crossed_upper",
+    "crossed_lower",
 )
+"""Faults that name a wire, alternately an upper and a lower one."""
 _RATES: Final = ("emcy_per_s", "babble_per_s", "restart_every_s")
 
 
@@ -149,6 +157,21 @@ class Faults:
     """This upper wire has a bad contact, which adds noise of 0.3 % to each of its resistances."""
     noisy_lower: int | None = None
     """This lower wire has a bad contact."""
+    frozen_upper: int | None = None
+    """This upper wire keeps the resistances that it has when the fault begins."""
+    frozen_lower: int | None = None
+    """This lower wire keeps the resistances that it has when the fault begins."""
+    stuck_upper: int | None = None
+    """With ``stuck_lower``: the crossing of these two wires keeps the resistance that it has when the fault
+    begins."""
+    stuck_lower: int | None = None
+    """See ``stuck_upper``."""
+    crossed_upper: int | None = None
+    """This upper wire and the next are connected in each other's place."""
+    crossed_lower: int | None = None
+    """This lower wire and the next are connected in each other's place."""
+    flipped: float = 0.0
+    """Fraction of the readings in which one bit of one code is flipped before the node computes its check."""
     restart_every_s: float = 0.0
     """Seconds between spontaneous resets of the node; 0 for never."""
     emcy_per_s: float = 0.0
@@ -167,6 +190,10 @@ class Faults:
         for name in OF_WIRES:
             if (wire := getattr(self, name)) is not None and wire < 0:
                 raise ConfigError(name, wire, "an integer of at least 0")
+        if (self.stuck_upper is None) != (self.stuck_lower is None):
+            given = {"stuck_upper": self.stuck_upper, "stuck_lower": self.stuck_lower}
+            name = next(name for name, wire in given.items() if wire is not None)
+            raise ConfigError(name, given[name], "both stuck_upper and stuck_lower, which name a crossing")
         for name in _RATES:
             if not 0.0 <= getattr(self, name) < math.inf:
                 raise ConfigError(name, getattr(self, name), "a number of at least 0")
@@ -214,7 +241,9 @@ class Injected:
     uncounted: int = 0
     """Readings by a converter that does not count its conversions."""
     miswired: int = 0
-    """Readings with an open, shorted or noisy wire."""
+    """Readings with a faulty wire or crossing: open, shorted, noisy, frozen, stuck or crossed."""
+    flipped: int = 0
+    """Readings in which one bit of one code was flipped."""
     unplugged: int = 0
     restarts: int = 0
     """Resets caused by ``restart_every_s``."""

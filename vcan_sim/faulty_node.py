@@ -1,7 +1,7 @@
 """A real node with faults. Every frame between the node and its bus passes through this module.
 
-Reading faults are in :mod:`vcan_sim.sensor`, scan faults in :mod:`vcan_sim.faulty_scans`. Faults depend on a
-seed and the order of the frames, not on the clock, except for periodic events.
+Reading faults are in :mod:`vcan_sim.faulty_converter`, scan faults in :mod:`vcan_sim.faulty_scans`. Faults
+depend on a seed and the order of the frames, not on the clock, except for periodic events.
 """
 
 from __future__ import annotations
@@ -16,11 +16,12 @@ from skinnode.model.layout import PatchLayout
 from skinnode.node import NmtState, PatchNode
 from skinnode.node.clock import THRIFTY, Pacing
 from skinnode.node.patch.source import ResistanceSource
+from skinnode.protocol.codes import CodeScale
 from skinnode.protocol.profile import PatchProfile
 from vcan_sim.faults import LOST_IN, LOST_OUT, NO_FAULTS, Faults, Injected
+from vcan_sim.faulty_converter import FaultyConverter
 from vcan_sim.faulty_scans import FaultyScans
 from vcan_sim.injector import Injector
-from vcan_sim.sensor import FaultyConverter
 from vcan_sim.tally import Kind, Tally, kind_of
 
 BABBLE_COB_ID: Final = 0x3F0
@@ -81,7 +82,11 @@ class FaultyNode(PatchNode):
         self._unplugged = self._stormed = False
         self._due_ns = dict.fromkeys(("restart", "emcy", "babble"), 0)
         self.converter = FaultyConverter(
-            source, self._injector, booting=lambda: self.nmt_state is NmtState.INITIALISING
+            source,
+            self._injector,
+            booting=lambda: self.nmt_state is NmtState.INITIALISING,
+            baseline_ohm=lambda: self.baseline_ohm,
+            scale=CodeScale(profile.code_bits),
         )
         super().__init__(
             node_id,

@@ -266,7 +266,9 @@ class _Station:
         return self._node
 
     def inject(self, faults: Faults) -> None:
-        for name, wires in zip(OF_WIRES, 3 * self.source.scene.layout.shape, strict=True):
+        shape = self.source.scene.layout.shape
+        for number, name in enumerate(OF_WIRES):
+            wires = shape[number % 2] - name.startswith("crossed")  # the last wire has no next one
             if (wire := getattr(faults, name)) is not None and wire >= wires:
                 raise ConfigError(f"{self._config.name}: {name}", wire, f"an integer from 0 to {wires - 1}")
         self._faults = faults

@@ -1,4 +1,4 @@
-"""Simulated resistances at a node's analogue inputs, with faults in the wires and the converter."""
+"""Simulated resistances at a node's analogue inputs."""
 
 from __future__ import annotations
 
@@ -10,17 +10,11 @@ from typing import Final
 import numpy as np
 
 from skinnode.model.layout import Float, PatchLayout
-from skinnode.node.patch.source import ResistanceSource, conversions_of
 from skinnode.protocol.device_time import TIME_STEP_US
-from vcan_sim.faults import OF_WIRES
-from vcan_sim.injector import Injector
 from vcan_sim.scene import Scene
 
 REMEMBERED_READINGS: Final = 4096
 """Number of readings whose times are kept: more than five minutes of scans at 12.5 per second."""
-
-WIRE_NOISE: Final = 3e-3
-"""Relative standard deviation of a resistance measured through a bad contact."""
 
 Fault = Callable[[Float, int], Float]
 """Function that takes the resistances (U, K) in ohm and the time in ns, and returns the resistances that the
@@ -112,57 +106,6 @@ class SimulatedPatch:
         self._read_ns[(t_ns // 1000 & 0xFFFF_FFFF) // TIME_STEP_US] = t_ns
         if len(self._read_ns) > REMEMBERED_READINGS:
             self._read_ns.popitem(last=False)
-
-
-class FaultyConverter:
-    """A converter whose readings may be frozen, or taken through open, shorted or noisy wires.
-
-    The wires are intact while the node boots, so that its tare at power-on is valid.
-
-    Args:
-        source: Resistances that an intact converter would measure.
-        injector: The node's faults, random generator and counts.
-        booting: Function that returns whether the node is booting.
-    """
-
-    def __init__(self, source: ResistanceSource, injector: Injector, *, booting: Callable[[], bool]) -> None:
-        self._source, self._injector, self._booting = source, injector, booting
-        self._reading: Float | None = None
-        self._conversions: int | None = None
-
-    @property
-    def conversions(self) -> int | None:
-        """Number of conversions; a frozen converter completes none. None if conversions are not counted."""
-        return None if self._injector.faults.uncounted else self._conversions
-
-    def read(self, t_ns: int) -> Float:
-        """Return the resistances (U, K) in ohm at ``t_ns``, or the previous reading while frozen."""
-        self._injector.injected.uncounted += self._injector.faults.uncounted
-        if self._injector.faults.frozen and self._reading is not None:
-            self._injector.injected.frozen += 1
-        else:
-            self._reading = self._through_wires(self._source.read(t_ns))
-            self._conversions = conversions_of(self._source)
-        return self._reading
-
-    def _through_wires(self, read: Float) -> Float:
-        faults = self._injector.faults
-        if all(getattr(faults, name) is None for name in OF_WIRES) or self._booting():
-            return read
-        self._injector.injected.miswired += 1
-        read = read.copy()
-        for wire, ohm in ((faults.noisy_upper, read), (faults.noisy_lower, read.T)):
-            if wire is not None:
-                ohm[wire] *= 1.0 + WIRE_NOISE * self._injector.random.standard_normal(ohm.shape[1])
-        for wire, ohm, value in (
-            (faults.shorted_upper, read, 0.0),
-            (faults.shorted_lower, read.T, 0.0),
-            (faults.open_upper, read, np.inf),
-            (faults.open_lower, read.T, np.inf),
-        ):
-            if wire is not None:
-                ohm[wire] = value
-        return read
 
 
 def simulated(layout: PatchLayout) -> SimulatedPatch:

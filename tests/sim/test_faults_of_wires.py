@@ -9,11 +9,12 @@ from skinnode.config import parse_hand
 from skinnode.errors import ConfigError
 from skinnode.model.layout import Float, PatchLayout
 from skinnode.node import NmtState
+from skinnode.protocol.codes import CodeScale, encode
 from skinnode.protocol.profile import PatchProfile
 from vcan_sim.faults import NO_FAULTS, Faults, faults_of
+from vcan_sim.faulty_converter import WIRE_NOISE, FaultyConverter
 from vcan_sim.faulty_node import FaultyNode
 from vcan_sim.fleet import Fleet
-from vcan_sim.sensor import WIRE_NOISE, FaultyConverter
 
 SHAPE = {"upper_wires": 4, "upper_electrodes": 4, "lower_wires": 12, "lower_electrodes": 4}
 HAND = parse_hand(
@@ -81,6 +82,11 @@ def test_of_one_patch_or_of_all() -> None:
         ("c:silent", "--fault: got 'c', allowed: a patch of the hand: a, b"),
         ("a:open_upper=4", "a: open_upper: got 4, allowed: an integer from 0 to 3"),
         ("a:noisy_lower=12", "a: noisy_lower: got 12, allowed: an integer from 0 to 11"),
+        ("a:crossed_upper=3", "a: crossed_upper: got 3, allowed: an integer from 0 to 2"),
+        (
+            "a:stuck_lower=3",
+            "stuck_lower: got 3, allowed: both stuck_upper and stuck_lower, which name a crossing",
+        ),
         ("a:open_upper=-1", "open_upper: got -1, allowed: an integer of at least 0"),
         ("a:open_upper=x", "--fault open_upper: got 'x', allowed: an integer"),
     ],
@@ -105,7 +111,11 @@ class Counting(Steady):
 def test_a_frozen_converter_counts_no_conversions() -> None:
     node = node_with(NO_FAULTS)
     converter = FaultyConverter(
-        Counting(HAND.patches[0].layout.build()), node._injector, booting=lambda: False
+        Counting(HAND.patches[0].layout.build()),
+        node._injector,
+        booting=lambda: False,
+        baseline_ohm=lambda: REST_OHM,
+        scale=CodeScale(),
     )
     counts = []
     for faults in (NO_FAULTS, Faults(frozen=True), Faults(frozen=True), NO_FAULTS, Faults(uncounted=True)):
@@ -114,3 +124,56 @@ def test_a_frozen_converter_counts_no_conversions() -> None:
         counts.append(converter.conversions)
     assert counts == [1, 1, 1, 2, None]
     assert (node.injected.frozen, node.injected.uncounted) == (2, 1)
+
+
+class Rising:
+    """Readings of which each is larger than the one before."""
+
+    def __init__(self) -> None:
+        self.reads = 0
+
+    def read(self, t_ns: int) -> Float:
+        self.reads += 1
+        return REST_OHM * (1.0 - 1e-3 * self.reads)
+
+
+def converter_of(node: FaultyNode) -> FaultyConverter:
+    options = {"booting": lambda: False, "baseline_ohm": lambda: REST_OHM, "scale": CodeScale()}
+    return FaultyConverter(Rising(), node._injector, **options)
+
+
+def test_what_is_frozen_keeps_its_reading_until_the_fault_ends() -> None:
+    node = node_with(NO_FAULTS)
+    converter = converter_of(node)
+    converter.read(0)
+    node.faults = Faults(frozen_lower=3, stuck_upper=1, stuck_lower=5)
+    seen = np.array([converter.read(0) for _ in range(4)]) / REST_OHM
+    expected = np.tile(1.0 - 1e-3 * np.arange(2, 6)[:, None, None], (1, 4, 12))
+    expected[:, :, 3] = expected[0, 0, 0]
+    expected[:, 1, 5] = expected[0, 0, 0]
+    np.testing.assert_allclose(seen, expected, rtol=1e-12)
+    node.faults = Faults(frozen_upper=2)
+    np.testing.assert_allclose(converter.read(0) / REST_OHM, 1.0 - 6e-3, rtol=1e-12)
+    after = converter.read(0) / REST_OHM
+    np.testing.assert_allclose(after[2], 1.0 - 6e-3, rtol=1e-12)
+    np.testing.assert_allclose(np.delete(after, 2, axis=0), 1.0 - 7e-3, rtol=1e-12)
+
+
+def test_crossed_wires() -> None:
+    node = node_with(Faults(crossed_upper=0, crossed_lower=10))
+    seen = converter_of(node).read(0) / (1.0 - 1e-3)
+    np.testing.assert_allclose(seen, REST_OHM[[1, 0, 2, 3]][:, [*range(10), 11, 10]], rtol=1e-12)
+
+
+def test_one_bit_of_one_code_is_flipped() -> None:
+    node = node_with(Faults(flipped=0.25))
+    converter = converter_of(node)
+    bits = []
+    for i in range(1, 401):
+        codes = encode(converter.read(0), REST_OHM, CodeScale())
+        sound = encode(REST_OHM * (1.0 - 1e-3 * i), REST_OHM, CodeScale())
+        bits += (codes ^ sound)[codes != sound].tolist()
+    assert len(bits) == node.injected.flipped
+    assert 60 < len(bits) < 140
+    assert {bit.bit_count() for bit in bits} == {1}
+    assert len(set(bits)) > 10

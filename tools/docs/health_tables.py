@@ -37,6 +37,8 @@ def faults() -> str:
         value = kinds.get(str(kind), "fraction of the frames")
         if name in (*OF_CHUNKS, *OF_SCANS):
             value = "fraction of the chunks" if name in OF_CHUNKS else "fraction of the scans"
+        elif name == "flipped":
+            value = "fraction of the readings"
         elif name in OF_WIRES:
             value = "number of a wire"
         elif name.endswith("_s"):

@@ -87,6 +87,11 @@ class PatchApplication:
         """Time at which :meth:`on_timer` must next take or send a scan, ns."""
         return min(self._scan_ns, self.stream.deadline_ns)
 
+    @property
+    def baseline_ohm(self) -> Float:
+        """(U, K) R0 in use, ohm; 0 where there is none."""
+        return self._acquisition.baseline_ohm.astype(np.float64)
+
     def power_on(self, t_ns: int) -> None:
         """Load the baseline from the memory, or tare if the memory holds none.
 

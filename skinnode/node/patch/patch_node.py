@@ -86,6 +86,11 @@ class PatchNode(CanopenDevice):
         return self._patch.stream.scans_sent
 
     @property
+    def baseline_ohm(self) -> Float:
+        """(U, K) R0 in use, ohm; 0 where there is none."""
+        return self._patch.baseline_ohm
+
+    @property
     def source_failures(self) -> int:
         """Number of failures of the source."""
         return self._patch.source.failures

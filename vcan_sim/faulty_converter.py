@@ -1,0 +1,115 @@
+"""Converter with faults in its wires and in itself."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Final
+
+import numpy as np
+
+from skinnode.model.layout import Float
+from skinnode.node.patch.source import ResistanceSource, conversions_of
+from skinnode.protocol.codes import CodeScale, encode
+from vcan_sim.faults import OF_WIRES, Faults
+from vcan_sim.injector import Injector
+
+WIRE_NOISE: Final = 3e-3
+"""Relative standard deviation of a resistance measured through a bad contact."""
+
+
+class FaultyConverter:
+    """A converter whose readings may be frozen, wrong, or taken through faulty wires.
+
+    The wires are intact while the node boots, so that its tare at power-on is valid.
+
+    Args:
+        source: Resistances that an intact converter would measure.
+        injector: The node's faults, random generator and counts.
+        booting: Function that returns whether the node is booting.
+        baseline_ohm: Function that returns R0 (U, K) in ohm, by which the node computes codes.
+        scale: Scale of the node's codes.
+    """
+
+    def __init__(
+        self,
+        source: ResistanceSource,
+        injector: Injector,
+        *,
+        booting: Callable[[], bool],
+        baseline_ohm: Callable[[], Float],
+        scale: CodeScale,
+    ) -> None:
+        self._source, self._injector, self._booting = source, injector, booting
+        self._baseline_ohm, self._scale = baseline_ohm, scale
+        self._reading: Float | None = None
+        self._conversions: int | None = None
+        self._held: dict[tuple[str, object], Float] = {}  # by fault: the reading at its onset
+
+    @property
+    def conversions(self) -> int | None:
+        """Number of conversions; a frozen converter completes none. None if conversions are not counted."""
+        return None if self._injector.faults.uncounted else self._conversions
+
+    def read(self, t_ns: int) -> Float:
+        """Return the resistances (U, K) in ohm at ``t_ns``, or the previous reading while frozen."""
+        self._injector.injected.uncounted += self._injector.faults.uncounted
+        if self._injector.faults.frozen and self._reading is not None:
+            self._injector.injected.frozen += 1
+        else:
+            self._reading = self._flip(self._through_wires(self._source.read(t_ns)))
+            self._conversions = conversions_of(self._source)
+        return self._reading
+
+    def _through_wires(self, read: Float) -> Float:
+        faults = self._injector.faults
+        if all(getattr(faults, name) is None for name in OF_WIRES) or self._booting():
+            self._held = {}
+            return read
+        self._injector.injected.miswired += 1
+        read = read.copy()
+        for wire, ohm in ((faults.crossed_upper, read), (faults.crossed_lower, read.T)):
+            if wire is not None:
+                ohm[[wire, wire + 1]] = ohm[[wire + 1, wire]]
+        for wire, ohm in ((faults.noisy_upper, read), (faults.noisy_lower, read.T)):
+            if wire is not None:
+                ohm[wire] *= 1.0 + WIRE_NOISE * self._injector.random.standard_normal(ohm.shape[1])
+        self._hold(read, faults)
+        for wire, ohm, value in (
+            (faults.shorted_upper, read, 0.0),
+            (faults.shorted_lower, read.T, 0.0),
+            (faults.open_upper, read, np.inf),
+            (faults.open_lower, read.T, np.inf),
+        ):
+            if wire is not None:
+                ohm[wire] = value
+        return read
+
+    def _hold(self, read: Float, faults: Faults) -> None:
+        """Replace what is frozen or stuck by its reading at the onset of the fault."""
+        stuck = None if faults.stuck_upper is None else (faults.stuck_upper, faults.stuck_lower)
+        held = {}
+        for name, place, ohm in (
+            ("frozen_upper", faults.frozen_upper, read),
+            ("frozen_lower", faults.frozen_lower, read.T),
+            ("stuck", stuck, read),
+        ):
+            if place is not None:
+                value = self._held.get((name, place))
+                held[name, place] = np.array(ohm[place]) if value is None else value
+                ohm[place] = held[name, place]
+        self._held = held
+
+    def _flip(self, read: Float) -> Float:
+        """Return a reading of which one bit of one code may be flipped."""
+        if not self._injector.draw(self._injector.faults.flipped) or self._booting():
+            return read
+        random, scale, baseline_ohm = self._injector.random, self._scale, self._baseline_ohm()
+        at = tuple(int(random.integers(size)) for size in read.shape)
+        code = int(encode(read[at], baseline_ohm[at], scale))
+        others = [code ^ 1 << bit for bit in range(scale.bits) if code ^ 1 << bit <= scale.steps]
+        if code > scale.steps or not others:
+            return read
+        self._injector.injected.flipped += 1
+        read = read.copy()
+        read[at] = (scale.lo + others[int(random.integers(len(others)))] * scale.step) * baseline_ohm[at]
+        return read

@@ -87,7 +87,7 @@ class FaultyConverter:
     def _hold(self, read: Float, faults: Faults) -> None:
         """Replace what is frozen or stuck by its reading at the onset of the fault."""
         stuck = None if faults.stuck_upper is None else (faults.stuck_upper, faults.stuck_lower)
-        held = {}
+        held: dict[tuple[str, object], Float] = {}
         for name, place, ohm in (
             ("frozen_upper", faults.frozen_upper, read),
             ("frozen_lower", faults.frozen_lower, read.T),

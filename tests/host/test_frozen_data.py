@@ -24,7 +24,7 @@ from .conftest import SMALL, eventually
 pytestmark = pytest.mark.real_time
 
 PRESSED_M = 5e-5
-"""Depth from which a press is under way: a quarter of its final depth."""
+"""Depth from which a press is under way: a twelfth of its final depth."""
 IN_FLIGHT = 3
 """Scans that may have been read before a fault took effect, or await their field."""
 
@@ -89,7 +89,7 @@ def road() -> Callable[..., AbstractContextManager[Road]]:
                 "buses": [{"name": "can0", "interface": "virtual", "channel": uuid.uuid4().hex[:8]}],
                 "patches": [{"name": "p0", "node_id": 5, "layout": SMALL, "relative_noise": noise}],
                 "sync": {"period_ms": 25},
-                "simulation": {"cycle_s": 16.0, "converter_noise": noise},
+                "simulation": {"cycle_s": 16.0, "depth": 0.3, "converter_noise": noise},
             }
         )
         with Fleet(hand, faults=faults) as fleet, Host.from_config(hand) as host:

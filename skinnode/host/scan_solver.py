@@ -65,6 +65,7 @@ class ScanSolver:
         Returns:
             The stamped field, with read-only arrays, and the number of codes that are not measurements.
         """
+        self._tracker.scan = stamp.scan
         field, invalid = self._tracker.update_codes(scan.codes)
         contacts = tuple(sealed(contact) for contact in field.contacts)
         return sealed(field, contacts=contacts, stamp=stamp.solved_at(self._clock())), invalid

@@ -61,6 +61,8 @@ class RootGate:
         self._last_m = np.zeros_like(layout.upper_m)
         self._lost, self._unsure, self._rough = np.zeros((3, layout.shape[0]), np.bool_)
         self._pause = 0  # frames until the next posterior solve
+        self.hurried = False
+        """Whether there was no time to check a doubtful wire of the last field."""
         self._confirmed: Float | None = None  # displacement at which a rough wire was last confirmed
         self._apart = np.zeros((len(problem.rest), 1, 1))  # m, uncertainty left by the confirmation
         self._any_apart = False
@@ -106,19 +108,21 @@ class RootGate:
         self._last_m[:] = 0.0
         self._pause = 0
 
-    def check(self, field: FieldFrame, start: float) -> FieldFrame:
+    def check(self, field: FieldFrame, start: float, *, again: bool = False) -> FieldFrame:
         """Return the field with each doubtful wire confirmed, replaced or left without a root.
 
         Args:
             field: Field of the exact tracker.
             start: Value of :func:`time.perf_counter` when the update began, s.
+            again: Whether the same frame was checked before, with other readings.
         """
         doubtful: Mask | None = None
+        self.hurried = False
         if self._doubtful():
             doubtful = self._lost | self._unsure
             until, anew = start + self._seconds, bool(self._unsure.any())
             if self._pause or (anew and perf_counter() + self._posterior.from_rest_s > until):
-                field = self._give_up(field, doubtful)
+                field, self.hurried = self._give_up(field, doubtful), True
             else:
                 if anew:
                     self._posterior.reset()  # anneal from rest; tracking a wrong root would confirm it
@@ -126,11 +130,12 @@ class RootGate:
                 self._posterior.stop_at(until)
                 # noise that is not positive stays so: its resistance is not usable for the posterior either
                 noise = np.where(its.noise > 0.0, np.maximum(its.noise, roots.REFEREE_NOISE), its.noise)
-                estimate = self._posterior.update(its.ohm.copy(), its.valid.copy(), noise)
+                estimate = self._posterior.estimate(its.ohm.copy(), its.valid.copy(), noise)
                 if Status.DEADLINE in estimate.status:
-                    self._pause = PAUSE
+                    self._pause, self.hurried = PAUSE, True
                 field = self._select(field, doubtful, estimate)
-        self._pause = max(0, self._pause - 1)
+        if not again:
+            self._pause = max(0, self._pause - 1)
         if self._any_apart:
             every = np.ones(len(self._apart), np.bool_)
             field = self._keep_apart(field, every if doubtful is None else ~doubtful)

@@ -12,6 +12,7 @@ noise is too large for it, and back when the noise falls again. Either change st
 from __future__ import annotations
 
 import dataclasses
+import math
 from time import perf_counter
 from typing import Final, Unpack
 
@@ -19,16 +20,20 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from skinnode.model.frames import FieldFrame
-from skinnode.model.layout import PatchLayout
+from skinnode.model.layout import Float, PatchLayout
+from skinnode.solve.checks.data_check import DataCheck, Solved
 from skinnode.solve.cramer_rao import patch_std
 from skinnode.solve.exact.tracker import ExactTracker
-from skinnode.solve.inputs import checked_codes
+from skinnode.solve.inputs import checked_codes, checked_mask
 from skinnode.solve.noise_estimate import NoiseEstimate
 from skinnode.solve.options import TrackerArguments, TrackerOptions, merged
 from skinnode.solve.posterior.posterior import Posterior
 from skinnode.solve.precision import is_precise, limits_of
 from skinnode.solve.root_gate import RootGate
+from skinnode.solve.wires.problem import PatchProblem
 
+NO_CODE: Final = np.uint32(0xFFFF_FFFF)
+"""Code wider than any that a converter sends, for readings left out."""
 EXACT_STD: Final = 0.0025
 """Standard deviation of the exact inverse at rest, in clearances, up to which ``auto`` chooses the exact
 inverse: 2.5 % of the depth of a press that indents the layer by a tenth. With 16-bit codes, the standard
@@ -88,6 +93,8 @@ class Tracker:
             noise_estimate=self._noise,
         )
         self._gate = RootGate(self._exact, self._posterior, options)
+        self._problem = PatchProblem.of(layout, options.baseline_ohm)
+        self._check = DataCheck(self._problem)
         self.reset()
 
     def reset(self) -> None:
@@ -97,6 +104,7 @@ class Tracker:
             return
         self._exact.reset()
         self._gate.reset()
+        self._check.reset()
         if self._noise is not None:
             self._noise.reset()
         self._follow_noise()
@@ -125,7 +133,11 @@ class Tracker:
         if self._exact is None or self.method == "posterior":
             field = self._posterior.update(frame_ohm, valid, relative_noise)
         else:
+            left_out = self._check.left_out
+            if left_out is not None:
+                valid = ~left_out if valid is None else checked_mask(valid, self.layout) & ~left_out
             field = self._gate.check(self._exact.update(frame_ohm, valid, relative_noise), start)
+            field = self._checked(field, self._exact.arrays.ohm, start)
         self._follow_noise()
         return self._judged(field)
 
@@ -151,10 +163,46 @@ class Tracker:
             field = self._posterior.update(ohm, valid, noise, rounding_ohm)
             invalid = valid.size - int(np.count_nonzero(valid))
         else:
-            field = self._gate.check(self._exact.update_codes(codes), start)
+            left_out, sent = self._check.left_out, codes
+            if left_out is not None:
+                sent = np.where(left_out, NO_CODE, checked_codes(codes, self.layout))
+            field = self._gate.check(self._exact.update_codes(sent), start)
             invalid = self._exact.invalid_codes
+            if left_out is None:
+                field = self._checked(field, self._exact.arrays.ohm, start)
+            else:
+                ohm, valid = meaning.decode(codes)
+                invalid -= int(np.count_nonzero(left_out & valid))
+                field = self._checked(field, ohm, start)
         self._follow_noise()
         return self._judged(field), invalid
+
+    @property
+    def scan(self) -> int | None:
+        """Number by which the user knows the next frame, for ``DataFault.since``; None to count frames."""
+        return self._posterior.check.scan
+
+    @scan.setter
+    def scan(self, number: int | None) -> None:
+        self._posterior.check.scan = number
+        if self._exact is not None:
+            self._check.scan = number
+
+    def _checked(self, field: FieldFrame, ohm: Float, start: float) -> FieldFrame:
+        """Return the field of the exact tracker's frame with its faults and the verdict on trust."""
+        exact = self._exact
+        assert exact is not None
+        its = exact.arrays
+        a = ohm * self._problem.gain
+
+        def solved(field: FieldFrame) -> Solved:
+            return Solved(field, a, its.noise, its.used > 0)
+
+        def solve_without(left_out: NDArray[np.bool_]) -> Solved:
+            return solved(self._gate.check(exact.update_again(left_out), perf_counter(), again=True))
+
+        until = -math.inf if self._gate.hurried else start + self.options.deadline_s
+        return self._check.check(solved(field), solve_without, until)
 
     def _judged(self, field: FieldFrame) -> FieldFrame:
         """Return the field with its verdict on precision."""

@@ -161,7 +161,8 @@ def test_missing_resistances_cost_certainty_not_truth(staggered, lost):
         moved = hertz_press(staggered, depth)
         frame = noisy(frame_ohm(staggered, moved), rng)
         full, field = whole.update(frame), some.update(np.where(valid, frame, np.nan), valid)
-        assert field.trusted
+        assert field.trusted == (lost in ("a tenth", "one wire"))  # the rest is too little, and said so
+        assert field.trusted or "of the readings are usable" in field.distrust
         assert np.abs(deviations(field, moved)).max() < 5
         few = ~valid.all(axis=1)
         spread = np.sqrt((field.displacement_std_m[few] ** 2).mean(axis=(1, 2)))
@@ -246,6 +247,9 @@ def test_a_scrambled_wire_is_named_and_the_others_are_solved(staggered, kind):
         field = tracker.update(bad)
         assert [u for u, status in enumerate(field.status) if status is not sk.Status.CONVERGED] == [6]
         assert field.status[6] in (sk.Status.INCONSISTENT, sk.Status.MAX_STEPS)
+        assert [(fault.part, fault.upper) for fault in field.faults] == [(sk.FaultyPart.UPPER, 6)]
+        assert field.trusted
+        assert not field.wires_trusted[6]
         assert np.abs(deviations(field, moved)).max() < 5
         assert field.residual[6] > 100 * np.delete(field.residual, 6).max()
         field = tracker.update(noisy(frame_ohm(staggered, moved), rng))
@@ -716,7 +720,10 @@ def test_a_bad_frame_is_not_put_down_to_the_model(staggered):
     assert tracker.update(noisy(good, rng)).trusted
     bad = good.copy()
     bad[:, 7] *= 1.3
-    assert not tracker.update(noisy(bad, rng)).trusted
+    field = tracker.update(noisy(bad, rng))
+    if field.trusted:  # the lower wire was left out
+        assert [fault.lower for fault in field.faults] == [7]
+        assert np.abs(deviations(field, moved)).max() < 5
     for _ in range(3):
         field = tracker.update(noisy(good, rng))
         assert field.trusted

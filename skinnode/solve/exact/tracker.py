@@ -174,6 +174,13 @@ class ExactTracker:
         estimate.see(arrays.ohm, self._code_noise, arrays.rounding_ohm)  # for the next frame
         return field
 
+    def update_again(self, left_out: NDArray[np.bool_]) -> FieldFrame:
+        """Return the field of the last frame, solved from rest without the readings ``left_out`` (U, K)."""
+        start = perf_counter()
+        self.distrust(np.asarray(left_out.any(axis=1)))
+        self.arrays.valid[left_out] = False
+        return self._advance(stage.SCALE, start)
+
     def _advance(self, stages: int, start: float) -> FieldFrame:
         """Run ``stages`` on the frame in :attr:`arrays`, solve it and return its field."""
         solver, arrays = self._stream.solver, self.arrays

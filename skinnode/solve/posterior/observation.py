@@ -39,6 +39,10 @@ class Readings:
         usable[wires] = False
         return Readings(self.a, self.noise, usable)
 
+    def except_for(self, left_out: NDArray[np.bool_]) -> Readings:
+        """Return a copy that marks the readings ``left_out`` (U, K) as unusable."""
+        return Readings(self.a, self.noise, self.usable & ~left_out)
+
 
 @dataclass
 class Observation:

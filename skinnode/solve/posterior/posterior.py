@@ -24,6 +24,7 @@ from skinnode.model.layout import Float, PatchLayout, require_array
 from skinnode.model.status import Status, as_statuses
 from skinnode.model.tolerances import EXACT
 from skinnode.solve import roots
+from skinnode.solve.checks.data_check import DataCheck, Solved
 from skinnode.solve.inputs import NOISE_MAX, broadcast_noise, checked_mask, checked_noise
 from skinnode.solve.linalg.vectors import Index
 from skinnode.solve.noise_estimate import NoiseEstimate
@@ -47,6 +48,9 @@ LEFT_OUT: Final = 3
 LEAST_STEPS: Final = 3.0
 """Minimum time for a solve from rest, in factorisations of all wires including standard deviations; 11 to 20
 were measured for presses on 1 to 10 wires."""
+
+PLACED: Final = 2.0
+"""Error of a reading, relative to the largest change, per pitch of misplacement."""
 
 Mask = NDArray[np.bool_]
 
@@ -101,6 +105,7 @@ class Posterior:
         scale2 = None if options.scale_m is None else (options.scale_m / layout.pitch_m) ** 2
         height = float(np.median(self._problem.clearance))
         self._hyper = Hyperparameters(self._estimator, height, scale2, options.estimate_noise)
+        self.check = DataCheck(self._problem, _model_std(options))
         self.noise_estimate: NoiseEstimate | None = None
         self.reset()
         self._warm_up()
@@ -120,7 +125,8 @@ class Posterior:
         touched[0, 0, 2] -= 0.1 * self._problem.clearance[0, 0] * self.layout.pitch_m
         potential = potential_per_m(self.layout, touched) * self.layout.pitch_m
         seconds, self._seconds = self._seconds, math.inf  # with a deadline, some kernels might not run
-        self.update(1.0 / (potential * self._problem.gain), relative_noise=1e-4)
+        a = 1.0 / (potential * self._problem.gain)
+        self.estimate(a, np.ones(self.layout.shape, bool), 1e-4)
         self._seconds = seconds
         self._estimator.gamma()  # compile gamma now, not in the first untouched frame
         if self._contacts is not None:
@@ -129,6 +135,7 @@ class Posterior:
     def reset(self) -> None:
         """Discard the state of the stream: the next frame is solved from the rest position."""
         wires = self.layout.shape[0]
+        self.check.reset()
         if self.noise_estimate is not None:
             self.noise_estimate.reset()
         self._hyper.reset()
@@ -176,7 +183,26 @@ class Posterior:
             ValueError: If a shape is wrong.
         """
         start = perf_counter()
+        left_out = self.check.left_out
+        if left_out is not None:
+            valid = ~left_out if valid is None else checked_mask(valid, self.layout) & ~left_out
         readings = self._readings(frame_ohm, valid, relative_noise, rounding_ohm)
+        with np.errstate(over="ignore", invalid="ignore"):
+            a = np.asarray(frame_ohm, np.float64) * self._problem.gain
+
+        def solve(without: Mask | None = None) -> Solved:
+            kept = readings if without is None else readings.except_for(without)
+            field = self._estimate(kept, start)
+            return Solved(field, a, self._hyper.noise_factor * kept.noise, kept.usable)
+
+        return self.check.check(solve(), solve, start + self._seconds)
+
+    def estimate(self, frame_ohm: ArrayLike, valid: ArrayLike, relative_noise: ArrayLike) -> FieldFrame:
+        """Estimate the field of one frame as :meth:`update` does, without testing its readings."""
+        start = perf_counter()
+        return self._estimate(self._readings(frame_ohm, valid, relative_noise, None), start)
+
+    def _estimate(self, readings: Readings, start: float) -> FieldFrame:
         estimator = self._estimator
         estimator.evaluations = estimator.factorisations = 0
         estimator.until = min(start + self._seconds, self._until)
@@ -455,3 +481,10 @@ class Posterior:
             if self.noise_estimate is None
             else self.noise_estimate.factor,
         )
+
+
+def _model_std(options: PosteriorOptions) -> float:
+    """Return the error of the forward model that the options state, relative to the largest change."""
+    made = options.tolerances or EXACT
+    placed = PLACED * math.hypot(made.placement, made.electrode_radius)
+    return math.hypot(options.model_error, placed, made.thickness, made.gain)

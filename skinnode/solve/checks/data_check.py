@@ -1,0 +1,254 @@
+"""Check of a frame's data: finds readings that contradict the others, solves without them, assesses trust.
+
+A frame is first solved with all readings but those already named. Its field then predicts, at rest geometry,
+what every reading should be (:mod:`skinnode.solve.checks.reading_model`). If one reading or wire contradicts
+the others, it is left out and the frame is solved again, up to :data:`ROUNDS` times.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from time import perf_counter
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skinnode.model.data_fault import FaultyPart
+from skinnode.model.frames import FieldFrame
+from skinnode.model.kernels import potential
+from skinnode.model.layout import Float
+from skinnode.model.status import Status
+from skinnode.solve.checks.explanations import Explainer, Group, crossing_gain
+from skinnode.solve.checks.fault_list import FaultList
+from skinnode.solve.checks.reading_model import LEAST, ReadingModel, changes, evidences
+from skinnode.solve.checks.trust import OF_WIRE, assess
+from skinnode.solve.wires.problem import PatchProblem
+
+ROUNDS: Final = 3
+"""Maximum number of times that a frame is solved again without some of its readings."""
+WRONG: Final = 0.1
+"""Expected relative error of a wrong reading. An open, shorted or stuck reading is off by 0.01 to 0.5."""
+SUSPICIOUS: Final = 5.0
+"""Gain in log evidence at which a reading is suspected and explanations are sought, nats."""
+OFFSETS: Final = (0, 1, 3)
+"""Steps below the κ that fits a frame at which single readings are tested."""
+EXCUSED: Final = 10.0
+"""Rise of the gain above that of a frame explained by loads that makes the next frame suspicious, nats."""
+COARSE: Final = 0.1
+"""Error of the linearised readings, relative to the largest change, if wires could not be solved."""
+UNSOLVED: Final = 1
+"""Number of upper wires without a solution that count as faults of these wires; if there are more, a lower
+wire may be the cause."""
+SPARED: Final = 3
+"""Maximum number of upper wires that the posterior leaves out by itself."""
+
+Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Solved:
+    """A field with the readings from which it was computed."""
+
+    field: FieldFrame
+    a: Float
+    """(U, K) R · gain in the units of the problem."""
+    noise: Float
+    """(U, K) relative standard deviation of R."""
+    used: Mask
+    """(U, K) readings used."""
+
+
+class DataCheck:
+    """Check of the data of one patch, frame by frame. Do not share an instance between owners.
+
+    Args:
+        problem: The patch.
+        model_std: Standard deviation of the forward model's error, relative to the largest change of a
+            reading: 0 for a patch that equals its layout.
+
+    Attributes:
+        scan: Number by which the user knows the next frame; by default, frames are counted.
+    """
+
+    def __init__(self, problem: PatchProblem, model_std: float = 0.0) -> None:
+        self._problem, self._model_std = problem, model_std
+        self._model = ReadingModel.of(problem.layout)
+        self._explainer = Explainer(self._model)
+        shape = problem.layout.shape
+        self._list = FaultList(shape)
+        self._z, self._f = np.empty(shape), np.empty(shape)
+        self._c, self._alpha = np.empty((2, self._z.size))
+        self._evidence = np.empty(len(self._model.kappa))
+        self.scan: int | None = None
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the stream."""
+        self._list.reset()
+        self._frame, self._excused = 0, -math.inf
+        self._last: FieldFrame | None = None
+
+    @property
+    def left_out(self) -> Mask | None:
+        """(U, K) readings to leave out of the next frame; None if there are none."""
+        return self._list.mask
+
+    def check(
+        self, solved: Solved, solve_without: Callable[[Mask], Solved], until: float = math.inf
+    ) -> FieldFrame:
+        """Return the field of a frame with its faults and the verdict on trust.
+
+        Args:
+            solved: The frame, solved without the readings of :attr:`left_out`.
+            solve_without: Solves the frame without these readings (U, K) and those of :attr:`left_out`.
+            until: Value of :func:`time.perf_counter` from which the frame is not solved again; −inf if some
+                of its wires are unsolved for lack of time, which proves nothing.
+        """
+        self._frame += 1
+        last = self._last
+        if last is not None and last.faults == self._list.faults and _still(solved, last):
+            return dataclasses.replace(
+                solved.field, faults=last.faults, distrust=last.distrust, wires_trusted=last.wires_trusted
+            )
+        layout = self._problem.layout
+        without = np.zeros(layout.shape, bool)
+        solved, groups = _spared(solved)
+        found = self._find(solved) if until > -math.inf else ()
+        while found and len(groups) < ROUNDS and perf_counter() < until:
+            groups += found
+            for group in found:
+                without |= group.mask(layout.shape)
+            solved, spared = _spared(solve_without(without))
+            groups += spared
+            found = self._find(solved)
+        scan = self._frame if self.scan is None else self.scan
+        before = self._list.faults
+        passing = self._list.add([] if found else groups, self._frame, scan)
+        if before:
+            self._follow(solved)
+        faults = self._list.faults + passing
+        reason, wires = assess(solved.field.status, solved.used, faults, contradiction=bool(found))
+        field = dataclasses.replace(solved.field, faults=faults, distrust=reason, wires_trusted=wires)
+        self._last = field
+        return field
+
+    def _find(self, solved: Solved) -> tuple[Group, ...]:
+        """Return the readings that contradict the others; none if there are none."""
+        status = np.array(solved.field.status)
+        enough = solved.used.mean(axis=1) >= OF_WIRE
+        unsolved = np.flatnonzero(enough & (status != Status.CONVERGED) & (status != Status.DEADLINE))
+        if 0 < unsolved.size <= UNSOLVED:
+            return tuple(Group(FaultyPart.UPPER, int(u), None, math.inf) for u in unsolved)
+        present = solved.used & (status == Status.CONVERGED)[:, None]
+        if unsolved.size:
+            return self._find_coarsely(solved)
+        if np.count_nonzero(present) < 0.5 * present.size:
+            return ()
+        sigma = self._linearised(solved, present)
+        best = self._evidences(present)
+        cost = math.log(max(WRONG / sigma, math.e))
+        gain = self._crossing_gain(present, best, cost)
+        if gain < max(SUSPICIOUS, self._excused + EXCUSED):
+            self._excused = max(self._excused - 0.1 * EXCUSED, gain if gain > SUSPICIOUS else -math.inf)
+            return ()
+        found = self._explainer.wrong_readings(self._z, present, self._evidence, best, cost)
+        self._excused = -math.inf if found else gain
+        return found
+
+    def _linearised(self, solved: Solved, present: Mask) -> float:
+        """Write the changes of the readings, as if F were linear, into ``_z``; return the noise."""
+        field, layout = solved.field, self._problem.layout
+        sigma = float(np.median(solved.noise[present]))
+        moved = field.displacement_m.reshape(layout.shape[0], -1) / layout.pitch_m
+        changes(self._model.jacobian, moved, 1.0, self._z)
+        if self._model_std > 0.0:
+            sigma = math.hypot(sigma, self._model_std * float(np.abs(self._z[present]).max()))
+        inexact = np.ones(len(moved), bool) if field.method == "posterior" else field.by_prior
+        if inexact is not None and inexact.any():
+            self._z[inexact] -= self._residuals(moved, solved.a, inexact)
+            if field.gain is not None:
+                self._z[inexact] += field.gain[inexact, None]
+        self._z /= sigma
+        self._z[~present] = 0.0
+        return sigma
+
+    def _residuals(self, moved: Float, a: Float, wires: Mask) -> Float:
+        """Return a F − 1 of these wires, (n, K)."""
+        for u in np.flatnonzero(wires).tolist():
+            potential(self._problem.rest[u] + moved[u], self._problem.lower, self._f[u])
+        return np.asarray(a[wires] * self._f[wires] - 1.0)
+
+    def _evidences(self, present: Mask) -> int:
+        """Write the evidence at every κ; return the index of the largest. Fills in the missing readings."""
+        model, z = self._model, self._z.ravel()
+        best = evidences(model.vectors_t, model.shrink, model.log_det, z, self._c, self._evidence)
+        missing = np.flatnonzero(~present)
+        if missing.size:  # with their expectation, given the others
+            p = model.level(best).precision[missing]
+            z[missing] = -np.linalg.solve(p[:, missing] + LEAST * np.eye(missing.size), p @ z)
+            best = evidences(model.vectors_t, model.shrink, model.log_det, z, self._c, self._evidence)
+        return best
+
+    def _crossing_gain(self, present: Mask, best: int, cost: float) -> float:
+        """Return the largest gain from treating a single reading as wrong."""
+        most, z = -math.inf, self._z.ravel()
+        for offset in OFFSETS:
+            number = best - offset
+            if number < 0:
+                break
+            p = self._model.level(number).precision
+            np.dot(p, z, out=self._alpha)
+            gain = crossing_gain(p, self._alpha, present.ravel(), cost)
+            most = max(most, gain + float(self._evidence[number] - self._evidence[best]))
+        return most
+
+    def _find_coarsely(self, solved: Solved) -> tuple[Group, ...]:
+        """Return the likeliest wrong wire if several upper wires have no solution."""
+        with np.errstate(divide="ignore", invalid="ignore"):
+            np.log(self._problem.a_rest / solved.a, out=self._z)
+        present = solved.used & np.isfinite(self._z)
+        self._z[~present] = 0.0
+        if np.count_nonzero(present) < 0.5 * present.size:
+            return ()
+        sigma = COARSE * float(np.quantile(np.abs(self._z[present]), 0.9))
+        sigma = max(sigma, float(np.median(solved.noise[present])))
+        self._z /= sigma
+        best = self._evidences(present)
+        groups = self._explainer.wrong_readings(
+            self._z, present, self._evidence, best, math.log(max(WRONG / sigma, math.e))
+        )
+        return groups[:1]
+
+    def _follow(self, solved: Solved) -> None:
+        """Compare the named readings with the field."""
+        layout = self._problem.layout
+        moved = solved.field.displacement_m.reshape(layout.shape[0], -1) / layout.pitch_m
+        residual = self._residuals(moved, solved.a, np.ones(len(moved), bool))
+        std = solved.field.displacement_std_m.reshape(layout.shape[0], -1) / layout.pitch_m
+        with np.errstate(invalid="ignore", over="ignore"):
+            spread = np.einsum("ukn,un->uk", self._model.jacobian**2, np.minimum(std, 1e3) ** 2)
+            deviation = residual / np.sqrt(spread + solved.noise**2)
+        known = np.isfinite(deviation) & (solved.noise > 0)
+        self._list.follow(np.where(known, deviation, np.inf), known)
+
+
+def _spared(solved: Solved) -> tuple[Solved, list[Group]]:
+    """Return the frame without the upper wires that its solver left out by itself, and these wires."""
+    field = solved.field
+    status = np.array(field.status)
+    out = (status != Status.CONVERGED) & (solved.used.mean(axis=1) >= OF_WIRE)
+    out &= np.isfinite(field.displacement_std_m).all(axis=(1, 2))
+    if not 0 < np.count_nonzero(out) <= SPARED:
+        return solved, []
+    groups = [Group(FaultyPart.UPPER, int(u), None, math.inf) for u in np.flatnonzero(out)]
+    return dataclasses.replace(solved, used=solved.used & ~out[:, None]), groups
+
+
+def _still(solved: Solved, last: FieldFrame) -> bool:
+    """Return whether no wire was solved in this frame and the last field was assessed with its status."""
+    held = solved.field.held
+    return held is not None and bool(held.all()) and solved.field.status == last.status

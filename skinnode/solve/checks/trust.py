@@ -1,0 +1,59 @@
+"""Trust in a field: the one place that says when a field is trusted, and why not.
+
+A field is trusted if every wire whose readings were used converged, if what was left out can be spared, and
+if nothing contradicts the rest. The host adds that the patch must be alive.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skinnode.model.data_fault import DataFault
+from skinnode.model.status import Status
+
+OF_PATCH: Final = 0.85
+"""Share of a patch's readings that a trusted field needs. One upper wire and one lower wire of the reference
+patch may be missing (0.87), two upper wires may not (0.8)."""
+OF_WIRE: Final = 0.8
+"""Share of a wire's readings that a trusted wire needs."""
+CONTRADICTION: Final = "the readings contradict each other, and no wire or crossing explains it"
+
+Mask = NDArray[np.bool_]
+
+
+def assess(
+    status: Sequence[Status], used: Mask, faults: Sequence[DataFault], *, contradiction: bool
+) -> tuple[str, Mask]:
+    """Return why a field is not trusted, in words, and which of its wires are.
+
+    Args:
+        status: Status of each of the U wires.
+        used: (U, K) readings used.
+        faults: What was found and left out.
+        contradiction: Whether the readings used still contradict each other.
+
+    Returns:
+        The reason, empty if the field is trusted, and (U,) wires that are trusted.
+    """
+    share = used.mean(axis=1)
+    converged = np.array([each is Status.CONVERGED for each in status])
+    trusted = converged & (share >= OF_WIRE)
+    if contradiction:
+        return CONTRADICTION, np.zeros_like(trusted)
+    left_out = np.zeros_like(trusted)
+    for fault in faults:
+        if fault.upper is not None and fault.lower is None:
+            left_out[fault.upper] = True
+    failed = [each for u, each in enumerate(status) if each is not Status.CONVERGED and not left_out[u]]
+    if failed:
+        counts = Counter(each.name for each in failed).most_common()
+        parts = ", ".join(f"{count} of {len(status)} wires {name}" for name, count in counts)
+        return f"not solved: {parts}", trusted
+    if used.mean() < OF_PATCH:
+        return f"only {used.mean():.0%} of the readings are usable", trusted
+    return "", trusted

@@ -116,6 +116,7 @@ def all_cases() -> list[Case]:
         *_faults(),
         *_drift(),
         *_wrong_roots(),
+        *_sheared(),
         *_contacts(),
         *_shapes(),
         *_wrong_models(),
@@ -313,6 +314,34 @@ def _wrong_roots() -> Iterator[Case]:
         for name, detour in (("swapped electrodes", _swap), ("mirror branch", _mirror)):
             make = _after_detour(skin, detour, converter)
             yield Case(9, f"{name}, staggered h={height:g}", skin, make, TRACKERS, converter)
+
+
+def _sheared() -> Iterator[Case]:
+    """Yield deep presses dragged by 0.8 of their pressure, under which the skin itself crosses folds.
+
+    The smooth root that a start from the smoothest displacement, the posterior and the live trackers find is
+    then wrong on some wires. Only a path has the samples that show it.
+    """
+    for name, height in (("aligned", 0.5), ("aligned", 1.0), ("staggered", 1.0)):
+        for contacts in (1, 2):
+            skin = Skin(preset(name, height))
+
+            def dragged(
+                rng: np.random.Generator, layout: PatchLayout = skin.layout, contacts: int = contacts
+            ) -> tuple[Press, ...]:
+                return tuple(_dragged(random_press(rng, layout, 0.7), rng) for _ in range(contacts))
+
+            many = "contact" if contacts == 1 else "contacts"
+            title = f"{name} h={height:g}, 70%, shear 0.8, {contacts} {many}"
+            make = pressing(skin, 0.7, Converter(), np.linspace(0.0, 1.0, 21), presses=dragged)
+            yield Case(9, title, skin, make, PATHS, Converter())
+
+
+def _dragged(press: Press, rng: np.random.Generator) -> Press:
+    """Return the press with a traction of 0.8 of its pressure in a random direction."""
+    angle = rng.uniform(0.0, 2.0 * np.pi)
+    traction = (0.8 * float(np.cos(angle)), 0.8 * float(np.sin(angle)))
+    return Press(press.center_m, press.radius_m, press.depth_m, traction)
 
 
 def _swap(rng: np.random.Generator, layout: PatchLayout, share: float) -> Float:

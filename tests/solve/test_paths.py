@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import skinnode as sk
+from skinnode.model.elastic import HertzContact, Rubber
 from skinnode.solve.operators.codes import OPERATORS
 
 from .press import frame_ohm, hertz_press
@@ -138,6 +139,40 @@ def test_a_fold_that_the_skin_itself_passes_is_followed():
         assert (wire_errors(path, press[-1])[converged] < 1e-6).all()
         passed += np.count_nonzero(converged & (sides(press[-1]) != sides(np.zeros_like(press[-1]))))
     assert passed >= 3
+
+
+DRAGGED = (((23.48, 17.41), 12.96, -1.15), ((13.23, 19.24), 6.74, 1.21), ((16.06, 17.78), 6.04, -1.76))
+"""Centre and radius of a sphere, mm, and the direction in which it is dragged, rad: on each of these presses
+the skin crosses a fold, and a start from the smoothest displacement finds a smoother root that is wrong."""
+
+
+@pytest.mark.parametrize("schedule", [sk.Uniform(), sk.Periodic(cycle=1), sk.Adaptive()])
+def test_a_smooth_root_to_which_the_samples_do_not_lead_is_not_converged(schedule):
+    layout = sk.PatchLayout.preset("aligned", pitch_m=4e-3, height_m=2e-3)
+    points = layout.upper_m[..., :2].reshape(-1, 2)
+    found = kept = 0
+    for centre, radius, turn in DRAGGED:
+        traction = (0.8 * np.cos(turn), 0.8 * np.sin(turn))
+        centre_m = (centre[0] * 1e-3, centre[1] * 1e-3)
+        press = [
+            HertzContact(Rubber(), radius * 1e-3, 0.7 * t * 2e-3, centre_m, traction)
+            .displacement_m(points)
+            .reshape(layout.upper_m.shape)
+            for t in np.linspace(0, 1, 21)[1:]
+        ]
+        path = sk.solve_path(
+            layout,
+            [frame_ohm(layout, moved) for moved in press],
+            operator="levenberg_marquardt",
+            schedule=schedule,
+        )
+        converged = np.array([status is sk.Status.CONVERGED for status in path.status])
+        error = wire_errors(path, press[-1])
+        assert (error[converged] < 1e-6).all(), centre
+        found += converged.sum()
+        kept += (error[~converged] < 1e-6).sum()
+    assert found >= 24  # of 30
+    assert kept >= 3  # the best iterate of a wire that is refused is the end of its path
 
 
 @pytest.mark.parametrize("operator", OPERATORS)

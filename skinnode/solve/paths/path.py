@@ -27,6 +27,7 @@ from skinnode.solve.paths.root_selection import (
     PatchEstimate,
     compare_with_estimate,
     doubt_twins,
+    heed_samples,
     keep_likeliest,
 )
 from skinnode.solve.paths.step_control import Schedule, Uniform
@@ -88,8 +89,9 @@ def solve_path(
 
     A wire is ILL_CONDITIONED instead of CONVERGED if it may have ended on a branch of F = b other than the
     skin's: the determinant of its Jacobian changed sign on the way, its electrodes crossed to the other side
-    of the lower layer, or an equally smooth root lies across a nearby fold. The skin itself can cross a fold.
-    A root across a fold is accepted if the path led there and the posterior of the patch finds the same root.
+    of the lower layer, an equally smooth root lies across a nearby fold, or the samples led smoothly to
+    another root, in which case the wire stays at that root. The skin itself can cross a fold. A root across a
+    fold is accepted if the path led there and the posterior of the patch finds the same root.
 
     Args:
         layout: The patch, with at least as many lower wires as unknowns per wire (K ≥ 3N).
@@ -125,6 +127,7 @@ def solve_path(
         if roots.folded_wires(layout).any():
             estimate = _ask_posterior(tracker, layout, samples[-1], baseline_ohm)
         doubt_twins(tracker, estimate)
+        heed_samples(tracker, SELECTION)
         tracker.end.doubt(roots.blind_wires(layout))
     displacement = problem.displacement_m(tracker.solver.x)
     log, end = tracker.corrector.log(), tracker.end

@@ -97,7 +97,8 @@ class PathTracker:
         self.cycle: int | None = None
         self.searched = 0
         self.second_tries = True
-        self._path_end = problem.rest
+        self._path_end = problem.rest.copy()
+        self._reached = np.zeros(self.wires, bool)
         self._everywhere = np.full(self.wires, wires.SOLVE, np.uint8)
         self._smoothness: Smoothness | None = None
         self._rest_branch = self.solver.solve_rest()
@@ -123,13 +124,17 @@ class PathTracker:
         self._branch = self._rest_branch.copy()
         self._crossed = np.zeros(self.wires, bool)
         self.stumbled = np.zeros(self.wires, bool)
-        self._points = [(self.problem.rest.copy(), self.problem.a_rest)] * 2
+        self._points = self._at_rest()
+
+    def _at_rest(self) -> list[tuple[Float, Float]]:
+        """Return the first two points of a path: both are the rest position, so their secant is zero."""
+        return [(self.problem.rest.copy(), self.problem.a_rest)] * 2
 
     # -- sample by sample, as the paper does -----------------------------------------------------------
 
     def extrapolate(self, sample: int) -> None:
         """Move every wire along the secant towards a sample, by at most the trust radius."""
-        (x_before, a_before), (x, a) = self._points
+        (x_before, a_before), (x, a) = self._points[-2:]
         a_next = self.corrector.sample_a(sample)
         secant(x_before, a_before, x, a, a_next, self.problem.step_limit, self.solver.x)
 
@@ -140,7 +145,7 @@ class PathTracker:
             (U,) steps; 0 if the first-order optimality was already below the tolerance.
         """
         self.corrector.correct(self._everywhere, float(sample), accuracy, tasks=wires.SKIP)
-        self._points = [self._points[1], (self.solver.x.copy(), self.corrector.sample_a(sample))]
+        self._points.append((self.solver.x.copy(), self.corrector.sample_a(sample)))
         known = self.solver.report[:, wires.BRANCH]
         self._crossed |= roots.crossed_fold(known, self._branch)
         self._branch = np.where(known != 0, known, self._branch)
@@ -150,9 +155,33 @@ class PathTracker:
         """Solve the last sample to the final accuracy, for the wires in ``todo`` (U,), by default all."""
         todo = np.ones(self.wires, bool) if todo is None else todo
         self.take(todo, accuracy)
-        self._path_end = self.solver.x.copy()
+        self._arrive(todo)
         self._crossed |= todo & roots.crossed_fold(self.solver.report[:, wires.BRANCH], self._branch)
         self.end.doubt(self._crossed)
+
+    def walk(self, todo: Mask, samples: list[int], accuracy: Accuracy) -> None:
+        """Follow these wires (U,) from rest along ``samples``, only to learn where the path ends.
+
+        The samples are in time order and end with the last sample. Neither the positions of the wires nor
+        :attr:`end` change.
+        """
+        x = self.solver.x.copy()
+        call = np.where(todo, wires.SOLVE, wires.LEAVE).astype(np.uint8)
+        self._points = self._at_rest()
+        for sample in samples[:-1]:
+            self.extrapolate(sample)
+            self.corrector.correct(call, float(sample), accuracy, tasks=wires.SKIP)
+            self._points.append((self.solver.x.copy(), self.corrector.sample_a(sample)))
+        self.extrapolate(samples[-1])
+        self.corrector.correct(call, float(samples[-1]), accuracy)
+        self._arrive(todo)
+        self.solver.x[:] = x
+
+    def _arrive(self, todo: Mask) -> None:
+        """Store the end of the path of the wires in ``todo`` (U,), from their solve of the last sample."""
+        self._path_end[todo] = self.solver.x[todo]
+        residual = self.solver.measure[:, wires.RESIDUAL]
+        self._reached[todo] = (residual <= roots.ROOT_RESIDUAL)[todo]
 
     # -- wire by wire ----------------------------------------------------------------------------------
 
@@ -219,6 +248,30 @@ class PathTracker:
         apart = roots.distance(self.solver.x, self._path_end)
         size = roots.distance(self._path_end, self.problem.rest)
         return np.asarray((apart <= roots.SAME_ROOT * size) & ~self.out_of_reach())
+
+    def led_elsewhere(self) -> Mask:
+        """Return the wires (U,) that are not at the root to which the samples led along a smooth path.
+
+        On a smooth path, the secant through two solutions predicts the next one, and the first solution is
+        close to rest (:data:`skinnode.solve.roots.SMOOTH_PATH`).
+        """
+        size = roots.distance(self._path_end, self.problem.rest)
+        elsewhere = roots.distance(self.solver.x, self._path_end) > roots.SAME_ROOT * size
+        elsewhere &= self._reached
+        if not elsewhere.any():
+            return elsewhere
+        points = [*self._points, (self._path_end, self.last_a)]
+        predicted = np.empty_like(self._path_end)
+        for before, last, (x, a) in zip(points[:-2], points[1:-1], points[2:], strict=True):
+            secant(*before, *last, a, self.problem.step_limit, predicted)
+            elsewhere &= roots.distance(x, predicted) <= roots.SMOOTH_PATH * size
+        return elsewhere
+
+    def return_to_path_end(self, todo: Mask, accuracy: Accuracy) -> None:
+        """Move these wires (U,) back to the end of their path; none of them is CONVERGED afterwards."""
+        self.solver.x[todo] = self._path_end[todo]
+        self.take(todo, accuracy)
+        self.end.doubt(todo)
 
     def out_of_reach(self) -> NDArray[np.bool_]:
         """Return the wires (U,) with an electrode farther from rest than its clearance."""

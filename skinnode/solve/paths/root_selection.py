@@ -194,6 +194,20 @@ def doubt_twins(tracker: PathTracker, estimate: PatchEstimate | None) -> None:
     solver.x[:] = root
 
 
+def heed_samples(tracker: PathTracker, accuracy: Accuracy) -> None:
+    """Reject each root to which the samples do not lead, and return its wire to the end of its path.
+
+    Where the skin itself crosses a fold, the root on the branch of the rest position can be the smoother and
+    the likelier root, and yet be wrong: a start from the smoothest displacement and the posterior both find
+    it. The samples are the only evidence against it.
+    """
+    if not tracker.second_tries:
+        return  # a plain path moves no wire away from its end
+    todo = tracker.led_elsewhere()
+    if todo.any():
+        tracker.return_to_path_end(todo, accuracy)
+
+
 def _twins(tracker: PathTracker) -> Float:
     """Return estimates (U, n) of the roots across the nearest folds; NaN for wires that are not CONVERGED."""
     x, end, last_a = tracker.solver.x, tracker.end, tracker.last_a

@@ -14,10 +14,12 @@ from typing import Final, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from skinnode.solve import roots
 from skinnode.solve.paths.corrector import REST, Accuracy
 from skinnode.solve.paths.path_tracker import PathTracker
 from skinnode.solve.paths.predictor import SQUARE_FLOOR
 from skinnode.solve.paths.root_selection import doubt_rough, doubtful, guide
+from skinnode.solve.roots import Mask
 
 RELAXED_TOLERANCES: Final = (1e-6, 1e-5, 1e-4, 1e-3)
 """Intermediate tolerances of the paper's figure 10, from tight to loose."""
@@ -31,6 +33,10 @@ SHORTEST: Final = 1 / 64
 ADAPTIVE_POINT: Final = Accuracy(tolerance=1e-9, max_steps=6)
 """Accuracy of an intermediate point: below √eps, a root is accurate enough for its ∂X/∂R to be kept, and
 Newton's method takes 5 steps from a contraction ratio of 1/2 to 1e-9."""
+
+ADAPTIVE_WALK: Final = Accuracy(tolerance=1e-9, max_steps=100)
+"""Accuracy of a sample that is solved only to learn where the samples lead; the maximum number of steps is
+the paper's."""
 
 
 class Schedule(Protocol):
@@ -190,7 +196,9 @@ class Adaptive:
     explains the last sample (:func:`skinnode.solve.starts.guided_start`). If this yields a second root, the
     smoother root is kept.
 
-    Two samples are enough: the patch at rest and the frame to solve.
+    Two samples are enough: the patch at rest and the frame to solve. If there are more, they are solved one
+    by one for each doubtful wire, and for each wire of a folded layout that moved far enough to have crossed
+    a fold: the smooth root can be wrong, and only the samples show it.
 
     Args:
         points: Maximum number of path points that a wire may try.
@@ -231,7 +239,13 @@ class Adaptive:
             position = np.where(arrived, target, position)
         accuracy = Accuracy(self.final_tolerance, self.final_steps)
         tracker.finish(accuracy, position == end)
-        guide(tracker, doubtful(tracker), accuracy)
+        unsure = doubtful(tracker)
+        guide(tracker, unsure, accuracy)
+        unsure |= _far_and_folded(tracker)
+        if tracker.samples > 1 and unsure.any():
+            count = min(self.points, tracker.samples)
+            samples = [round(part * tracker.samples / count) - 1 for part in range(1, count + 1)]
+            tracker.walk(unsure, samples, ADAPTIVE_WALK)
 
 
 def _finish(tracker: PathTracker, how: Uniform | Periodic) -> None:
@@ -245,6 +259,14 @@ def _finish(tracker: PathTracker, how: Uniform | Periodic) -> None:
         doubt_rough(tracker, accuracy)
     else:
         guide(tracker, doubtful(tracker), accuracy)
+
+
+def _far_and_folded(tracker: PathTracker) -> Mask:
+    """Return the wires (U,) of a folded layout that moved far enough from rest to have crossed a fold."""
+    problem = tracker.problem
+    moved = roots.distance(tracker.solver.x, problem.rest)
+    far = moved > roots.JUMP * problem.clearance.min()
+    return far & roots.folded_wires(problem.layout) if far.any() else far
 
 
 def _require_count(name: str, value: int) -> None:

@@ -253,7 +253,7 @@ class PathTracker:
         """Return the wires (U,) that are not at the root to which the samples led along a smooth path.
 
         On a smooth path, the secant through two solutions predicts the next one, and the first solution is
-        close to rest (:data:`skinnode.solve.roots.SMOOTH_PATH`).
+        close to rest (:data:`skinnode.solve.roots.SMOOTH_PATH`). Of a long path, only the second half counts.
         """
         size = roots.distance(self._path_end, self.problem.rest)
         elsewhere = roots.distance(self.solver.x, self._path_end) > roots.SAME_ROOT * size
@@ -261,6 +261,9 @@ class PathTracker:
         if not elsewhere.any():
             return elsewhere
         points = [*self._points, (self._path_end, self.last_a)]
+        samples = len(points) - 2
+        if samples >= roots.LONG_PATH:
+            points = points[samples // 2 :]
         predicted = np.empty_like(self._path_end)
         for before, last, (x, a) in zip(points[:-2], points[1:-1], points[2:], strict=True):
             secant(*before, *last, a, self.problem.step_limit, predicted)

@@ -265,8 +265,8 @@ def _far_and_folded(tracker: PathTracker) -> Mask:
     """Return the wires (U,) of a folded layout that moved far enough from rest to have crossed a fold."""
     problem = tracker.problem
     moved = roots.distance(tracker.solver.x, problem.rest)
-    far = moved > roots.JUMP * problem.clearance.min()
-    return far & roots.folded_wires(problem.layout) if far.any() else far
+    far = np.asarray(moved > roots.JUMP * problem.clearance.min())
+    return np.asarray(far & roots.folded_wires(problem.layout)) if far.any() else far
 
 
 def _require_count(name: str, value: int) -> None:

@@ -24,7 +24,7 @@ from skinnode.model.layout import Float, PatchLayout
 from skinnode.solve.checks.data_check import DataCheck, Solved
 from skinnode.solve.cramer_rao import patch_std
 from skinnode.solve.exact.tracker import ExactTracker
-from skinnode.solve.inputs import checked_codes, checked_mask
+from skinnode.solve.inputs import checked_codes
 from skinnode.solve.noise_estimate import NoiseEstimate
 from skinnode.solve.options import TrackerArguments, TrackerOptions, merged
 from skinnode.solve.posterior.posterior import Posterior
@@ -133,10 +133,8 @@ class Tracker:
         if self._exact is None or self.method == "posterior":
             field = self._posterior.update(frame_ohm, valid, relative_noise)
         else:
-            left_out = self._check.left_out
-            if left_out is not None:
-                valid = ~left_out if valid is None else checked_mask(valid, self.layout) & ~left_out
-            field = self._gate.check(self._exact.update(frame_ohm, valid, relative_noise), start)
+            field = self._exact.update(frame_ohm, valid, relative_noise, self._check.left_out)
+            field = self._gate.check(field, start)
             field = self._checked(field, self._exact.arrays.ohm, start)
         self._follow_noise()
         return self._judged(field)

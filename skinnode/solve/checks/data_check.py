@@ -110,6 +110,8 @@ class DataCheck:
         """
         self._frame += 1
         last = self._last
+        if last is not None and last.noise_factor != solved.field.noise_factor:
+            self._list.reset()  # what contradicted the stated noise may not contradict the actual noise
         if last is not None and last.faults == self._list.faults and _still(solved, last):
             return dataclasses.replace(
                 solved.field, faults=last.faults, distrust=last.distrust, wires_trusted=last.wires_trusted

@@ -127,7 +127,11 @@ class ExactTracker:
         self.arrays.order[:], self._waiting = self._in_order, False
 
     def update(
-        self, frame_ohm: ArrayLike, valid: ArrayLike | None = None, relative_noise: ArrayLike | None = None
+        self,
+        frame_ohm: ArrayLike,
+        valid: ArrayLike | None = None,
+        relative_noise: ArrayLike | None = None,
+        left_out: NDArray[np.bool_] | None = None,
     ) -> FieldFrame:
         """Return the displacement field of one frame.
 
@@ -136,6 +140,7 @@ class ExactTracker:
             valid: (U, K) bool, False if a chunk or wire is missing; default all True.
             relative_noise: As in the constructor, for this frame only; resistances whose noise is not
                 positive and finite are ignored.
+            left_out: (U, K) readings that are not used, although they are valid and show the noise.
 
         No resistance value raises an exception. A wire with fewer usable resistances than unknowns is
         ILL_CONDITIONED, or NON_FINITE if resistances not marked as missing were unusable. Such a wire, and
@@ -156,6 +161,8 @@ class ExactTracker:
             estimate.see(arrays.ohm, arrays.noise, valid=None if valid is None else arrays.valid)
             if estimate.factor != 1.0:
                 arrays.noise *= estimate.factor
+        if left_out is not None:
+            arrays.valid[left_out] = False
         return self._advance(stage.SCALE, start)
 
     def update_codes(self, codes: NDArray[np.uint32]) -> FieldFrame:

@@ -183,10 +183,9 @@ class Posterior:
             ValueError: If a shape is wrong.
         """
         start = perf_counter()
-        left_out = self.check.left_out
-        if left_out is not None:
-            valid = ~left_out if valid is None else checked_mask(valid, self.layout) & ~left_out
         readings = self._readings(frame_ohm, valid, relative_noise, rounding_ohm)
+        if self.check.left_out is not None:
+            readings = readings.except_for(self.check.left_out)
         with np.errstate(over="ignore", invalid="ignore"):
             a = np.asarray(frame_ohm, np.float64) * self._problem.gain
 

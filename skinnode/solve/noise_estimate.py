@@ -31,10 +31,13 @@ from skinnode.model.layout import Float
 
 BLOCK: Final = 4
 """Number of frames in a block: the smallest number that gives two contrasts."""
-WINDOW: Final = 12
-"""Number of blocks in the estimate, 48 frames."""
+WINDOW: Final = 11
+"""Number of blocks in the estimate, 44 frames; odd, so that a median never lies between old and new noise."""
 LEAST_BLOCKS: Final = 5
 """Minimum number of blocks in the estimate: 20 frames."""
+PAUSE: Final = 12
+"""Number of frames between two blocks once the window is full and the last block agrees with it, or after
+several blocks that do not count; a look at every frame would cost 8 % of the time of a patch at rest."""
 REPEATED: Final = 0.15
 """Maximum share of repeated readings in a block that counts. With noise of half a code, a tenth of the
 readings repeat in all four frames; with less noise, the variance of the codes no longer is the sum of the
@@ -50,9 +53,9 @@ DEPARTED: Final = math.log(1.5)
 results stay those of the stated noise to the last bit."""
 RETURNED: Final = math.log(1.25)
 """Logarithm of the same ratio below which the stated noise is used again."""
-STEP: Final = math.log(1.15)
-"""Logarithm of the change in an estimate in use that triggers an update; every update solves the frame
-again."""
+STEP: Final = math.log(1.05)
+"""Logarithm of the change in an estimate in use, besides what chance contributes, that triggers an update;
+every update solves the frame again."""
 UNEQUAL: Final = 0.3
 """Largest mean logarithm of the ratio between the powers of the two contrasts. Motion that makes up this much
 raises the estimate by 8 %; noise of half a code, whose contrasts take few values, stays below 0.15."""
@@ -195,7 +198,7 @@ class NoiseEstimate:
     def reset(self) -> None:
         """Discard the state of the stream."""
         self.factor, self.relative_std = 1.0, math.inf
-        self._next = 0
+        self._next, self._pause, self._rejected = 0, 0, 0
         self._blocks: list[tuple[int, float, float, float]] = []
 
     def see(
@@ -213,6 +216,9 @@ class NoiseEstimate:
             rounding_ohm: (U, K) standard deviation of the rounding to codes, ohm.
             valid: (U, K) bool, False if a reading is missing; default all True.
         """
+        if self._pause:
+            self._pause -= 1
+            return False
         frame = self._frames[self._next]
         frame[:] = ohm
         if valid is not None:
@@ -228,12 +234,16 @@ class NoiseEstimate:
         return self.factor != before
 
     def _assess(self) -> None:
+        """Take the block into the window, and decide."""
         count, slow, fast, share = assess_block(
             self._frames, self._noise, self._rounding_ohm, self._work[0], self._work[1]
         )
-        if not count:
-            return
         blocks = self._blocks
+        if not count:
+            self._rejected += 1
+            self._pause = min(PAUSE, BLOCK * self._rejected)
+            return
+        self._rejected = 0
         blocks.append((count, 0.25 * math.log(slow * fast), math.log(slow / fast), share))
         del blocks[:-WINDOW]
         if len(blocks) >= LEAST_BLOCKS:
@@ -243,14 +253,16 @@ class NoiseEstimate:
         """Set :attr:`factor` from the last blocks."""
         blocks = self._blocks
         values = sum(block[0] for block in blocks)
-        unequal = math.fsum(block[2] for block in blocks) / len(blocks)
-        if abs(unequal) > UNEQUAL + DEVIATIONS * _STD * math.sqrt(2.0 / values):
-            return
         levels = sorted(block[1] for block in blocks)
         level = 0.5 * (levels[(len(levels) - 1) // 2] + levels[len(levels) // 2])
+        agrees = abs(blocks[-1][1] - level) < RETURNED + DEVIATIONS * _STD / math.sqrt(8.0 * blocks[-1][0])
+        self._pause = PAUSE if agrees and len(blocks) == WINDOW else 0
         # of a mean of logarithms of standard deviations, with the efficiency of a median of blocks
         std = 1.25 * 0.5 * _STD / math.sqrt(2.0 * values)
         self.relative_std = std
+        unequal = math.fsum(block[2] for block in blocks) / len(blocks)
+        if abs(unequal) > UNEQUAL + DEVIATIONS * _STD * math.sqrt(2.0 / values):
+            return
         if self.factor == 1.0:
             if abs(level) <= DEPARTED + DEVIATIONS * std:
                 return

@@ -112,6 +112,7 @@ class ExactTracker:
         if codes is not None:
             self.arrays.set_codes(codes)
             self._code_noise[:] = codes.relative_noise
+        self._code_factor = 1.0  # noise factor in the code map
         self._noise_estimate: NoiseEstimate | None = None
         self.invalid_codes = 0
         """Number of invalid codes in the latest scan."""
@@ -176,7 +177,9 @@ class ExactTracker:
         arrays.codes[:] = checked_codes(codes, self.layout)
         if estimate is None:
             return self._advance(stage.DECODE | stage.SCALE, start)
-        arrays.code_map[NOISE] = self._code_noise[0, 0] * estimate.factor
+        if estimate.factor != self._code_factor:
+            self._code_factor = estimate.factor
+            arrays.code_map[NOISE] = self._code_noise[0, 0] * estimate.factor
         field = self._advance(stage.DECODE | stage.SCALE, start)
         estimate.see(arrays.ohm, self._code_noise, arrays.rounding_ohm)  # for the next frame
         return field

@@ -255,7 +255,7 @@ def test_of_a_running_hand(hand: HandConfig, fleet: Fleet) -> None:
     assert [frame.scan for frame in frames] == list(range(frames[0].scan, frames[0].scan + 10))
     for frame in frames[1:]:  # the first SYNC may have been before
         assert frame.complete
-        assert set(frame.fields) == {"p0", "p1"}
+        assert set(frame.fields) == set(frame.skeleton.mounts) == {"p0", "p1"}
         assert {one.stamp.t_sync_ns for one in frame.fields.values() if one.stamp} == {frame.t_sync_ns}
 
 

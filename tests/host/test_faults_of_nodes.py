@@ -293,7 +293,7 @@ def test_frozen_values(make_hand: Callable[..., HandConfig]) -> None:
         fleet.inject(NO_FAULTS)
         assert running.hears("p0", "operational")
         assert running.well_again()
-    assert fleet.injected("p0").frozen > 40
+    assert fleet.injected("p0").frozen >= 3  # the phase tells at once: PHASES_REPEATED
 
 
 def test_heartbeat_and_emergency_of_wrong_length(running: Hand) -> None:

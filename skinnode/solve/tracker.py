@@ -19,7 +19,7 @@ from typing import Final, Unpack
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from skinnode.model.frames import FieldFrame
+from skinnode.model.frames import FieldFrame, amended
 from skinnode.model.layout import Float, PatchLayout
 from skinnode.solve.checks.data_check import DataCheck, Solved
 from skinnode.solve.cramer_rao import patch_std
@@ -94,7 +94,8 @@ class Tracker:
         )
         self._gate = RootGate(self._exact, self._posterior, options)
         self._problem = PatchProblem.of(layout, options.baseline_ohm)
-        self._check = DataCheck(self._problem)
+        sigma = float(np.median(np.asarray(options.relative_noise, np.float64)))
+        self._check = DataCheck(self._problem, sigma)
         self.reset()
 
     def reset(self) -> None:
@@ -204,7 +205,7 @@ class Tracker:
 
     def _judged(self, field: FieldFrame) -> FieldFrame:
         """Return the field with its verdict on precision."""
-        return field if is_precise(field, self._limits) else dataclasses.replace(field, precise=False)
+        return field if is_precise(field, self._limits) else amended(field, precise=False)
 
     def _follow_noise(self) -> None:
         """Adapt method and gate of an exact tracker if the estimated noise has changed."""

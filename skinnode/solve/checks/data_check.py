@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skinnode.model.data_fault import FaultyPart
-from skinnode.model.frames import FieldFrame
+from skinnode.model.frames import FieldFrame, amended
 from skinnode.model.kernels import potential
 from skinnode.model.layout import Float
 from skinnode.model.status import Status
@@ -26,6 +26,7 @@ from skinnode.solve.checks.explanations import Explainer, Group, crossing_gain
 from skinnode.solve.checks.fault_list import FaultList
 from skinnode.solve.checks.reading_model import LEAST, ReadingModel, changes, evidences
 from skinnode.solve.checks.trust import OF_WIRE, assess
+from skinnode.solve.linalg.cholesky import multiply_vector
 from skinnode.solve.wires.problem import PatchProblem
 
 ROUNDS: Final = 3
@@ -34,10 +35,12 @@ WRONG: Final = 0.1
 """Expected relative error of a wrong reading. An open, shorted or stuck reading is off by 0.01 to 0.5."""
 SUSPICIOUS: Final = 5.0
 """Gain in log evidence at which a reading is suspected and explanations are sought, nats."""
-OFFSETS: Final = (0, 1, 3)
+OFFSETS: Final = (1, 3)
 """Steps below the κ that fits a frame at which single readings are tested."""
 EXCUSED: Final = 10.0
 """Rise of the gain above that of a frame explained by loads that makes the next frame suspicious, nats."""
+USUAL: Final = (-11, -3)
+"""Range of log2 s, s in pitches, of healthy and faulty presses of 1 to 50 %."""
 COARSE: Final = 0.1
 """Error of the linearised readings, relative to the largest change, if wires could not be solved."""
 UNSOLVED: Final = 1
@@ -67,6 +70,7 @@ class DataCheck:
 
     Args:
         problem: The patch.
+        sigma: Usual noise of a reading, for which tables are prepared.
         model_std: Standard deviation of the forward model's error, relative to the largest change of a
             reading: 0 for a patch that equals its layout.
 
@@ -74,7 +78,7 @@ class DataCheck:
         scan: Number by which the user knows the next frame; by default, frames are counted.
     """
 
-    def __init__(self, problem: PatchProblem, model_std: float = 0.0) -> None:
+    def __init__(self, problem: PatchProblem, sigma: float, model_std: float = 0.0) -> None:
         self._problem, self._model_std = problem, model_std
         self._model = ReadingModel.of(problem.layout)
         self._explainer = Explainer(self._model)
@@ -83,7 +87,19 @@ class DataCheck:
         self._z, self._f = np.empty(shape), np.empty(shape)
         self._c, self._alpha = np.empty((2, self._z.size))
         self._evidence = np.empty(len(self._model.kappa))
+        self._present = np.ones(shape, bool)
+        self._all_converged = (Status.CONVERGED,) * shape[0]
+        self._all_trusted = np.ones(shape[0], bool)
+        self._all_trusted.setflags(write=False)
         self.scan: int | None = None
+        octaves = np.log2(self._model.kappa * sigma)
+        usual = np.flatnonzero((octaves >= USUAL[0]) & (octaves <= USUAL[1])).tolist()
+        for number in usual:
+            self._model.level(number)
+        every = np.ones(shape, bool)
+        self._z[:] = 0.0
+        self._explainer.wrong_readings(self._z, every, self._evidence, usual[0], 1.0)  # compiles the kernels
+        self._crossing_gain(every, self._evidences(every), 1.0)
         self.reset()
 
     def reset(self) -> None:
@@ -112,8 +128,12 @@ class DataCheck:
         last = self._last
         if last is not None and last.noise_factor != solved.field.noise_factor:
             self._list.reset()  # what contradicted the stated noise may not contradict the actual noise
+        if self._list.mask is None and self._is_clean(solved):
+            field = amended(solved.field, distrust="", wires_trusted=self._all_trusted)
+            self._last = field
+            return field
         if last is not None and last.faults == self._list.faults and _still(solved, last):
-            return dataclasses.replace(
+            return amended(
                 solved.field, faults=last.faults, distrust=last.distrust, wires_trusted=last.wires_trusted
             )
         layout = self._problem.layout
@@ -134,9 +154,42 @@ class DataCheck:
             self._follow(solved)
         faults = self._list.faults + passing
         reason, wires = assess(solved.field.status, solved.used, faults, contradiction=bool(found))
-        field = dataclasses.replace(solved.field, faults=faults, distrust=reason, wires_trusted=wires)
+        field = amended(solved.field, faults=faults, distrust=reason, wires_trusted=wires)
         self._last = field
         return field
+
+    def _is_clean(self, solved: Solved) -> bool:
+        """Return whether an exact field with all readings passes the test of single readings.
+
+        This is the fast path of :meth:`_find`, which most frames take.
+        """
+        field, layout = solved.field, self._problem.layout
+        clean = (
+            field.status == self._all_converged
+            and field.method == "exact"
+            and field.by_prior is None
+            and bool(solved.used.all())
+        )
+        if not clean:
+            return False
+        if field.held is not None and field.held.all():
+            return True
+        sigma = float(solved.noise.mean())
+        moved = field.displacement_m.reshape(layout.shape[0], -1)
+        changes(self._model.jacobian, moved, sigma * layout.pitch_m, self._z)
+        best = self._evidences(self._present)
+        cost = math.log(max(WRONG / sigma, math.e))
+        return self._is_unsuspicious(self._crossing_gain(self._present, best, cost))
+
+    def _is_unsuspicious(self, gain: float) -> bool:
+        """Return whether a gain needs no explanation: it is small, or loads explained one as large.
+
+        A gain that loads explained is forgotten by and by.
+        """
+        if gain >= max(SUSPICIOUS, self._excused + EXCUSED):
+            return False
+        self._excused = max(self._excused - 0.1 * EXCUSED, gain if gain > SUSPICIOUS else -math.inf)
+        return True
 
     def _find(self, solved: Solved) -> tuple[Group, ...]:
         """Return the readings that contradict the others; none if there are none."""
@@ -154,8 +207,7 @@ class DataCheck:
         best = self._evidences(present)
         cost = math.log(max(WRONG / sigma, math.e))
         gain = self._crossing_gain(present, best, cost)
-        if gain < max(SUSPICIOUS, self._excused + EXCUSED):
-            self._excused = max(self._excused - 0.1 * EXCUSED, gain if gain > SUSPICIOUS else -math.inf)
+        if self._is_unsuspicious(gain):
             return ()
         found = self._explainer.wrong_readings(self._z, present, self._evidence, best, cost)
         self._excused = -math.inf if found else gain
@@ -188,10 +240,10 @@ class DataCheck:
         """Write the evidence at every κ; return the index of the largest. Fills in the missing readings."""
         model, z = self._model, self._z.ravel()
         best = evidences(model.vectors_t, model.shrink, model.log_det, z, self._c, self._evidence)
-        missing = np.flatnonzero(~present)
-        if missing.size:  # with their expectation, given the others
+        missing = np.flatnonzero(~present) if present is not self._present else ()
+        if len(missing):  # with their expectation, given the others
             p = model.level(best).precision[missing]
-            z[missing] = -np.linalg.solve(p[:, missing] + LEAST * np.eye(missing.size), p @ z)
+            z[missing] = -np.linalg.solve(p[:, missing] + LEAST * np.eye(len(missing)), p @ z)
             best = evidences(model.vectors_t, model.shrink, model.log_det, z, self._c, self._evidence)
         return best
 
@@ -203,7 +255,7 @@ class DataCheck:
             if number < 0:
                 break
             p = self._model.level(number).precision
-            np.dot(p, z, out=self._alpha)
+            multiply_vector(p, z, self._alpha)
             gain = crossing_gain(p, self._alpha, present.ravel(), cost)
             most = max(most, gain + float(self._evidence[number] - self._evidence[best]))
         return most

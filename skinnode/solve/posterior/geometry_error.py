@@ -7,11 +7,11 @@ press. The errors are nuisances with a variance of 1, in units of their toleranc
 thickness        all upper electrodes move along their normals, in proportion to the clearance
 radius           the mean of F over the rims of electrodes of radius ρ is F + (ρ²/2) ∇²F within the surface,
                  ρ²/4 from each layer; the nuisance is ρ² in units of the squared tolerance
-gain             the change in each resistance has a relative error: half of its variance is common to the
+gain             the change in each resistance has a factor e^γ: half of the variance of γ is common to the
                  patch, half independent in each upper wire
 placement        each upper and each lower wire moves along x, y and z
 
-Displaced wires and thickness enter F itself, not its linearisation, because at a noise of 1e-5 the second
+The errors enter the residuals themselves, not their linearisation, because at a noise of 1e-5 the second
 order of an error of 0.02 pitch is a hundred standard deviations. A residual depends on ten of the nuisances;
 the other elements of H are zero and are not stored.
 """
@@ -75,14 +75,8 @@ class GeometryError:
         self._placement = tolerances.placement
         self._square = 0.5 * tolerances.electrode_radius**2
         self._gain = GAIN_SHARE * tolerances.gain
-        self._f, self._rims, self._bend = np.zeros((3, equations))
-        self._jt, self._bend_jt = np.zeros((2, layout.unknowns, equations))
-        self._bend_at_rest = np.zeros((wires, equations))
-        for u in range(wires):
-            surface_laplacian(
-                problem.rest[u], problem.lower, self._normal[u], self._bend_at_rest[u], self._bend_jt
-            )
-        self._bend_at_rest *= problem.a_rest
+        self._rows = np.zeros((4, equations))
+        self._slopes = np.zeros((3, layout.unknowns, equations))
 
     def linearise(  # noqa: PLR0913 - arrays by name
         self, members: Index, moved: Float, a: Float, weight: Float, g: Float, r: Float, jt: Float,
@@ -104,8 +98,8 @@ class GeometryError:
         problem = self._problem
         _linearise(
             members, problem.rest + moved + shift, problem.rest + shift, lower, a, problem.a_rest, weight,
-            self._normal, self._outward, self._bend_at_rest, self._placement, self._square, self._gain, g,
-            self._f, self._jt, self._rims, self._bend, self._bend_jt, r, jt, effect,
+            self._normal, self._outward, self._placement, self._square, self._gain, g, self._rows,
+            self._slopes, r, jt, effect,
         )  # fmt: skip
 
     def residuals(  # noqa: PLR0913 - arrays by name
@@ -119,8 +113,7 @@ class GeometryError:
         problem = self._problem
         return _residuals(
             members, problem.rest + moved + shift, problem.rest + shift, lower, a, problem.a_rest, weight,
-            self._normal, self._bend_at_rest, self._square, self._gain, h, own, g, self._f, self._bend,
-            self._bend_jt, r,
+            self._normal, self._square, self._gain, h, own, g, self._rows, self._slopes, r,
         )  # fmt: skip
 
     def _shifts(self, g: Float) -> tuple[Float, Float]:
@@ -132,72 +125,102 @@ class GeometryError:
         return shift, self._problem.lower + self._placement * lower.T[:, None, :]
 
 
+@njit_part
+def _bend(  # noqa: PLR0913 - a kernel: arrays by name
+    x: Float, lower: Float, normal: Float, square: float, out: Float, slope_t: Float
+) -> None:
+    """Write the effect of the electrodes' radius on F and its derivative; 0 for points."""
+    if square > 0.0:
+        surface_laplacian(x, lower, normal, out, slope_t)
+    else:
+        for k in range(out.size):
+            out[k] = 0.0
+
+
 @njit
 def _linearise(  # noqa: PLR0913 - a kernel: arrays by name
     members: Index, x: Float, rest: Float, lower: Float, a: Float, a_rest: Float, weight: Float,
-    normal: Float, outward: Float, bend_at_rest: Float, placement: float, square: float, gain: float,
-    g: Float, f: Float, rest_jt: Float, rims: Float, bend: Float, bend_jt: Float, r: Float, jt: Float,
-    effect: Float,
+    normal: Float, outward: Float, placement: float, square: float, gain: float, g: Float, rows: Float,
+    slopes: Float, r: Float, jt: Float, effect: Float,
 ) -> None:  # fmt: skip
-    """Write residuals, Jacobians and effects at the shifted positions ``x``, ``rest`` and ``lower``."""
-    equations = f.size
+    """Write residuals, Jacobians and effects at the shifted positions ``x``, ``rest`` and ``lower``.
+
+    ``rows`` (4, K) and ``slopes`` (3, 3N, K) are scratch.
+    """
+    f, bend, rest_bend, rims = rows[0], rows[1], rows[2], rows[3]
+    rest_jt, bend_jt, rest_bend_jt = slopes[0], slopes[1], slopes[2]
     for i in range(members.size):
         u = members[i]
         r_u, jt_u, h_u = r[u], jt[u], effect[u]
         potential_jacobian(x[u], lower, r_u, jt_u)
         potential_jacobian(rest[u], lower, f, rest_jt)
-        surface_laplacian(x[u], lower, normal[u], bend, bend_jt)
-        own_gain = g[COMMON + UPPER * u + 3]
-        for k in range(equations):
-            w = weight[u, k]
-            scale = w * a[u, k] / (a_rest[u, k] * f[k])
-            level = scale * r_u[k]
-            inverse = 1.0 / r_u[k]
-            rim = w * square * (bend[k] * inverse - bend_at_rest[u, k])
-            change = w * gain * (1.0 - a_rest[u, k] / a[u, k])
-            r_u[k] = level - w + rim * g[RADIUS] - change * (g[GAIN] + own_gain)
+        _bend(x[u], lower, normal[u], square, bend, bend_jt)
+        _bend(rest[u], lower, normal[u], square, rest_bend, rest_bend_jt)
+        correction = math.exp(-gain * (g[GAIN] + g[COMMON + UPPER * u + 3]))
+        for k in range(f.size):
+            w, own, before = weight[u, k], r_u[k], f[k]
+            change = correction * (a[u, k] / a_rest[u, k] - 1.0)
+            scale = w * (1.0 + change) / before
+            rim = w * square * (bend[k] / own - rest_bend[k] / before)
             h_u[k, RADIUS] = -rim
-            h_u[k, GAIN] = change
-            h_u[k, COMMON + 3] = change
-            f[k] = level / f[k]  # factor of ∂F/∂x at rest
-            rims[k] = w * square * g[RADIUS] * inverse
-            bend[k] = scale - rims[k] * bend[k] * inverse
+            h_u[k, GAIN] = w * gain * change * own / before
+            h_u[k, COMMON + 3] = h_u[k, GAIN]
+            r_u[k] = scale * own - w + rim * g[RADIUS]
+            # factors of the derivatives of F and of the rims, at the displacement and at rest
+            rims[k] = w * square * g[RADIUS] / own
+            bend[k] = scale - rims[k] * bend[k] / own
+            at_rest = w * square * g[RADIUS] / before
+            f[k] = (scale * own - at_rest * rest_bend[k]) / before
+            rest_bend[k] = at_rest
             h_u[k, THICKNESS] = 0.0
             for t in range(3):
                 h_u[k, COMMON + t] = 0.0
-        for j in range(jt_u.shape[0]):
-            row, before, along, t = jt_u[j], rest_jt[j], outward[u, j], COMMON + j % 3
-            curve = bend_jt[j]
-            for k in range(equations):
-                row[k] = bend[k] * row[k] + rims[k] * curve[k]
-                grown = row[k] - f[k] * before[k]
-                h_u[k, t] -= placement * grown
-                h_u[k, THICKNESS] -= along * grown
-        for k in range(equations):
-            for t in range(3):
-                h_u[k, COMMON + UPPER + t] = -h_u[k, COMMON + t]
+        _slopes(square, outward[u], placement, rows, slopes, jt_u, h_u)
+
+
+@njit_part
+def _slopes(  # noqa: PLR0913 - a kernel: arrays by name
+    square: float, outward: Float, placement: float, rows: Float, slopes: Float, jt: Float, effect: Float
+) -> None:
+    """Turn the derivatives of F of one wire into those of its residuals, and write the effects of shifts."""
+    f, bend, rest_bend, rims = rows[0], rows[1], rows[2], rows[3]
+    for j in range(jt.shape[0]):
+        row, before, along, t = jt[j], slopes[0, j], outward[j], COMMON + j % 3
+        curve, rest_curve = slopes[1, j], slopes[2, j]
+        for k in range(f.size):
+            row[k] *= bend[k]
+            grown = row[k] - f[k] * before[k]
+            if square > 0.0:
+                row[k] += rims[k] * curve[k]
+                grown += rims[k] * curve[k] - rest_bend[k] * rest_curve[k]
+            effect[k, t] -= placement * grown
+            effect[k, THICKNESS] -= along * grown
+    for k in range(f.size):
+        for t in range(3):
+            effect[k, COMMON + UPPER + t] = -effect[k, COMMON + t]
 
 
 @njit
 def _residuals(  # noqa: PLR0913 - a kernel: arrays by name
     members: Index, x: Float, rest: Float, lower: Float, a: Float, a_rest: Float, weight: Float,
-    normal: Float, bend_at_rest: Float, square: float, gain: float, h: Float, own: Float, g: Float, f: Float,
-    bend: Float, bend_jt: Float, r: Float,
+    normal: Float, square: float, gain: float, h: Float, own: Float, g: Float, rows: Float, slopes: Float,
+    r: Float,
 ) -> float:  # fmt: skip
     """Write the residuals of :func:`_linearise` less H g of the other nuisances; return their Σ r²."""
+    f, bend, rest_bend = rows[0], rows[1], rows[2]
     total = 0.0
     for i in range(members.size):
         u = members[i]
         r_u = r[u]
         potential(x[u], lower, r_u)
         potential(rest[u], lower, f)
-        surface_laplacian(x[u], lower, normal[u], bend, bend_jt)
-        both_gains = gain * (g[GAIN] + g[COMMON + UPPER * u + 3])
-        for k in range(r_u.size):
-            rim = square * g[RADIUS] * (bend[k] / r_u[k] - bend_at_rest[u, k])
-            change = 1.0 - a_rest[u, k] / a[u, k]
-            off = a[u, k] / (a_rest[u, k] * f[k]) * r_u[k] - 1.0
-            r_u[k] = weight[u, k] * (off + rim - both_gains * change)
+        _bend(x[u], lower, normal[u], square, bend, slopes[1])
+        _bend(rest[u], lower, normal[u], square, rest_bend, slopes[2])
+        correction = math.exp(-gain * (g[GAIN] + g[COMMON + UPPER * u + 3]))
+        for k in range(f.size):
+            rim = square * g[RADIUS] * (bend[k] / r_u[k] - rest_bend[k] / f[k])
+            change = correction * (a[u, k] / a_rest[u, k] - 1.0)
+            r_u[k] = weight[u, k] * ((1.0 + change) * r_u[k] / f[k] - 1.0 + rim)
             for q in range(own.size):
                 r_u[k] -= h[u, k, q] * own[q]
         total += dot(r_u, r_u)

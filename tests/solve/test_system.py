@@ -176,6 +176,27 @@ def test_steps_are_bounded_and_counted():
         assert stats.steps == calls["f"] - 1  # one trial point each, after the start
 
 
+@pytest.mark.parametrize(
+    ("pair", "x0"), [(chebyquad, (0.5, 4.0, 6.0, 8.0, 9.5)), (jennrich_sampson, (0.3, 0.4))]
+)
+def test_functions_may_return_the_same_array_every_time(pair, x0):
+    """The first system needs a second attempt from the start, the second one differences of J."""
+    r, j = pair(np.array(x0))
+
+    def residual(x):
+        r[:] = pair(x)[0]
+        return r
+
+    def jacobian(x):
+        j[:] = pair(x)[1]
+        return j
+
+    fresh, reused = solve(pair, x0), sk.solve_system(residual, jacobian, x0)
+    assert fresh.status is reused.status is sk.Status.CONVERGED
+    assert fresh.stats.evaluations == reused.stats.evaluations > 50
+    np.testing.assert_array_equal(fresh.x, reused.x)
+
+
 def test_a_wrong_jacobian_never_ends_converged():
     for operator in OPERATORS:
         solution = sk.solve_system(

@@ -28,14 +28,21 @@ steps)."""
 
 
 class System:
-    """The caller's functions; counts their calls and checks their arrays."""
+    """The caller's functions; counts their calls and checks their arrays.
+
+    An array returned by a method may be the caller's own, which the next call may overwrite.
+    """
 
     def __init__(
         self, residual: Callable[[Float], ArrayLike], jacobian: Callable[[Float], ArrayLike], x0: Float
     ) -> None:
         self._residual, self._jacobian = residual, jacobian
         self.n, self.evaluations, self.jacobians = x0.size, 1, 0
-        self.first = require_array("residual(x0)", residual(x0.copy()), ("m",), finite=False)
+        first = residual(x0.copy())
+        shape: tuple[int | str, ...] = ("m",)
+        if type(first) is np.ndarray and first.ndim == 1 and first.size > 0:
+            shape = first.shape  # known, so that nothing is left to check
+        self.first = require_array("residual(x0)", first, shape, finite=False).copy()
         self.m = self.first.size
 
     def residual(self, x: Float) -> Float:
@@ -46,7 +53,10 @@ class System:
     def jacobian(self, x: Float) -> Float:
         """Return J (m, n) at x. Raises ValueError if the caller's function returns another shape."""
         self.jacobians += 1
-        return require_array("jacobian(x)", self._jacobian(x.copy()), (self.m, self.n), finite=False)
+        j, shape = self._jacobian(x.copy()), (self.m, self.n)
+        if type(j) is np.ndarray and j.dtype == np.float64 and j.shape == shape:
+            return j  # in any order: the workspace has J transposed
+        return require_array("jacobian(x)", j, shape, finite=False)
 
     @property
     def steps(self) -> int:
@@ -72,8 +82,8 @@ class Attempt:
 
     @property
     def at(self) -> Point:
-        """The best iterate."""
-        return self._settled or Point(self._w.x.copy(), self._w.r.copy(), self._w.jt.T.copy())
+        """The best iterate; its arrays change when the attempt goes on."""
+        return self._settled or Point(self._w.x, self._w.r, self._w.jt.T)
 
     @property
     def norm(self) -> float:
@@ -92,17 +102,18 @@ class Attempt:
 
     def run(self, steps: int, tol_f: float, tol_x: float) -> None:
         """Take at most this many steps; at the end of the solve, or near a minimum, judge the point."""
-        w, system, left = self._w, self._system, steps
-        while not self.ended:
-            if self.went == op.TRY:
+        code, w, system, went, left = self._code, self._w, self._system, self.went, steps
+        while went < 0:
+            if went == op.TRY:
                 if left == 0:
                     break
                 left -= 1
                 w.r_trial[:] = system.residual(w.trial)
-            self.went = advance(self._code, w, self.went, tol_f, tol_x)
-            if self.went == op.ACCEPTED:
+            went = advance(code, w, went, tol_f, tol_x)
+            if went == op.ACCEPTED:
                 w.jt[:] = system.jacobian(w.x).T
-        if self.went == op.INVALID_START:
+        self.went = went
+        if went == op.INVALID_START:
             return
         if self._is_root(tol_f):
             self.kind = PointKind.ROOT
@@ -128,7 +139,9 @@ class Attempt:
             self.went = op.ILL_CONDITIONED
         if not at.cosine <= NEAR:
             return
-        settled = settle(system.residual, system.jacobian, at, tol_x, steps)
+        settled = settle(
+            lambda x: system.residual(x).copy(), lambda x: system.jacobian(x).copy(), at, tol_x, steps
+        )
         minimum = settled.error <= op.MINIMUM_SHARE * max(1.0, float(np.abs(settled.at.x).max()))
         if minimum:
             self.error = settled.error

@@ -89,15 +89,16 @@ def solve_system(  # noqa: PLR0913 - keyword arguments of the public interface
     x = require_array("x0", x0, ("n",))
     system = System(residual, jacobian, x)
     wide = system.m < system.n
-    start = Point(x, system.first, np.zeros((system.m, system.n)) if wide else system.jacobian(x))
+    first = np.zeros((system.m, system.n)) if wide else system.jacobian(x).copy()
+    start = Point(x, system.first, first)
     best = _solve(code, system, start, tol_f, tol_x, int(max_steps))
     at, invalid = best.at, best.went == op.INVALID_START
     with np.errstate(all="ignore"):
         return Solution(
-            x=at.x,
+            x=at.x.copy(),
             status=Status(best.went if best.went >= 0 else op.MAX_STEPS),
             kind=best.kind,
-            residual_norm=float(np.linalg.norm(at.r)),
+            residual_norm=math.sqrt(at.r.dot(at.r)),
             optimality=math.nan if invalid else float(np.abs(at.j.T @ at.r).max()),
             error_estimate=best.error if best.went == op.CONVERGED else math.inf,
             stats=SolveStats(system.evaluations, system.jacobians, system.steps, time.perf_counter() - begin),
@@ -109,13 +110,13 @@ def _solve(  # noqa: PLR0913 - the arguments of solve_system
 ) -> Attempt:
     """Let the attempts take turns until one decides; return it, else that with the smallest residual."""
     attempts = [Attempt(code, system, start, 0.0)]
-    size = float(np.linalg.norm(start.x)) or 1.0
-    later = [] if code == op.GAUSS_NEWTON else [-size * radius for radius in RADII]
+    later = [] if code == op.GAUSS_NEWTON else list(RADII)
     turn = TURN if later else max_steps
     while not all(each.ended for each in attempts):
         for number in range(1 + len(RADII)):
             if number >= len(attempts) and later:
-                attempts.append(Attempt(code, system, start, later.pop(0)))
+                size = float(np.linalg.norm(start.x)) or 1.0
+                attempts.append(Attempt(code, system, start, -size * later.pop(0)))
             if number < len(attempts) and not attempts[number].ended:
                 attempts[number].run(min(turn, max_steps - system.steps), tol_f, tol_x)
                 if attempts[number].decided:

@@ -30,7 +30,7 @@ from skinnode.bench.trust_loads import LOADS, draw
 from skinnode.bench.trust_report import part_verdicts, verdicts
 from skinnode.bench.trust_score import Naming, Score, judge
 from skinnode.bench.trust_signal import RATE_HZ, Setting, Timeline, all_settings, make
-from skinnode.bench.trust_solver import fields_of, solve, solver_of
+from skinnode.bench.trust_solver import fields_of, host_patch
 from skinnode.process.child_processes import starting_children
 from skinnode.text.json_values import plain
 
@@ -118,14 +118,14 @@ def solve_item(item: Item, seed: int) -> Score:
 def _watch(item: Item, rng: np.random.Generator) -> Score:
     """Score touches in one long stream, and count false namings."""
     total, known, number = Score(), set[Naming](), 0
-    solver = None
+    patch = None
     for touch in range(WATCHED // QUIET.scans):
         load = draw(LOADS[(item.number + touch) % len(LOADS)], item.setting.layout(), rng)
         taken = make(item.setting, load, (), rng, QUIET)
-        solver = solver_of(taken) if solver is None else solver
+        patch = host_patch(taken) if patch is None else patch
         fields = []
         for codes in taken.codes:
-            fields.append(solve(solver, codes, number))
+            fields.append(patch.field(codes, number))
             number += 1
         total.add(judge(taken, fields, known))
     return total

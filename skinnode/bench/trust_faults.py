@@ -201,6 +201,7 @@ def _open(axis: int) -> InPlace:
     def read(signal: Signal) -> None:
         rows = _row(signal, axis, _one(signal, axis), _pressing(signal))
         signal.ohm[rows] = np.inf
+        signal.bad[rows] = True
 
     return read
 
@@ -209,6 +210,7 @@ def _shorted_to_all(axis: int) -> InPlace:
     def read(signal: Signal) -> None:
         rows = _row(signal, axis, _one(signal, axis), _pressing(signal))
         signal.ohm[rows] = 0.0
+        signal.bad[rows] = True
 
     return read
 

@@ -1,13 +1,19 @@
-"""The host's solver, fed with the codes of a stream for ``skinnode bench trust``."""
+"""The path of a patch through the host, fed with the codes of a stream, for ``skinnode bench trust``.
+
+As in the host, a scan is judged (frozen parts, open wires), solved without the readings left out, and then
+watched for slower faults. Its summary counts no conversions, so only the codes show whether they are new.
+"""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
 
 from skinnode.bench.trust_signal import SCALE, CodeStream
 from skinnode.config import PatchConfig, SolverConfig
+from skinnode.host.code_watch import CodeWatch
 from skinnode.host.node_facts import NodeFacts
 from skinnode.host.scan_solver import ScanSolver
 from skinnode.model.frames import FieldFrame, ScanStamp
@@ -19,8 +25,24 @@ PERIOD_NS: Final = 10_000_000
 """Time between scans, ns."""
 
 
-def solver_of(taken: CodeStream, config: PatchConfig | None = None, **options: Any) -> ScanSolver:
-    """Return the solver that a host makes for a patch with this stream's layout, noise and tolerances.
+@dataclass
+class HostPatch:
+    """What a host keeps of a patch: its watch and its solver."""
+
+    solver: ScanSolver
+    watch: CodeWatch
+
+    def field(self, codes: Codes, number: int) -> FieldFrame:
+        """Return the field of the scan ``number`` with ``codes`` (U, K)."""
+        scan, stamp = _scan_of(self.solver.facts.profile, codes, number)
+        verdict = self.watch.judge(scan, number)
+        field = verdict.applied(self.solver.solve(verdict.admitted(scan), stamp)[0])
+        self.watch.on_scan(scan)
+        return field
+
+
+def host_patch(taken: CodeStream, config: PatchConfig | None = None, **options: Any) -> HostPatch:
+    """Return what a host keeps of a patch with this stream's layout, noise and tolerances.
 
     Args:
         taken: Stream.
@@ -42,19 +64,19 @@ def solver_of(taken: CodeStream, config: PatchConfig | None = None, **options: A
         heartbeat_s=0.5,
         checked=True,
     )
-    return ScanSolver(facts, SolverConfig(**options), clock=lambda: 0)
+    solver = ScanSolver(facts, SolverConfig(**options), clock=lambda: 0)
+    return HostPatch(solver, CodeWatch(SCALE, facts.config.relative_noise))
 
 
-def fields_of(taken: CodeStream, solver: ScanSolver | None = None) -> list[FieldFrame]:
+def fields_of(taken: CodeStream, patch: HostPatch | None = None) -> list[FieldFrame]:
     """Return the field of every scan."""
-    solver = solver_of(taken) if solver is None else solver
-    return [solve(solver, codes, number) for number, codes in enumerate(taken.codes)]
+    patch = host_patch(taken) if patch is None else patch
+    return [patch.field(codes, number) for number, codes in enumerate(taken.codes)]
 
 
-def solve(solver: ScanSolver, codes: Codes, number: int) -> FieldFrame:
-    """Return the field of a scan with ``codes`` (U, K)."""
+def _scan_of(profile: PatchProfile, codes: Codes, number: int) -> tuple[Scan, ScanStamp]:
     lost = int((~(codes <= SCALE.open)).sum())
-    chunks = solver.facts.profile.n_chunks
+    chunks = profile.n_chunks
     t_ns = (number + 1) * PERIOD_NS
     scan = Scan(
         codes=codes,
@@ -63,11 +85,10 @@ def solve(solver: ScanSolver, codes: Codes, number: int) -> FieldFrame:
         scan=number,
         complete=lost == 0,
         chunks_expected=chunks,
-        chunks_received=chunks - -(-lost // solver.facts.profile.codes_per_chunk),
+        chunks_received=chunks - -(-lost // profile.codes_per_chunk),
         device_time_us=t_ns // 1000,
         flags=0,
         t_first_ns=t_ns,
         t_last_ns=t_ns,
     )
-    stamp = ScanStamp("patch", number, scan.counter, t_ns // 1000, t_ns, t_ns)
-    return solver.solve(scan, stamp)[0]
+    return scan, ScanStamp("patch", number, scan.counter, t_ns // 1000, t_ns, t_ns)

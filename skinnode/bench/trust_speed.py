@@ -10,8 +10,8 @@ import numpy as np
 
 from skinnode.bench.trust_loads import LOADS, draw
 from skinnode.bench.trust_score import deviations
-from skinnode.bench.trust_signal import CodeStream, Setting, Timeline, make
-from skinnode.bench.trust_solver import solve, solver_of
+from skinnode.bench.trust_signal import SCALE, CodeStream, Setting, Timeline, make
+from skinnode.bench.trust_solver import host_patch
 from skinnode.solve.exact.tracker import ExactTracker
 from skinnode.solve.inputs import CodeMap
 
@@ -59,17 +59,16 @@ def _fields(name: str, taken: CodeStream) -> list[tuple[Any, float]]:
             field = bare.update_codes(codes)
             found.append((field, time.perf_counter() - start))
         return found
-    solver = solver_of(taken, method=name)
+    patch = host_patch(taken, method=name)
     for number, codes in enumerate(taken.codes):
         start = time.perf_counter()
-        field = solve(solver, codes, number)
+        field = patch.field(codes, number)
         found.append((field, time.perf_counter() - start))
     return found
 
 
 def _bare(taken: CodeStream) -> ExactTracker:
-    solver = solver_of(taken, method="exact")
-    scale = solver.facts.scale
+    scale = SCALE
     codes = CodeMap(
         baseline_ohm=taken.baseline_ohm,
         lo=scale.lo,

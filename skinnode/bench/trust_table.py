@@ -18,7 +18,7 @@ from skinnode.bench.trust_faults import Fault, singles, some_bits
 from skinnode.bench.trust_loads import Bonded, draw
 from skinnode.bench.trust_score import BEYOND, LIMIT, Score, deviations, judge, trusted_wires
 from skinnode.bench.trust_signal import PITCH_M, CodeStream, Setting, Timeline, make
-from skinnode.bench.trust_solver import fields_of, solver_of
+from skinnode.bench.trust_solver import fields_of, host_patch
 from skinnode.bench.truth import Converter, Load, Skin, random_press, stream
 from skinnode.config import PatchConfig, parse_hand
 from skinnode.model.frames import FieldFrame
@@ -77,7 +77,7 @@ def _streams(  # noqa: PLR0913 - parts of a stream
         layout = setting.layout()
         body = draw("sphere", layout, rng, 0.3) if load is None else load(rng, layout)
         taken = make(setting, body, faults, rng, Timeline() if timeline is None else timeline)
-        yield taken, fields_of(taken, solver_of(taken, config))
+        yield taken, fields_of(taken, host_patch(taken, config))
 
 
 def _fault(name: str) -> Fault:

@@ -90,8 +90,14 @@ def _solved(frames: list[FieldFrame]) -> Solved:
     return Solved(
         np.stack([frame.displacement_m for frame in frames]),
         np.stack([frame.displacement_std_m for frame in frames]),
-        np.stack([_converged(frame.status) for frame in frames]),
+        np.stack([_claimed(frame) for frame in frames]),
     )
+
+
+def _claimed(frame: FieldFrame) -> NDArray[np.bool_]:
+    """Return the wires (U,) that are CONVERGED and, if trust was assessed, trusted."""
+    converged = _converged(frame.status)
+    return converged if frame.wires_trusted is None else converged & frame.wires_trusted
 
 
 def _converged(status: tuple[Status, ...]) -> NDArray[np.bool_]:

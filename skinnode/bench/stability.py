@@ -121,8 +121,8 @@ HEAD = (
 LEGEND = (
     "# is the number of the hard case. error and reported standard deviation are relative to the\n"
     "displacement of the CONVERGED wires in the deepest frame; the worst error is that of any frame.\n"
-    "Wires of all frames are accurate, flagged (not CONVERGED), or wrong: CONVERGED, but off by more\n"
-    "than chance and the reported standard deviation allow."
+    "Wires of all frames are accurate, flagged (not CONVERGED, or not trusted), or wrong: claimed, but\n"
+    "off by more than chance and the reported standard deviation allow."
 )
 
 

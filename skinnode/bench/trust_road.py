@@ -39,6 +39,12 @@ ROAD: Final[tuple[dict[str, Any], ...]] = (
     {"shorted_lower": 13},
     {"noisy_upper": 4},
     {"noisy_lower": 13},
+    {"frozen_upper": 4},
+    {"frozen_lower": 13},
+    {"stuck_upper": 4, "stuck_lower": 13},
+    {"crossed_upper": 4},
+    {"crossed_lower": 13},
+    {"flipped": 0.2},
 )
 """Faults that change, withhold or repeat values, one or none per patch."""
 AT_ONCE: Final = 4

@@ -2,9 +2,10 @@
 
 A wire in a frame is
 
-flagged    if its status is not CONVERGED, so that no accuracy was claimed
-accurate   if it is CONVERGED and every coordinate is within the reported uncertainty
-wrong      if it is CONVERGED and an error is too large, or if it is not finite, whatever its status
+flagged    if its status is not CONVERGED or its data failed a test (``wires_trusted``), so that no accuracy
+           was claimed
+accurate   if accuracy was claimed and every coordinate is within the reported uncertainty
+wrong      if accuracy was claimed and an error is too large, or if it is not finite, whatever its status
 
 With noise, an error may reach 5 reported standard deviations; chance alone puts 6e-7 of all coordinates
 beyond this limit. A long run must not fail by chance, and a fault must not be attributed to chance, so each
@@ -52,7 +53,7 @@ class Solved:
     std_m: Float
     """(F, U, N, 3), reported standard deviation, or a fifth of an error estimate."""
     converged: NDArray[np.bool_]
-    """(F, U)"""
+    """(F, U) wires that are CONVERGED and, if trust was assessed, trusted."""
 
     def equals(self, other: Solved) -> bool:
         """Return whether both results are equal, bit for bit."""

@@ -125,7 +125,7 @@ def _watch(item: Item, rng: np.random.Generator) -> Score:
         patch = host_patch(taken) if patch is None else patch
         fields = []
         for codes in taken.codes:
-            fields.append(patch.field(codes, number))
+            fields.append(patch.field(codes, number, 1 + number % 3))
             number += 1
         total.add(judge(taken, fields, known))
     return total

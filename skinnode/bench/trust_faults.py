@@ -124,9 +124,14 @@ def _leave_one(signal: Signal) -> None:
     signal.codes[:, 3, 7] = kept
 
 
-def _freeze(start: Callable[[Signal], int]) -> InPlace:
+def _freeze(start: Callable[[Signal], int], *, counted: bool = True) -> InPlace:
+    """Repeat the codes of a scan; ``counted`` tells whether the patch counts its conversions."""
+
     def sent(signal: Signal) -> None:
         t = start(signal)
+        signal.phase[t + 1 :] = signal.phase[t]
+        if not counted:
+            signal.phase[:] = 0
         signal.codes[t + 1 :] = signal.codes[t]
         signal.bad[t + 1 :] = True
 
@@ -331,6 +336,7 @@ def singles() -> list[Fault]:
         Fault("all readings lost", sent=_lose_all),
         Fault("one reading left", sent=_leave_one),
         Fault("patch frozen in mid-press", sent=_freeze(_pressing)),
+        Fault("patch frozen, nothing counted", sent=_freeze(_pressing, counted=False)),
         Fault("patch frozen at rest", sent=_freeze(_at_rest)),
         Fault("patch frozen while held", sent=_freeze(lambda signal: signal.pressed.start + 5)),
         Fault("upper wire frozen", sent=_freeze_wire(upper), local=True),

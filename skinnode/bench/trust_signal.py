@@ -79,6 +79,8 @@ class Signal:
     """(T, U, K) readings that differ from those of the intact patch by more than noise."""
     pressed: slice
     """Scans in which the load is at full depth."""
+    phase: NDArray[np.int64]
+    """(T,) conversion phase in the summaries, 1 to 3 in turn; 0 if the patch does not count conversions."""
     codes: Codes = field(default_factory=lambda: np.zeros(0, np.uint32))
 
     @property
@@ -111,6 +113,8 @@ class CodeStream:
     """(T,) scans with the load at full depth."""
     untouched: NDArray[np.bool_]
     """(T,) scans with the patch at rest."""
+    phase: NDArray[np.int64]
+    """(T,) conversion phase in the summaries; 0 if the patch does not count conversions."""
     scored_from: int = 0
     """First scan that counts."""
 
@@ -170,6 +174,7 @@ def make(
         ohm,
         np.zeros(ohm.shape, bool),
         slice(start, start + timeline.hold + timeline.slide),
+        1 + np.arange(timeline.scans) % 3,
     )
     for fault in faults:
         if fault.wired is not None:
@@ -194,6 +199,7 @@ def make(
         signal.bad & (signal.codes != MISSING),
         shares == 1.0,
         shares == 0.0,
+        signal.phase,
         scored_from,
     )
 

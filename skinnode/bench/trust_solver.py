@@ -1,7 +1,7 @@
 """The path of a patch through the host, fed with the codes of a stream, for ``skinnode bench trust``.
 
 As in the host, a scan is judged (frozen parts, open wires), solved without the readings left out, and then
-watched for slower faults. Its summary counts no conversions, so only the codes show whether they are new.
+watched for slower faults.
 """
 
 from __future__ import annotations
@@ -20,7 +20,9 @@ from skinnode.model.frames import FieldFrame, ScanStamp
 from skinnode.protocol.codes import Codes
 from skinnode.protocol.profile import PatchProfile
 from skinnode.protocol.scan import Scan
+from skinnode.protocol.summary import SummaryFlag
 
+CONVERSIONS: Final = int(SummaryFlag.CONVERSIONS)
 PERIOD_NS: Final = 10_000_000
 """Time between scans, ns."""
 
@@ -32,9 +34,9 @@ class HostPatch:
     solver: ScanSolver
     watch: CodeWatch
 
-    def field(self, codes: Codes, number: int) -> FieldFrame:
-        """Return the field of the scan ``number`` with ``codes`` (U, K)."""
-        scan, stamp = _scan_of(self.solver.facts.profile, codes, number)
+    def field(self, codes: Codes, number: int, phase: int) -> FieldFrame:
+        """Return the field of the scan ``number`` with ``codes`` (U, K) and the conversion phase."""
+        scan, stamp = _scan_of(self.solver.facts.profile, codes, number, phase)
         verdict = self.watch.judge(scan, number)
         field = verdict.applied(self.solver.solve(verdict.admitted(scan), stamp)[0])
         self.watch.on_scan(scan)
@@ -71,10 +73,11 @@ def host_patch(taken: CodeStream, config: PatchConfig | None = None, **options: 
 def fields_of(taken: CodeStream, patch: HostPatch | None = None) -> list[FieldFrame]:
     """Return the field of every scan."""
     patch = host_patch(taken) if patch is None else patch
-    return [patch.field(codes, number) for number, codes in enumerate(taken.codes)]
+    scans = enumerate(zip(taken.codes, taken.phase.tolist(), strict=True))
+    return [patch.field(codes, number, phase) for number, (codes, phase) in scans]
 
 
-def _scan_of(profile: PatchProfile, codes: Codes, number: int) -> tuple[Scan, ScanStamp]:
+def _scan_of(profile: PatchProfile, codes: Codes, number: int, phase: int) -> tuple[Scan, ScanStamp]:
     lost = int((~(codes <= SCALE.open)).sum())
     chunks = profile.n_chunks
     t_ns = (number + 1) * PERIOD_NS
@@ -87,7 +90,7 @@ def _scan_of(profile: PatchProfile, codes: Codes, number: int) -> tuple[Scan, Sc
         chunks_expected=chunks,
         chunks_received=chunks - -(-lost // profile.codes_per_chunk),
         device_time_us=t_ns // 1000,
-        flags=0,
+        flags=phase * (CONVERSIONS & -CONVERSIONS),  # shifted to the lowest bit of the mask
         t_first_ns=t_ns,
         t_last_ns=t_ns,
     )

@@ -62,7 +62,7 @@ def _fields(name: str, taken: CodeStream) -> list[tuple[Any, float]]:
     patch = host_patch(taken, method=name)
     for number, codes in enumerate(taken.codes):
         start = time.perf_counter()
-        field = patch.field(codes, number)
+        field = patch.field(codes, number, 1 + number % 3)
         found.append((field, time.perf_counter() - start))
     return found
 

@@ -22,7 +22,7 @@ from skinnode.model.frames import FieldFrame, amended
 from skinnode.model.kernels import potential
 from skinnode.model.layout import Float
 from skinnode.model.status import Status
-from skinnode.solve.checks.explanations import Explainer, Group, crossing_gain
+from skinnode.solve.checks.explanations import DOUBT, Explainer, Group, crossing_gain
 from skinnode.solve.checks.fault_list import FaultList
 from skinnode.solve.checks.reading_model import LEAST, ReadingModel, changes, evidences
 from skinnode.solve.checks.trust import OF_WIRE, assess
@@ -35,10 +35,15 @@ WRONG: Final = 0.1
 """Expected relative error of a wrong reading. An open, shorted or stuck reading is off by 0.01 to 0.5."""
 SUSPICIOUS: Final = 5.0
 """Gain in log evidence at which a reading is suspected and explanations are sought, nats."""
-OFFSETS: Final = (1, 3)
+OFFSETS: Final = (0, 1, 3, 5)
 """Steps below the κ that fits a frame at which single readings are tested."""
+CLEAR: Final = -30.0
+"""Log evidence of faults over loads below which loads explain a frame so well that the next need no
+explanation, nats."""
 EXCUSED: Final = 10.0
-"""Rise of the gain above that of a frame explained by loads that makes the next frame suspicious, nats."""
+"""Rise of the gain after such a frame that makes a frame suspicious again, nats."""
+EXCUSED_FRAMES: Final = 8
+"""Number of frames after such a frame that need no explanation; finding one takes 9 ms."""
 USUAL: Final = (-11, -3)
 """Range of log2 s, s in pitches, of healthy and faulty presses of 1 to 50 %."""
 COARSE: Final = 0.1
@@ -105,7 +110,8 @@ class DataCheck:
     def reset(self) -> None:
         """Forget the stream."""
         self._list.reset()
-        self._frame, self._excused = 0, -math.inf
+        self._frame, self._doubtful = 0, False
+        self._excused, self._excused_until = -math.inf, 0
         self._last: FieldFrame | None = None
 
     @property
@@ -153,7 +159,8 @@ class DataCheck:
         if before:
             self._follow(solved)
         faults = self._list.faults + passing
-        reason, wires = assess(solved.field.status, solved.used, faults, contradiction=bool(found))
+        contradiction = bool(found) or self._doubtful
+        reason, wires = assess(solved.field.status, solved.used, faults, contradiction=contradiction)
         field = amended(solved.field, faults=faults, distrust=reason, wires_trusted=wires)
         self._last = field
         return field
@@ -179,20 +186,16 @@ class DataCheck:
         changes(self._model.jacobian, moved, sigma * layout.pitch_m, self._z)
         best = self._evidences(self._present)
         cost = math.log(max(WRONG / sigma, math.e))
-        return self._is_unsuspicious(self._crossing_gain(self._present, best, cost))
+        return self._needs_no_explanation(self._crossing_gain(self._present, best, cost))
 
-    def _is_unsuspicious(self, gain: float) -> bool:
-        """Return whether a gain needs no explanation: it is small, or loads explained one as large.
-
-        A gain that loads explained is forgotten by and by.
-        """
-        if gain >= max(SUSPICIOUS, self._excused + EXCUSED):
-            return False
-        self._excused = max(self._excused - 0.1 * EXCUSED, gain if gain > SUSPICIOUS else -math.inf)
-        return True
+    def _needs_no_explanation(self, gain: float) -> bool:
+        """Return whether a gain is small, or hardly larger than one that loads explained just before."""
+        excused = self._frame < self._excused_until and gain < self._excused + EXCUSED
+        return gain < SUSPICIOUS or excused
 
     def _find(self, solved: Solved) -> tuple[Group, ...]:
         """Return the readings that contradict the others; none if there are none."""
+        self._doubtful = False
         status = np.array(solved.field.status)
         enough = solved.used.mean(axis=1) >= OF_WIRE
         unsolved = np.flatnonzero(enough & (status != Status.CONVERGED) & (status != Status.DEADLINE))
@@ -207,10 +210,12 @@ class DataCheck:
         best = self._evidences(present)
         cost = math.log(max(WRONG / sigma, math.e))
         gain = self._crossing_gain(present, best, cost)
-        if self._is_unsuspicious(gain):
+        if self._needs_no_explanation(gain):
             return ()
         found = self._explainer.wrong_readings(self._z, present, self._evidence, best, cost)
-        self._excused = -math.inf if found else gain
+        self._doubtful = self._explainer.margin > DOUBT and not found
+        if self._explainer.margin < CLEAR:
+            self._excused, self._excused_until = gain, self._frame + EXCUSED_FRAMES
         return found
 
     def _linearised(self, solved: Solved, present: Mask) -> float:

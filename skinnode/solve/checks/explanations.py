@@ -24,8 +24,11 @@ from skinnode.solve.linalg.cholesky import multiply_vector
 from skinnode.solve.linalg.vectors import Index, dot
 
 MARGIN: Final = 20.0
-"""Log evidence by which faults must explain a frame better than loads alone, nats. In 108 presses of six
-kinds, at three noises, no healthy frame reached it."""
+"""Log evidence by which faults must explain a frame better than loads alone to be named, nats. In 108 presses
+of six kinds, at three noises, no healthy frame came near it."""
+DOUBT: Final = 5.0
+"""Log evidence by which faults must explain a frame better than loads alone to make it doubtful, nats. The
+largest of 144 healthy frames was 0."""
 STEPS: Final = 8
 """Maximum number of loads and groups of readings in an explanation."""
 STRIDE: Final = 2
@@ -77,6 +80,8 @@ class Explainer:
         self._block = np.empty((widest, widest))
         self._kind, self._number = np.empty((2, STEPS), np.int64)
         self._gain = np.empty(STEPS)
+        self.margin = -math.inf
+        """Log evidence by which faults explained the last frame better than loads alone, nats."""
 
     def wrong_readings(
         self, z: Float, present: Mask, evidence: Float, best: int, cost: float
@@ -98,7 +103,8 @@ class Explainer:
             total = start + self._explain(level, z, present, cost, faults=True)
             if total > by_faults:
                 by_faults, groups = total, self._groups()
-        return groups if by_faults - by_loads > MARGIN else ()
+        self.margin = by_faults - by_loads
+        return groups if self.margin > MARGIN else ()
 
     def _explain(self, level: Level, z: Float, present: Mask, cost: float, *, faults: bool) -> float:
         """Return the gain in log evidence of the best explanation; its parts stay in the arrays."""

@@ -252,12 +252,12 @@ def test_no_node_answers(error_of: Callable[..., str], tmp_path: Path, hand: Han
         (
             "node_id = 12",
             "node_id = 11",
-            ":17:1: patches[1].node_id: got 11, allowed: a value that patches[0] does not use",
+            ":18:1: patches[1].node_id: got 11, allowed: a value that patches[0] does not use",
         ),
         (
             "node_id = 12",
             'node_id = 12\neds = "none.eds"',
-            ":18:1: patches[1].eds: got 'none.eds', "
+            ":19:1: patches[1].eds: got 'none.eds', "
             "allowed: the path of an EDS file; there is no file {folder}/none.eds",
         ),
         (

@@ -37,6 +37,7 @@ def line_of(field: FieldFrame) -> str:
         "solved": 12,
         "deepest_m": 1e-4,
         "deepest_std_m": 1e-6,
+        "noise_factor": 1.0,
     }
     counts = dict.fromkeys(("torn", "corrupt", "missed", "skipped"), 0)
     return _patch_text("palm", {**facts, **counts, **trust_table(field)})

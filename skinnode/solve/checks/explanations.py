@@ -30,7 +30,10 @@ DOUBT: Final = 5.0
 """Log evidence by which faults must explain a frame better than loads alone to make it doubtful, nats. The
 largest of 144 healthy frames was 0."""
 STEPS: Final = 8
-"""Maximum number of loads and groups of readings in an explanation."""
+"""Maximum number of loads and groups of readings in an explanation with faults."""
+LOADS: Final = 60
+"""Maximum number of loads in an explanation by loads alone: a contact covers up to twenty cells, with three
+loads each. With 8, at a noise of 3e-6, half of all healthy frames of a deep slide were taken for faults."""
 STRIDE: Final = 2
 """Step in log2 κ between the scales at which explanations are sought."""
 SCALES: Final = 4
@@ -78,8 +81,8 @@ class Explainer:
         self._work, self._by_load = np.empty(m), np.empty(loads)
         widest = max(model.shape) + 1
         self._block = np.empty((widest, widest))
-        self._kind, self._number = np.empty((2, STEPS), np.int64)
-        self._gain = np.empty(STEPS)
+        self._kind, self._number = np.empty((2, LOADS), np.int64)
+        self._gain = np.empty(LOADS)
         self.margin = -math.inf
         """Log evidence by which faults explained the last frame better than loads alone, nats."""
 
@@ -99,10 +102,10 @@ class Explainer:
         groups: tuple[Group, ...] = ()
         for number in range(best, max(best - STRIDE * SCALES, -1), -STRIDE):
             level, start = self._model.level(number), float(evidence[number])
-            by_loads = max(by_loads, start + self._explain(level, z, present, cost, faults=False))
             total = start + self._explain(level, z, present, cost, faults=True)
             if total > by_faults:
                 by_faults, groups = total, self._groups()
+            by_loads = max(by_loads, start + self._explain(level, z, present, cost, faults=False))
         self.margin = by_faults - by_loads
         return groups if self.margin > MARGIN else ()
 
@@ -114,6 +117,7 @@ class Explainer:
             z.ravel(), present.ravel().copy(), *self._model.shape, cost, faults,
             LEAST * float(level.stiffness.max()), self._response_t, self._p, self._alpha, self._stiffness,
             self._work, self._by_load, self._block, self._kind, self._number, self._gain,
+            STEPS if faults else LOADS,
         )  # fmt: skip
 
     def _groups(self) -> tuple[Group, ...]:
@@ -271,6 +275,7 @@ def _explain(  # noqa: PLR0913, C901 - a kernel: arrays by name, a greedy search
     kinds: Index,
     numbers: Index,
     gains: Float,
+    steps: int,
 ) -> float:
     """Write the best explanation of ``z`` (m,) into the last three arrays; return its gain.
 
@@ -281,7 +286,7 @@ def _explain(  # noqa: PLR0913, C901 - a kernel: arrays by name, a greedy search
         if not present[i]:
             _condition(i, response_t, p, alpha, stiffness, work, by_load)
     total = 0.0
-    for step in range(kinds.size):
+    for step in range(steps):
         multiply_vector(response_t, alpha, by_load)
         gain, kind, number = 0.0, _LOAD, -1
         for j in range(stiffness.size):

@@ -84,13 +84,17 @@ def stability(
     _prepare(json, plot)
     typer.echo(bench.HEAD)
     figures = bench.run(seeds, jobs=jobs, report=lambda row: typer.echo(bench.line(row)))
-    wrong = [row for row in figures["rows"] if row["wrong"]]
+    off = [row for row in figures["rows"] if row["wrong"]]
+    wrong = [row for row in off if not row["known_limit"]]
     _print_machine(figures)
     typer.echo(bench.LEGEND)
     each = "one seed" if seeds == 1 else f"{seeds} seeds each"
     typer.echo(f"\n{len(figures['rows'])} rows, {each}: {len(wrong)} converged and wrong")
     for row in wrong:
         typer.echo(f"  {named(row)}")
+    for row in off:
+        if row["known_limit"]:
+            typer.echo(f"  known limit: {named(row)}")
     _write(json, figures)
     if plot is not None:
         from skinnode.bench.plots.stability import draw

@@ -2,7 +2,8 @@
 
 ``tracker`` solves a live stream with the method that suits the patch: ``exact`` inverts each wire separately,
 ``posterior`` estimates the whole patch. ``root_gate`` checks doubtful wires of the exact inverse with the
-posterior, using the rules and thresholds in ``roots``. ``noise_estimate`` corrects a stated noise that the
+posterior, using the rules and thresholds in ``roots``. ``checks`` finds readings that contradict the others
+and says whether a field is trusted. ``noise_estimate`` corrects a stated noise that the
 stream contradicts; ``precision`` compares standard deviations with what the user asked for. ``paths`` follows
 a recorded press. All these modules use ``operators``, ``linalg`` and ``wires``.
 """

@@ -24,11 +24,12 @@ from skinnode.solve.linalg.cholesky import multiply_vector
 from skinnode.solve.linalg.vectors import Index, dot
 
 MARGIN: Final = 20.0
-"""Log evidence by which faults must explain a frame better than loads alone to be named, nats. In 108 presses
-of six kinds, at three noises, no healthy frame came near it."""
+"""Log evidence by which faults must explain a frame better than loads alone to be named, nats. With
+:data:`LOADS` loads, none of 6,800 frames of deep slides at a noise of 3e-6, and of 270 frames of presses of
+six kinds at 1e-5, was taken for a fault."""
 DOUBT: Final = 5.0
 """Log evidence by which faults must explain a frame better than loads alone to make it doubtful, nats. The
-largest of 144 healthy frames was 0."""
+largest of 144 healthy frames was 0, with 8 loads in place of :data:`LOADS`."""
 STEPS: Final = 8
 """Maximum number of loads and groups of readings in an explanation with faults."""
 LOADS: Final = 60

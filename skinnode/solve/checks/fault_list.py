@@ -15,12 +15,13 @@ from skinnode.model.layout import Float
 from skinnode.solve.checks.explanations import Group
 
 FRAMES: Final = 3
-"""Number of frames, within :data:`WITHIN`, in which readings must contradict the others to be named."""
+"""Number of frames, among :data:`WITHIN`, in which readings must contradict the others to be named. Not
+tuned."""
 WITHIN: Final = 10
 """Number of frames within which these must lie."""
 ADMIT: Final = 64
 """Number of consecutive frames in which named readings must agree with the field to be admitted again; twice
-as many after each relapse."""
+as many after each relapse. Not tuned."""
 AGREE: Final = 3.0
 """RMS difference between a reading and the field, in standard deviations, up to which they agree."""
 

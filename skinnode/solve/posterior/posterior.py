@@ -50,7 +50,8 @@ LEAST_STEPS: Final = 3.0
 were measured for presses on 1 to 10 wires."""
 
 PLACED: Final = 2.0
-"""Error of a reading, relative to the largest change, per pitch of misplacement."""
+"""Error of a reading, relative to the largest change, per pitch of misplacement; not
+measured."""
 
 Mask = NDArray[np.bool_]
 

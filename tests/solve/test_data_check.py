@@ -1,0 +1,121 @@
+"""Readings that contradict the others: found, left out, named and admitted again; loads are none of them.
+
+The truth is Hertz's closed form, or a dent that no half-space forms; it does not come from the solver.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import skinnode as sk
+from skinnode.bench.truth import RUBBER
+from skinnode.model.elastic import HertzContact
+from skinnode.model.layout import Float
+from skinnode.solve.checks.fault_list import ADMIT, FRAMES
+from tests.solve.press import dent, noisy
+
+LAYOUT = sk.PatchLayout.preset("staggered")
+NOISE = 1e-5
+
+
+def press(depth: float, centre_m: tuple[float, float] = (17e-3, 18e-3), radius_m: float = 14e-3) -> Float:
+    points = LAYOUT.upper_m[..., :2].reshape(-1, 2)
+    contact = HertzContact(RUBBER, radius_m, depth * LAYOUT.height_m, centre_m, (0.2, 0.1))
+    return contact.displacement_m(points).reshape(LAYOUT.upper_m.shape)
+
+
+def readings(moved: Float, rng: np.random.Generator) -> Float:
+    return sk.resistance_ohm(LAYOUT, LAYOUT.upper_m + moved) * rng.normal(1.0, NOISE, LAYOUT.shape)
+
+
+def off(field: sk.FieldFrame, moved: Float) -> float:
+    """Return the largest error of the trusted wires, in standard deviations."""
+    ratio = np.abs(field.displacement_m - moved) / field.displacement_std_m
+    return float(ratio[field.wires_trusted].max())
+
+
+def spoil(kind: str, frame: Float, rest: Float) -> None:
+    match kind:
+        case "crossing":
+            frame[4, 13] = 0.9 * rest[4, 13]
+        case "lower wire open":
+            frame[:, 13] = 1.24 * rest[:, 13]
+        case "upper wire open":
+            frame[4] = 1.24 * rest[4]
+
+
+PLACES = {"crossing": (4, 13), "lower wire open": (None, 13), "upper wire open": (4, None)}
+
+
+@pytest.mark.parametrize("method", ["exact", "posterior"])
+@pytest.mark.parametrize("kind", PLACES)
+def test_wrong_readings_under_a_press_are_named_and_the_rest_goes_on(kind: str, method: str) -> None:
+    rng = np.random.default_rng(3)
+    tracker = sk.Tracker(LAYOUT, method=method, relative_noise=NOISE)
+    rest = sk.resistance_ohm(LAYOUT, LAYOUT.upper_m)
+    for share in (0.0, 0.05, 0.1, 0.1):
+        field = tracker.update(readings(press(share) if share else np.zeros_like(LAYOUT.upper_m), rng))
+        assert field.trusted
+        assert field.faults == ()
+    for _ in range(FRAMES + 3):
+        frame = readings(press(0.1), rng)
+        spoil(kind, frame, rest)
+        field = tracker.update(frame)
+        assert field.trusted
+        assert off(field, press(0.1)) < 5.0
+    upper, lower = PLACES[kind]
+    assert field.faults
+    for fault in field.faults:  # a crossing may be named as its whole wire
+        assert fault.upper == upper or (upper is not None and fault.upper is None)
+        assert fault.lower == lower or (kind == "crossing" and fault.lower is None)
+    first = {(fault.upper, fault.lower): fault.since for fault in field.faults}
+    assert all(4 < since <= 4 + FRAMES for since in first.values())
+
+
+def test_named_readings_that_agree_again_are_admitted() -> None:
+    rng = np.random.default_rng(4)
+    tracker = sk.Tracker(LAYOUT, method="posterior", relative_noise=NOISE)
+    rest = sk.resistance_ohm(LAYOUT, LAYOUT.upper_m)
+    for _ in range(FRAMES + 1):
+        frame = readings(press(0.1), rng)
+        spoil("lower wire open", frame, rest)
+        field = tracker.update(frame)
+    assert field.faults
+    for _ in range(ADMIT + FRAMES):
+        field = tracker.update(readings(press(0.1), rng))
+    assert field.faults == ()
+    assert field.trusted
+    assert off(field, press(0.1)) < 5.0
+
+
+def test_a_deep_slide_is_not_taken_for_a_fault() -> None:
+    """Under a wide sphere at little noise, a wire's removal explains more than a few loads do."""
+    rng = np.random.default_rng(5)
+    tracker = sk.Tracker(LAYOUT, relative_noise=5e-6)
+    for x_m in np.linspace(10e-3, 26e-3, 25):
+        moved = press(0.3, (x_m, 24e-3), radius_m=40e-3)
+        field = tracker.update(
+            sk.resistance_ohm(LAYOUT, LAYOUT.upper_m + moved) * rng.normal(1.0, 5e-6, LAYOUT.shape)
+        )
+        assert field.trusted, field.distrust
+        assert field.faults == ()
+
+
+@pytest.mark.parametrize("depth", [0.05, 0.1, 0.2, 0.3])
+def test_no_wire_is_named_under_a_dent_that_no_half_space_forms(depth: float) -> None:
+    """Such a dent may make a frame doubtful, which then is not trusted; its wires are not at fault."""
+    rng = np.random.default_rng(6)
+    for centre in ((4.0, 5.0), (3.5, 4.5), (6.0, 2.0)):
+        moved = dent(LAYOUT, depth, centre=centre)
+        field = sk.Tracker(LAYOUT, relative_noise=NOISE).update(noisy(LAYOUT, moved, rng, NOISE))
+        assert field.faults == ()
+        assert (np.abs(field.displacement_m - moved) < 5.0 * field.displacement_std_m).all()
+
+
+def test_half_of_the_readings_are_not_enough_and_the_reason_says_so() -> None:
+    rng = np.random.default_rng(7)
+    valid = rng.random(LAYOUT.shape) > 0.5
+    field = sk.Tracker(LAYOUT, relative_noise=NOISE).update(readings(press(0.1), rng), valid)
+    assert not field.trusted
+    assert field.distrust == f"only {valid.mean():.0%} of the readings are usable"

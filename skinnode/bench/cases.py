@@ -54,8 +54,8 @@ class Case:
     stride: int = 1
     """Number of stream frames per tracker frame; a path uses all frames."""
     known_wrong: tuple[str, ...] = ()
-    """Methods known to be wrong on this case, a limit that ``docs/limits.md`` states. Their rows are shown, but
-    do not count as wrong."""
+    """Methods known to be wrong on this case, as ``docs/limits.md`` states. Their rows are shown, but do not
+    count as wrong."""
     model_error: float = 0.0
     """Relative error that the user expects the model to make in predicting the change in R."""
     tolerances: Tolerances | None = None

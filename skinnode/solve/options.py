@@ -41,6 +41,11 @@ class EstimateOptions:
             to all resistances, and 0.7 times this value for an independent error in each resistance.
         tolerances: Tolerances to which the patch was made, which the standard deviations then include; the
             default None means exact. The resistances at rest count as measured on the patch.
+        contacts: Whether to estimate contacts and forces.
+        force_calibrated: Whether ``rubber`` reproduces known forces on this patch, for instance from presses
+            with a load cell. A modulus from a data sheet does not count: the skin is a layer on a support,
+            which may carry fifty times the force of the half-space that the forces are computed for. If
+            False, the standard deviation of each normal force covers that.
         normal_only: Whether only z is unknown, which leaves a third of the unknowns.
         hold: Whether to keep the last solution of wires whose resistances changed no more than their noise.
         deadline_us: Time limit of an update, µs; the update may exceed it by one step. Wires not solved by
@@ -59,6 +64,8 @@ class EstimateOptions:
     drift_std: float = 0.02
     model_error: float = 0.0
     tolerances: Tolerances | None = None
+    contacts: bool = True
+    force_calibrated: bool = False
     normal_only: bool = False
     hold: bool = True
     deadline_us: float | None = None
@@ -82,18 +89,16 @@ class EstimateOptions:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PosteriorOptions(EstimateOptions):
-    """Options of :class:`skinnode.Posterior`: those of :class:`EstimateOptions` and two more.
+    """Options of :class:`skinnode.Posterior`: those of :class:`EstimateOptions` and one more.
 
     Args:
         scale_m: RMS normal displacement that the prior expects, metres; by default set from the data.
-        contacts: Whether to estimate forces and contacts.
 
     Raises:
         ValueError: If an option is out of range.
     """
 
     scale_m: float | None = None
-    contacts: bool = True
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -111,8 +116,8 @@ class TrackerOptions(EstimateOptions):
     Args:
         method: ``exact``, ``posterior`` or ``auto``.
         operator: ``levenberg_marquardt``, ``dogleg`` or ``gauss_newton``; exact inverse only.
-        stiffness_n_per_m: Stiffness k of the paper's law F = k Δs, N/m; without it, the exact inverse returns
-            no forces. The posterior computes forces from ``rubber`` instead.
+        stiffness_n_per_m: Stiffness k of the paper's law F = k Δs, N/m, which then gives ``force_n`` of exact
+            fields. All other forces, and those of contacts, are computed from ``rubber``.
         active_only: Whether to solve only for electrodes that contacts move; exact inverse only.
         codes: Mapping from the codes passed to :meth:`skinnode.Tracker.update_codes` to resistances.
         max_std_m: Largest standard deviation of a coordinate of a precise field, metres; by default set from
@@ -169,6 +174,8 @@ class EstimateArguments(TypedDict, total=False):
     drift_std: float
     model_error: float
     tolerances: Tolerances | None
+    contacts: bool
+    force_calibrated: bool
     normal_only: bool
     hold: bool
     deadline_us: float | None
@@ -178,7 +185,6 @@ class PosteriorArguments(EstimateArguments, total=False):
     """Keyword arguments of :class:`skinnode.Posterior`, as in :class:`PosteriorOptions`."""
 
     scale_m: float | None
-    contacts: bool
 
 
 class TrackerArguments(EstimateArguments, total=False):

@@ -23,6 +23,7 @@ from skinnode.model.frames import FieldFrame, amended
 from skinnode.model.layout import Float, PatchLayout
 from skinnode.solve.checks.data_check import DataCheck, Solved
 from skinnode.solve.cramer_rao import patch_std
+from skinnode.solve.exact.contacts import ExactContacts
 from skinnode.solve.exact.tracker import ExactTracker
 from skinnode.solve.inputs import checked_codes
 from skinnode.solve.noise_estimate import NoiseEstimate
@@ -72,6 +73,7 @@ class Tracker:
         self.method, self.reason = self._chosen = choose_method(layout, options)
         self._limits = limits_of(layout, options)
         self._exact: ExactTracker | None = None
+        self._contacts: ExactContacts | None = None
         if self.method == "posterior":
             self._posterior = Posterior(layout, options.of_posterior())
             return
@@ -96,6 +98,9 @@ class Tracker:
         self._problem = PatchProblem.of(layout, options.baseline_ohm)
         sigma = float(np.median(np.asarray(options.relative_noise, np.float64)))
         self._check = DataCheck(self._problem, sigma)
+        if options.contacts:
+            self._contacts = ExactContacts(layout, options)
+            self._exact.untouched_force_n = self._contacts.no_force_n
         self.reset()
 
     def reset(self) -> None:
@@ -106,6 +111,8 @@ class Tracker:
         self._exact.reset()
         self._gate.reset()
         self._check.reset()
+        if self._contacts is not None:
+            self._contacts.reset()
         if self._noise is not None:
             self._noise.reset()
         self._follow_noise()
@@ -204,7 +211,9 @@ class Tracker:
         return self._check.check(solved(field), solve_without, until)
 
     def _judged(self, field: FieldFrame) -> FieldFrame:
-        """Return the field with its verdict on precision."""
+        """Return the field with the contacts of an exact field and with its verdict on precision."""
+        if field.method == "exact" and self._contacts is not None:
+            field = self._contacts.add(field)
         return field if is_precise(field, self._limits) else amended(field, precise=False)
 
     def _follow_noise(self) -> None:
@@ -232,6 +241,8 @@ class Tracker:
             self._posterior.noise_estimate = None
             self._exact.reset()
             self._gate.reset()
+            if self._contacts is not None:
+                self._contacts.reset()
 
 
 def choose_method(layout: PatchLayout, options: TrackerOptions) -> tuple[str, str]:

@@ -12,6 +12,7 @@ from .press import frame_ohm
 
 SIGMA = 1e-5
 RUBBER = Rubber(young_pa=0.4e6)
+CALIBRATED = {"rubber": RUBBER, "force_calibrated": True}  # the skin is a half-space of this rubber
 
 
 @pytest.fixture(scope="module")
@@ -46,7 +47,7 @@ def test_a_sphere_is_one_contact_with_hertzs_numbers(staggered, depth, centre):
     twentieth of a pitch, the area as far as contacts of a cell can be told."""
     rng = np.random.default_rng(3)
     truth = sphere(staggered, depth, centre, traction=(0.25, -0.15))
-    field = sk.Posterior(staggered, rubber=RUBBER).update(noisy_frame(staggered, [truth], rng))
+    field = sk.Posterior(staggered, **CALIBRATED).update(noisy_frame(staggered, [truth], rng))
     assert field.trusted
     assert len(field.contacts) == 1
     found = field.contacts[0]
@@ -66,7 +67,7 @@ def test_a_sphere_is_one_contact_with_hertzs_numbers(staggered, depth, centre):
 def test_forces_of_many_presses_spread_as_reported(staggered):
     """60 spheres anywhere: RMS of (found − true)/deviation about 1 for force, shear and centre."""
     rng = np.random.default_rng(4)
-    tracker = sk.Posterior(staggered, rubber=RUBBER)
+    tracker = sk.Posterior(staggered, **CALIBRATED)
     z = []
     for _ in range(60):
         centre = tuple(rng.uniform(8e-3, 28e-3, 2))
@@ -91,8 +92,8 @@ def test_forces_of_many_presses_spread_as_reported(staggered):
 def test_modulus_scales_forces_and_nothing_else(staggered):
     rng = np.random.default_rng(5)
     frame = noisy_frame(staggered, [sphere(staggered, 0.3, traction=(0.2, 0.1))], rng)
-    soft = sk.Posterior(staggered, rubber=Rubber(0.2e6)).update(frame)
-    hard = sk.Posterior(staggered, rubber=Rubber(1.0e6)).update(frame)
+    soft = sk.Posterior(staggered, rubber=Rubber(0.2e6), force_calibrated=True).update(frame)
+    hard = sk.Posterior(staggered, rubber=Rubber(1.0e6), force_calibrated=True).update(frame)
     np.testing.assert_allclose(hard.displacement_m, soft.displacement_m, rtol=0, atol=1e-9 * 2e-3)
     np.testing.assert_allclose(hard.force_n, 5 * soft.force_n, rtol=0, atol=1e-6 * np.abs(hard.force_n).max())
     one, two = soft.contacts[0], hard.contacts[0]
@@ -107,7 +108,7 @@ def test_loads_of_the_electrodes_sum_to_the_contact(staggered):
     """A press well inside: nearly all of its load lies on the cells of the electrodes."""
     rng = np.random.default_rng(6)
     truth = sphere(staggered, 0.3, traction=(0.3, 0.1))
-    field = sk.Posterior(staggered, rubber=RUBBER).update(noisy_frame(staggered, [truth], rng))
+    field = sk.Posterior(staggered, **CALIBRATED).update(noisy_frame(staggered, [truth], rng))
     assert field.force_n is not None
     assert field.force_n.shape == staggered.upper_m.shape
     total = field.force_n.sum(axis=(0, 1))
@@ -123,7 +124,7 @@ def test_two_spheres_are_two_contacts_the_stronger_first(staggered, apart):
     rng = np.random.default_rng(7)
     left = sphere(staggered, 0.2, (18e-3 - apart / 2, 14e-3), radius_m=8e-3)
     right = sphere(staggered, 0.3, (18e-3 + apart / 2, 20e-3), radius_m=8e-3)
-    field = sk.Posterior(staggered, rubber=RUBBER).update(noisy_frame(staggered, [left, right], rng))
+    field = sk.Posterior(staggered, **CALIBRATED).update(noisy_frame(staggered, [left, right], rng))
     assert field.trusted
     assert len(field.contacts) == 2
     for found, truth in zip(field.contacts, (right, left), strict=True):
@@ -137,7 +138,7 @@ def test_nothing_touches_a_patch_at_rest(name, hold):
     """250 noisy frames: not one contact, and no sum of loads that a user would take for a touch."""
     layout = sk.PatchLayout.preset(name)
     rng = np.random.default_rng(8)
-    tracker = sk.Posterior(layout, rubber=RUBBER, hold=hold)
+    tracker = sk.Posterior(layout, **CALIBRATED, hold=hold)
     rest = frame_ohm(layout, np.zeros_like(layout.upper_m))
     touch = -sphere(layout, 0.1).force_n[2]
     for _ in range(250):
@@ -149,7 +150,7 @@ def test_nothing_touches_a_patch_at_rest(name, hold):
 def test_a_light_touch_is_found(staggered):
     """2 % of the layer, two hundredths of a newton here: 20 of 20 at the noise of a good converter."""
     rng = np.random.default_rng(9)
-    tracker = sk.Posterior(staggered, rubber=RUBBER)
+    tracker = sk.Posterior(staggered, **CALIBRATED)
     for _ in range(20):
         tracker.reset()
         truth = sphere(staggered, 0.02, tuple(rng.uniform(8e-3, 28e-3, 2)))
@@ -160,7 +161,7 @@ def test_a_light_touch_is_found(staggered):
 
 def test_contacts_stay_while_held_and_go_with_the_release(staggered):
     rng = np.random.default_rng(10)
-    tracker = sk.Posterior(staggered, rubber=RUBBER)
+    tracker = sk.Posterior(staggered, **CALIBRATED)
     truth = sphere(staggered, 0.25)
     tracker.update(noisy_frame(staggered, [truth], rng))
     for _ in range(5):
@@ -181,7 +182,7 @@ def test_forces_on_a_turned_skin_are_in_the_frame_of_the_layout():
     edge = sk.PatchLayout(flat.upper_m @ turn.T, flat.lower_m @ turn.T)
     truth = sphere(flat, 0.2, (9.5e-3, 10.2e-3), radius_m=8e-3)
     frame = noisy_frame(flat, [truth], np.random.default_rng(11))
-    lying, standing = (sk.Posterior(layout, rubber=RUBBER).update(frame) for layout in (flat, edge))
+    lying, standing = (sk.Posterior(layout, **CALIBRATED).update(frame) for layout in (flat, edge))
     np.testing.assert_allclose(standing.displacement_m, lying.displacement_m @ turn.T, rtol=0, atol=1e-8)
     np.testing.assert_allclose(standing.force_n, lying.force_n @ turn.T, rtol=0, atol=1e-4)
     one, two = lying.contacts[0], standing.contacts[0]

@@ -95,6 +95,8 @@ class ExactTracker:
         self.layout = layout
         problem = PatchProblem.of(layout, baseline_ohm)
         self.stiffness_n_per_m = stiffness_n_per_m
+        self.untouched_force_n: Float | None = None
+        """(U, N, 3) forces put into fields without a stiffness, N; those of an untouched patch, if any."""
         self._noise = checked_noise(relative_noise, layout)
         self._sigma = float(self._noise.min())
         self._seconds = math.inf if deadline_us is None else deadline_us * 1e-6
@@ -228,7 +230,11 @@ class ExactTracker:
             status=self._all_converged if easy else as_statuses(arrays.status.tolist()),
             residual=residual,
             stats=SolveStats(evaluations, jacobians, steps, perf_counter() - start),
-            force_n=None if self.stiffness_n_per_m is None else self.stiffness_n_per_m * displacement,
+            force_n=(
+                self.untouched_force_n
+                if self.stiffness_n_per_m is None
+                else self.stiffness_n_per_m * displacement
+            ),
             held=arrays.held.copy(),
             noise_factor=1.0 if self._noise_estimate is None else self._noise_estimate.factor,
         )

@@ -4,46 +4,93 @@ The loads q ~ N(0, s² D) of the prior move the electrodes by u = G q + slack. G
 of q is D Gᵀ C⁻¹ u. Given the frame, the variance of a sum wᵀ q is s² wᵀ D w − ‖L⁻¹ J G s² D w‖², in the
 notation of :mod:`skinnode.solve.posterior.measurement_update`.
 
-The errors in single cells are large but cancel between neighbours, so contacts are found in sums of 3 × 3
-cells. Cells whose sum is significant, and not much smaller than the largest sum, form contacts with their
-neighbours.
+:mod:`skinnode.solve.posterior.contact_regions` decides which cells belong to which contact. This module
+measures force, centre, area and shear of each, with standard deviations.
 """
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 
 from skinnode.compiled.jit import njit
+from skinnode.model.elastic import Rubber
 from skinnode.model.frames import Contact
 from skinnode.model.layout import Float, PatchLayout
+from skinnode.solve.layer_force import bonded_force_n, layer_std_n
 from skinnode.solve.linalg.vectors import Index
+from skinnode.solve.posterior.contact_regions import find_regions, region_scratch
 from skinnode.solve.posterior.elastic_prior import ElasticPrior
-from skinnode.solve.posterior.load_posterior import LoadPosterior
 from skinnode.solve.posterior.map_estimate import PRIOR_DOUBT
 
-SIGNIFICANT: Final = 5.0
-"""Significance, in standard deviations, above which a sum is part of a contact; with 200 sums per frame,
-noise reaches it about once in ten thousand frames."""
-RELEVANT: Final = 0.25
-"""Fraction of the largest sum that another sum must exceed; ringing next to a contact reaches a tenth of the
-largest sum."""
 HERTZ_SPREAD: Final = 2.5
 """Ratio of a² to the mean of r² under Hertz's pressure √(1 − r²/a²)."""
+PULLING: Final = 0.25
+"""Ratio of the sum of all loads of a contact to the sum of its pressing loads, below which the pulling loads
+are left out. Nothing pulls on the skin, but a half-space can form the displacement of a layer on a support
+only by pulling at the rim of the contact: 16 mm of rubber bonded to metal give a ratio of 0.5, 8 mm give
+0.15, 4 mm and less about 0. On a half-space it is 0.8 to 1, and from 0.33 if the contact is much smaller
+than a cell."""
+PULLED_OFF: Final = 0.1
+"""Standard deviation of the centre along the surface if pulling loads were left out, in cell widths. Measured
+on layers of 2, 4 and 8 mm: 0.11, 0.08 and 0.05 RMS, 0.25 at most. The area is then known to a factor only."""
+BEYOND: Final = 1.0
+"""Standard deviation of the loads in the outermost ring of cells, relative to the loads themselves, which
+stand for all loads beyond the patch. With 0.5, the forces of plates larger than the patch are up to 4.8
+standard deviations off."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LoadEstimate:
+    """Loads given a frame, with their posterior covariance s² (D − s² D Wᵀ W D), W = diag(weight) rows."""
+
+    mean: Float
+    """(Q, 3) mean loads, in units of the prior's loads."""
+    rows: Float
+    """(m, 3Q) rows of W before weighting."""
+    weight: Float
+    """(m,) factors of the rows."""
+    share: Float
+    """(Q,) D: load variance of each cell relative to s²."""
+    scale2: float
+    """s², pitch²."""
 
 
 class ContactFinder:
-    """Finder of the contacts on one patch, frame by frame.
+    """Finder of the contacts on one patch, frame by frame. Do not share an instance between owners.
+
+    The number of contacts has a memory of one frame (:mod:`skinnode.solve.posterior.contact_regions`);
+    :meth:`reset` clears it.
 
     Args:
         prior: Elasticity of the patch.
         layout: The patch.
+        rubber: Material of the skin.
+        calibrated: Whether the forces are calibrated. If not, the standard deviation of a normal force covers
+            a layer as thick as the clearance, bonded to a rigid support.
+        thickness: Tolerance of the thickness, as a fraction of the clearance.
+        outermost: Whether the loads of the outermost ring of cells count for a contact next to it. They do if
+            the prior knows where loads are; a prior that expects equal loads everywhere spreads them too far.
     """
 
-    def __init__(self, prior: ElasticPrior, layout: PatchLayout) -> None:
+    def __init__(  # noqa: PLR0913 - what the patch is
+        self,
+        prior: ElasticPrior,
+        layout: PatchLayout,
+        rubber: Rubber | None = None,
+        *,
+        calibrated: bool = False,
+        thickness: float = 0.0,
+        outermost: bool = True,
+    ) -> None:
         self._prior = prior
+        self._rubber = Rubber() if rubber is None else rubber
+        self._calibrated, self._outermost = calibrated, outermost
+        gaps = layout.upper_m.reshape(-1, 1, 3) - layout.lower_m.reshape(1, -1, 3)
+        self._thickness_m = (1.0 - thickness) * float(np.median(np.linalg.norm(gaps, axis=2).min(axis=1)))
         self._own = prior.own_cells().ravel()
         self._own_frame = prior.frame[self._own]
         self._electrodes = layout.upper_m.shape
@@ -52,147 +99,242 @@ class ContactFinder:
         rows, columns = prior.shape
         box = np.stack([near[i : i + rows, j : j + columns] for i in range(3) for j in range(3)], axis=-1)
         self._near: Index = box.reshape(cells, 9)  # each cell with its neighbours; −1 outside the lattice
-        self._region, self._label, self._stack = np.empty((3, cells), np.int64)
-        self._made_by = -1
-        self._box_std = np.full(cells, np.nan)
+        self._has_electrode = np.zeros(cells, bool)
+        self._has_electrode[self._own] = True
+        self._number, self._outside, self._before = np.zeros((3, cells), np.int64)
+        self._depth_m, self._depth = np.zeros((2, cells))
+        self._press = np.zeros(cells)
+        self._field = np.zeros((2, len(self._own), 3))  # displacement and standard deviations, m
+        self._scratch = region_scratch(cells)
+        self._work = np.empty(cells, np.int64), np.empty(cells), np.empty((cells, 5))
 
-    def find(self, loads: LoadPosterior) -> tuple[Float, tuple[Contact, ...]]:
+    def reset(self) -> None:
+        """Forget the contacts of the last frame."""
+        self._number[:] = 0
+
+    def find(
+        self, loads: LoadEstimate, displacement_m: Float, std_m: Float
+    ) -> tuple[Float, tuple[Contact, ...]]:
         """Return the loads on the electrodes and the contacts.
 
         Args:
-            loads: Posterior of the loads.
+            loads: Loads of the frame.
+            displacement_m: (U, N, 3) displacement, metres.
+            std_m: (U, N, 3) standard deviation of the displacement, metres; inf where nothing is known.
 
         Returns:
             (U, N, 3) forces on the electrodes' cells, N, and the contacts, largest normal force first.
         """
-        q = loads.mean()
-        force = np.einsum("qt,qti->qi", q[self._own] * self._prior.load_n, self._own_frame)
-        pressing = -np.append(q[:, 2], 0.0)[self._near].sum(axis=1)
-        strong = np.flatnonzero(pressing > RELEVANT * max(float(pressing.max()), 0.0))
-        seed = strong[pressing[strong] > SIGNIFICANT * self._deviations(strong, loads)]
-        count = _number_regions(self._near, seed, self._label, self._region, self._stack)
-        found = [
-            contact
-            for number in range(1, count + 1)
-            if (contact := self._contact(np.flatnonzero(self._region == number), q, loads)) is not None
-        ]
+        np.copyto(self._field[0], displacement_m.reshape(-1, 3))
+        np.copyto(self._field[1], std_m.reshape(-1, 3))
+        force = np.empty(self._electrodes)
+        _prepare(
+            loads.mean, self._prior.load_n, self._own, self._own_frame, self._field, self._press,
+            self._depth_m, self._depth, force.reshape(-1, 3),
+        )  # fmt: skip
+        self._before[:] = self._number
+        count = find_regions(
+            self._press, self._depth, loads.rows, loads.weight, loads.share, loads.scale2,
+            self._has_electrode, self._near, self._before, self._number, self._outside,
+            self._scratch,
+        )  # fmt: skip
+        found = [self._contact(number, loads) for number in range(1, count + 1)]
         found.sort(key=lambda contact: -contact.normal_force_n)
-        return force.reshape(self._electrodes), tuple(found)
+        return force, tuple(found)
 
-    def warm_up(self, posterior: LoadPosterior) -> None:
+    def warm_up(self, loads: LoadEstimate) -> None:
         """Compile the kernels that contact finding needs."""
-        self._contact(np.arange(1), np.full((len(self._near), 3), -1.0), posterior)
+        pressed = LoadEstimate(-np.ones_like(loads.mean), loads.rows, loads.weight, loads.share, loads.scale2)
+        self.find(pressed, -self._own_frame[:, 2].reshape(self._electrodes), np.ones(self._electrodes))
+        self.reset()
 
-    def _deviations(self, boxes: Index, posterior: LoadPosterior) -> Float:
-        """Return the standard deviations (B,) of the sums at ``boxes`` (B,), cached per set of factors."""
-        if self._made_by != posterior.factors:
-            self._made_by = posterior.factors
-            self._box_std[:] = np.nan
-        new = boxes[np.isnan(self._box_std[boxes])]
-        if new.size:
-            near = self._near[new]
-            self._box_std[new] = posterior.std(3 * np.maximum(near, 0) + 2, (near >= 0).astype(float))
-        return self._box_std[boxes]
-
-    def _contact(self, region: Index, q: Float, posterior: LoadPosterior) -> Contact | None:
-        """Return the contact on the cells ``region``, or None if their normal force is not compressive."""
-        loads, weights = np.empty((7, len(region)), np.int64), np.empty((7, len(region)))
-        centroid, shear = np.empty((2, 3))
-        force, spread = _sum_region(
-            region, q, self._prior.load_n, self._prior.cell_m, centroid, shear, loads, weights
-        )
-        if not force > 0:
-            return None
-        # the prior largely determines how a contact's load is distributed over its cells
-        std = math.sqrt(PRIOR_DOUBT) * posterior.std(loads, weights)
-        spread += self._prior.cell_area_m2 / 6.0  # mean r² of a load that is uniform over its cell
-        away = self._prior.cell_m[region] - centroid
-        middle = region[np.argmin(np.einsum("qi,qi->q", away, away))]
+    def _contact(self, number: int, loads: LoadEstimate) -> Contact:
+        """Return the contact on the cells of ``number``."""
+        prior, mean, std = self._prior, np.empty(7), np.empty(7)
+        middle, pulls = _measure(
+            number, self._number, self._outside, self._outermost, loads.mean, prior.load_n, prior.cell_m,
+            loads.rows, loads.weight, loads.share, loads.scale2, mean, std, *self._work,
+        )  # fmt: skip
+        force_n, force_std_n = float(mean[0]), float(std[0])
+        # mean r² of a load that is uniform over its cell
+        area = math.pi * HERTZ_SPREAD * (max(float(mean[4]), 0.0) + prior.cell_area_m2 / 6.0)
+        if not self._calibrated:
+            depth_m = max(float(self._depth_m[self._number == number].max()), 0.0)
+            radius_m = math.sqrt(area / math.pi)
+            bonded_n = bonded_force_n(self._rubber, depth_m, radius_m, self._thickness_m)
+            force_std_n = math.hypot(force_std_n, layer_std_n(bonded_n, force_n))
+        centroid_std_m, area_std = std[1:4], math.pi * HERTZ_SPREAD * float(std[4])
+        if pulls:
+            along = 1.0 - prior.frame[middle][2] ** 2
+            centroid_std_m = np.sqrt(centroid_std_m**2 + PULLED_OFF**2 * prior.cell_area_m2 * along)
+            area_std = math.hypot(area_std, area)
         return Contact(
-            centroid_m=centroid,
-            centroid_std_m=std[1:4],
-            area_m2=math.pi * HERTZ_SPREAD * max(spread, 0.0),
-            area_std_m2=math.pi * HERTZ_SPREAD * float(std[4]),
-            normal_force_n=force,
-            normal_force_std_n=float(std[0]),
-            shear_force_n=shear[:2],
+            centroid_m=mean[1:4],
+            centroid_std_m=centroid_std_m,
+            area_m2=area,
+            area_std_m2=area_std,
+            normal_force_n=force_n,
+            normal_force_std_n=force_std_n,
+            shear_force_n=mean[5:],
             shear_force_std_n=std[5:],
-            axes=self._prior.frame[middle],
+            force_calibrated=self._calibrated,
+            axes=prior.frame[middle],
         )
 
 
 @njit
-def _number_regions(near: Index, seed: Index, label: Index, region: Index, stack: Index) -> int:
-    """Number the connected groups of the cells ``seed`` from 1, and return the number of groups.
+def _prepare(  # noqa: PLR0913 - a kernel: loads, field and outputs by name
+    q: Float,
+    load: Float,
+    own: Index,
+    frame: Float,
+    field: Float,
+    press: Float,
+    depth_m: Float,
+    depth: Float,
+    force: Float,
+) -> None:
+    """Write pressing loads (Q,), depths (Q,) in m and in deviations, and forces (UN, 3) in N.
 
-    ``label`` (Q,) receives the group number of each seed cell, ``region`` (Q,) that of each seed cell and its
-    neighbours; both are 0 elsewhere. A cell between two groups belongs to the first. ``stack`` (Q,) is
-    scratch.
+    ``field`` (2, UN, 3) holds the displacement and its standard deviations, m. Depths are 0 where a standard
+    deviation is infinite, and in cells without an electrode, where they are not written.
     """
-    label[:], region[:] = 0, 0
-    for cell in seed:
-        label[cell] = -1
-    count = 0
-    for first in seed:
-        if label[first] > 0:
-            continue
-        count += 1
-        label[first], stack[0], top = count, first, 1
-        while top > 0:
-            top -= 1
-            for i in near[stack[top]]:
-                if i < 0:
-                    continue
-                if region[i] == 0:
-                    region[i] = count
-                if label[i] < 0:
-                    label[i], stack[top] = count, i
-                    top += 1
-    return count
+    for cell in range(press.size):
+        press[cell] = -q[cell, 2]
+    for e in range(own.size):
+        cell, deep, variance = own[e], 0.0, 0.0
+        for t in range(3):
+            normal = frame[e, 2, t]
+            deep -= normal * field[0, e, t]
+            variance += (normal * field[1, e, t]) ** 2 if normal != 0.0 else 0.0
+            force[e, t] = 0.0
+            for s in range(3):
+                force[e, t] += q[cell, s] * load[s] * frame[e, s, t]
+        known = variance > 0.0 and variance < math.inf
+        depth_m[cell] = deep if variance < math.inf else 0.0
+        depth[cell] = deep / math.sqrt(variance) if known else 0.0
 
 
 @njit
-def _sum_region(  # noqa: PLR0913 - a kernel: cells, loads and outputs by name
-    region: Index,
+def _measure(  # noqa: PLR0913, C901 - a kernel: cells, loads and outputs by name
+    contact: int,
+    number: Index,
+    outside: Index,
+    outermost: bool,
     q: Float,
     load: Float,
     place: Float,
-    centroid: Float,
-    shear: Float,
-    loads: Index,
-    weights: Float,
-) -> tuple[float, float]:
-    """Return the normal force in N and the mean r² of the pressure in m² on the cells ``region`` (n,).
+    rows: Float,
+    weight: Float,
+    share: Float,
+    scale2: float,
+    mean: Float,
+    std: Float,
+    cells: Index,
+    r2: Float,
+    slopes: Float,
+) -> tuple[int, bool]:
+    """Measure one contact: force in N, centre (3) in m, mean r² in m² and shear (2) in N.
 
-    Writes ``centroid`` (3,) in m and ``shear`` (3,) in N. Also writes ``loads`` and ``weights`` (7, n), the
-    first-order sensitivities of force, centroid, mean r² and shear to the loads (delta method). If the force
-    is not positive, all other outputs are undefined.
+    Writes the seven figures to ``mean`` and their standard deviations, by the delta method, to ``std``.
+    Returns the cell closest to the centre, and whether pulling loads were left out. The prior largely
+    determines how a contact's load is distributed over its cells, so variances are multiplied by
+    ``PRIOR_DOUBT``. ``cells`` (Q,), ``r2`` (Q,) and ``slopes`` (Q, 5) are scratch.
     """
-    force, mean = 0.0, 0.0
-    for t in range(3):
-        centroid[t], shear[t] = 0.0, 0.0
-    for cell in region:
-        force -= q[cell, 2] * load[2]
-    if not force > 0.0:
-        return force, mean
-    for cell in region:
+    size, every, pressing = 0, 0.0, 0.0
+    for cell in range(number.size):
+        if number[cell] == contact or (outermost and outside[cell] == contact):
+            cells[size] = cell
+            size += 1
+            every -= q[cell, 2]
+            pressing += max(-q[cell, 2], 0.0)
+    pulls = every < PULLING * pressing
+    if pulls:
+        kept = 0
+        for c in range(size):
+            if q[cells[c], 2] < 0.0:
+                cells[kept] = cells[c]
+                kept += 1
+        size = kept
+    for f in range(7):
+        mean[f], std[f] = 0.0, 0.0
+    for c in range(size):
+        mean[0] -= q[cells[c], 2] * load[2]
+    force = mean[0]
+    for c in range(size):
+        cell = cells[c]
         for t in range(3):
-            centroid[t] -= q[cell, 2] * load[2] * place[cell, t] / force
-            shear[t] += q[cell, t] * load[t]
-    for c in range(region.size):
-        cell = region[c]
-        spread = 0.0
+            mean[1 + t] -= q[cell, 2] * load[2] * place[cell, t] / force
+        mean[5] += q[cell, 0] * load[0]
+        mean[6] += q[cell, 1] * load[1]
+    middle = cells[0]
+    for cell in range(number.size):
+        r2[cell] = 0.0
         for t in range(3):
-            away = place[cell, t] - centroid[t]
-            weights[1 + t, c] = away * load[2] / force
-            spread += away * away
-        weights[4, c] = spread
-        mean -= q[cell, 2] * load[2] * spread / force
-    for c in range(region.size):
-        weights[0, c] = load[2]
-        weights[4, c] = (weights[4, c] - mean) * load[2] / force
-        weights[5, c], weights[6, c] = load[0], load[1]
+            r2[cell] += (place[cell, t] - mean[1 + t]) ** 2
+    for c in range(size):
+        cell = cells[c]
+        mean[4] -= q[cell, 2] * load[2] * r2[cell] / force
+        if r2[cell] < r2[middle]:
+            middle = cell
+    for c in range(size):
+        cell = cells[c]
+        slope, shared = slopes[c], share[cells[c]]
+        slope[0] = load[2]
+        for t in range(3):
+            slope[1 + t] = (place[cell, t] - mean[1 + t]) * load[2] / force
+        slope[4] = (r2[cell] - mean[4]) * load[2] / force
         for f in range(5):
-            loads[f, c] = 3 * region[c] + 2
-        loads[5, c], loads[6, c] = 3 * region[c], 3 * region[c] + 1
-    return force, mean
+            std[f] += slope[f] * slope[f] * shared
+            slope[f] *= shared
+        std[5] += load[0] * load[0] * shared
+        std[6] += load[1] * load[1] * shared
+    s0, s1, s2, s3, s4, s5, s6 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    for i in range(rows.shape[0]):
+        row, w = rows[i], weight[i]
+        v0, v1, v2, v3, v4, v5, v6 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+        for c in range(size):
+            first, slope, shared = 3 * cells[c], slopes[c], share[cells[c]]
+            normal = row[first + 2]
+            v0 += slope[0] * normal
+            v1 += slope[1] * normal
+            v2 += slope[2] * normal
+            v3 += slope[3] * normal
+            v4 += slope[4] * normal
+            v5 += shared * row[first]
+            v6 += shared * row[first + 1]
+        w *= w
+        s0 += w * v0 * v0
+        s1 += w * v1 * v1
+        s2 += w * v2 * v2
+        s3 += w * v3 * v3
+        s4 += w * v4 * v4
+        s5 += w * v5 * v5
+        s6 += w * v6 * v6
+    std[0], std[1], std[2], std[3], std[4] = (
+        std[0] - scale2 * s0, std[1] - scale2 * s1, std[2] - scale2 * s2, std[3] - scale2 * s3,
+        std[4] - scale2 * s4,
+    )  # fmt: skip
+    std[5] -= scale2 * load[0] * load[0] * s5
+    std[6] -= scale2 * load[1] * load[1] * s6
+    for f in range(7):
+        std[f] = PRIOR_DOUBT * scale2 * max(std[f], 0.0)
+    b0, b1, b2, b3, b4, b5, b6 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    for cell in range(number.size):
+        if outside[cell] == contact:
+            pressed = abs(q[cell, 2]) * load[2]
+            b0 += pressed
+            b1 += pressed * abs(place[cell, 0] - mean[1]) / force
+            b2 += pressed * abs(place[cell, 1] - mean[2]) / force
+            b3 += pressed * abs(place[cell, 2] - mean[3]) / force
+            b4 += pressed * abs(r2[cell] - mean[4]) / force
+            b5 += abs(q[cell, 0]) * load[0]
+            b6 += abs(q[cell, 1]) * load[1]
+    std[0] = math.sqrt(std[0] + (BEYOND * b0) ** 2)
+    std[1] = math.sqrt(std[1] + (BEYOND * b1) ** 2)
+    std[2] = math.sqrt(std[2] + (BEYOND * b2) ** 2)
+    std[3] = math.sqrt(std[3] + (BEYOND * b3) ** 2)
+    std[4] = math.sqrt(std[4] + (BEYOND * b4) ** 2)
+    std[5] = math.sqrt(std[5] + (BEYOND * b5) ** 2)
+    std[6] = math.sqrt(std[6] + (BEYOND * b6) ** 2)
+    return middle, pulls

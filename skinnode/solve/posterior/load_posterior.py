@@ -1,4 +1,4 @@
-"""Posterior of the loads on a patch: mean, standard deviations, and the loads found in a frame.
+"""Posterior of the loads on a patch: mean, covariance, and the loads found in a frame.
 
 All results use the current factors of a :class:`skinnode.solve.posterior.map_estimate.MapEstimator`.
 """
@@ -12,7 +12,7 @@ import numpy as np
 
 from skinnode.compiled.jit import njit
 from skinnode.model.layout import Float
-from skinnode.solve.linalg.vectors import Index
+from skinnode.solve.posterior.contacts import LoadEstimate
 from skinnode.solve.posterior.map_estimate import MapEstimator
 
 LOCAL_SIGNIFICANT: Final = 4.0
@@ -35,34 +35,18 @@ class LoadPosterior:
         self._estimator, self._prior = estimator, estimator.load_prior
         loads = self._prior.response.shape[1]
         self._whitened = np.empty((estimator.equations, loads))
+        self._ones = np.ones(estimator.equations)
         self._stiffness = np.empty(loads)
         self._factors = -1  # the factors from which the last two arrays were computed
 
-    @property
-    def factors(self) -> int:
-        """Serial number of the current factors."""
-        return self._estimator.factors
+    def estimate(self) -> LoadEstimate:
+        """Return the loads and their covariance; the arrays are valid until the next frame."""
+        rows, prior = self._whiten(), self._prior
+        return LoadEstimate(self.mean(), rows, self._ones[: len(rows)], prior.share, prior.scale2)
 
     def mean(self) -> Float:
         """Return the mean loads (Q, 3), given the displacement, in units of the prior's loads."""
         return self._prior.loads(self._estimator.free_displacement())
-
-    def std(self, loads: Index, weights: Float) -> Float:
-        """Return the standard deviations of weighted sums of loads.
-
-        Args:
-            loads: (F, n) indices of the loads, below 3Q.
-            weights: (F, n) weights of the loads.
-
-        Returns:
-            (F,) standard deviations, in units of the prior's loads times the weights.
-        """
-        prior = self._prior
-        shared = weights * prior.share[loads // 3]
-        square = np.empty(len(weights))
-        _squares(self._whiten(), loads, shared, square)
-        variance = prior.scale2 * ((weights * shared).sum(axis=1) - prior.scale2 * square)
-        return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
 
     def expected(self, least: float) -> Float:
         """Return the load variances (Q,) in pitch² implied by the loads found; at least ``least``.
@@ -86,23 +70,6 @@ class LoadPosterior:
             self._estimator.whiten(self._prior.response, rows)
             self._stiffness[:] = np.maximum(np.einsum("mq,mq->q", rows, rows), 1e-300)
         return rows
-
-
-@njit
-def _squares(whitened: Float, loads: Index, weights: Float, out: Float) -> None:
-    """Write ‖L⁻¹ J G w‖² of each weighted sum into ``out`` (F,), given L⁻¹ J G as ``whitened`` (m, 3Q).
-
-    ``loads`` (F, n) and ``weights`` (F, n) are as in :meth:`LoadPosterior.std`.
-    """
-    for f in range(out.size):
-        out[f] = 0.0
-    for i in range(whitened.shape[0]):
-        row = whitened[i]
-        for f in range(out.size):
-            value, column, weight = 0.0, loads[f], weights[f]
-            for c in range(weight.size):
-                value += weight[c] * row[column[c]]
-            out[f] += value * value
 
 
 @njit

@@ -98,7 +98,15 @@ class Posterior:
             self._problem, options.drift, options.drift_std, options.model_error, made
         )
         self._estimator = MapEstimator(self._problem, elastic, self._free, self._model.fixed, made)
-        self._contacts = ContactFinder(elastic, layout) if options.contacts else None
+        self._contacts: ContactFinder | None = None
+        if options.contacts:
+            self._contacts = ContactFinder(
+                elastic,
+                layout,
+                options.rubber,
+                calibrated=options.force_calibrated,
+                thickness=made.thickness,
+            )
         self._gate = Gate(wires, layout.shape[1])
         self._folded = float(roots.folded_wires(layout, options.normal_only).mean()) > 0.5
         self._noise_least = roots.REFEREE_NOISE if self._folded else NOISE_LEAST
@@ -131,7 +139,7 @@ class Posterior:
         self._seconds = seconds
         self._estimator.gamma()  # compile gamma now, not in the first untouched frame
         if self._contacts is not None:
-            self._contacts.warm_up(self._hyper.loads)
+            self._contacts.warm_up(self._hyper.loads.estimate())
 
     def reset(self) -> None:
         """Discard the state of the stream: the next frame is solved from the rest position."""
@@ -145,6 +153,8 @@ class Posterior:
         self._share = np.zeros_like(self._estimator.moved)
         self._trusted = np.zeros_like(self._estimator.moved)  # last accepted field; its nuisances follow
         self._trusted_g = np.zeros_like(self._estimator.g)
+        if self._contacts is not None:
+            self._contacts.reset()
         self._contacts_found: tuple[Contact, ...] = ()
         self._force = np.zeros((*self.layout.upper_m.shape,))
         self._compared = np.zeros_like(self._trusted)  # field at the last comparison with an annealed field
@@ -454,7 +464,9 @@ class Posterior:
             for each in (std, core):
                 each[:, self._free] = np.maximum(each[:, self._free], 0.5 * self._overlooked)
         if self._contacts is not None and self._known and not held.all():
-            self._force, self._contacts_found = self._contacts.find(self._hyper.loads)
+            self._force, self._contacts_found = self._contacts.find(
+                self._hyper.loads.estimate(), displacement, (std * pitch).reshape(displacement.shape)
+            )
         if not held.all():
             self._share = self._data_share()
         used = observation.weight > 0

@@ -1,0 +1,328 @@
+"""Contacts and loads from exact fields.
+
+The field of the exact inverse is u = G q + slack + e: the loads q ~ N(0, s²) of the elastic prior move the
+electrodes, and e ~ N(0, ν² Σ) is the error of the inverse, with the covariance Σ at rest and a factor ν² from
+the standard deviations of the field. In the basis U of the singular value decomposition
+
+    Σ^(−1/2) [G, ε I] = U S Vᵀ,   z = Uᵀ Σ^(−1/2) u,   B = Uᵀ Σ^(−1/2) G
+
+the covariance s² S² + ν² of z is diagonal for every s and ν. Both matrices are computed once per patch, so a
+frame costs two products of a matrix and a vector: z, and q = s² Bᵀ (s² S² + ν²)⁻¹ z. The scale s is that of
+the largest evidence.
+
+Wires without a position, or with a much larger standard deviation than the others, are left out: their rows
+are projected out of z and B, which costs a few milliseconds once.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import math
+from dataclasses import dataclass
+from time import perf_counter
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skinnode.compiled.jit import njit
+from skinnode.model.elastic import Rubber
+from skinnode.model.forward import jacobian
+from skinnode.model.frames import Contact, FieldFrame
+from skinnode.model.layout import Float, PatchLayout
+from skinnode.solve.linalg.vectors import Index
+from skinnode.solve.options import TrackerOptions
+from skinnode.solve.posterior.contacts import ContactFinder, LoadEstimate
+from skinnode.solve.posterior.elastic_prior import SLACK, ElasticPrior
+from skinnode.solve.wires.problem import PatchProblem
+
+UNTOUCHED: Final = 4.0
+"""Largest displacement of an untouched patch, in standard deviations. Noise exceeds it in 2 % of frames,
+which are then searched for contacts."""
+WILD: Final = 16.0
+"""Ratio of a wire's variances to those of the others above which the wire is left out."""
+SCALE_STEPS: Final = 30
+"""Maximum number of steps of the scale s²."""
+SCALE_CLOSE: Final = 0.01
+"""Relative change of s² that ends the search; the loads change by less."""
+SCALE_LEAST: Final = 1e-12
+"""Smallest s², pitch²."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LoadFactors:
+    """Matrices of one patch at one noise; see the module's docstring."""
+
+    prior: ElasticPrior
+    whitening: Float
+    """(n, n) transpose of Uᵀ Σ^(−1/2) for the free coordinates, 1/pitch."""
+    rows: Float
+    """(n, 3Q) B."""
+    gain: Float
+    """(n,) S²."""
+    rest_std: Float
+    """(n,) standard deviations of the exact inverse at rest, pitches."""
+    free: Index
+    """(n,) indices of the free coordinates."""
+
+
+class ExactContacts:
+    """Contacts of a stream of exact fields. Do not share an instance between owners.
+
+    Args:
+        layout: The patch.
+        options: Options of the tracker.
+    """
+
+    def __init__(self, layout: PatchLayout, options: TrackerOptions) -> None:
+        self.layout = layout
+        noise = np.broadcast_to(np.asarray(options.relative_noise, float), layout.shape)
+        level = float(np.sqrt(np.mean(noise[np.isfinite(noise)] ** 2)))
+        uniform = bool((noise == noise.flat[0]).all())
+        self._factors = (
+            _cached_factors(layout, options.rubber, level, options.normal_only)
+            if uniform
+            else _factors(layout, options.rubber, np.array(noise), options.normal_only)
+        )
+        factors = self._factors
+        self._finder = ContactFinder(
+            factors.prior,
+            layout,
+            options.rubber,
+            calibrated=options.force_calibrated,
+            outermost=False,
+        )
+        n, loads = factors.rows.shape
+        self._z, self._weight, self._moved, self._load = (
+            np.empty(n),
+            np.empty(n),
+            np.empty(n),
+            np.empty(loads),
+        )
+        self._share = np.ones(loads // 3)
+        self._stiff = options.stiffness_n_per_m is not None
+        self._field = np.empty((2, layout.upper_m.size))
+        self._ratio, self._sorted = np.empty((2, layout.upper_m.shape[0]))
+        self._no_contacts: tuple[Contact, ...] = ()
+        self.no_force_n = np.zeros(layout.upper_m.shape)
+        """Forces on an untouched patch, read-only."""
+        self.no_force_n.setflags(write=False)
+        self._wire = factors.free // (3 * layout.upper_m.shape[1])
+        self.reset()
+        solved = np.full(n, 1e-3)
+        self._finder.warm_up(self._estimate(solved, 1.0))
+        self._find(np.zeros(layout.upper_m.shape), np.ones(layout.upper_m.shape))  # compiles the test
+        self.reset()
+
+    def reset(self) -> None:
+        """Discard the state of the stream."""
+        self._finder.reset()
+        self._scale2 = 1e-4
+        self._force, self._contacts, self._known = self.no_force_n, self._no_contacts, False
+        self._without: tuple[bytes, float, float, Float, Float] | None = None
+
+    def add(self, field: FieldFrame) -> FieldFrame:
+        """Return the field with its contacts and, unless the paper's law gave them, its forces.
+
+        Wires with an infinite standard deviation do not count. A field without any other wire has neither.
+
+        Args:
+            field: Exact field, checked.
+        """
+        start = perf_counter()
+        held = field.held is not None and bool(field.held.all())
+        if not (held and self._known):
+            self._force, self._contacts = self._find(field.displacement_m, field.displacement_std_m)
+            self._known = True
+        if not self._contacts and (self._stiff or self._force is field.force_n):
+            return field
+        force, contacts = self._force, self._contacts
+        stats = dataclasses.replace(field.stats, time_s=field.stats.time_s + perf_counter() - start)
+        if self._stiff:
+            return dataclasses.replace(field, contacts=contacts, stats=stats)
+        return dataclasses.replace(field, contacts=contacts, force_n=force, stats=stats)
+
+    def _find(self, displacement_m: Float, std_m: Float) -> tuple[Float, tuple[Contact, ...]]:
+        np.copyto(self._field[0], displacement_m.ravel())
+        np.copyto(self._field[1], std_m.ravel())
+        factors = self._factors
+        largest, level, wild = _judge(
+            self._field, factors.free, factors.rest_std, self.layout.pitch_m, self._moved, self._ratio,
+            self._sorted,
+        )  # fmt: skip
+        if not largest > UNTOUCHED:  # also if nothing is known: every standard deviation is infinite
+            self._finder.reset()
+            return self.no_force_n, ()
+        if wild:
+            left_out = ~(self._ratio <= WILD * level)
+            loads = self._estimate_without(left_out, level)
+            std_m = np.where(left_out[:, None, None], np.inf, std_m)
+        else:
+            loads = self._estimate(self._moved, level)
+        return self._finder.find(loads, displacement_m, std_m)
+
+    def _estimate(self, moved: Float, level: float) -> LoadEstimate:
+        """Return the loads of a displacement (n,), pitches, with ν² = ``level``."""
+        factors = self._factors
+        self._scale2 = _solve_loads(
+            moved, factors.whitening, factors.gain, factors.rows, level, self._scale2,
+            self._z, self._weight, self._load,
+        )  # fmt: skip
+        return LoadEstimate(self._load.reshape(-1, 3), factors.rows, self._weight, self._share, self._scale2)
+
+    def _estimate_without(self, left_out: NDArray[np.bool_], level: float) -> LoadEstimate:
+        """Return the loads without the wires ``left_out`` (U,).
+
+        The scale follows from the displacement with the most probable positions of those wires.
+        """
+        factors, gone = self._factors, left_out[self._wire]
+        moved = np.where(gone, 0.0, self._moved)
+        columns = factors.whitening[gone].T  # (n, of these wires)
+        seen = factors.whitening[~gone].T @ moved[~gone]
+        for _ in range(2):
+            weight = 1.0 / (self._scale2 * factors.gain + level)
+            precision = columns.T @ (weight[:, None] * columns)
+            moved[gone] = -np.linalg.solve(precision, columns.T @ (weight * seen))
+            self._estimate(moved, level)
+        key = left_out.tobytes()
+        known = self._without
+        if (
+            known is None
+            or known[0] != key
+            or abs(known[1] / self._scale2 - 1) > 0.25
+            or abs(known[2] / level - 1) > 0.25
+        ):
+            root = 1.0 / np.sqrt(self._scale2 * factors.gain + level)
+            basis = np.linalg.qr(root[:, None] * columns)[0]
+            rows = root[:, None] * factors.rows
+            rows -= basis @ (basis.T @ rows)
+            known = self._without = key, self._scale2, level, rows, basis
+        _, scale2, level, rows, basis = known
+        y = seen / np.sqrt(scale2 * factors.gain + level)
+        y -= basis @ (basis.T @ y)
+        q = scale2 * (y @ rows)
+        return LoadEstimate(q.reshape(-1, 3), rows, np.ones(len(rows)), self._share, scale2)
+
+
+@functools.lru_cache(maxsize=32)
+def _cached_factors(
+    layout: PatchLayout, rubber: Rubber | None, noise: float, normal_only: bool
+) -> LoadFactors:
+    return _factors(layout, rubber, np.full(layout.shape, noise), normal_only)
+
+
+def _factors(layout: PatchLayout, rubber: Rubber | None, noise: Float, normal_only: bool) -> LoadFactors:
+    """Return the matrices of a patch with the relative noise (U, K)."""
+    problem, prior, pitch = PatchProblem.of(layout), ElasticPrior.of(layout, rubber), layout.pitch_m
+    wires, electrodes = layout.upper_m.shape[:2]
+    slopes = jacobian(layout, layout.upper_m) * pitch**2 * problem.a_rest[..., None, None]
+    slopes = slopes[..., 2:] if normal_only else slopes
+    weighted = slopes.reshape(*layout.shape, -1) / noise[..., None]
+    every = np.arange(3 * wires * electrodes)
+    free = every[2::3] if normal_only else every
+    n = weighted.shape[2]
+    least = 1.0 / float(problem.clearance.min())  # nothing moves farther than the clearance
+    root, std = np.zeros((free.size, free.size)), np.empty((wires, n))
+    for u in range(wires):
+        _, singular, turn = np.linalg.svd(weighted[u])
+        singular = np.hypot(np.append(singular, np.zeros(n - singular.size)), least)
+        root[u * n : (u + 1) * n, u * n : (u + 1) * n] = singular[:, None] * turn
+        std[u] = np.sqrt(((turn / singular[:, None]) ** 2).sum(axis=0))
+    moved = root @ prior.response[free]
+    basis, gain, _ = np.linalg.svd(np.hstack([moved, SLACK * root]), full_matrices=False)
+    return LoadFactors(
+        prior,
+        np.ascontiguousarray(root.T @ basis),
+        np.ascontiguousarray(basis.T @ moved),
+        gain**2,
+        std.ravel(),
+        free,
+    )
+
+
+@njit
+def _judge(  # noqa: PLR0913 - a kernel: field, factors and outputs by name
+    field: Float,
+    free: Index,
+    rest_std: Float,
+    pitch: float,
+    moved: Float,
+    ratio: Float,
+    ordered: Float,
+) -> tuple[float, float, bool]:
+    """Compare a field (2, 3UN) of displacements and standard deviations, m, with the one at rest.
+
+    Writes the free displacements (n,) in pitches to ``moved``, and the mean ratio of each wire's variances to
+    those at rest to ``ratio`` (U,), inf if one is infinite. ``ordered`` (U,) is scratch.
+
+    Returns:
+        The largest displacement in standard deviations, the median ratio of the wires with finite ratios,
+        and whether a wire's ratio exceeds the median by :data:`WILD`.
+    """
+    largest, each, known = 0.0, free.size // ratio.size, 0
+    for u in range(ratio.size):
+        ratio[u] = 0.0
+        for j in range(u * each, (u + 1) * each):
+            at, std = field[0, free[j]], field[1, free[j]]
+            moved[j] = at / pitch
+            if std > 0.0:
+                largest = max(largest, abs(at) / std)
+            ratio[u] += (std / (pitch * rest_std[j])) ** 2 / each
+        if ratio[u] < math.inf:
+            place = known
+            while place > 0 and ordered[place - 1] > ratio[u]:
+                ordered[place] = ordered[place - 1]
+                place -= 1
+            ordered[place] = ratio[u]
+            known += 1
+    if known == 0:
+        return 0.0, 1.0, True
+    level, wild = ordered[known // 2], False
+    for u in range(ratio.size):
+        wild = wild or not ratio[u] <= WILD * level
+    return largest, level, wild
+
+
+@njit
+def _solve_loads(  # noqa: PLR0913, C901 - a kernel: field, matrices and outputs by name, sums as loops
+    moved: Float,
+    whitening: Float,
+    gain: Float,
+    rows: Float,
+    level: float,
+    scale2: float,
+    z: Float,
+    weight: Float,
+    loads: Float,
+) -> float:
+    """Find s² and the loads of a displacement; return s².
+
+    Writes z (n,), the factors (s² S² + ν²)^(−1/2) to ``weight`` (n,), and the mean loads (3Q,).
+    """
+    for j in range(z.size):
+        z[j] = 0.0
+    for i in range(moved.size):
+        if moved[i] != 0.0:
+            row, factor = whitening[i], moved[i]
+            for j in range(z.size):
+                z[j] += factor * row[j]
+    for _ in range(SCALE_STEPS):  # MacKay's fixed point: Σ E[x]² = s² Σ (1 − posterior / prior variance)
+        power, count = 0.0, 0.0
+        for j in range(z.size):
+            variance = scale2 * gain[j] + level
+            share = scale2 * gain[j] / variance
+            power += share * scale2 * z[j] * z[j] / variance
+            count += share
+        last, scale2 = scale2, max(power / count, SCALE_LEAST)
+        if abs(scale2 - last) <= SCALE_CLOSE * last:
+            break
+    for q in range(loads.size):
+        loads[q] = 0.0
+    for j in range(z.size):
+        variance = scale2 * gain[j] + level
+        weight[j] = 1.0 / variance**0.5
+        factor, row = scale2 * z[j] / variance, rows[j]
+        for q in range(loads.size):
+            loads[q] += factor * row[q]
+    return scale2

@@ -1,0 +1,423 @@
+"""Division of the loads on a patch into contacts: which cells belong to which body.
+
+Sums of the pressing loads of 3 × 3 cells have peaks. Cells are visited in the order of their sums, the
+largest first, and join the neighbouring peak. Where the areas of two peaks meet, the peaks belong to one body
+unless the sum between them is much smaller than both and the difference is significant (topological
+persistence). A peak is a contact if its load is significant: its 3 × 3 cells in sum, the same cells as a
+whole (χ²), or the sum over its area. The strongest peak is also a contact if the skin under it is
+significantly pressed in: something touches, even if the loads cannot be located.
+
+Only cells with an electrode decide, because beyond the outermost electrodes a load of any size at any
+distance gives nearly the same displacement. The cells beyond are added to the contact next to them.
+
+The thresholds depend on the last frame, so that noise does not switch a contact on and off: the loads between
+two peaks must change by a third before one contact becomes two or two become one.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skinnode.compiled.jit import njit, njit_part
+from skinnode.model.layout import Float
+from skinnode.solve.linalg.vectors import Index
+
+SIGNIFICANT: Final = 5.0
+"""Significance, in standard deviations, above which a load is a contact; with 100 sums per frame, noise
+reaches it about once in ten thousand frames."""
+SIGNIFICANT_STILL: Final = 4.0
+"""Significance above which a contact of the last frame remains a contact."""
+BLOCK_EXTRA: Final = 22.0
+"""Extra χ² that the nine loads of a box need beyond the squared significance of a sum. With nine degrees of
+freedom, χ² exceeds 47 as rarely as a normal variable exceeds five standard deviations."""
+PRESSED: Final = 6.0
+"""Depth of the skin in standard deviations at which something touches the patch."""
+PRESSED_STILL: Final = 5.0
+"""The same for a patch that was touched in the last frame."""
+RELEVANT: Final = 0.2
+"""Ratio of a peak to the strongest contact's above which it is a contact; ringing next to a contact reaches a
+tenth."""
+RELEVANT_STILL: Final = 0.15
+"""The same for a contact of the last frame."""
+PART: Final = 0.1
+"""Ratio of a cell's sum to the peak's above which the cell belongs to the contact."""
+GAP: Final = 0.5
+"""Ratio of the sum between two peaks to the smaller peak below which the peaks are two contacts. Measured on
+ten families of loads (spheres inside, on the edge and half off the patch, punches, plates, ridges, dents,
+large areas; ``tests/solve/test_contact_number.py``): with 0.4, 0.5 and 0.6 no single body was split; with
+0.75 the ringing of plates at the edge splits them. Two spheres are told apart from 5 pitches on."""
+GAP_ONE: Final = 0.4
+"""The same for two peaks that were one contact in the last frame."""
+GAP_TWO: Final = 0.6
+"""The same for two peaks that were two contacts in the last frame."""
+GAP_SIGNIFICANT: Final = 3.0
+"""Significance of the difference between the smaller peak and the sum between the peaks, in standard
+deviations."""
+
+
+RegionScratch = tuple[
+    Float, Float, Float, Float, Float, Index, Index, Index, Index, Index, Index, NDArray[np.bool_]
+]
+
+
+def region_scratch(cells: int) -> RegionScratch:
+    """Return the scratch arrays of :func:`find_regions` for a lattice of ``cells`` cells."""
+    return (
+        np.empty(cells), np.ones(cells), np.empty((9, 9)), np.empty(9), np.empty(18),
+        np.empty(cells, np.int64), np.empty(cells, np.int64), np.empty(cells, np.int64),
+        np.empty(cells, np.int64), np.empty(9, np.int64), np.empty(27, np.int64),
+        np.empty((cells, cells), np.bool_),
+    )  # fmt: skip
+
+
+@njit_part
+def _variance(  # noqa: PLR0913 - a kernel: loads and their posterior by name
+    cells: Index, signs: Float, count: int, rows: Float, weight: Float, share: Float, scale2: float
+) -> float:
+    """Return the variance of the sum of the normal loads of ``cells``, each with its sign."""
+    own, seen = 0.0, 0.0
+    for c in range(count):
+        own += signs[c] * signs[c] * share[cells[c]]
+    for i in range(rows.shape[0]):
+        row, value = rows[i], 0.0
+        for c in range(count):
+            value += signs[c] * share[cells[c]] * row[3 * cells[c] + 2]
+        value *= weight[i]
+        seen += value * value
+    return max(scale2 * (own - scale2 * seen), 1e-300)
+
+
+@njit_part
+def _block_chi2(  # noqa: PLR0913, C901 - a kernel: loads and their posterior by name, sums as loops
+    cells: Index,
+    count: int,
+    press: Float,
+    rows: Float,
+    weight: Float,
+    share: Float,
+    scale2: float,
+    s: Float,
+    b: Float,
+) -> float:
+    """Return qᵀ Σ⁻¹ q for the normal loads q of up to nine cells with the posterior covariance Σ.
+
+    ``s`` (9, 9) and ``b`` (9,) are scratch.
+    """
+    for c in range(count):
+        for d in range(count):
+            s[c, d] = 0.0
+    for i in range(rows.shape[0]):
+        row, w = rows[i], scale2 * weight[i]
+        for c in range(count):
+            b[c] = w * share[cells[c]] * row[3 * cells[c] + 2]
+        for c in range(count):
+            for d in range(c + 1):
+                s[c, d] -= b[c] * b[d]
+    for c in range(count):
+        s[c, c] = max(s[c, c] + scale2 * share[cells[c]], 1e-9 * scale2 * share[cells[c]])
+    chi2 = 0.0
+    for c in range(count):  # Cholesky factor of Σ and L⁻¹ q, row by row
+        value = press[cells[c]]
+        for d in range(c):
+            entry = s[c, d]
+            for e in range(d):
+                entry -= s[c, e] * s[d, e]
+            s[c, d] = entry / s[d, d]
+            value -= s[c, d] * b[d]
+        pivot = s[c, c]
+        for e in range(c):
+            pivot -= s[c, e] * s[c, e]
+        s[c, c] = math.sqrt(max(pivot, 1e-9 * scale2 * share[cells[c]]))
+        b[c] = value / s[c, c]
+        chi2 += b[c] * b[c]
+    return chi2
+
+
+@njit_part
+def _box(cell: int, near: Index, own: NDArray[np.bool_], out: Index) -> int:
+    """Write the own cells among a cell and its neighbours into ``out``; return their number."""
+    count = 0
+    for i in near[cell]:
+        if i >= 0 and own[i]:
+            out[count] = i
+            count += 1
+    return count
+
+
+@njit_part
+def _apart(  # noqa: PLR0913 - a kernel: loads and their posterior by name
+    peak: int,
+    other: int,
+    between: int,
+    total: Float,
+    before: Index,
+    near: Index,
+    own: NDArray[np.bool_],
+    rows: Float,
+    weight: Float,
+    share: Float,
+    scale2: float,
+    cells: Index,
+    signs: Float,
+) -> bool:
+    """Return whether ``peak`` and the smaller peak ``other`` are two contacts, with ``between`` between.
+
+    ``cells`` (27,) and ``signs`` (18,) are scratch.
+    """
+    gap = GAP
+    if before[peak] > 0 and before[other] > 0:
+        gap = GAP_ONE if before[peak] == before[other] else GAP_TWO
+    fall = total[other] - total[between]
+    if not total[between] < gap * total[other]:
+        return False
+    count = _box(other, near, own, cells)
+    for c in range(count):
+        signs[c] = 1.0
+    part = cells[18:]
+    for c in range(_box(between, near, own, part)):
+        known = False
+        for d in range(count):
+            if cells[d] == part[c]:
+                signs[d] -= 1.0
+                known = True
+        if not known:
+            cells[count], signs[count] = part[c], -1.0
+            count += 1
+    variance = _variance(cells, signs, count, rows, weight, share, scale2)
+    certain: bool = fall * fall > GAP_SIGNIFICANT * GAP_SIGNIFICANT * variance
+    return certain
+
+
+@njit_part
+def _sort_peaks(press: Float, own: NDArray[np.bool_], near: Index, total: Float, order: Index) -> int:
+    """Write the sum of the pressing loads around each electrode, and the cells by falling sum.
+
+    Returns the number of cells with an electrode.
+    """
+    count = 0
+    for cell in range(press.size):
+        total[cell] = 0.0
+        if not own[cell]:
+            continue
+        for i in near[cell]:
+            if i >= 0 and own[i] and press[i] > 0.0:
+                total[cell] += press[i]
+        at = count
+        while at > 0 and total[order[at - 1]] < total[cell]:
+            order[at] = order[at - 1]
+            at -= 1
+        order[at] = cell
+        count += 1
+    return count
+
+
+@njit_part
+def _grow_areas(  # noqa: PLR0913, C901 - a kernel: loads, their posterior and scratch by name
+    electrodes: int,
+    order: Index,
+    total: Float,
+    before: Index,
+    near: Index,
+    own: NDArray[np.bool_],
+    rows: Float,
+    weight: Float,
+    share: Float,
+    scale2: float,
+    parent: Index,
+    area: Index,
+    around: Index,
+    few: Index,
+    signs: Float,
+    split: NDArray[np.bool_],
+) -> None:
+    """Write to ``area`` (Q,) the peak that each cell belongs to; −1 for cells with small sums."""
+    cells, top = total.size, total[order[0]]
+    for cell in range(cells):
+        area[cell], parent[cell] = -1, cell
+    for k in range(electrodes):
+        cell = order[k]
+        if total[cell] <= PART * RELEVANT_STILL * top:
+            break
+        for other in range(cells):
+            split[cell, other] = False
+        count = 0
+        for i in near[cell]:
+            if i < 0 or area[i] < 0:
+                continue
+            peak = area[i]
+            while parent[peak] != peak:
+                peak = parent[peak]
+            known = False
+            for c in range(count):
+                known = known or around[c] == peak
+            if not known:
+                around[count] = peak
+                count += 1
+        if count == 0:
+            area[cell] = cell
+            continue
+        best = around[0]
+        for c in range(1, count):
+            if total[around[c]] > total[best]:
+                best = around[c]
+        area[cell] = best
+        for c in range(count):
+            other = around[c]
+            if other == best or split[best, other]:
+                continue
+            if _apart(best, other, cell, total, before, near, own, rows, weight, share, scale2, few, signs):
+                split[best, other] = True
+            else:
+                parent[other] = best
+    for cell in range(cells):
+        if area[cell] >= 0:
+            while parent[area[cell]] != area[cell]:
+                area[cell] = parent[area[cell]]
+
+
+@njit_part
+def _number_contacts(  # noqa: PLR0913, C901 - a kernel: loads, their posterior and scratch by name
+    electrodes: int,
+    order: Index,
+    total: Float,
+    press: Float,
+    depth: Float,
+    before: Index,
+    near: Index,
+    own: NDArray[np.bool_],
+    rows: Float,
+    weight: Float,
+    share: Float,
+    scale2: float,
+    area: Index,
+    patch: Index,
+    few: Index,
+    ones: Float,
+    block_cov: Float,
+    block: Float,
+    number: Index,
+) -> int:
+    """Number the areas of the peaks that are contacts; return their number."""
+    cells = total.size
+    found, strongest = 0, 0.0
+    for k in range(electrodes):
+        peak = order[k]
+        if area[peak] != peak:
+            continue
+        still = before[peak] > 0
+        if found > 0 and total[peak] < (RELEVANT_STILL if still else RELEVANT) * strongest:
+            continue
+        size, deep, load = 0, 0.0, 0.0
+        for cell in range(cells):
+            if area[cell] == peak and total[cell] > PART * total[peak]:
+                patch[size] = cell
+                size += 1
+                deep = max(deep, depth[cell])
+                load += press[cell]
+        least = SIGNIFICANT_STILL if still else SIGNIFICANT
+        real = found == 0 and peak == order[0] and deep > (PRESSED_STILL if still else PRESSED)
+        if not real:
+            count = _box(peak, near, own, few)
+            box = 0.0
+            for c in range(count):
+                box += press[few[c]]
+            real = box > 0.0 and box * box > least * least * _variance(
+                few, ones, count, rows, weight, share, scale2
+            )
+            if not real and press[peak] > 0.0:
+                chi2 = _block_chi2(few, count, press, rows, weight, share, scale2, block_cov, block)
+                real = chi2 > least * least + BLOCK_EXTRA
+        if not real and load > 0.0:
+            real = load * load > least * least * _variance(patch, ones, size, rows, weight, share, scale2)
+        if real:
+            found += 1
+            if found == 1:
+                strongest = total[peak]
+            for c in range(size):
+                number[patch[c]] = found
+    return found
+
+
+@njit
+def find_regions(  # noqa: PLR0913 - a kernel: loads, their posterior, lattice and outputs by name
+    press: Float,
+    depth: Float,
+    rows: Float,
+    weight: Float,
+    share: Float,
+    scale2: float,
+    own: NDArray[np.bool_],
+    near: Index,
+    before: Index,
+    number: Index,
+    outside: Index,
+    scratch: RegionScratch,
+) -> int:
+    """Number the cells of each contact from 1, the strongest peak first; return the number of contacts.
+
+    Args:
+        press: (Q,) pressing loads.
+        depth: (Q,) depth of the skin at the electrode of each cell, in standard deviations.
+        rows: (m, 3Q) L⁻¹ J G, before its rows are multiplied by ``weight``.
+        weight: (m,) factors of the rows.
+        share: (Q,) prior variances of the loads, relative to ``scale2``.
+        scale2: s², pitch².
+        own: (Q,) cells with an electrode.
+        near: (Q, 9) each cell and its neighbours; −1 outside the lattice.
+        before: (Q,) numbers of the last frame.
+        number: (Q,) receives the number of each cell's contact; 0 for none, and in the outermost ring.
+        outside: (Q,) receives the numbers of the cells in the outermost ring.
+        scratch: Arrays of :func:`region_scratch`.
+    """
+    total, ones, block_cov, block, signs, order, parent, area, patch, around, few, split = scratch
+    for cell in range(press.size):
+        number[cell], outside[cell] = 0, 0
+    electrodes = _sort_peaks(press, own, near, total, order)
+    if not total[order[0]] > 0.0:
+        return 0
+    _grow_areas(
+        electrodes, order, total, before, near, own, rows, weight, share, scale2, parent, area, around,
+        few, signs, split,
+    )  # fmt: skip
+    found = _number_contacts(
+        electrodes, order, total, press, depth, before, near, own, rows, weight, share, scale2, area,
+        patch, few, ones, block_cov, block, number,
+    )  # fmt: skip
+    if found > 0:
+        _dilate(total, near, number, outside, patch)
+    return found
+
+
+@njit_part
+def _dilate(  # noqa: C901 - neighbours as loops
+    total: Float, near: Index, number: Index, outside: Index, added: Index
+) -> None:
+    """Add the neighbours of each contact's cells, and number the outermost ring behind them."""
+    cells = number.size
+    for cell in range(cells):
+        added[cell] = 0
+        if number[cell] > 0:
+            continue
+        best = -1.0
+        for i in near[cell]:
+            if i >= 0 and number[i] > 0 and total[i] > best:
+                added[cell], best = number[i], total[i]
+    for cell in range(cells):
+        if added[cell] > 0:
+            number[cell] = added[cell]
+    for cell in range(cells):
+        ring = False
+        for i in near[cell]:
+            ring = ring or i < 0
+        if ring:
+            for i in near[cell]:
+                if i >= 0 and number[i] > 0:
+                    outside[cell] = number[i]
+    for cell in range(cells):
+        for i in near[cell]:
+            if i < 0:
+                number[cell] = 0

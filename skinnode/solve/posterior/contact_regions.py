@@ -45,6 +45,11 @@ RELEVANT_STILL: Final = 0.15
 """The same for a contact of the last frame."""
 PART: Final = 0.1
 """Ratio of a cell's sum to the peak's above which the cell belongs to the contact."""
+PART_SIGNIFICANT: Final = 3.0
+"""Sum of a cell in standard deviations of the peak's above which the cell belongs to the contact. Around a
+touch at the limit of detection, pressing loads made by noise would otherwise shift the centre by a pitch."""
+PART_MOST: Final = 0.6
+"""Ratio of a cell's sum to the peak's above which the cell belongs to the contact in any case."""
 GAP: Final = 0.5
 """Ratio of the sum between two peaks to the smaller peak below which the peaks are two contacts. Measured on
 ten families of loads (spheres inside, on the edge and half off the patch, punches, plates, ridges, dents,
@@ -311,9 +316,14 @@ def _number_contacts(  # noqa: PLR0913, C901 - a kernel: loads, their posterior 
         still = before[peak] > 0
         if found > 0 and total[peak] < (RELEVANT_STILL if still else RELEVANT) * strongest:
             continue
+        count, box = _box(peak, near, own, few), 0.0
+        for c in range(count):
+            box += press[few[c]]
+        variance = _variance(few, ones, count, rows, weight, share, scale2)
+        part = max(PART * total[peak], min(PART_SIGNIFICANT * math.sqrt(variance), PART_MOST * total[peak]))
         size, deep, load = 0, 0.0, 0.0
         for cell in range(cells):
-            if area[cell] == peak and total[cell] > PART * total[peak]:
+            if area[cell] == peak and total[cell] > part:
                 patch[size] = cell
                 size += 1
                 deep = max(deep, depth[cell])
@@ -321,13 +331,7 @@ def _number_contacts(  # noqa: PLR0913, C901 - a kernel: loads, their posterior 
         least = SIGNIFICANT_STILL if still else SIGNIFICANT
         real = found == 0 and peak == order[0] and deep > (PRESSED_STILL if still else PRESSED)
         if not real:
-            count = _box(peak, near, own, few)
-            box = 0.0
-            for c in range(count):
-                box += press[few[c]]
-            real = box > 0.0 and box * box > least * least * _variance(
-                few, ones, count, rows, weight, share, scale2
-            )
+            real = box > 0.0 and box * box > least * least * variance
             if not real and press[peak] > 0.0:
                 chi2 = _block_chi2(few, count, press, rows, weight, share, scale2, block_cov, block)
                 real = chi2 > least * least + BLOCK_EXTRA

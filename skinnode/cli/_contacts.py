@@ -14,10 +14,9 @@ def contact_tables(field: FieldFrame | None) -> list[dict[str, Any]] | None:
     """Return the contacts of a field, strongest first, with the standard deviation of each value.
 
     Returns:
-        The contacts, with lengths in m, areas in m² and forces in N; None if there is no field yet, or if the
-        solver's method is not ``posterior``.
+        The contacts, with lengths in m, areas in m² and forces in N; None if there is no field yet.
     """
-    if field is None or field.method != "posterior":
+    if field is None:
         return None
     return [
         plain(
@@ -30,6 +29,7 @@ def contact_tables(field: FieldFrame | None) -> list[dict[str, Any]] | None:
                 "normal_force_std_n": float(contact.normal_force_std_n),
                 "shear_force_n": contact.shear_force_n.tolist(),
                 "shear_force_std_n": contact.shear_force_std_n.tolist(),
+                "force_calibrated": contact.force_calibrated,
             }
         )
         for contact in field.contacts

@@ -29,8 +29,8 @@ def host(
 ) -> None:
     """Bring a hand's patches up as CANopen manager, solve their scans and report every second.
 
-    With --json each patch has `contacts` (null unless solver.method is "posterior"): centroid, area, normal
-    and shear force with standard deviations, in m, m² and N. Ctrl-C ends the command and leaves the nodes
+    With --json each patch has `contacts` (null before the first field): centroid, area, normal and
+    shear force with standard deviations, in m, m² and N. Ctrl-C ends the command and leaves the nodes
     pre-operational. Exit status 1 if a patch was not operational at the end, a scan was torn or a frame lost
     (unless its node reported that its computer was too slow), an interface failed or reported errors, or a
     guest received no SYNC; 2 if the hand could not be run, or if a node sent frames whose content does not

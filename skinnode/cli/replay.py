@@ -31,8 +31,8 @@ def replay(
 ) -> None:
     """Decode and solve a recording made by `skinnode record`; results are bit-identical to the live run's.
 
-    With --json each field has `contacts` (null unless solver.method is "posterior"): centroid, area, normal
-    and shear force with standard deviations, in m, m² and N.
+    With --json each field has `contacts`: centroid, area, normal and shear force with standard deviations, in
+    m, m² and N.
 
     Exit status 1 if the recording is damaged, was not ended properly, lacks frames or contains error frames,
     or if a scan was torn or missed, or a chunk or summary lost; 2 if the recording cannot be read at all.

@@ -125,18 +125,22 @@ class CalibrationConfig(Table):
     young_pa: Annotated[
         float, Field(ge=1e3, le=1e10, allow_inf_nan=False), Allowed("a number of Pa from 1e3 to 1e10")
     ] = _RUBBER.young_pa
-    """Young's modulus of the rubber, from which the posterior method computes forces."""
+    """Young's modulus of the rubber, from which the forces of contacts are computed."""
     poisson: Annotated[float, Field(ge=0, le=0.5, allow_inf_nan=False), Allowed("a number from 0 to 0.5")] = (
         _RUBBER.poisson
     )
     """Poisson's ratio of the rubber."""
+    force_calibrated: bool = False
+    """Whether ``young_pa`` reproduces known forces on this patch, for instance presses with a load cell by
+    objects like those that will touch it. If not, the deviations of normal forces cover a layer bonded to a
+    rigid support, which can carry fifty times the force. A modulus from a data sheet is no calibration."""
     upper_gain: Annotated[tuple[_Gain, ...] | None, Field(strict=False), Allowed("a list of numbers")] = None
     """Correction factors, one per upper wire, that restore the wire's resistances to their values at the time
     of the baseline."""
 
     @property
     def rubber(self) -> Rubber:
-        """Rubber parameters for the posterior."""
+        """Rubber parameters for the forces."""
         return Rubber(self.young_pa, self.poisson)
 
 

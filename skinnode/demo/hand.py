@@ -25,7 +25,13 @@ def demo_hand(patches: int, seed: int) -> HandConfig:
             "name": "demo",
             "buses": [{"name": "can0", "interface": "virtual", "channel": f"demo-{uuid.uuid4().hex[:8]}"}],
             "patches": [
-                {"name": name, "node_id": i + 1, "layout": {"preset": "staggered"}, "tolerances": "exact"}
+                {
+                    "name": name,
+                    "node_id": i + 1,
+                    "layout": {"preset": "staggered"},
+                    "tolerances": "exact",
+                    "calibration": {"force_calibrated": True},
+                }
                 for i, name in enumerate(names)
             ],
             "sync": {"period_ms": _SYNC_MS_PER_PATCH * patches},

@@ -90,6 +90,7 @@ def tracker_options(
         baseline_ohm=baseline_ohm,
         stiffness_n_per_m=calibration.stiffness_n_per_m or config.stiffness_n_per_m,
         rubber=calibration.rubber,
+        force_calibrated=calibration.force_calibrated,
         # the exact inverse cannot include tolerances
         tolerances=None if config.method == "exact" else patch.tolerances.build(),
         deadline_us=config.deadline_us,

@@ -93,8 +93,10 @@ class Contact:
     shear_force_std_n: Float
     """(2,) standard deviation of the shear force, N."""
     force_calibrated: bool = False
-    """Whether the forces rest on a calibration of this patch. Without one, their standard deviations also
-    cover the tolerance of the layer's thickness and the support of the layer."""
+    """Whether the forces rest on a calibration of this patch (``force_calibrated`` of Tracker, of
+    ``[patches.calibration]``). Without one, five standard deviations of the normal force reach from the force
+    of a half-space to that of a layer as thick as the clearance, bonded to a rigid support: a bound on the
+    model, not noise. For the shear force there is no such bound."""
     axes: Float = field(default_factory=lambda: _FLAT)
     """(3, 3) unit vectors as rows, in the frame of the layout, at the centre of the contact: along the wire,
     across the wires and out of the skin. On a flat patch these are x, y and z."""
@@ -116,8 +118,8 @@ class FieldFrame:
     """(U,) RMS of the relative residual F/b − 1 over the valid resistances of a wire."""
     stats: SolveStats
     force_n: Float | None = None
-    """(U, N, 3) loads on the skin in newtons; estimated by the posterior, or computed from the paper's law
-    F = k Δs if a stiffness was given."""
+    """(U, N, 3) loads on the skin in newtons, computed from the displacement of an elastic half-space; in an
+    exact field with a given stiffness, the paper's law F = k Δs. None if ``contacts`` was switched off."""
     stamp: ScanStamp | None = None
     """Scan from which the field was computed; None outside a host."""
     method: str = "exact"
@@ -127,9 +129,8 @@ class FieldFrame:
     in a posterior field, wires without equations. For these wires, ``trusted`` may rest on the prior
     alone."""
     contacts: tuple[Contact, ...] = ()
-    """Contacts, strongest first, if ``method`` is ``posterior``. Exact fields have no contacts, and ``auto``
-    computes exact fields if the noise and the layout permit. Select the posterior if contacts are needed
-    (``solver.method`` in hand.toml, ``method`` of Tracker)."""
+    """Contacts, strongest first; empty if nothing touches, if no wire could be solved, or if ``contacts`` was
+    switched off. Their number has a memory of one frame, so that noise does not split or drop a contact."""
     gain: Float | None = None
     """(U,) estimated gain error of each wire's resistances, as a fraction; None if no drift is estimated."""
     noise_factor: float = 1.0

@@ -23,8 +23,7 @@ LEAST_TOUCH_M: Final = 1e-5
 class Touch:
     """One contact on a patch; unknown values are None.
 
-    The posterior estimates forces. An exact field without a known stiffness gives only position, area and
-    depth.
+    Without contacts in the field, forces are known only if a stiffness was given.
     """
 
     x_m: float
@@ -41,14 +40,14 @@ class Touch:
 def touches_of(field: FieldFrame, rest_m: Float) -> tuple[Touch, ...]:
     """Return the contacts on a patch, strongest first.
 
-    Returns the posterior's contacts or, for an exact field, connected regions of pressed skin, with forces if
-    a stiffness was given.
+    Returns the contacts of the field. If it has none and is exact, returns connected regions of pressed skin,
+    with forces if a stiffness was given: fields recorded without contacts have only those.
 
     Args:
         field: Newest field of the patch.
         rest_m: (U, N, 3) positions of the electrodes at rest, m.
     """
-    if field.method == "posterior":
+    if field.contacts or field.method == "posterior":
         return tuple(
             Touch(
                 x_m=float(contact.centroid_m[0]),

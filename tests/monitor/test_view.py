@@ -171,7 +171,9 @@ def test_touches_and_rates_are_those_of_the_scene() -> None:
     x_m, y_m = hand.patches[0].layout.build().upper_m[wire, electrode, :2]
     assert abs(touch.x_m - x_m) < 4e-3  # a pitch
     assert abs(touch.y_m - y_m) < 4e-3
-    assert touch.force_n is None  # an exact field without a stiffness knows of none
+    assert patch.method == "exact"
+    assert touch.force_n is not None
+    assert touch.force_n > 0.0
     assert report["patches"]["p0"]["touches"][0]["x_m"] == touch.x_m
     assert report["patches"]["p0"]["condition"] == "operational"
     assert report["buses"]["can0"]["level"] == "good"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import random
 import signal
@@ -292,10 +293,12 @@ def test_contacts_and_forces_are_in_the_json_of_host_and_replay(tmp_path: Path) 
     assert all(contact["normal_force_n"] > 0 for contact in found)
 
 
-def test_an_exact_field_knows_no_contacts(tmp_path: Path) -> None:
+def test_contacts_are_unknown_before_the_first_field_and_none_if_nothing_touches(tmp_path: Path) -> None:
     assert contact_tables(None) is None
     hand, path = a_hand(), tmp_path / "run.log"
     with Fleet(hand), Recorder(hand, path) as recorder, Host.from_config(hand, tap=recorder) as host:
         field = host.fields().get(5.0)
     assert field is not None
-    assert contact_tables(field) is None
+    assert field.method == "exact"
+    assert contact_tables(dataclasses.replace(field, contacts=())) == []
+    assert contact_tables(field) is not None

@@ -151,7 +151,7 @@ class ContactFinder:
     def _contact(self, number: int, loads: LoadEstimate) -> Contact:
         """Return the contact on the cells of ``number``."""
         prior, mean, std = self._prior, np.empty(7), np.empty(7)
-        middle, pulls = _measure(
+        middle, pulls, pressing_n = _measure(
             number, self._number, self._outside, self._outermost, loads.mean, prior.load_n, prior.cell_m,
             loads.rows, loads.weight, loads.share, loads.scale2, mean, std, *self._work,
         )  # fmt: skip
@@ -162,7 +162,7 @@ class ContactFinder:
             depth_m = max(float(self._depth_m[self._number == number].max()), 0.0)
             radius_m = math.sqrt(area / math.pi)
             bonded_n = bonded_force_n(self._rubber, depth_m, radius_m, self._thickness_m)
-            force_std_n = math.hypot(force_std_n, layer_std_n(bonded_n, force_n))
+            force_std_n = math.hypot(force_std_n, layer_std_n(max(bonded_n, pressing_n), force_n))
         centroid_std_m, area_std = std[1:4], math.pi * HERTZ_SPREAD * float(std[4])
         if pulls:
             along = 1.0 - prior.frame[middle][2] ** 2
@@ -233,13 +233,13 @@ def _measure(  # noqa: PLR0913, C901 - a kernel: cells, loads and outputs by nam
     cells: Index,
     r2: Float,
     slopes: Float,
-) -> tuple[int, bool]:
+) -> tuple[int, bool, float]:
     """Measure one contact: force in N, centre (3) in m, mean r² in m² and shear (2) in N.
 
     Writes the seven figures to ``mean`` and their standard deviations, by the delta method, to ``std``.
-    Returns the cell closest to the centre, and whether pulling loads were left out. The prior largely
-    determines how a contact's load is distributed over its cells, so variances are multiplied by
-    ``PRIOR_DOUBT``. ``cells`` (Q,), ``r2`` (Q,) and ``slopes`` (Q, 5) are scratch.
+    Returns the cell closest to the centre, whether pulling loads were left out, and the sum of the pressing
+    loads in N. The prior largely determines how a contact's load is distributed over its cells, so variances
+    are multiplied by ``PRIOR_DOUBT``. ``cells`` (Q,), ``r2`` (Q,) and ``slopes`` (Q, 5) are scratch.
     """
     size, every, pressing = 0, 0.0, 0.0
     for cell in range(number.size):
@@ -337,4 +337,4 @@ def _measure(  # noqa: PLR0913, C901 - a kernel: cells, loads and outputs by nam
     std[4] = math.sqrt(std[4] + (BEYOND * b4) ** 2)
     std[5] = math.sqrt(std[5] + (BEYOND * b5) ** 2)
     std[6] = math.sqrt(std[6] + (BEYOND * b6) ** 2)
-    return middle, pulls
+    return middle, pulls, pressing * load[2]

@@ -5,6 +5,6 @@ The entry point is ``posterior``, which turns a stream of frames into fields. Ea
 displacement in steps of ``measurement_update`` (the linear algebra of one step); ``geometry_error`` adds the
 errors of a patch made to tolerances. The prior combines
 elasticity (``prior``) with expected loads (``load_prior``); ``hyperparameters`` sets the prior's scale and
-the noise from the evidence. ``load_posterior`` estimates the loads of a frame, ``contacts`` groups them into
-contacts, and ``data_share`` says how much of a field comes from the data.
+the noise from the evidence. ``load_posterior`` estimates the loads of a frame, ``contact_regions`` divides
+them into contacts, ``contacts`` measures each contact, and ``data_share`` says how much of a field comes from the data.
 """

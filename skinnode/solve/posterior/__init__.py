@@ -6,5 +6,6 @@ displacement in steps of ``measurement_update`` (the linear algebra of one step)
 errors of a patch made to tolerances. The prior combines
 elasticity (``prior``) with expected loads (``load_prior``); ``hyperparameters`` sets the prior's scale and
 the noise from the evidence. ``load_posterior`` estimates the loads of a frame, ``contact_regions`` divides
-them into contacts, ``contacts`` measures each contact, and ``data_share`` says how much of a field comes from the data.
+them into contacts, ``contacts`` measures each contact, and ``data_share`` says how much of a field comes from
+the data.
 """

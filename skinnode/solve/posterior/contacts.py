@@ -158,12 +158,12 @@ class ContactFinder:
         force_n, force_std_n = float(mean[0]), float(std[0])
         # mean r² of a load that is uniform over its cell
         area = math.pi * HERTZ_SPREAD * (max(float(mean[4]), 0.0) + prior.cell_area_m2 / 6.0)
-        centroid_std_m, area_std = std[1:4], math.pi * HERTZ_SPREAD * float(std[4])
         if not self._calibrated:
             depth_m = max(float(self._depth_m[self._number == number].max()), 0.0)
-            radius_m = math.sqrt((area + area_std) / math.pi)
+            radius_m = math.sqrt(area / math.pi)
             bonded_n = bonded_force_n(self._rubber, depth_m, radius_m, self._thickness_m)
             force_std_n = math.hypot(force_std_n, layer_std_n(max(bonded_n, pressing_n), force_n))
+        centroid_std_m, area_std = std[1:4], math.pi * HERTZ_SPREAD * float(std[4])
         if pulls:
             along = 1.0 - prior.frame[middle][2] ** 2
             centroid_std_m = np.sqrt(centroid_std_m**2 + PULLED_OFF**2 * prior.cell_area_m2 * along)

@@ -74,7 +74,8 @@ def test_example_says_the_defaults() -> None:
         patch.layout.build().layout_hash for patch in hand.patches
     ]
     assert {patch.tolerances.build() for patch in hand.patches} == {EXACT}  # as its comment says
-    others = {"layout", "tolerances"}
+    assert all(patch.calibration.force_calibrated for patch in hand.patches)  # as its comment says
+    others = {"layout", "tolerances", "calibration"}
     assert [patch.model_dump(exclude=others) for patch in spare.patches] == [
         patch.model_dump(exclude=others) for patch in spare_patches
     ]

@@ -283,5 +283,6 @@ name = "patch{i}"
 # link = "palm_link"              # name of the robot link that carries the patch; without: the hand itself
 # pose = {{ position_m = [0.0, 0.0, 0.0], rpy_rad = [0.0, 0.0, 0.0] }}   # in the frame of the link
 layout = {{ preset = "staggered", pitch_m = 4e-3, height_m = 2e-3, upper_wires = 10, upper_electrodes = 10 }}
+# calibration = {{ young_pa = 1e6, force_calibrated = true }}   # once known forces are reproduced
 tolerances = "ordinary"           # how exactly the patch was made; "exact" for a simulated patch
 """

@@ -81,6 +81,12 @@ def _of_results(patch: PatchConfig, solver: SolverConfig) -> Iterator[tuple[str,
             "the exact inverse cannot include the tolerances of the patch: its deviations hold only for "
             'a patch that equals its layout; method = "auto" uses the posterior',
         )
+    if not patch.calibration.force_calibrated:
+        yield (
+            "patches.calibration",
+            "no calibrated forces: their deviations reach from a half-space to a layer bonded to metal "
+            "(force_calibrated)",
+        )
     if solver.normal_only:
         yield "solver.normal_only", "no shear, neither displacement nor force"
     reached_m = share * float(PatchProblem.of(layout).clearance.min()) * layout.pitch_m

@@ -176,6 +176,7 @@ def test_comments_of_a_new_file_are_keys() -> None:
     hand = parse_hand(tomllib.loads(said))
     assert (hand.patches[0].serial, hand.patches[0].link) == (12345, "palm_link")
     assert (hand.solver.max_std_m, hand.solver.max_force_std_n) == (20e-6, 0.1)
+    assert hand.patches[0].calibration.force_calibrated
 
 
 def test_schema_is_the_one_that_is_shipped() -> None:
@@ -241,6 +242,13 @@ def test_the_exact_inverse_where_it_is_useless(tmp_path: Path) -> None:
     assert "cannot include the tolerances" in said(notes(tmp_path, solver + PALM), "solver.method")["palm"]
     assert not said(notes(tmp_path, solver + PALM + EXACT), "solver.method")
     assert not said(notes(tmp_path, PALM), "solver.method")
+
+
+def test_forces_that_are_not_calibrated(tmp_path: Path) -> None:
+    calibrated = "calibration = { young_pa = 0.8e6, force_calibrated = true }\n"
+    listed = notes(tmp_path, PALM + calibrated + TIP)
+    assert list(said(listed, "patches.calibration")) == ["tip"]
+    assert "no calibrated forces" in said(listed, "patches.calibration")["tip"]
 
 
 def test_where_contacts_cannot_be_placed(tmp_path: Path) -> None:

@@ -72,7 +72,8 @@ def draw_demo(file: Path, traces: Sequence[PatchTrace]) -> None:
     figure = Figure(figsize=(2.2 + 2.6 * count, 9.4), layout="constrained")
     FigureCanvasAgg(figure)
     grid = figure.subplots(4, count, squeeze=False, height_ratios=[1, 1, 1, 0.9])
-    full_um = 1e6 * max(float(-trace.snapshot_truth_m[..., 2].min()) for trace in traces)
+    deepest_um = 1e6 * max(float(-trace.snapshot_truth_m[..., 2].min()) for trace in traces)
+    full_um = max(deepest_um, 1.0)  # axes need a range, and nothing may have been pressed yet
     shear_um = 1e6 * max(float(np.abs(trace.snapshot_truth_m[..., :2]).max()) for trace in traces)
     highest_um = 1e6 * max(float(np.fmax(trace.error_m, trace.reported_m).max()) for trace in traces)
     errors = [trace.snapshot_m - trace.snapshot_truth_m for trace in traces]

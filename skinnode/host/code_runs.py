@@ -186,3 +186,8 @@ def _any_wire(state: _Int, limits: _Int) -> bool:
         if likely and 4 * still <= known + 4 * others:
             return True
     return False
+
+
+def compile_kernels() -> None:
+    """Compile the kernel, or load it from the cache, before the first scan."""
+    follow(np.zeros((1, 1), np.uint32), new_runs((1, 1)), np.zeros(7, np.int64), np.zeros(8, np.int64))

@@ -79,6 +79,7 @@ class CodeWatch:
         self._parts: FrozenParts | None = None  # until the first scan gives the shape
         self._state = code_runs.new_runs((0, 0))
         self._found = np.zeros(8, np.int64)
+        code_runs.compile_kernels()
         self._seen_windows = 0
         self._broken: tuple[WireFault, ...] = ()
         self._since: dict[WireFault | None, int] = {}  # first scan of each broken wire, and of a frozen patch

@@ -195,7 +195,7 @@ def test_one_uncalibrated_contact_makes_the_wrench_uncalibrated() -> None:
 
 
 def the_contact(skin: Skin, press: Press) -> Contact:
-    posterior = Posterior(skin.layout, relative_noise=1e-5, baseline_ohm=skin.rest_ohm)
+    posterior = Posterior(skin.layout, relative_noise=1e-5, baseline_ohm=skin.rest_ohm, force_calibrated=True)
     rng = np.random.default_rng(3)
     for share in (0.5, 1.0):
         ohm = skin.resistance_ohm(skin.displacement_m((press,), share))

@@ -40,7 +40,10 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Recorded:
     for _ in range(10):  # a machine that stands still for a period costs a scan, which is then missing here
         hand, path = a_hand(), tmp_path_factory.mktemp("whole") / "run.log"
         with Fleet(hand), Recorder(hand, path) as recorder, Host.from_config(hand, tap=recorder) as host:
-            time.sleep(1.5)
+            end_s = time.monotonic() + 60.0
+            while min(each.assembler.scans_complete for each in host.stats().patches.values()) < 40:
+                assert time.monotonic() < end_s
+                time.sleep(0.05)
             streams = [stream.assembler for stream in host.stats().patches.values()]
         assert recorder.stats().dropped == 0
         if not any(stream.scans_missed or stream.scans_torn for stream in streams):

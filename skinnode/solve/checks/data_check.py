@@ -103,7 +103,9 @@ class DataCheck:
         for number in usual:
             self._model.level(number)
         every = np.ones(shape, bool)
-        self._z[:] = 0.0
+        at_rest = np.zeros((shape[0], 3 * problem.layout.upper_m.shape[1]))
+        changes(self._model.jacobian, at_rest, 1.0, self._z)
+        self._residuals(at_rest, np.ones(shape), np.ones(shape[0], bool))
         self._explainer.wrong_readings(self._z, every, self._evidence, usual[0], 1.0)  # compiles the kernels
         self._crossing_gain(every, self._evidences(every), 1.0)
         self.reset()

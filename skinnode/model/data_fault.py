@@ -20,6 +20,7 @@ class FaultKind(enum.StrEnum):
     """What is wrong with the readings."""
 
     CONTRADICTS = "contradicts the other readings"
+    CROSSED = "exchanged with another wire"
     FROZEN = "repeats its codes"
     OPEN = "open"
     SHORT = "short"

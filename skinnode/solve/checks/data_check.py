@@ -22,6 +22,7 @@ from skinnode.model.frames import FieldFrame, amended
 from skinnode.model.kernels import potential
 from skinnode.model.layout import Float
 from skinnode.model.status import Status
+from skinnode.solve.checks.crossed_wires import likeliest
 from skinnode.solve.checks.explanations import DOUBT, Explainer, Group, crossing_gain
 from skinnode.solve.checks.fault_list import FaultList
 from skinnode.solve.checks.reading_model import LEAST, ReadingModel, changes, evidences
@@ -107,7 +108,7 @@ class DataCheck:
         changes(self._model.jacobian, at_rest, 1.0, self._z)
         self._residuals(at_rest, np.ones(shape), np.ones(shape[0], bool))
         self._explainer.wrong_readings(self._z, every, self._evidence, usual[0], 1.0)  # compiles the kernels
-        self._crossing_gain(every, self._evidences(every), 1.0)
+        self._largest_gain(every, self._evidences(every), 1.0)
         self.reset()
 
     def reset(self) -> None:
@@ -191,7 +192,7 @@ class DataCheck:
         changes(self._model.jacobian, moved, sigma * layout.pitch_m, self._z)
         best = self._evidences(self._present)
         cost = math.log(max(WRONG / sigma, math.e))
-        return self._needs_no_explanation(self._crossing_gain(self._present, best, cost))
+        return self._needs_no_explanation(self._largest_gain(self._present, best, cost))
 
     def _needs_no_explanation(self, gain: float) -> bool:
         """Return whether a gain is small, or hardly larger than one that loads explained just before."""
@@ -214,7 +215,7 @@ class DataCheck:
         sigma = self._linearised(solved, present)
         best = self._evidences(present)
         cost = math.log(max(WRONG / sigma, math.e))
-        gain = self._crossing_gain(present, best, cost)
+        gain = self._largest_gain(present, best, cost)
         if self._needs_no_explanation(gain):
             return ()
         found = self._explainer.wrong_readings(self._z, present, self._evidence, best, cost)
@@ -257,8 +258,8 @@ class DataCheck:
             best = evidences(model.vectors_t, model.shrink, model.log_det, z, self._c, self._evidence)
         return best
 
-    def _crossing_gain(self, present: Mask, best: int, cost: float) -> float:
-        """Return the largest gain from treating a single reading as wrong."""
+    def _largest_gain(self, present: Mask, best: int, cost: float) -> float:
+        """Return the largest gain from treating a reading as wrong or two neighbouring wires as crossed."""
         most, z = -math.inf, self._z.ravel()
         for offset in OFFSETS:
             number = best - offset
@@ -268,6 +269,8 @@ class DataCheck:
             multiply_vector(p, z, self._alpha)
             gain = crossing_gain(p, self._alpha, present.ravel(), cost)
             most = max(most, gain + float(self._evidence[number] - self._evidence[best]))
+            if not offset:
+                most = max(most, likeliest(p, self._alpha, self._z, present)[0])
         return most
 
     def _find_coarsely(self, solved: Solved) -> tuple[Group, ...]:

@@ -1,10 +1,11 @@
-"""Explanations of a frame: loads on the skin, or readings that are wrong.
+"""Explanations of a frame: loads on the skin, readings that are wrong, or two wires that are crossed.
 
-A frame that the elastic prior makes unlikely has one of two causes: loads that the prior does not expect at
-their place, as under a contact much narrower than the patch, or wrong readings. Both are added one at a time,
-the one that raises the log evidence most first (greedy search, as in orthogonal matching pursuit). Readings
-are at fault only if the best explanation with faults beats the best explanation by loads alone by
-:data:`MARGIN`.
+A frame that the elastic prior makes unlikely has one of these causes: loads that the prior does not expect at
+their place, as under a contact much narrower than the patch, wrong readings, or two crossed wires. Loads and
+wrong readings are added one at a time, the one that raises the log evidence most first (greedy search, as in
+orthogonal matching pursuit). Readings are at fault only if the best explanation with faults beats the best
+explanation by loads alone by :data:`MARGIN`. So do wires that are crossed, with loads alone explaining the
+exchanged readings.
 """
 
 from __future__ import annotations
@@ -17,9 +18,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skinnode.compiled.jit import njit
-from skinnode.model.data_fault import FaultyPart
+from skinnode.model.data_fault import FaultKind, FaultyPart
 from skinnode.model.layout import Float
-from skinnode.solve.checks.reading_model import LEAST, Level, ReadingModel
+from skinnode.solve.checks.crossed_wires import WirePair, exchanged, likeliest
+from skinnode.solve.checks.reading_model import LEAST, Level, ReadingModel, evidences
 from skinnode.solve.linalg.cholesky import multiply_vector
 from skinnode.solve.linalg.vectors import Index, dot
 
@@ -58,6 +60,7 @@ class Group:
     lower: int | None
     gain: float
     """Gain in log evidence, nats."""
+    kind: FaultKind = FaultKind.CONTRADICTS
 
     def mask(self, shape: tuple[int, int]) -> Mask:
         """Return the readings (U, K) of the group."""
@@ -107,8 +110,29 @@ class Explainer:
             if total > by_faults:
                 by_faults, groups = total, self._groups()
             by_loads = max(by_loads, start + self._explain(level, z, present, cost, faults=False))
+        p = self._model.level(best).precision
+        multiply_vector(p, z.ravel(), self._work)
+        gain, pair = likeliest(p, self._work, z, present, far=True)
+        if gain > DOUBT:
+            by_exchange = self._by_exchange(z, present, cost, pair)
+            if by_exchange > by_faults:
+                by_faults, groups = by_exchange, _crossed(pair, by_exchange - by_loads)
         self.margin = by_faults - by_loads
         return groups if self.margin > MARGIN else ()
+
+    def _by_exchange(self, z: Float, present: Mask, cost: float, pair: WirePair) -> float:
+        """Return the log evidence of the best explanation by loads with the readings exchanged."""
+        model = self._model
+        straight, there = exchanged(z, present, pair)
+        evidence, scratch = np.empty(len(model.kappa)), np.empty(z.size)
+        best = evidences(model.vectors_t, model.shrink, model.log_det, straight.ravel(), scratch, evidence)
+        choice = math.log(sum(math.comb(count, 2) for count in model.shape))
+        return max(
+            float(evidence[number])
+            - choice
+            + self._explain(model.level(number), straight, there, cost, faults=False)
+            for number in range(best, max(best - STRIDE * SCALES, -1), -STRIDE)
+        )
 
     def _explain(self, level: Level, z: Float, present: Mask, cost: float, *, faults: bool) -> float:
         """Return the gain in log evidence of the best explanation; its parts stay in the arrays."""
@@ -137,6 +161,14 @@ class Explainer:
                     )
                 )
         return tuple(found)
+
+
+def _crossed(pair: WirePair, gain: float) -> tuple[Group, ...]:
+    """Return the two wires of a pair as groups of wrong readings."""
+    wires = pair.one, pair.other
+    if pair.part is FaultyPart.UPPER:
+        return tuple(Group(pair.part, wire, None, gain, FaultKind.CROSSED) for wire in wires)
+    return tuple(Group(pair.part, None, wire, gain, FaultKind.CROSSED) for wire in wires)
 
 
 @njit

@@ -10,7 +10,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from skinnode.model.data_fault import DataFault, FaultKind
+from skinnode.model.data_fault import DataFault
 from skinnode.model.layout import Float
 from skinnode.solve.checks.explanations import Group
 
@@ -82,7 +82,7 @@ class FaultList:
             frames = [old for old in self._seen.get(key, ()) if frame - old < WITHIN]
             self._seen[key] = [*frames, frame]
             deviations = math.sqrt(2.0 * max(group.gain, 0.0))
-            fault = DataFault(group.part, FaultKind.CONTRADICTS, *key, scan, deviations)
+            fault = DataFault(group.part, group.kind, *key, scan, deviations)
             if len(self._seen[key]) >= FRAMES:
                 needed = self._needed[key] = 2 * self._needed.get(key, ADMIT // 2)
                 self._named[key] = _Named(fault, group.mask(self._shape), needed=needed)

@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 from skinnode.model.data_fault import DataFault
 from skinnode.model.status import Status
 
-OF_PATCH: Final = 0.85
-"""Share of a patch's readings that a trusted field needs. One upper wire and one lower wire of the reference
-patch may be missing (0.87), two upper wires may not (0.8)."""
+OF_PATCH: Final = 0.75
+"""Share of a patch's readings, and of its upper wires, that a trusted field needs. Two upper wires and a
+lower wire of the reference patch may be missing (0.77), three upper wires may not (0.7)."""
 OF_WIRE: Final = 0.8
 """Share of a wire's readings that a trusted wire needs."""
 CONTRADICTION: Final = "the readings contradict each other, and no wire or crossing explains it"
@@ -56,4 +56,6 @@ def assess(
         return f"not solved: {parts}", trusted
     if used.mean() < OF_PATCH:
         return f"only {used.mean():.0%} of the readings are usable", trusted
+    if trusted.mean() < OF_PATCH:
+        return f"only {np.count_nonzero(trusted)} of {len(status)} upper wires are trusted", trusted
     return "", trusted

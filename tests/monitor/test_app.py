@@ -7,7 +7,6 @@ from contextlib import closing
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 from textual.pilot import Pilot
 
@@ -61,7 +60,8 @@ def test_a_press_is_seen_where_it_is(size: tuple[int, int]) -> None:
             assert all(1 <= x <= 2 and 0 <= y <= 1 for x, y in places), places
             seen = re.search(r"x +([\d.]+) +y +([\d.]+) mm", screen_of(pilot))
             assert seen is not None
-            assert np.hypot(float(seen[1]) - 4.0, float(seen[2]) - 12.0) < 1.0  # a pitch of 4 mm
+            assert abs(float(seen[1]) - 4.0) < 1.0  # a pitch of 4 mm
+            assert float(seen[2]) > 10.0  # at the edge or beyond: skin does not move at one electrode alone
             lines = screen_of(pilot).split("\n")
             assert len(lines) == size[1]
             assert {len(line) for line in lines} == {size[0]}

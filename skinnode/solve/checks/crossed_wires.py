@@ -72,7 +72,7 @@ def best_exchange(  # noqa: PLR0913 - a kernel: arrays by name
     Wires up to ``reach`` apart are compared; the choice among n pairs costs ln n. ``delta`` (max(U, K),) is
     scratch.
     """
-    best, is_upper, one, other, pairs = -math.inf, True, 0, 0, 1
+    best, is_upper, one, other, pairs = -math.inf, True, 0, 0, 0
     for apart in range(1, reach + 1):
         for u in range(upper - apart):
             pairs += 1
@@ -84,7 +84,7 @@ def best_exchange(  # noqa: PLR0913 - a kernel: arrays by name
             gain = _gain(p, alpha, z, present, k, apart, lower, upper, best, delta)
             if gain > best:
                 best, one, other, is_upper = gain, k, k + apart, False
-    return best - math.log(pairs), is_upper, one, other
+    return best - math.log(max(pairs, 1)), is_upper, one, other
 
 
 @njit_part

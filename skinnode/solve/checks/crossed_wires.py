@@ -57,9 +57,12 @@ def likeliest(
         present: (U, K) readings that there are; others are not exchanged.
         far: Whether the wires need not be neighbours, which takes ten times as long.
     """
+    upper_wires, lower_wires = z.shape
+    longest = max(upper_wires, lower_wires)
     gain, upper, one, other = best_exchange(
-        p, alpha, z.ravel(), present.ravel(), *z.shape, max(z.shape) - 1 if far else 1, np.empty(max(z.shape))
-    )
+        p, alpha, z.ravel(), present.ravel(), upper_wires, lower_wires, longest - 1 if far else 1,
+        np.empty(longest),
+    )  # fmt: skip
     return gain, WirePair(FaultyPart.UPPER if upper else FaultyPart.LOWER, int(one), int(other))
 
 

@@ -24,9 +24,10 @@ from skinnode.model.layout import Float
 from skinnode.model.status import Status
 from skinnode.solve.checks.crossed_wires import likeliest
 from skinnode.solve.checks.explanations import DOUBT, Explainer, Group, crossing_gain
-from skinnode.solve.checks.fault_list import FaultList
-from skinnode.solve.checks.reading_model import LEAST, ReadingModel, changes, evidences
+from skinnode.solve.checks.fault_list import FaultList, agree
+from skinnode.solve.checks.reading_model import ReadingModel, changes, evidences
 from skinnode.solve.checks.trust import OF_WIRE, assess
+from skinnode.solve.checks.wire_tests import GAIN_STD, LEAST, least_fitting
 from skinnode.solve.linalg.cholesky import multiply_vector
 from skinnode.solve.wires.problem import PatchProblem
 
@@ -50,6 +51,9 @@ USUAL: Final = (-11, -3)
 """Range of log2 s, s in pitches, whose tables are prepared in advance; others are computed when needed."""
 COARSE: Final = 0.1
 """Error of the linearised readings, relative to the largest change, if wires could not be solved."""
+COARSE_GROUPS: Final = 3
+"""Maximum number of groups that are left out at once if wires could not be solved; of more, only the
+likeliest is."""
 UNSOLVED: Final = 1
 """Number of upper wires without a solution that count as faults of these wires; if there are more, a lower
 wire may be the cause."""
@@ -80,19 +84,23 @@ class DataCheck:
         sigma: Usual noise of a reading, for which tables are prepared.
         model_std: Standard deviation of the forward model's error, relative to the largest change of a
             reading: 0 for a patch that equals its layout.
+        drift: Gain errors that are expected and no fault: ``none``, ``patch`` or ``wire``.
 
     Attributes:
         scan: Number by which the user knows the next frame; by default, frames are counted.
     """
 
-    def __init__(self, problem: PatchProblem, sigma: float, model_std: float = 0.0) -> None:
-        self._problem, self._model_std = problem, model_std
+    def __init__(
+        self, problem: PatchProblem, sigma: float, model_std: float = 0.0, drift: str = "none"
+    ) -> None:
+        self._problem, self._model_std, self._drift = problem, model_std, drift
         self._model = ReadingModel.of(problem.layout)
         self._explainer = Explainer(self._model)
         shape = problem.layout.shape
         self._list = FaultList(shape)
         self._z, self._f = np.empty(shape), np.empty(shape)
         self._c, self._alpha = np.empty((2, self._z.size))
+        self._row = np.empty(max(shape))
         self._evidence = np.empty(len(self._model.kappa))
         self._present = np.ones(shape, bool)
         self._all_converged = (Status.CONVERGED,) * shape[0]
@@ -107,8 +115,8 @@ class DataCheck:
         at_rest = np.zeros((shape[0], 3 * problem.layout.upper_m.shape[1]))
         changes(self._model.jacobian, at_rest, 1.0, self._z)
         self._residuals(at_rest, np.ones(shape), np.ones(shape[0], bool))
-        self._explainer.wrong_readings(self._z, every, self._evidence, usual[0], 1.0)  # compiles the kernels
-        self._largest_gain(every, self._evidences(every), 1.0)
+        self._explainer.wrong_readings(self._z, every, self._evidence, usual[0], 1.0, 1.0)  # compiles
+        self._largest_gain(every, self._evidences(every), 1.0, 1.0)
         self.reset()
 
     def reset(self) -> None:
@@ -151,6 +159,7 @@ class DataCheck:
         layout = self._problem.layout
         without = np.zeros(layout.shape, bool)
         solved, groups = _spared(solved)
+        self._coarse: tuple[Group, ...] = ()
         found = self._find(solved) if until > -math.inf else ()
         while found and len(groups) < ROUNDS and perf_counter() < until:
             groups += found
@@ -161,7 +170,7 @@ class DataCheck:
             found = self._find(solved)
         scan = self._frame if self.scan is None else self.scan
         before = self._list.faults
-        passing = self._list.add([] if found else groups, self._frame, scan)
+        passing = self._list.add([] if found else self._contradicting(groups, solved), self._frame, scan)
         if before:
             self._follow(solved)
         faults = self._list.faults + passing
@@ -192,7 +201,7 @@ class DataCheck:
         changes(self._model.jacobian, moved, sigma * layout.pitch_m, self._z)
         best = self._evidences(self._present)
         cost = math.log(max(WRONG / sigma, math.e))
-        return self._needs_no_explanation(self._largest_gain(self._present, best, cost))
+        return self._needs_no_explanation(self._largest_gain(self._present, best, cost, sigma))
 
     def _needs_no_explanation(self, gain: float) -> bool:
         """Return whether a gain is small, or hardly larger than one that loads explained just before."""
@@ -215,10 +224,10 @@ class DataCheck:
         sigma = self._linearised(solved, present)
         best = self._evidences(present)
         cost = math.log(max(WRONG / sigma, math.e))
-        gain = self._largest_gain(present, best, cost)
+        gain = self._largest_gain(present, best, cost, sigma)
         if self._needs_no_explanation(gain):
             return ()
-        found = self._explainer.wrong_readings(self._z, present, self._evidence, best, cost)
+        found = self._explainer.wrong_readings(self._z, present, self._evidence, best, cost, sigma)
         self._doubtful = self._explainer.margin > DOUBT and not found
         if self._explainer.margin < CLEAR:
             self._excused, self._excused_until = gain, self._frame + EXCUSED_FRAMES
@@ -239,7 +248,25 @@ class DataCheck:
                 self._z[inexact] += field.gain[inexact, None]
         self._z /= sigma
         self._z[~present] = 0.0
+        if self._drift != "none":
+            self._remove_gain(present, GAIN_STD / sigma)
         return sigma
+
+    def _remove_gain(self, present: Mask, std: float) -> None:
+        """Subtract the gain errors, N(0, ``std``²) each, that the readings still show.
+
+        The solver's estimate is not enough: its prior takes part of a gain for a displacement of the wire.
+        """
+        upper, lower = self._z.shape
+        p = self._model.level(self._evidences(present)).precision
+        multiply_vector(p, self._z.ravel(), self._alpha)
+        sums = self._alpha.reshape(upper, lower).sum(axis=1)
+        blocks = p.reshape(upper, lower, upper, lower).sum(axis=(1, 3))
+        if self._drift == "wire":
+            self._z -= np.linalg.solve(blocks + np.eye(upper) / std**2, sums)[:, None]
+        else:
+            self._z -= sums.sum() / (blocks.sum() + 1.0 / std**2)
+        self._z[~present] = 0.0
 
     def _residuals(self, moved: Float, a: Float, wires: Mask) -> Float:
         """Return a F − 1 of these wires, (n, K)."""
@@ -258,23 +285,30 @@ class DataCheck:
             best = evidences(model.vectors_t, model.shrink, model.log_det, z, self._c, self._evidence)
         return best
 
-    def _largest_gain(self, present: Mask, best: int, cost: float) -> float:
-        """Return the largest gain from treating a reading as wrong or two neighbouring wires as crossed."""
+    def _largest_gain(self, present: Mask, best: int, cost: float, sigma: float) -> float:
+        """Return the largest gain from a wrong reading, a wire that does not fit, or two that are crossed."""
         most, z = -math.inf, self._z.ravel()
         for offset in OFFSETS:
             number = best - offset
             if number < 0:
                 break
-            p = self._model.level(number).precision
+            level = self._model.level(number)
+            p = level.precision
             multiply_vector(p, z, self._alpha)
             gain = crossing_gain(p, self._alpha, present.ravel(), cost)
             most = max(most, gain + float(self._evidence[number] - self._evidence[best]))
             if not offset:
                 most = max(most, likeliest(p, self._alpha, self._z, present)[0])
+                wire = least_fitting(level.wires, self._z, self._alpha, present, sigma, self._row)
+                most = max(most, wire.gain)
         return most
 
     def _find_coarsely(self, solved: Solved) -> tuple[Group, ...]:
-        """Return the likeliest wrong wire if several upper wires have no solution."""
+        """Return the likeliest wrong readings if several upper wires have no solution.
+
+        No load explains such a frame, so loads are no alternative here; :meth:`check` compares the readings
+        left out with the field of the others before it names them.
+        """
         with np.errstate(divide="ignore", invalid="ignore"):
             np.log(self._problem.a_rest / solved.a, out=self._z)
         present = solved.used & np.isfinite(self._z)
@@ -285,13 +319,18 @@ class DataCheck:
         sigma = max(sigma, float(np.median(solved.noise[present])))
         self._z /= sigma
         best = self._evidences(present)
-        groups = self._explainer.wrong_readings(
+        groups = self._explainer.wrong_without_loads(
             self._z, present, self._evidence, best, math.log(max(WRONG / sigma, math.e))
         )
-        return groups[:1]
+        self._coarse += groups
+        return groups if len(groups) <= COARSE_GROUPS else groups[:1]
 
     def _follow(self, solved: Solved) -> None:
         """Compare the named readings with the field."""
+        self._list.follow(*self._deviations(solved))
+
+    def _deviations(self, solved: Solved) -> tuple[Float, Mask]:
+        """Return the readings (U, K) minus the field, divided by its std, and which of them exist."""
         layout = self._problem.layout
         moved = solved.field.displacement_m.reshape(layout.shape[0], -1) / layout.pitch_m
         residual = self._residuals(moved, solved.a, np.ones(len(moved), bool))
@@ -300,7 +339,20 @@ class DataCheck:
             spread = np.einsum("ukn,un->uk", self._model.jacobian**2, np.minimum(std, 1e3) ** 2)
             deviation = residual / np.sqrt(spread + solved.noise**2)
         known = np.isfinite(deviation) & (solved.noise > 0)
-        self._list.follow(np.where(known, deviation, np.inf), known)
+        return np.where(known, deviation, np.inf), known
+
+    def _contradicting(self, groups: list[Group], solved: Solved) -> list[Group]:
+        """Return the groups without those found coarsely that agree with the field of the others."""
+        if not self._coarse:
+            return groups
+        deviation, known = self._deviations(solved)
+        kept = []
+        for group in groups:
+            here = group.mask(known.shape) & known
+            agrees = here.any() and agree(deviation[here])
+            if not (group in self._coarse and agrees):
+                kept.append(group)
+        return kept
 
 
 def _spared(solved: Solved) -> tuple[Solved, list[Group]]:

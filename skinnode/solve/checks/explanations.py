@@ -11,6 +11,7 @@ exchanged readings.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
 
@@ -21,7 +22,8 @@ from skinnode.compiled.jit import njit
 from skinnode.model.data_fault import FaultKind, FaultyPart
 from skinnode.model.layout import Float
 from skinnode.solve.checks.crossed_wires import WirePair, exchanged, likeliest
-from skinnode.solve.checks.reading_model import LEAST, Level, ReadingModel, evidences
+from skinnode.solve.checks.reading_model import Level, ReadingModel, evidences
+from skinnode.solve.checks.wire_tests import GAIN_STD, LEAST, WireFinding, least_fitting
 from skinnode.solve.linalg.cholesky import multiply_vector
 from skinnode.solve.linalg.vectors import Index, dot
 
@@ -84,14 +86,14 @@ class Explainer:
         self._p, self._alpha, self._stiffness = np.empty((m, m)), np.empty(m), np.empty(loads)
         self._work, self._by_load = np.empty(m), np.empty(loads)
         widest = max(model.shape) + 1
-        self._block = np.empty((widest, widest))
+        self._block, self._row = np.empty((widest, widest)), np.empty(widest)
         self._kind, self._number = np.empty((2, LOADS), np.int64)
         self._gain = np.empty(LOADS)
         self.margin = -math.inf
         """Log evidence by which faults explained the last frame better than loads alone, nats."""
 
-    def wrong_readings(
-        self, z: Float, present: Mask, evidence: Float, best: int, cost: float
+    def wrong_readings(  # noqa: PLR0913 - the frame, and what is known of it
+        self, z: Float, present: Mask, evidence: Float, best: int, cost: float, sigma: float
     ) -> tuple[Group, ...]:
         """Return the groups of readings that are wrong; none if loads explain the frame as well.
 
@@ -101,6 +103,7 @@ class Explainer:
             evidence: (L,) log evidence at every κ.
             best: Index of the κ that fits the frame as it is.
             cost: Cost of a wrong reading: ln of the ratio between its expected error and the noise.
+            sigma: Relative noise of the readings.
         """
         by_loads, by_faults = -math.inf, -math.inf
         groups: tuple[Group, ...] = ()
@@ -110,36 +113,103 @@ class Explainer:
             if total > by_faults:
                 by_faults, groups = total, self._groups()
             by_loads = max(by_loads, start + self._explain(level, z, present, cost, faults=False))
-        p = self._model.level(best).precision
-        multiply_vector(p, z.ravel(), self._work)
-        gain, pair = likeliest(p, self._work, z, present, far=True)
+        level = self._model.level(best)
+        multiply_vector(level.precision, z.ravel(), self._alpha)
+        alpha = self._alpha.copy()
+        gain, pair = likeliest(level.precision, alpha, z, present, far=True)
         if gain > DOUBT:
             by_exchange = self._by_exchange(z, present, cost, pair)
             if by_exchange > by_faults:
                 by_faults, groups = by_exchange, _crossed(pair, by_exchange - by_loads)
+        finding = least_fitting(level.wires, z, alpha, present, sigma, self._row)
+        if finding.gain > DOUBT:
+            by_wire = self._by_wire(z, present, cost, finding, alpha, best, GAIN_STD / sigma)
+            if by_wire > by_faults:
+                by_faults, groups = by_wire, (self._wire(finding.wire, by_wire - by_loads),)
         self.margin = by_faults - by_loads
         return groups if self.margin > MARGIN else ()
+
+    def wrong_without_loads(
+        self, z: Float, present: Mask, evidence: Float, best: int, cost: float
+    ) -> tuple[Group, ...]:
+        """Return the groups of readings that are wrong in a frame that no load explains; at least one.
+
+        The arguments are those of :meth:`wrong_readings`.
+        """
+        most, groups = -math.inf, ()
+        for number in range(best, -1, -STRIDE):
+            level = self._model.level(number)
+            total = float(evidence[number]) + self._explain(level, z, present, cost, faults=True, loads=False)
+            if total > most:
+                most, groups = total, self._groups()
+        return groups
 
     def _by_exchange(self, z: Float, present: Mask, cost: float, pair: WirePair) -> float:
         """Return the log evidence of the best explanation by loads with the readings exchanged."""
         model = self._model
         straight, there = exchanged(z, present, pair)
-        evidence, scratch = np.empty(len(model.kappa)), np.empty(z.size)
-        best = evidences(model.vectors_t, model.shrink, model.log_det, straight.ravel(), scratch, evidence)
         choice = math.log(sum(math.comb(count, 2) for count in model.shape))
+        return self._by_loads(straight, there, cost, lambda level: -choice)
+
+    def _by_wire(  # noqa: PLR0913 - the frame, and what was found in it
+        self, z: Float, present: Mask, cost: float, finding: WireFinding, alpha: Float, best: int, tau: float
+    ) -> float:
+        """Return the log evidence of the best explanation by loads if a wire is at fault."""
+        upper, lower = self._model.shape
+        wire, choice = finding.wire, math.log(2.0 * (upper + lower))
+        rows = (slice(wire, wire + 1), slice(None)) if wire < upper else (slice(None), wire - upper)
+        z, present = z.copy(), present.copy()
+        if math.isfinite(finding.factor):
+            z[rows] -= finding.factor
+            prior = 0.5 * (finding.factor / tau) ** 2
+            return self._by_loads(
+                z,
+                present,
+                cost,
+                lambda level: -choice - prior - 0.5 * math.log1p(tau**2 * level.wires.sums[wire]),
+            )
+        own = z[rows].ravel().copy()
+        tables = self._model.level(best).wires
+        of_p = tables.upper_p[wire] if wire < upper else tables.lower_p[wire - upper]
+        error = np.linalg.solve(of_p @ of_p.T, alpha.reshape(z.shape)[rows].ravel())
+        z[rows] = (own - error).reshape(z[rows].shape)  # what the others predict
+        present[rows] = False
+
+        def alone(level: Level) -> float:
+            tables = level.wires
+            of_s = tables.upper_s[wire] if wire < upper else tables.lower_s[wire - upper]
+            square = float((np.linalg.solve(of_s, own) ** 2).sum())
+            return -choice - float(tables.log_det_p[wire] + tables.log_det_s[wire]) - 0.5 * square
+
+        return self._by_loads(z, present, cost, alone)
+
+    def _by_loads(self, z: Float, present: Mask, cost: float, extra: Callable[[Level], float]) -> float:
+        """Return the log evidence of the best explanation by loads, plus ``extra``."""
+        model = self._model
+        evidence, scratch = np.empty(len(model.kappa)), np.empty(z.size)
+        best = evidences(model.vectors_t, model.shrink, model.log_det, z.ravel(), scratch, evidence)
         return max(
             float(evidence[number])
-            - choice
-            + self._explain(model.level(number), straight, there, cost, faults=False)
+            + extra(model.level(number))
+            + self._explain(model.level(number), z, present, cost, faults=False)
             for number in range(best, max(best - STRIDE * SCALES, -1), -STRIDE)
         )
 
-    def _explain(self, level: Level, z: Float, present: Mask, cost: float, *, faults: bool) -> float:
+    def _wire(self, wire: int, gain: float) -> Group:
+        """Return a wire as a group of wrong readings."""
+        upper = self._model.shape[0]
+        if wire < upper:
+            return Group(FaultyPart.UPPER, wire, None, gain)
+        return Group(FaultyPart.LOWER, None, wire - upper, gain)
+
+    def _explain(  # noqa: PLR0913 - the frame, and which explanations are allowed
+        self, level: Level, z: Float, present: Mask, cost: float, *, faults: bool, loads: bool = True
+    ) -> float:
         """Return the gain in log evidence of the best explanation; its parts stay in the arrays."""
         self._kind[:] = -1
         self._p[:], self._stiffness[:] = level.precision, level.stiffness
         return _explain(
-            z.ravel(), present.ravel().copy(), *self._model.shape, cost, faults,
+            z.ravel(), present.ravel().copy(), *self._model.shape, cost, loads, faults,
             LEAST * float(level.stiffness.max()), self._response_t, self._p, self._alpha, self._stiffness,
             self._work, self._by_load, self._block, self._kind, self._number, self._gain,
             STEPS if faults else LOADS,
@@ -296,6 +366,7 @@ def _explain(  # noqa: PLR0913, C901 - a kernel: arrays by name, a greedy search
     upper: int,
     lower: int,
     cost: float,
+    with_loads: bool,
     faults: bool,
     least: float,
     response_t: Float,
@@ -322,7 +393,7 @@ def _explain(  # noqa: PLR0913, C901 - a kernel: arrays by name, a greedy search
     for step in range(steps):
         multiply_vector(response_t, alpha, by_load)
         gain, kind, number = 0.0, _LOAD, -1
-        for j in range(stiffness.size):
+        for j in range(stiffness.size if with_loads else 0):
             if stiffness[j] > least:
                 ratio = by_load[j] * by_load[j] / stiffness[j]
                 if ratio > 1.0:

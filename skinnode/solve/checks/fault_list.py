@@ -28,6 +28,11 @@ AGREE: Final = 3.0
 Mask = NDArray[np.bool_]
 
 
+def agree(deviation: Float) -> bool:
+    """Return whether readings agree with a field from which they differ by ``deviation``, in deviations."""
+    return float(np.mean(deviation**2)) <= AGREE**2
+
+
 @dataclass
 class _Named:
     fault: DataFault
@@ -101,8 +106,7 @@ class FaultList:
             here = named.mask & known
             if not here.any():
                 continue
-            agrees = float(np.mean(deviation[here] ** 2)) <= AGREE**2
-            named.agreed = named.agreed + 1 if agrees else 0
+            named.agreed = named.agreed + 1 if agree(deviation[here]) else 0
             if named.agreed >= named.needed:
                 del self._named[key]
                 self._seen.pop(key, None)

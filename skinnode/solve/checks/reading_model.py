@@ -18,13 +18,12 @@ import numpy as np
 from skinnode.compiled.jit import njit
 from skinnode.model.forward import jacobian, potential_per_m
 from skinnode.model.layout import Float, PatchLayout
+from skinnode.solve.checks.wire_tests import WireTables
 from skinnode.solve.linalg.cholesky import multiply, multiply_vector
 from skinnode.solve.posterior.elastic_prior import ElasticPrior
 
 OCTAVES: Final = (-7, 21)
 """Range of log2 κ: noise from 1e-6 to 1e-2 and prior scales from 1e-4 to 1 pitch."""
-LEAST: Final = 1e-9
-"""Smallest precision of a reading, relative to its noise; smaller values are rounding errors."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,6 +34,8 @@ class Level:
     """(m, m) P."""
     stiffness: Float
     """(3Q,) bᵀ P b for the response b of the readings to each load."""
+    wires: WireTables
+    """Factors of the wires' blocks of P and S."""
 
 
 class ReadingModel:
@@ -92,14 +93,18 @@ class ReadingModel:
     def _compute(self, number: int) -> Level:
         upper, lower = self.shape
         m = upper * lower
-        precision, weighted = np.empty((2, m, m))
+        precision, covariance, weighted = np.empty((3, m, m))
+        vectors = np.ascontiguousarray(self.vectors_t.T)
+        np.divide(self.vectors_t, self.shrink[number][:, None], out=weighted)
+        multiply(vectors, weighted, covariance)
         np.multiply(self.vectors_t, self.shrink[number][:, None], out=weighted)
-        multiply(np.ascontiguousarray(self.vectors_t.T), weighted, precision)
+        multiply(vectors, weighted, precision)
         moved = np.empty_like(self.response)
         multiply(precision, self.response, moved)
         return Level(
             precision=precision,
             stiffness=np.einsum("mj,mj->j", self.response, moved),
+            wires=WireTables.of(precision, covariance, self.shape),
         )
 
 

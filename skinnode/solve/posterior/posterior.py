@@ -114,7 +114,9 @@ class Posterior:
         scale2 = None if options.scale_m is None else (options.scale_m / layout.pitch_m) ** 2
         height = float(np.median(self._problem.clearance))
         self._hyper = Hyperparameters(self._estimator, height, scale2, options.estimate_noise)
-        self.check = DataCheck(self._problem, float(np.median(self._noise)), _model_std(options))
+        self.check = DataCheck(
+            self._problem, float(np.median(self._noise)), _model_std(options), options.drift
+        )
         self.noise_estimate: NoiseEstimate | None = None
         self.reset()
         self._warm_up()

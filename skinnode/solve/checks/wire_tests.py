@@ -1,0 +1,157 @@
+"""Tests of whole wires: does a wire fit the others, and is its gain right?
+
+A wire that lags behind, or whose readings belong elsewhere, differs from what the other wires predict in many
+readings by a little each, which no test of single readings sees. With the readings G of a wire, the precision
+P, the covariance S = P⁻¹ and α = P z, two hypotheses are compared with that of a healthy wire:
+
+unrelated  z_G has its own distribution N(0, S_GG), whatever the other wires read. The log evidence changes by
+           ½ α_Gᵀ P_GG⁻¹ α_G − ½ z_Gᵀ S_GG⁻¹ z_G − ½ ln det P_GG S_GG
+gain       all readings of the wire are off by the same factor 1 + c, c ~ N(0, τ²). The change is
+           ½ (1ᵀα_G)² / (q + τ⁻²) − ½ ln(1 + τ² q) with q = 1ᵀ P_GG 1
+
+Both follow from the rules for conditioning a normal distribution.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skinnode.compiled.jit import njit, njit_part
+from skinnode.model.layout import Float
+
+GAIN_STD: Final = 0.02
+"""Standard deviation of a wrong gain, as that of drift. Not tuned."""
+LEAST: Final = 1e-9
+"""Smallest precision of a reading, relative to its noise; smaller values are rounding errors."""
+
+Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, eq=False)
+class WireTables:
+    """Factors of the wires' blocks at one κ; upper wires (U, K, K), lower wires (K, U, U)."""
+
+    upper_p: Float
+    """Cholesky factors of P_GG."""
+    upper_s: Float
+    """Cholesky factors of S_GG."""
+    lower_p: Float
+    lower_s: Float
+    log_det_p: Float
+    """(U + K,) ½ ln det P_GG."""
+    log_det_s: Float
+    """(U + K,) ½ ln det S_GG."""
+    sums: Float
+    """(U + K,) 1ᵀ P_GG 1."""
+
+    @classmethod
+    def of(cls, p: Float, s: Float, shape: tuple[int, int]) -> WireTables:
+        """Return the tables of a precision and a covariance (m, m)."""
+        upper, lower = shape
+        blocks = [np.arange(u * lower, (u + 1) * lower) for u in range(upper)]
+        blocks += [np.arange(k, upper * lower, lower) for k in range(lower)]
+        factors: list[list[Float]] = []
+        for matrix, least in ((p, LEAST), (s, 0.0)):
+            parts = [matrix[np.ix_(block, block)] for block in blocks]
+            factors.append([np.linalg.cholesky(part + least * np.eye(len(part))) for part in parts])
+        log_dets = [np.array([np.log(np.diag(each)).sum() for each in some]) for some in factors]
+        sums = np.array([((each.T @ np.ones(len(each))) ** 2).sum() for each in factors[0]])
+        (of_p, of_s) = factors
+        return cls(
+            np.stack(of_p[:upper]),
+            np.stack(of_s[:upper]),
+            np.stack(of_p[upper:]),
+            np.stack(of_s[upper:]),
+            *log_dets,
+            sums,
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class WireFinding:
+    """The wire that fits least."""
+
+    gain: float
+    """Gain in log evidence, nats."""
+    wire: int
+    """Number of the upper wire, or U plus that of the lower wire."""
+    factor: float
+    """Common error of the wire's readings in units of their noise; nan if the wire is unrelated."""
+
+
+def least_fitting(  # noqa: PLR0913 - the frame, its tables and scratch
+    tables: WireTables, z: Float, alpha: Float, present: Mask, sigma: float, work: Float
+) -> WireFinding:
+    """Return the wire for which one of the two hypotheses gains most.
+
+    Args:
+        tables: Factors of the blocks.
+        z: (U, K) changes of the readings since rest, in units of their noise.
+        alpha: (m,) P z.
+        present: (U, K) readings that there are; wires with less than half of theirs are not tested.
+        sigma: Relative noise of the readings.
+        work: (max(U, K),) scratch.
+    """
+    gain, wire, factor = _least_fitting(
+        z.ravel(), alpha, present.ravel(), GAIN_STD / sigma, tables.upper_p, tables.upper_s, tables.lower_p,
+        tables.lower_s, tables.log_det_p, tables.log_det_s, tables.sums, work,
+    )  # fmt: skip
+    return WireFinding(gain, int(wire), factor)
+
+
+@njit
+def _least_fitting(  # noqa: PLR0913 - a kernel: arrays by name
+    z: Float,
+    alpha: Float,
+    present: Mask,
+    tau: float,
+    upper_p: Float,
+    upper_s: Float,
+    lower_p: Float,
+    lower_s: Float,
+    log_det_p: Float,
+    log_det_s: Float,
+    sums: Float,
+    work: Float,
+) -> tuple[float, int, float]:
+    upper, lower = upper_p.shape[0], lower_p.shape[0]
+    best, wire, factor = -math.inf, 0, math.nan
+    for w in range(upper + lower):
+        first, step, count = (w * lower, 1, lower) if w < upper else (w - upper, lower, upper)
+        here, total = 0, 0.0
+        for i in range(count):
+            here += present[first + i * step]
+            total += alpha[first + i * step]
+        if 2 * here < count:
+            continue
+        if w < upper:
+            p, s = upper_p[w], upper_s[w]
+        else:
+            p, s = lower_p[w - upper], lower_s[w - upper]
+        unrelated = 0.5 * (_square(p, alpha, first, step, work) - _square(s, z, first, step, work))
+        unrelated -= log_det_p[w] + log_det_s[w]
+        if unrelated > best:
+            best, wire, factor = unrelated, w, math.nan
+        q = sums[w]
+        off = 0.5 * total * total / (q + 1.0 / (tau * tau)) - 0.5 * math.log(1.0 + tau * tau * q)
+        if off > best:
+            best, wire, factor = off, w, total / (q + 1.0 / (tau * tau))
+    return best - math.log(2.0 * (upper + lower)), wire, factor
+
+
+@njit_part
+def _square(factor: Float, values: Float, first: int, step: int, work: Float) -> float:
+    """Return xᵀ (L Lᵀ)⁻¹ x for the values first, first + step, … and the Cholesky factor L."""
+    square = 0.0
+    for i in range(factor.shape[0]):
+        value = values[first + i * step]
+        for j in range(i):
+            value -= factor[i, j] * work[j]
+        work[i] = value / factor[i, i]
+        square += work[i] * work[i]
+    return square

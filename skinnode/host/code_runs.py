@@ -33,7 +33,8 @@ the code before; largest change; number of crossings whose last code is reserved
 named crossings that changed; whether a part that is not named may be frozen."""
 
 LEAST_RUN: Final = 5
-"""Minimum run of a frozen part, in scans."""
+"""Minimum run of a frozen crossing, of a part without noise and of a frozen patch, in scans. A wire whose
+neighbours have moved needs no more than one."""
 LEADS: Final = 3
 """Minimum number of crossings of a frozen wire whose neighbours have moved."""
 
@@ -94,9 +95,6 @@ def _update_leads(state: _Int, steps: int) -> None:
     rows, columns = state.shape[1], state.shape[2]
     for u in range(rows):
         for k in range(columns):
-            run = state[RUN, u, k]
-            if 0 < run < LEAST_RUN:
-                continue
             if columns > 2:
                 one, two = _one(k), _two(k, columns)
                 a, b = state[LAST, u, one], state[LAST, u, two]
@@ -180,7 +178,7 @@ def _any_wire(state: _Int, limits: _Int) -> bool:
                 still += 4 * run >= limits[side]
                 least = run if least < 0 else min(least, run)
                 leads += abs(state[ACROSS - side, u, k]) >= limits[WIRE_LEAD]
-            if least >= LEAST_RUN and leads >= LEADS:
+            if least >= 1 and leads >= LEADS:
                 return True
             likely |= least >= limits[side]
         if likely and 4 * still <= known + 4 * others:

@@ -12,7 +12,8 @@ have shown that it is larger (:mod:`skinnode.host.wire_windows`). In addition, t
 shown noise before, that is, ``FLICKERS`` scans in which a code returned to its previous value, and the run
 must be ``LONGER`` times as long as any earlier run that ended on its own. Runs of skin at rest and of pressed
 skin are counted separately, because the same converter repeats its codes for minutes at rest and for two or
-three scans under a press.
+three scans under a press. Fields are not trusted from the first such scan on; the patch counts as frozen from
+``LEAST_RUN`` on, and a run that ended before it is an earlier run like any other.
 
 If neither decides and no code has changed for a second, the answer is *cannot tell*.
 """
@@ -83,7 +84,7 @@ class PatchLife:
         self.measured_noise = 0.0
         """Noise shown by recent windows, codes; 0 if they show none."""
         self._log_p = 0.0  # of the current run, if it counts as frozen
-        self._repeats_frozen = False
+        self._improbable = False  # no live converter would repeat its codes so often
         self._run = self._codes = self._flickers = self._check_at = 0
         self._pressed = False
         self._longest = {False: 0, True: 0}
@@ -95,7 +96,7 @@ class PatchLife:
     @property
     def stopped(self) -> bool:
         """Whether the newest scan repeats a conversion, or codes that no live converter would repeat."""
-        return self._same_phase > 0 or self._repeats_frozen
+        return self._same_phase > 0 or self._improbable
 
     @property
     def deviations(self) -> float:
@@ -105,7 +106,7 @@ class PatchLife:
     @property
     def alive(self) -> Alive:
         """Whether the converter was running at the newest scan."""
-        if self._same_phase >= PHASES_REPEATED or self._repeats_frozen:
+        if self._same_phase >= PHASES_REPEATED or self._repeats_frozen():
             return Alive.NO
         if self._t_proof_ns is None or self._t_ns - self._t_proof_ns > PROOF_NS:
             return Alive.CANNOT_TELL
@@ -116,7 +117,7 @@ class PatchLife:
         """Why the converter is not known to be alive, in words; empty if it is."""
         if self._same_phase:
             return f"its converter has completed no conversion for {counted(self._same_phase, 'scan')}"
-        if self._repeats_frozen:
+        if self._improbable:
             return f"its codes have not changed for {counted(self._run, 'scan')}"
         if self.alive is Alive.YES:
             return ""
@@ -145,9 +146,12 @@ class PatchLife:
             return
         self._run += 1
         self._codes += measured
-        if self._run >= max(self._check_at, LEAST_RUN) and not self._repeats_frozen:
-            self._check_at = max(2 * self._run, LEAST_RUN)  # the probability falls slowly: look rarely
+        if self._run >= self._check_at and not self._improbable:
+            self._check_at = 2 * self._run  # the probability falls slowly: look rarely
             self._evaluate_run(last, run, least)
+
+    def _repeats_frozen(self) -> bool:
+        return self._improbable and self._run >= LEAST_RUN
 
     def _compare_phase(self, scan: Scan, *, unchanged: bool) -> None:
         phase = scan.phase
@@ -164,10 +168,10 @@ class PatchLife:
     def _end_run(self, returned: int, largest: int) -> None:
         self._t_proof_ns = self._t_ns
         self._flickers += returned > 0
-        if self._run and (not self._repeats_frozen or largest <= 1):  # else an end of freezing
+        if self._run and (not self._repeats_frozen() or largest <= 1):  # else an end of freezing
             self._longest[self._pressed] = max(self._longest[self._pressed], self._run)
         self._run = self._codes = self._check_at = self._same_phase = 0
-        self._pressed = self._repeats_frozen = False
+        self._pressed = self._improbable = False
         self._log_p, self._noise_before = 0.0, self.measured_noise
 
     def _evaluate_run(self, last: NDArray[Any], run: NDArray[Any], least: int) -> None:
@@ -185,4 +189,4 @@ class PatchLife:
         quiet = max(self._stated / QUIETER, 0.5 * self._noise_before)
         probable = log_p(quiet)
         if log_p(self._stated) <= math.log(FALSE_ALARM) and probable <= math.log(FALSE_ALARM_QUIET):
-            self._repeats_frozen, self._log_p = True, probable
+            self._improbable, self._log_p = True, probable

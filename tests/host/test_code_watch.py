@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from skinnode.config import SimulationConfig
+from skinnode.host.code_runs import LEAST_RUN
 from skinnode.host.code_watch import CodeWatch, Verdict
 from skinnode.host.patch_life import Alive
 from skinnode.host.wire_faults import WireFault, WireState
@@ -77,14 +78,39 @@ def test_frozen_after_noise_was_seen(bits: int, noise: float, ohm: Float) -> Non
     stuck = patch.read(ohm)
     first = next(scan for scan in range(2000) if patch.see(stuck).distrust)
     assert first < 1000
-    verdict = patch.see(stuck)
+    more = max(1, LEAST_RUN - first)  # a field is not trusted at once, a patch is frozen later
+    for _ in range(more):
+        verdict = patch.see(stuck)
     assert patch.watch.frozen
-    assert f"its codes have not changed for {first + 1} scans" == verdict.distrust
+    assert f"its codes have not changed for {first + more} scans" == verdict.distrust
     (fault,) = verdict.faults
     assert (fault.part, fault.kind, fault.since) == (FaultyPart.PATCH, FaultKind.FROZEN, 201 + first)
     assert 5.0 < fault.deviations < 100.0
     assert patch.see(patch.read(ohm * 1.01)).faults == ()
     assert not patch.watch.frozen
+
+
+def test_a_repeated_scan_is_not_trusted_and_the_patch_is_not_frozen() -> None:
+    patch = Patch(1e-4, stated=1e-4)
+    for _ in range(100):
+        patch.see(patch.read())
+    once = patch.read()
+    assert patch.see(once).distrust == ""
+    assert patch.see(once).distrust == "its codes have not changed for 1 scan"
+    assert not patch.watch.frozen
+    assert patch.see(patch.read()).distrust == ""
+
+
+def test_a_converter_at_half_the_rate_of_the_scans_is_soon_trusted() -> None:
+    patch = Patch(1e-4, stated=1e-4)
+    for _ in range(100):
+        patch.see(patch.read())
+    distrusted = 0
+    for _ in range(100):
+        codes = patch.read()
+        distrusted += sum(patch.see(codes).distrust != "" for _ in range(2))
+        assert not patch.watch.frozen
+    assert distrusted == 1
 
 
 def test_quiet_patch_at_rest_that_says_nothing() -> None:

@@ -289,5 +289,5 @@ def test_nodes_of_both_revisions_on_one_bus(
 def test_threads_do_not_pile_up(running: Hand) -> None:
     before = threading.active_count()
     running.suffer(Faults(lost=0.2, sync_lost=0.2))
-    assert threading.active_count() == before
+    assert eventually(lambda: threading.active_count() <= before)
     assert np.isfinite(running.host.stats().buses["can0"].load)

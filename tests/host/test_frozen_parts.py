@@ -76,6 +76,17 @@ def test_part_of_the_quietest_patch_that_stays_behind_a_press(at, part, upper, l
     assert patch.see(press(30.0, middle)).faults == ()
 
 
+@pytest.mark.parametrize(("at", "part", "upper", "lower"), PARTS[:3])
+def test_wire_that_stays_behind_a_fast_press_is_named_in_the_first_scan(at, part, upper, lower) -> None:
+    patch = Patch()
+    for _ in range(10):
+        assert patch.see(press(0.0)).faults == ()
+    codes = press(1000.0, 0.0 if lower == 0 else 14.0)
+    codes[at] = REST
+    (fault,) = patch.see(codes).faults
+    assert (fault.part, fault.kind, fault.upper, fault.lower) == (part, FaultKind.FROZEN, upper, lower)
+
+
 def test_the_scan_that_is_solved_lacks_what_is_frozen() -> None:
     patch = Patch()
     for depth in (*[0] * 10, *range(0, 2000, 40)):

@@ -136,7 +136,8 @@ class Explainer:
 
         The arguments are those of :meth:`wrong_readings`.
         """
-        most, groups = -math.inf, ()
+        most = -math.inf
+        groups: tuple[Group, ...] = ()
         for number in range(best, -1, -STRIDE):
             level = self._model.level(number)
             total = float(evidence[number]) + self._explain(level, z, present, cost, faults=True, loads=False)

@@ -55,20 +55,16 @@ class WireTables:
         upper, lower = shape
         blocks = [np.arange(u * lower, (u + 1) * lower) for u in range(upper)]
         blocks += [np.arange(k, upper * lower, lower) for k in range(lower)]
-        factors: list[list[Float]] = []
-        for matrix, least in ((p, LEAST), (s, 0.0)):
-            parts = [matrix[np.ix_(block, block)] for block in blocks]
-            factors.append([np.linalg.cholesky(part + least * np.eye(len(part))) for part in parts])
-        log_dets = [np.array([np.log(np.diag(each)).sum() for each in some]) for some in factors]
-        sums = np.array([((each.T @ np.ones(len(each))) ** 2).sum() for each in factors[0]])
-        (of_p, of_s) = factors
+        of_p = [np.linalg.cholesky(p[np.ix_(b, b)] + LEAST * np.eye(len(b))) for b in blocks]
+        of_s = [np.linalg.cholesky(s[np.ix_(b, b)]) for b in blocks]
         return cls(
-            np.stack(of_p[:upper]),
-            np.stack(of_s[:upper]),
-            np.stack(of_p[upper:]),
-            np.stack(of_s[upper:]),
-            *log_dets,
-            sums,
+            upper_p=np.stack(of_p[:upper]),
+            upper_s=np.stack(of_s[:upper]),
+            lower_p=np.stack(of_p[upper:]),
+            lower_s=np.stack(of_s[upper:]),
+            log_det_p=np.array([np.log(np.diag(each)).sum() for each in of_p]),
+            log_det_s=np.array([np.log(np.diag(each)).sum() for each in of_s]),
+            sums=np.array([(each.sum(axis=0) ** 2).sum() for each in of_p]),
         )
 
 

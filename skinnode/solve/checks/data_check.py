@@ -116,7 +116,7 @@ class DataCheck:
         changes(self._model.jacobian, at_rest, 1.0, self._z)
         self._residuals(at_rest, np.ones(shape), np.ones(shape[0], bool))
         self._explainer.wrong_readings(self._z, every, self._evidence, usual[0], 1.0, 1.0)  # compiles
-        self._largest_gain(every, self._evidences(every), 1.0, 1.0)
+        self._largest_gains(every, self._evidences(every), 1.0, 1.0)
         self.reset()
 
     def reset(self) -> None:
@@ -201,7 +201,7 @@ class DataCheck:
         changes(self._model.jacobian, moved, sigma * layout.pitch_m, self._z)
         best = self._evidences(self._present)
         cost = math.log(max(WRONG / sigma, math.e))
-        return self._needs_no_explanation(self._largest_gain(self._present, best, cost, sigma))
+        return self._needs_no_explanation(max(self._largest_gains(self._present, best, cost, sigma)))
 
     def _needs_no_explanation(self, gain: float) -> bool:
         """Return whether a gain is small, or hardly larger than one that loads explained just before."""
@@ -224,10 +224,13 @@ class DataCheck:
         sigma = self._linearised(solved, present)
         best = self._evidences(present)
         cost = math.log(max(WRONG / sigma, math.e))
-        gain = self._largest_gain(present, best, cost, sigma)
+        of_readings, of_wires = self._largest_gains(present, best, cost, sigma)
+        gain = max(of_readings, of_wires)
         if self._needs_no_explanation(gain):
             return ()
-        found = self._explainer.wrong_readings(self._z, present, self._evidence, best, cost, sigma)
+        found = self._explainer.wrong_readings(
+            self._z, present, self._evidence, best, cost, sigma, whole_wires_only=of_readings < SUSPICIOUS
+        )
         self._doubtful = self._explainer.margin > DOUBT and not found
         if self._explainer.margin < CLEAR:
             self._excused, self._excused_until = gain, self._frame + EXCUSED_FRAMES
@@ -285,9 +288,9 @@ class DataCheck:
             best = evidences(model.vectors_t, model.shrink, model.log_det, z, self._c, self._evidence)
         return best
 
-    def _largest_gain(self, present: Mask, best: int, cost: float, sigma: float) -> float:
-        """Return the largest gain from a wrong reading, a wire that does not fit, or two that are crossed."""
-        most, z = -math.inf, self._z.ravel()
+    def _largest_gains(self, present: Mask, best: int, cost: float, sigma: float) -> tuple[float, float]:
+        """Return the largest gain from a wrong reading or crossed wires, and that from an unfit wire."""
+        most, of_wires, z = -math.inf, -math.inf, self._z.ravel()
         for offset in OFFSETS:
             number = best - offset
             if number < 0:
@@ -299,9 +302,8 @@ class DataCheck:
             most = max(most, gain + float(self._evidence[number] - self._evidence[best]))
             if not offset:
                 most = max(most, likeliest(p, self._alpha, self._z, present)[0])
-                wire = least_fitting(level.wires, self._z, self._alpha, present, sigma, self._row)
-                most = max(most, wire.gain)
-        return most
+                of_wires = least_fitting(level.wires, self._z, self._alpha, present, sigma, self._row).gain
+        return most, of_wires
 
     def _find_coarsely(self, solved: Solved) -> tuple[Group, ...]:
         """Return the likeliest wrong readings if several upper wires have no solution.

@@ -93,7 +93,14 @@ class Explainer:
         """Log evidence by which faults explained the last frame better than loads alone, nats."""
 
     def wrong_readings(  # noqa: PLR0913 - the frame, and what is known of it
-        self, z: Float, present: Mask, evidence: Float, best: int, cost: float, sigma: float
+        self,
+        z: Float,
+        present: Mask,
+        evidence: Float,
+        best: int,
+        cost: float,
+        sigma: float,
+        whole_wires_only: bool = False,
     ) -> tuple[Group, ...]:
         """Return the groups of readings that are wrong; none if loads explain the frame as well.
 
@@ -104,29 +111,33 @@ class Explainer:
             best: Index of the κ that fits the frame as it is.
             cost: Cost of a wrong reading: ln of the ratio between its expected error and the noise.
             sigma: Relative noise of the readings.
+            whole_wires_only: Look only for a wire that does not fit, not for wrong or exchanged readings.
         """
         by_loads, by_faults = -math.inf, -math.inf
         groups: tuple[Group, ...] = ()
         for number in range(best, max(best - STRIDE * SCALES, -1), -STRIDE):
             level, start = self._model.level(number), float(evidence[number])
-            total = start + self._explain(level, z, present, cost, faults=True)
-            if total > by_faults:
-                by_faults, groups = total, self._groups()
+            if not whole_wires_only:
+                total = start + self._explain(level, z, present, cost, faults=True)
+                if total > by_faults:
+                    by_faults, groups = total, self._groups()
             by_loads = max(by_loads, start + self._explain(level, z, present, cost, faults=False))
         level = self._model.level(best)
         multiply_vector(level.precision, z.ravel(), self._alpha)
         alpha = self._alpha.copy()
-        gain, pair = likeliest(level.precision, alpha, z, present, far=True)
-        if gain > DOUBT:
-            by_exchange = self._by_exchange(z, present, cost, pair)
-            if by_exchange > by_faults:
-                by_faults, groups = by_exchange, _crossed(pair, by_exchange - by_loads)
+        if not whole_wires_only:
+            gain, pair = likeliest(level.precision, alpha, z, present, far=True)
+            if gain > DOUBT:
+                by_exchange = self._by_exchange(z, present, cost, pair)
+                if by_exchange > by_faults:
+                    by_faults, groups = by_exchange, _crossed(pair, by_exchange - by_loads)
+        self.margin = by_faults - by_loads
         finding = least_fitting(level.wires, z, alpha, present, sigma, self._row)
         if finding.gain > DOUBT:
             by_wire = self._by_wire(z, present, cost, finding, alpha, best, GAIN_STD / sigma)
-            if by_wire > by_faults:
-                by_faults, groups = by_wire, (self._wire(finding.wire, by_wire - by_loads),)
-        self.margin = by_faults - by_loads
+            # a wire under a load of its own does not fit the others either: no doubt follows from less
+            if by_wire > max(by_faults, by_loads + MARGIN):
+                self.margin, groups = by_wire - by_loads, (self._wire(finding.wire, by_wire - by_loads),)
         return groups if self.margin > MARGIN else ()
 
     def wrong_without_loads(

@@ -76,7 +76,7 @@ def test_a_wire_whose_gain_changes_by_one_percent_is_named_at_once(layer: str, m
 
 @pytest.mark.parametrize("layer", ["upper", "lower"])
 def test_a_wire_that_lags_far_behind_is_named(layer: str) -> None:
-    """By four scans, in which the press deepens by 1 % each: found when it is 3 % behind, the upper wire too."""
+    """By four scans, in which the press deepens by 1 % each: found when 3 % behind, an upper one too."""
     rng, wire = np.random.default_rng(6), 4 if layer == "upper" else 14
     here = np.s_[wire] if layer == "upper" else np.s_[:, wire]
     tracker, scans = sk.Tracker(LAYOUT, relative_noise=NOISE), []

@@ -19,7 +19,8 @@ import numpy as np
 
 from skinnode.bench.accuracy_noise import Pool
 from skinnode.bench.accuracy_time import Cycle
-from skinnode.bench.cases import fingertip, preset
+from skinnode.bench.case import preset
+from skinnode.bench.cases import fingertip
 from skinnode.bench.timing import take_turns
 from skinnode.bench.trust_loads import LOADS, draw
 from skinnode.bench.truth import Converter, Press, Skin, stream

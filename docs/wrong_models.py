@@ -18,7 +18,8 @@ from scipy.special import j0, j1
 
 import skinnode as sk
 from skinnode.bench import stability
-from skinnode.bench.cases import MODEL_ERROR, all_cases
+from skinnode.bench.case import MODEL_ERROR
+from skinnode.bench.cases import all_cases
 from skinnode.model.elastic import Rubber
 
 Float = NDArray[np.float64]

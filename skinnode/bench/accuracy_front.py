@@ -17,7 +17,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from skinnode.bench.cases import preset
+from skinnode.bench.case import preset
 from skinnode.bench.solve import Case, Solve, peers
 from skinnode.bench.truth import Press, Skin
 from skinnode.model.layout import Float, PatchLayout

@@ -16,7 +16,7 @@ from typing import Any, Final
 import numpy as np
 
 from skinnode.bench import methods
-from skinnode.bench.cases import Case, preset
+from skinnode.bench.case import Case, preset
 from skinnode.bench.score import bound_std_m
 from skinnode.bench.truth import Converter, Press, Skin, Stream, random_press, stream
 from skinnode.model.frames import Z_95_TWO_SIDED, FieldFrame

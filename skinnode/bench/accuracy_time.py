@@ -8,7 +8,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from skinnode.bench.cases import preset
+from skinnode.bench.case import preset
 from skinnode.bench.timing import take_turns
 from skinnode.bench.truth import Converter, Press, Skin, stream
 from skinnode.model.layout import Float

@@ -12,7 +12,7 @@ from typing import Final
 
 import numpy as np
 
-from skinnode.bench.cases import FINE, PATHS, PITCH_M, Case, preset, press_and_release, pressing
+from skinnode.bench.case import FINE, PATHS, PITCH_M, Case, preset, press_and_release, pressing
 from skinnode.bench.trust_loads import draw
 from skinnode.bench.truth import Converter, Load, Press, Skin, Stream, random_press
 from skinnode.model.layout import PatchLayout

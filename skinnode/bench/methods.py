@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from skinnode.bench.cases import DRIFT, Case
+from skinnode.bench.case import DRIFT, Case
 from skinnode.bench.truth import Stream
 from skinnode.bench.verdict import LIMIT, Solved
 from skinnode.model.frames import FieldFrame

@@ -14,7 +14,8 @@ from typing import Any, Final
 import numpy as np
 
 from skinnode.bench import methods
-from skinnode.bench.cases import Case, all_cases
+from skinnode.bench.case import Case
+from skinnode.bench.cases import all_cases
 from skinnode.bench.timing import machine
 from skinnode.bench.verdict import Solved, Tally
 from skinnode.process.child_processes import starting_children

@@ -43,7 +43,7 @@ def no_answer(wrong: str) -> str:
     """Describe a node without a valid SDO response; ``wrong`` is its newest invalid response, or empty."""
     if not wrong:
         return "does not answer SDO requests"
-    return f"responds to SDO requests with data that is not a CiA 301 response (newest: {wrong})"
+    return f"sends SDO frames that do not respond to the request (newest: {wrong})"
 
 
 class BusConnection:

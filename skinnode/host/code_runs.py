@@ -187,5 +187,7 @@ def _any_wire(state: _Int, limits: _Int) -> bool:
 
 
 def compile_kernels() -> None:
-    """Compile the kernel, or load it from the cache, before the first scan."""
-    follow(np.zeros((1, 1), np.uint32), new_runs((1, 1)), np.zeros(7, np.int64), np.zeros(8, np.int64))
+    """Compile the kernel, or load it from the cache, before the first scan, whose codes are read-only."""
+    codes = np.zeros((1, 1), np.uint32)
+    codes.setflags(write=False)
+    follow(codes, new_runs((1, 1)), np.zeros(7, np.int64), np.zeros(8, np.int64))

@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 from skinnode.bench import accuracy as bench
 from skinnode.bench import accuracy_front as front
 from skinnode.bench import accuracy_noise as noise
-from skinnode.bench.cases import preset
+from skinnode.bench.case import preset
 from skinnode.bench.truth import Skin, Stream
 from skinnode.cli.bench import app
 from skinnode.model.forward import jacobian, potential_per_m

@@ -28,6 +28,7 @@ taken = make(setting, load, faults, rng, Timeline(rest=4, press=4, hold=6, slide
 patch = host_patch(taken)
 before = kernels()
 for number, codes in enumerate(taken.codes):
+    codes.setflags(write=False)  # as in the scans of a host
     patch.field(codes, number, 1 + number % 3)
 print(json.dumps([len(before), sorted(kernels() - before)]))
 """

@@ -99,7 +99,7 @@ class PatchLife:
         self._pressed = False
         self._longest = {False: 0, True: 0}
         self._noise_before = 0.0  # noise shown before the run: the run itself shows none
-        self._phase = self._phase_scan = self._same_phase = 0
+        self._phase = self._phase_scan = self._same_phase = self._missing = 0
         self._t_ns = 0
         self._t_proof_ns: int | None = None
 
@@ -151,7 +151,9 @@ class PatchLife:
         self._t_ns = scan.t_last_ns
         if changed:
             self._end_run(returned, largest)
-        self._compare_phase(scan, unchanged=measured > 0 and not changed)
+        # a code that was missing from the scan before differs from an older one
+        self._compare_phase(scan, unchanged=measured > 0 and changed <= self._missing)
+        self._missing = 0 if scan.flags & SummaryFlag.CHANGED_ONLY else scan.codes.size - measured
         if changed or not measured or scan.flags & SummaryFlag.CHANGED_ONLY:
             return
         self._run += 1

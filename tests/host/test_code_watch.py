@@ -146,6 +146,19 @@ def test_phase_proves_life_and_death_of_the_quietest_patch() -> None:
     assert patch.watch.alive is Alive.YES
 
 
+def test_a_code_that_was_missing_before_is_no_sign_of_life() -> None:
+    patch = Patch(1e-4, stated=1e-4)
+    for phase in (1, 2, 3, 1):
+        assert patch.see(patch.read(), phase << 6).faults == ()
+    last = patch.read()
+    lossy = last.copy()
+    lossy[1, 3:6] = MISSING
+    assert patch.see(lossy, 2 << 6).faults == ()
+    assert patch.see(last, 2 << 6).distrust == "its converter has completed no conversion for 1 scan"
+    assert patch.see(patch.read(), 3 << 6).faults == ()
+    assert patch.see(patch.read(), 3 << 6).faults == ()  # three conversions, or six
+
+
 def test_equal_phase_after_lost_scans_or_a_lost_summary_says_nothing() -> None:
     patch = Patch(noise=0.0)
     for phase in (1, 2, 3):

@@ -278,8 +278,11 @@ def test_nodes_of_both_revisions_on_one_bus(
         old, new = (stats.patches[name].assembler for name in ("p0", "p1"))
         lost = {name: fleet.injected(name).summary_lost for name in ("p0", "p1")}
         assert min(lost.values()) > 2
-        assert (old.summaries_lost, old.scans_unchecked) == (lost["p0"], 0)
-        assert new.summaries_lost == new.scans_unchecked == lost["p1"]
+        # a node that the machine holds up ends its scan without a summary, and says so
+        late = {node.patch: node.overruns for node in fleet.report()}
+        assert 0 <= old.summaries_lost - lost["p0"] <= late["p0"]
+        assert 0 <= new.summaries_lost - lost["p1"] <= late["p1"]
+        assert (old.scans_unchecked, new.scans_unchecked) == (0, new.summaries_lost)
         assert old.scans_torn == new.scans_torn == old.scans_corrupt == new.scans_corrupt == 0
         assert old.bad_form == new.bad_form == 0
         assert tags.mixed == []

@@ -50,9 +50,9 @@ QUIETER: Final = 10.0
 """Ratio by which the noise may be smaller than stated."""
 ABRUPT: Final = 16
 """Minimum change of a code in the last scan of a movement that ends abruptly, codes. Not tuned."""
-DOUBT_RUN: Final = 16
+DOUBT_RUN: Final = 64
 """Number of scans after such a movement whose fields are not trusted; later, probability alone decides. In
-test streams of patches that froze in mid-press, it took up to 11 scans."""
+most test streams of patches that froze in mid-press, it took up to 11 scans, in some more than 16."""
 FLICKERS: Final = 5
 """Number of scans in which a code must return to its previous value to prove that the codes contain noise."""
 LONGER: Final = 4

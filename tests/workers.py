@@ -91,7 +91,11 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 def pytest_sessionstart(session: pytest.Session) -> None:
-    """Compile the kernels before the workers start."""
+    """Compile the kernels before the workers start; load them before the first test in real time.
+
+    Loading them keeps all threads of a process from running for a second, also those of simulated nodes."""
+    if getattr(session.config, "workerinput", {}).get("workerid") == "gw0" and is_whole(session.config):
+        warm_up.main()
     if session.config.option.numprocesses and not session.config.option.collectonly and warm_up.is_needed():
         subprocess.run([sys.executable, warm_up.__file__], check=True)
 

@@ -1,7 +1,8 @@
 """Hard cases 14 to 16 of ``skinnode bench stability``: wrong data, patches made to tolerances, wide touches.
 
-The data of case 14 are wrong and not marked. A wire is claimed if it is CONVERGED and trusted; only a tracker
-tests the data, so the bare posterior does not solve these cases.
+The data of case 14 are wrong and not marked. A wire is claimed if it is CONVERGED and trusted. Only a tracker
+tests the data, so the bare posterior does not solve these cases; a tracker gets resistances. That codes repeat,
+which gives a frozen wire away, is known to the host alone (:mod:`skinnode.host.frozen_parts`).
 """
 
 from __future__ import annotations
@@ -25,6 +26,8 @@ SHARES: Final = np.array([0.0, 0.0, 0.0, 0.0, 0.25, 0.5, 0.75, 1.0, 1.0, 1.0, 1.
 """Fractions of the depth in case 14."""
 FAILS: Final = 5
 """Frame, during the press, from which the data of case 14 are wrong."""
+TESTED: Final = ("exact", "auto")
+"""Methods of case 14; a load on one upper wire alone, or at one crossing of an edge, explains some of it."""
 UPPER, LOWER = 1, 2
 """Axes of the wires in an array (T, U, K)."""
 
@@ -51,7 +54,8 @@ def _wrong_data() -> Iterator[Case]:
             ("half of the chunks lost", _half),
         ):
             make = pressing(skin, 0.3, converter, SHARES, spoil=spoil)
-            yield Case(14, f"{name}, noise {noise}", skin, make, ("exact", "auto"), converter)
+            known = TESTED if name in ("upper wire frozen", "bits flipped") else ()
+            yield Case(14, f"{name}, noise {noise}", skin, make, TESTED, converter, known_wrong=known)
 
 
 def _tolerances() -> Iterator[Case]:

@@ -245,11 +245,11 @@ def with_parts(
     if "table" in parts:
         found["table"] = []
         for row in trust_table.rows(seed):
-            found["table"].append(row)
+            found["table"].append(plain(row))
             progress(f"table: {row['tried']}")
     if "speed" in parts:
         progress("speed against error")
-        found["speed"] = trust_speed.rows(seed)
+        found["speed"] = plain(trust_speed.rows(seed))
     if "road" in parts:
         progress("faults over the bus")
         found["road"] = plain(trust_road.rows(seed))

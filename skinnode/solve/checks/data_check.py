@@ -123,7 +123,8 @@ class DataCheck:
         """Forget the stream."""
         self._list.reset()
         self._frame, self._doubtful = 0, False
-        self._excused, self._excused_until = -math.inf, 0
+        self._excused, self._excused_where, self._excused_until = -math.inf, -1, 0
+        self._where = -1
         self._last: FieldFrame | None = None
 
     @property
@@ -204,8 +205,15 @@ class DataCheck:
         return self._needs_no_explanation(max(self._largest_gains(self._present, best, cost, sigma)))
 
     def _needs_no_explanation(self, gain: float) -> bool:
-        """Return whether a gain is small, or hardly larger than one that loads explained just before."""
-        excused = self._frame < self._excused_until and gain < self._excused + EXCUSED
+        """Return whether a gain is small, or hardly larger than one that loads explained just before.
+
+        The latter only if the likeliest wrong reading is that one: another may be wrong under a press.
+        """
+        excused = (
+            self._frame < self._excused_until
+            and gain < self._excused + EXCUSED
+            and self._where == self._excused_where
+        )
         return gain < SUSPICIOUS or excused
 
     def _find(self, solved: Solved) -> tuple[Group, ...]:
@@ -225,7 +233,7 @@ class DataCheck:
         best = self._evidences(present)
         cost = math.log(max(WRONG / sigma, math.e))
         of_readings, of_wires = self._largest_gains(present, best, cost, sigma)
-        gain = max(of_readings, of_wires)
+        gain, where = max(of_readings, of_wires), self._where
         if self._needs_no_explanation(gain):
             return ()
         found = self._explainer.wrong_readings(
@@ -233,7 +241,8 @@ class DataCheck:
         )
         self._doubtful = self._explainer.margin > DOUBT and not found
         if self._explainer.margin < CLEAR:
-            self._excused, self._excused_until = gain, self._frame + EXCUSED_FRAMES
+            self._excused, self._excused_where = gain, where
+            self._excused_until = self._frame + EXCUSED_FRAMES
         return found
 
     def _linearised(self, solved: Solved, present: Mask) -> float:
@@ -298,8 +307,10 @@ class DataCheck:
             level = self._model.level(number)
             p = level.precision
             multiply_vector(p, z, self._alpha)
-            gain = crossing_gain(p, self._alpha, present.ravel(), cost)
-            most = max(most, gain + float(self._evidence[number] - self._evidence[best]))
+            gain, where = crossing_gain(p, self._alpha, present.ravel(), cost)
+            gain += float(self._evidence[number] - self._evidence[best])
+            if gain > most:
+                most, self._where = gain, where
             if not offset:
                 most = max(most, likeliest(p, self._alpha, self._z, present)[0])
                 of_wires = least_fitting(level.wires, self._z, self._alpha, present, sigma, self._row).gain

@@ -254,14 +254,16 @@ def _crossed(pair: WirePair, gain: float) -> tuple[Group, ...]:
 
 
 @njit
-def crossing_gain(p: Float, alpha: Float, present: Mask, cost: float) -> float:
-    """Return the largest gain from treating a single reading as wrong, nats."""
-    best = -math.inf
+def crossing_gain(p: Float, alpha: Float, present: Mask, cost: float) -> tuple[float, int]:
+    """Return the largest gain from treating a reading as wrong, nats, and the number of the reading."""
+    best, where = -math.inf, -1
     for i in range(alpha.size):
         if present[i]:
             d = max(p[i, i], LEAST)
-            best = max(best, 0.5 * alpha[i] * alpha[i] / d - 0.5 * math.log(d))
-    return best - cost - math.log(alpha.size)
+            gain = 0.5 * alpha[i] * alpha[i] / d - 0.5 * math.log(d)
+            if gain > best:
+                best, where = gain, i
+    return best - cost - math.log(alpha.size), where
 
 
 @njit

@@ -126,11 +126,13 @@ class Explainer:
         multiply_vector(level.precision, z.ravel(), self._alpha)
         alpha = self._alpha.copy()
         if not whole_wires_only:
-            gain, pair = likeliest(level.precision, alpha, z, present, far=True)
-            if gain > DOUBT:
-                by_exchange = self._by_exchange(z, present, cost, pair)
-                if by_exchange > by_faults:
-                    by_faults, groups = by_exchange, _crossed(pair, by_exchange - by_loads)
+            by_pair, pair = self._by_exchange(z, present, cost, alpha, level)
+            if by_pair > by_faults:
+                by_faults, groups = by_pair, _crossed(pair, by_pair - by_loads)
+            by_reading, number = self._by_reading(z, present, evidence, best, cost)
+            # a narrow load at the edge of a patch resembles a wrong reading: no doubt follows from less
+            if by_reading > max(by_faults, by_loads + MARGIN):
+                by_faults, groups = by_reading, (self._reading(number, by_reading - by_loads),)
         self.margin = by_faults - by_loads
         finding = least_fitting(level.wires, z, alpha, present, sigma, self._row)
         if finding.gain > DOUBT:
@@ -156,12 +158,44 @@ class Explainer:
                 most, groups = total, self._groups()
         return groups
 
-    def _by_exchange(self, z: Float, present: Mask, cost: float, pair: WirePair) -> float:
-        """Return the log evidence of the best explanation by loads with the readings exchanged."""
-        model = self._model
+    def _by_reading(
+        self, z: Float, present: Mask, evidence: Float, best: int, cost: float
+    ) -> tuple[float, int]:
+        """Return the log evidence of the best explanation by loads if one reading is wrong, and that reading.
+
+        A search that adds the best group at each step would leave out its whole wire first at small scales.
+        """
+        p = self._model.level(best).precision
+        multiply_vector(p, z.ravel(), self._alpha)
+        gain, number = crossing_gain(p, self._alpha, present.ravel(), cost)
+        most = -math.inf
+        if gain < DOUBT:
+            return most, number
+        without = present.copy()
+        without.ravel()[number] = False
+        for scale in range(best, max(best - STRIDE * SCALES, -1), -STRIDE):
+            level = self._model.level(scale)
+            d = max(float(level.precision[number, number]), LEAST)
+            alpha = float(level.precision[number] @ z.ravel())
+            gain = 0.5 * alpha * alpha / d - 0.5 * math.log(d) - cost - math.log(z.size)
+            total = float(evidence[scale]) + gain + self._explain(level, z, without, cost, faults=False)
+            most = max(most, total)
+        return most, number
+
+    def _reading(self, number: int, gain: float) -> Group:
+        upper, lower = divmod(number, self._model.shape[1])
+        return Group(FaultyPart.CROSSING, upper, lower, gain)
+
+    def _by_exchange(
+        self, z: Float, present: Mask, cost: float, alpha: Float, level: Level
+    ) -> tuple[float, WirePair]:
+        """Return the log evidence of the best explanation by loads with two wires exchanged, and these."""
+        gain, pair = likeliest(level.precision, alpha, z, present, far=True)
+        if gain < DOUBT:
+            return -math.inf, pair
         straight, there = exchanged(z, present, pair)
-        choice = math.log(sum(math.comb(count, 2) for count in model.shape))
-        return self._by_loads(straight, there, cost, lambda level: -choice)
+        choice = math.log(sum(math.comb(count, 2) for count in self._model.shape))
+        return self._by_loads(straight, there, cost, lambda level: -choice), pair
 
     def _by_wire(  # noqa: PLR0913 - the frame, and what was found in it
         self, z: Float, present: Mask, cost: float, finding: WireFinding, alpha: Float, best: int, tau: float

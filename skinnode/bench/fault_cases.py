@@ -1,8 +1,8 @@
 """Hard cases 14 to 16 of ``skinnode bench stability``: wrong data, patches made to tolerances, wide touches.
 
 The data of case 14 are wrong and not marked. A wire is claimed if it is CONVERGED and trusted. Only a tracker
-tests the data, so the bare posterior does not solve these cases. A tracker gets resistances: only the host sees
-codes that repeat, which give a frozen wire away (:mod:`skinnode.host.frozen_parts`).
+tests the data, so the bare posterior does not solve these cases. A tracker gets resistances: only the host
+sees codes that repeat, which give a frozen wire away (:mod:`skinnode.host.frozen_parts`).
 """
 
 from __future__ import annotations

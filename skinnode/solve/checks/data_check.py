@@ -17,7 +17,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from skinnode.model.data_fault import FaultyPart
+from skinnode.model.data_fault import FaultKind, FaultyPart
 from skinnode.model.frames import FieldFrame, amended
 from skinnode.model.kernels import potential
 from skinnode.model.layout import Float
@@ -47,6 +47,8 @@ EXCUSED: Final = 10.0
 """Rise of the gain after such a frame that makes a frame suspicious again, nats."""
 EXCUSED_FRAMES: Final = 8
 """Number of frames after such a frame that need no explanation; finding one takes 9 ms."""
+CROSSED_FRAMES: Final = 5
+"""Number of frames after one with two exchanged wires in which finding one of them means both."""
 USUAL: Final = (-11, -3)
 """Range of log2 s, s in pitches, whose tables are prepared in advance; others are computed when needed."""
 COARSE: Final = 0.1
@@ -125,6 +127,8 @@ class DataCheck:
         self._frame, self._doubtful = 0, False
         self._excused, self._excused_where, self._excused_until = -math.inf, -1, 0
         self._where = -1
+        self._crossed: tuple[Group, ...] = ()
+        self._crossed_until = 0
         self._last: FieldFrame | None = None
 
     @property
@@ -239,10 +243,21 @@ class DataCheck:
         found = self._explainer.wrong_readings(
             self._z, present, self._evidence, best, cost, sigma, whole_wires_only=of_readings < SUSPICIOUS
         )
+        found = self._with_both_crossed(found)
         self._doubtful = self._explainer.margin > DOUBT and not found
         if self._explainer.margin < CLEAR:
             self._excused, self._excused_where = gain, where
             self._excused_until = self._frame + EXCUSED_FRAMES
+        return found
+
+    def _with_both_crossed(self, found: tuple[Group, ...]) -> tuple[Group, ...]:
+        """Return both of two wires that were exchanged just before if one of them is found alone."""
+        if any(group.kind is FaultKind.CROSSED for group in found):
+            self._crossed, self._crossed_until = found, self._frame + CROSSED_FRAMES
+        elif self._frame <= self._crossed_until:
+            wires = [(group.part, group.upper, group.lower) for group in self._crossed]
+            if any((group.part, group.upper, group.lower) in wires for group in found):
+                return self._crossed
         return found
 
     def _linearised(self, solved: Solved, present: Mask) -> float:

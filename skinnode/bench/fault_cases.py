@@ -27,7 +27,15 @@ SHARES: Final = np.array([0.0, 0.0, 0.0, 0.0, 0.25, 0.5, 0.75, 1.0, 1.0, 1.0, 1.
 FAILS: Final = 5
 """Frame, during the press, from which the data of case 14 are wrong."""
 TESTED: Final = ("exact", "auto")
-"""Methods of case 14; a load on one upper wire alone, or at one crossing of an edge, explains some of it."""
+"""Methods of case 14."""
+KNOWN: Final = {
+    ("upper wire frozen", "1e-5"),
+    ("upper wire frozen", "1e-4"),
+    ("bits flipped", "1e-5"),
+    ("bits flipped", "1e-4"),
+    ("lower wires crossed, tared", "1e-4"),
+}
+"""Faults and noises at which a few wires are trusted and wrong; ``docs/limits.md`` says why."""
 UPPER, LOWER = 1, 2
 """Axes of the wires in an array (T, U, K)."""
 
@@ -54,7 +62,7 @@ def _wrong_data() -> Iterator[Case]:
             ("half of the chunks lost", _half),
         ):
             make = pressing(skin, 0.3, converter, SHARES, spoil=spoil)
-            known = TESTED if name in ("upper wire frozen", "bits flipped") else ()
+            known = TESTED if (name, noise) in KNOWN else ()
             yield Case(14, f"{name}, noise {noise}", skin, make, TESTED, converter, known_wrong=known)
 
 

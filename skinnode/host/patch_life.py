@@ -14,9 +14,9 @@ must be ``LONGER`` times as long as any earlier run that ended on its own. Runs 
 skin are counted separately, because the same converter repeats its codes for minutes at rest and for two or
 three scans under a press.
 
-**Doubt.** A patch is not frozen after one scan, but a press moves on meanwhile. If a patch that has shown
-noise and has never repeated its codes stops moving from one scan to the next, the first ``DOUBT_RUN`` fields
-are not trusted.
+**Doubt.** A patch is not frozen after one scan, but a press moves on meanwhile. If a patch that supplies no
+phase, has shown noise and has never repeated its codes stops moving from one scan to the next, the first
+``DOUBT_RUN`` fields are not trusted.
 
 If neither decides and no code has changed for a second, the answer is *cannot tell*.
 """
@@ -159,8 +159,8 @@ class PatchLife:
         self._run += 1
         self._codes += measured
         if self._run == 1:
-            never = not any(self._longest.values())
-            self._abrupt = never and self._largest >= ABRUPT and self._flickers >= FLICKERS
+            unheard = not self._phase and not any(self._longest.values())
+            self._abrupt = unheard and self._largest >= ABRUPT and self._flickers >= FLICKERS
         if self._run >= self._check_at and not self._improbable:
             self._check_at = self._run + 1 + self._run // 4  # the probability falls slowly: look rarely
             self._evaluate_run(last, run, least)

@@ -90,6 +90,18 @@ def test_frozen_after_noise_was_seen(bits: int, noise: float, ohm: Float) -> Non
     assert not patch.watch.frozen
 
 
+@pytest.mark.parametrize("counts", [False, True])
+def test_movement_that_ends_at_once_is_doubted_unless_the_patch_counts(counts: bool) -> None:
+    patch = Patch(3e-5, stated=1e-6)  # as stated, noise would hardly show in the codes
+    for _ in range(100):
+        patch.see(patch.read(), (patch.number % 3 + 1) << 6 if counts else 0)
+    pressed = patch.read(0.9 * REST)
+    for expected in ("", "its codes have not changed for 1 scan", "its codes have not changed for 2 scans"):
+        verdict = patch.see(pressed, (patch.number % 3 + 1) << 6 if counts else 0)
+        assert verdict.distrust == ("" if counts else expected)
+        assert not patch.watch.frozen
+
+
 def test_a_repeated_scan_is_not_trusted_and_the_patch_is_not_frozen() -> None:
     patch = Patch(1e-4, stated=1e-4)
     for _ in range(100):

@@ -1,7 +1,7 @@
-"""pytest plugin: run the whole suite in several processes, and leave its long tests to a lane of their own.
+"""pytest plugin: run the whole suite in several processes, and leave its long tests to lanes of their own.
 
 A run without a file or folder is a run of the whole suite: it uses :data:`WORKERS` processes, and leaves out
-the tests marked ``long`` unless ``-m`` chooses. A run of chosen files stays in one process and has all tests.
+the tests marked ``long`` or ``release`` unless ``-m`` chooses. A run of chosen files stays in one process and has all tests.
 
 Each test goes to the next worker that is free. Tests of one group run one after the other in one worker.
 """
@@ -32,6 +32,9 @@ PAGES = "pages"
 
 RANKS = {REAL_TIME: 0, PAGES: 1, None: 3}
 """Order of the groups: real time takes longest, and its worker has priority."""
+
+LANES = "long", "release"
+"""Markers of the tests that run in a lane of their own."""
 
 NICE = 3
 """Niceness of all workers but the first, so that they keep real-time tests from running less often."""
@@ -121,8 +124,9 @@ def pytest_configure_node(node: Any) -> None:
 @pytest.hookimpl(trylast=True)
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     if is_whole(config) and not config.option.markexpr:
-        config.hook.pytest_deselected(items=[item for item in items if item.get_closest_marker("long")])
-        items[:] = [item for item in items if not item.get_closest_marker("long")]
+        later = {item for item in items if any(item.get_closest_marker(lane) for lane in LANES)}
+        config.hook.pytest_deselected(items=list(later))
+        items[:] = [item for item in items if item not in later]
     if hasattr(config, "workerinput"):
         ranks = {item: RANKS.get(group_of(item), 2) for item in items}
         items.sort(key=ranks.__getitem__)

@@ -211,7 +211,7 @@ def test_two_minutes_of_rest_leave_no_trace(method: str) -> None:
     _rest(method, 10_000)
 
 
-@pytest.mark.long
+@pytest.mark.release
 @pytest.mark.timeout(1800)
 @pytest.mark.parametrize("method", ["exact", "posterior"])
 def test_an_hour_of_rest_leaves_no_trace(method: str) -> None:

@@ -61,7 +61,7 @@ def test_each_body_is_one_contact_in_every_frame(staggered, family, method):
                 assert max(deviations(field, load, share)) < 5, (seed, share)
 
 
-@pytest.mark.long
+@pytest.mark.release
 @pytest.mark.parametrize("method", ["exact", "posterior"])
 @pytest.mark.parametrize("family", FAMILIES)
 def test_two_hundred_presses_of_each_family(staggered, family, method):

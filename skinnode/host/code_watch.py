@@ -35,8 +35,7 @@ class Verdict:
     """What the codes of a scan say about its patch."""
 
     distrust: str = ""
-    """Why the field of this scan must not be trusted, in words; empty if the patch is not known to be
-    frozen."""
+    """Why the field of this scan must not be trusted, in words; empty if nothing speaks against it."""
     faults: tuple[DataFault, ...] = ()
     """Frozen patch, frozen wires and crossings, open and shorted wires."""
     left_out: NDArray[np.bool_] | None = None
@@ -50,8 +49,8 @@ class Verdict:
         return replace(scan, codes=codes, valid=scan.valid & ~self.left_out)
 
     def applied(self, field: FieldFrame) -> FieldFrame:
-        """Return the field of the scan with these faults, and not trusted if the patch is frozen."""
-        if not self.faults:
+        """Return the field of the scan with these faults, and not trusted if the patch may be frozen."""
+        if not (self.faults or self.distrust):
             return field
         faults = (*self.faults, *field.faults)
         if not self.distrust:
@@ -132,7 +131,7 @@ class CodeWatch:
             parts.assume_noise(self._life.measured_noise, least)
         if reserved or self._broken:
             self._broken = broken_wires(last, self._scale)
-        if not (self._broken or parts.faults or self._life.stopped):
+        if not (self._broken or parts.faults or self._life.stopped or self._life.doubtful):
             if self._since:
                 self._since = {}
             self._verdict = FAULTLESS
@@ -158,7 +157,8 @@ class CodeWatch:
             sure = self._life.deviations
             since = self._since[None]
             faults.insert(0, DataFault(FaultyPart.PATCH, FaultKind.FROZEN, since=since, deviations=sure))
-        return Verdict(self._life.words if stopped else "", (*faults, *parts.faults), parts.left_out)
+        distrust = self._life.words if stopped or self._life.doubtful else ""
+        return Verdict(distrust, (*faults, *parts.faults), parts.left_out)
 
     def on_scan(self, scan: Scan) -> None:
         """Look for noisy and drifting wires. Call :meth:`judge` first."""

@@ -106,7 +106,12 @@ class PatchLife:
     @property
     def stopped(self) -> bool:
         """Whether the newest scan repeats a conversion, or codes that no live converter would repeat."""
-        return self._same_phase > 0 or self._improbable or (self._abrupt and self._run <= DOUBT_RUN)
+        return self._same_phase > 0 or self._improbable
+
+    @property
+    def doubtful(self) -> bool:
+        """Whether movement ended from one scan to the next, so recently that nothing else decides."""
+        return self._abrupt and self._run <= DOUBT_RUN
 
     @property
     def deviations(self) -> float:
@@ -129,6 +134,11 @@ class PatchLife:
             return f"its converter has completed no conversion for {counted(self._same_phase, 'scan')}"
         if self.stopped:
             return f"its codes have not changed for {counted(self._run, 'scan')}"
+        if self.doubtful:
+            return (
+                "cannot tell whether its converter runs: its codes stopped in mid-movement, "
+                f"{counted(self._run, 'scan')} ago"
+            )
         if self.alive is Alive.YES:
             return ""
         if self._t_proof_ns is None:

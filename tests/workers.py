@@ -1,7 +1,8 @@
 """pytest plugin: run the whole suite in several processes, and leave its long tests to lanes of their own.
 
 A run without a file or folder is a run of the whole suite: it uses :data:`WORKERS` processes, and leaves out
-the tests marked ``long`` or ``release`` unless ``-m`` chooses. A run of chosen files stays in one process and has all tests.
+the tests marked ``long`` or ``release`` unless ``-m`` chooses. A run of chosen files stays in one process and
+has all tests.
 
 Each test goes to the next worker that is free. Tests of one group run one after the other in one worker.
 """

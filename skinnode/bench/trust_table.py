@@ -57,7 +57,7 @@ def rows(seed: int, only: Sequence[str] = ()) -> Iterator[dict[str, Any]]:
         if only and not any(part in line.tried for part in only):
             continue
         now, reached = line.measure(seed)
-        yield {"tried": line.tried, "before": line.before, "now": now, "reached": reached}
+        yield {"tried": line.tried, "before": line.before, "now": now, "reached": bool(reached)}
 
 
 def _streams(  # noqa: PLR0913 - parts of a stream

@@ -31,6 +31,9 @@ MARGIN: Final = 20.0
 """Log evidence by which faults must explain a frame better than loads alone to be named, nats. With
 :data:`LOADS` loads, none of 6,800 frames of deep slides at a noise of 3e-6, and of 270 frames of presses of
 six kinds at 1e-5, was taken for a fault."""
+MARGIN_OF_READING: Final = 50.0
+"""The same for a single reading that is compared at every scale: under a narrow load at the edge of a patch,
+a reading that is right reached 29 nats."""
 DOUBT: Final = 5.0
 """Log evidence by which faults must explain a frame better than loads alone to make it doubtful, nats. The
 largest of 144 healthy frames was 0, with 8 loads in place of :data:`LOADS`."""
@@ -131,7 +134,7 @@ class Explainer:
                 by_faults, groups = by_pair, _crossed(pair, by_pair - by_loads)
             by_reading, number = self._by_reading(z, present, evidence, best, cost)
             # a narrow load at the edge of a patch resembles a wrong reading: no doubt follows from less
-            if by_reading > max(by_faults, by_loads + MARGIN):
+            if by_reading > max(by_faults, by_loads + MARGIN_OF_READING):
                 by_faults, groups = by_reading, (self._reading(number, by_reading - by_loads),)
         self.margin = by_faults - by_loads
         finding = least_fitting(level.wires, z, alpha, present, sigma, self._row)

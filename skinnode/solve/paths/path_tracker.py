@@ -79,6 +79,7 @@ class PathTracker:
         second_tries: Whether a wire may move away from the end of its path; if not, only its status may
             change.
         stumbled: (U,) wires on which at least one step was undone.
+        reached: (U,) wires for which the end of the path is a root.
     """
 
     def __init__(self, problem: PatchProblem, a: Float, operator: int) -> None:
@@ -98,7 +99,7 @@ class PathTracker:
         self.searched = 0
         self.second_tries = True
         self._path_end = problem.rest.copy()
-        self._reached = np.zeros(self.wires, bool)
+        self.reached = np.zeros(self.wires, bool)
         self._everywhere = np.full(self.wires, wires.SOLVE, np.uint8)
         self._smoothness: Smoothness | None = None
         self._rest_branch = self.solver.solve_rest()
@@ -181,7 +182,7 @@ class PathTracker:
         """Store the end of the path of the wires in ``todo`` (U,), from their solve of the last sample."""
         self._path_end[todo] = self.solver.x[todo]
         residual = self.solver.measure[:, wires.RESIDUAL]
-        self._reached[todo] = (residual <= roots.ROOT_RESIDUAL)[todo]
+        self.reached[todo] = (residual <= roots.ROOT_RESIDUAL)[todo]
 
     # -- wire by wire ----------------------------------------------------------------------------------
 
@@ -257,7 +258,7 @@ class PathTracker:
         """
         size = roots.distance(self._path_end, self.problem.rest)
         elsewhere = roots.distance(self.solver.x, self._path_end) > roots.SAME_ROOT * size
-        elsewhere &= self._reached
+        elsewhere &= self.reached
         if not elsewhere.any():
             return elsewhere
         points = [*self._points, (self._path_end, self.last_a)]

@@ -199,13 +199,16 @@ def heed_samples(tracker: PathTracker, accuracy: Accuracy) -> None:
 
     Where the skin itself crosses a fold, the root on the branch of the rest position can be the smoother and
     the likelier root, and yet be wrong: a start from the smoothest displacement and the posterior both find
-    it. The samples are the only evidence against it.
+    it. The samples are the only evidence against it. Where they refute the estimate of the patch, the roots
+    that its other wires owe to the estimate are rejected with it.
     """
     if not tracker.second_tries:
         return  # a plain path moves no wire away from its end
     todo = tracker.led_elsewhere()
     if todo.any():
-        tracker.return_to_path_end(todo, accuracy)
+        moved = ~tracker.at_path_end()
+        tracker.end.doubt(moved)
+        tracker.return_to_path_end(todo | (moved & tracker.reached), accuracy)
 
 
 def _twins(tracker: PathTracker) -> Float:

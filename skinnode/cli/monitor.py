@@ -200,7 +200,7 @@ def _print(source: Source, stop: threading.Event, seconds: float | None) -> list
     from skinnode.monitor.report import FaultBook, watch
     from skinnode.text.json_values import plain
 
-    faults = FaultBook()
+    faults = FaultBook(live=source.live)
     for line in watch(source, stop, seconds, faults):
         print(json.dumps(plain(line)), flush=True)
     return faults.lines

@@ -90,7 +90,7 @@ class MonitorApp(App[None]):
         seconds: float | None = None,
     ) -> None:
         super().__init__(driver_class=PatientDriver, ansi_color=colours != "rgb")
-        self.faults = FaultBook()
+        self.faults = FaultBook(live=source.live)
         self.failure: SkinError | None = None
         """Error that ended the source."""
         self._source, self._folder, self._over, self._seconds = source, folder, over, seconds
@@ -159,9 +159,10 @@ class MonitorApp(App[None]):
         self.set_timer(min(SLOWEST_S, max(PERIOD_S, spent_s / SHARE)), self._turn)
 
     def _look_at_source(self) -> None:
+        ending = self._source.over
         snapshot = self._source.snapshot()
         view = self._history.add(snapshot)
-        self.faults.update(view, time.monotonic_ns())
+        self.faults.update(view, time.monotonic_ns(), ending=ending)
         for event in self._source.events():
             begins = event.what == "operational" and time.monotonic() - self._begun_s < _BEGIN_S
             if not begins:  # omitted at start-up, when all patches become operational

@@ -15,7 +15,7 @@ from skinnode.monitor.touches import Touch
 from skinnode.monitor.view_model import History, PatchView, View
 
 SETTLE_NS: Final = 3_000_000_000
-"""Time after which a patch that is not operational counts as a fault, ns."""
+"""Time after which a patch of a running hand that is not operational counts as a fault, ns."""
 
 LOOK_S: Final = 0.1
 """Interval at which the source is checked for faults, s."""
@@ -25,9 +25,15 @@ LINE_S: Final = 1.0
 
 
 class FaultBook:
-    """Faults of a session, each listed once, in order of appearance."""
+    """Faults of a session, each listed once, in order of appearance.
 
-    def __init__(self) -> None:
+    Args:
+        live: Whether the hand is running, so that its patches must soon be operational. A recording begins
+            before the bring-up: only at its end do patches that have never been operational count as faults.
+    """
+
+    def __init__(self, *, live: bool) -> None:
+        self._live = live
         self._found: dict[tuple[str, str], str] = {}
         self._begun_ns: int | None = None
         self._settled: set[str] = set()
@@ -42,12 +48,12 @@ class FaultBook:
 
         Args:
             view: Current view of the hand.
-            real_ns: Monotonic time of the monitor in ns, even when it replays a recording.
+            real_ns: Monotonic time of the monitor, ns.
             ending: Whether the session is ending, so that patches not yet operational count as faults.
         """
         if self._begun_ns is None:
             self._begun_ns = real_ns
-        patient = not ending and real_ns - self._begun_ns < SETTLE_NS
+        patient = not ending and not (self._live and real_ns - self._begun_ns >= SETTLE_NS)
         for patch in view.patches:
             if patch.condition == Condition.OPERATIONAL:
                 self._settled.add(patch.name)

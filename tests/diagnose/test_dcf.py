@@ -209,9 +209,9 @@ def test_strings_that_look_alike_differ_visibly(
         done = run(["od", NODE_ID, "--eds", sheet, "--dcf", file], bus)
         assert done.stdout.startswith("1 value of node 16 in ")
         assert had_back(load_data_sheet(file)) == data
-    for data in ALIKE:
+    for number, data in enumerate(ALIKE):
         node.set_data(0x2001, 0, data)
-        for other, file in zip(ALIKE, files, strict=True):
+        for other, file in zip(ALIKE[number:], files[number:], strict=True):  # every pair once
             done = run(["od", NODE_ID, "--diff", file, "--json"], bus)
             assert done.status == (data != other), (data, other)
             assert len(done.json) == (data != other)

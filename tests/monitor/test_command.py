@@ -57,7 +57,7 @@ def test_json_of_a_recording(tmp_path: Path) -> None:
                 time.sleep(0.05)
         time.sleep(1.5)
     solved = len(list(replay(path)))
-    done = run("--replay", str(path), "--speed", "10", "--json")  # 30 s for the bring-up before it is a fault
+    done = run("--replay", str(path), "--speed", "10", "--json")
     assert done.returncode == 0, done.stderr
     newest = json.loads(done.stdout.splitlines()[-1])
     assert sum(patch["scan"] is not None for patch in newest["patches"].values()) == 2

@@ -265,7 +265,7 @@ def test_a_recording_is_shown_as_it_was_and_cannot_be_tared(tmp_path: Path) -> N
         while host.stats().patches["p1"].solved < 6 and time.monotonic() < end_s:
             time.sleep(0.02)
         live = host.stats().patches["p0"].solved
-    faults = FaultBook()
+    faults = FaultBook(live=False)
     with ReplaySource(replay(tmp_path / "run.log", speed=20.0)) as source:
         history = History(source.hand)
         end_s = time.monotonic() + 10.0
@@ -278,6 +278,21 @@ def test_a_recording_is_shown_as_it_was_and_cannot_be_tared(tmp_path: Path) -> N
     assert view.patch("p0").stream.solved >= live
     assert view.patch("p0").surface is not None
     assert faults.lines == []
+
+
+@pytest.mark.parametrize(("live", "says"), [(True, ["p0: never seen"]), (False, [])])
+def test_a_patch_that_never_comes_is_a_fault_after_three_seconds_or_at_the_end_of_a_recording(
+    live: bool, says: list[str]
+) -> None:
+    hand = a_hand(1, bring_up={"missing": "wait"})
+    with Host.from_config(hand) as host, HostSource(host) as source:
+        view = History(source.hand).add(source.snapshot())
+    faults = FaultBook(live=live)
+    for t_s in (0, 1, 4):
+        faults.update(view, t_s * 1_000_000_000)
+    assert faults.lines == says
+    faults.update(view, 5_000_000_000, ending=True)
+    assert faults.lines == ["p0: never seen"]
 
 
 def test_a_field_that_is_not_to_be_trusted_says_why_on_its_tile_and_alone() -> None:

@@ -6,11 +6,13 @@ are those of the reference model.
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import os
 import subprocess
 import sys
 import threading
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -32,6 +34,18 @@ def staggered() -> sk.PatchLayout:
 @pytest.fixture(scope="module")
 def small() -> sk.PatchLayout:
     return sk.PatchLayout.preset("staggered", upper_wires=5, upper_electrodes=5, lower_electrodes=6)
+
+
+@pytest.fixture(scope="module")
+def noise_tracker() -> Callable[[int], tuple[sk.PatchLayout, sk.Posterior]]:
+    """Layout and tracker for a number of lower wires; setting one up for 150 takes seconds."""
+
+    @functools.cache
+    def make(lower_wires: int) -> tuple[sk.PatchLayout, sk.Posterior]:
+        layout = sk.PatchLayout.preset("staggered", lower_wires=lower_wires)
+        return layout, sk.Posterior(layout, estimate_noise=True)
+
+    return make
 
 
 def sphere(layout: sk.PatchLayout, rng: np.random.Generator, depth: float) -> np.ndarray:
@@ -376,10 +390,10 @@ def test_model_error_covers_a_layer_of_another_thickness(staggered, thicker):
 
 @pytest.mark.parametrize("factor", [1 / 3, 1.0, 3.0])
 @pytest.mark.parametrize("lower_wires", [60, 150])
-def test_noise_is_found_where_there_are_equations_to_spare(factor, lower_wires):
-    layout = sk.PatchLayout.preset("staggered", lower_wires=lower_wires)
+def test_noise_is_found_where_there_are_equations_to_spare(noise_tracker, factor, lower_wires):
+    layout, tracker = noise_tracker(lower_wires)
+    tracker.reset()
     rng = np.random.default_rng(7)
-    tracker = sk.Posterior(layout, estimate_noise=True)
     for depth in (0.0, 0.1, 0.2):
         moved = hertz_press(layout, depth)
         field = tracker.update(noisy(frame_ohm(layout, moved), rng, factor * SIGMA))

@@ -22,7 +22,7 @@ from xdist.scheduler import LoadScopeScheduling
 
 from . import warm_up
 
-WORKERS = 5
+WORKERS = 7
 """Processes for the whole suite: on two processors, because many tests wait rather than compute."""
 
 REAL_TIME = "real_time"

@@ -141,9 +141,15 @@ def test_a_fold_that_the_skin_itself_passes_is_followed():
     assert passed >= 3
 
 
-DRAGGED = (((23.48, 17.41), 12.96, -1.15), ((13.23, 19.24), 6.74, 1.21), ((16.06, 17.78), 6.04, -1.76))
+DRAGGED = (
+    ((23.48, 17.41), 12.96, -1.15),
+    ((13.23, 19.24), 6.74, 1.21),
+    ((16.06, 17.78), 6.04, -1.76),
+    ((26.4966, 12.8967), 14.2644, 1.0314),
+)
 """Centre and radius of a sphere, mm, and the direction in which it is dragged, rad: on each of these presses
-the skin crosses a fold, and a start from the smoothest displacement finds a smoother root that is wrong."""
+the skin crosses a fold, and a start from the smoothest displacement finds a smoother root that is wrong. On
+the last, the posterior moves two wires away from the ends of their paths, and only one path is smooth."""
 
 
 @pytest.mark.parametrize("schedule", [sk.Uniform(), sk.Periodic(cycle=1), sk.Adaptive()])
@@ -171,8 +177,8 @@ def test_a_smooth_root_to_which_the_samples_do_not_lead_is_not_converged(schedul
         assert (error[converged] < 1e-6).all(), centre
         found += converged.sum()
         kept += (error[~converged] < 1e-6).sum()
-    assert found >= 24  # of 30
-    assert kept >= 3  # the best iterate of a wire that is refused is the end of its path
+    assert found >= 32  # of 40
+    assert kept >= 5  # the best iterate of a wire that is refused is the end of its path
 
 
 @pytest.mark.parametrize("operator", OPERATORS)

@@ -3,8 +3,8 @@
     .venv/bin/skinnode bench path --json out/path.json --plot out/path.png
     .venv/bin/python docs/figures.py out
 
-The folder holds some of {kernel,solve,systems,path,accuracy,stability}.json and .png; a table without a file
-stays as it is. ``wrong_models.txt`` is the output of docs/wrong_models.py.
+The folder holds some of {kernel,solve,systems,path,accuracy,stability,trust}.json and .png; a table without a
+file stays as it is. ``wrong_models.txt`` is the output of docs/wrong_models.py.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from skinnode.bench import trust_report
 from skinnode.bench.accuracy import best_of_each
 
 DOCS = Path(__file__).parent
@@ -319,6 +320,10 @@ def exact_data(figures: dict[str, Any]) -> str:
     return f"{summary}\n\n" + table(["method", "wires", "accurate", "flagged", "wrong"], rows)
 
 
+def trust(figures: dict[str, Any]) -> str:
+    return f"{machine(figures)}\n\n```text\n" + "\n".join(trust_report.lines(figures)) + "\n```"
+
+
 MADE: dict[str, dict[str, Callable[[dict[str, Any]], str]]] = {
     "kernel": {"kernel": kernel},
     "solve": {"solve": solve},
@@ -334,6 +339,7 @@ MADE: dict[str, dict[str, Callable[[dict[str, Any]], str]]] = {
         "limits": limits,
     },
     "stability": {"stability": stability, "exact data": exact_data},
+    "trust": {"trust": trust},
 }
 """Tables by the benchmark that measures them, and by their markers."""
 

@@ -119,3 +119,19 @@ def test_half_of_the_readings_are_not_enough_and_the_reason_says_so() -> None:
     field = sk.Tracker(LAYOUT, relative_noise=NOISE).update(readings(press(0.1), rng), valid)
     assert not field.trusted
     assert field.distrust == f"only {valid.mean():.0%} of the readings are usable"
+
+
+@pytest.mark.parametrize("method", ["exact", "posterior"])
+def test_noise_larger_than_stated_is_not_taken_for_wrong_readings(method: str) -> None:
+    """Until it has been estimated, no field is trusted; no reading is ever named."""
+    rng = np.random.default_rng(7)
+    tracker = sk.Tracker(LAYOUT, method=method, relative_noise=NOISE)
+    rest = sk.resistance_ohm(LAYOUT, LAYOUT.upper_m)
+    for _ in range(60):
+        field = tracker.update(rest * rng.normal(1.0, 10 * NOISE, LAYOUT.shape))
+        assert field.faults == ()
+        if field.noise_factor == 1.0:
+            assert field.distrust == "the readings are noisier than stated"
+        else:
+            assert field.trusted
+    assert field.noise_factor == pytest.approx(10.0, rel=0.2)

@@ -26,7 +26,7 @@ from skinnode.solve.checks.crossed_wires import likeliest
 from skinnode.solve.checks.explanations import DOUBT, Explainer, Group, crossing_gain
 from skinnode.solve.checks.fault_list import FaultList, agree
 from skinnode.solve.checks.reading_model import ReadingModel, changes, evidences
-from skinnode.solve.checks.trust import OF_WIRE, assess
+from skinnode.solve.checks.trust import CONTRADICTION, NOISIER, OF_WIRE, assess
 from skinnode.solve.checks.wire_tests import GAIN_STD, LEAST, least_fitting
 from skinnode.solve.linalg.cholesky import multiply_vector
 from skinnode.solve.wires.problem import PatchProblem
@@ -51,6 +51,8 @@ CROSSED_FRAMES: Final = 5
 """Number of frames after one with two exchanged wires in which finding one of them means both."""
 USUAL: Final = (-11, -3)
 """Range of log2 s, s in pitches, whose tables are prepared in advance; others are computed when needed."""
+NOISE_RATIOS: Final = (2.0, 4.0, 8.0, 16.0)
+"""Ratios of the actual to the stated noise that are considered in a suspicious frame."""
 COARSE: Final = 0.1
 """Error of the linearised readings, relative to the largest change, if wires could not be solved."""
 COARSE_GROUPS: Final = 3
@@ -103,7 +105,7 @@ class DataCheck:
         self._z, self._f = np.empty(shape), np.empty(shape)
         self._c, self._alpha = np.empty((2, self._z.size))
         self._row = np.empty(max(shape))
-        self._evidence = np.empty(len(self._model.kappa))
+        self._evidence, self._of_noise = np.empty((2, len(self._model.kappa)))
         self._present = np.ones(shape, bool)
         self._all_converged = (Status.CONVERGED,) * shape[0]
         self._all_trusted = np.ones(shape[0], bool)
@@ -124,7 +126,8 @@ class DataCheck:
     def reset(self) -> None:
         """Forget the stream."""
         self._list.reset()
-        self._frame, self._doubtful = 0, False
+        self._frame, self._doubtful, self._noisy = 0, False, False
+        self._lead = 0.0  # log evidence of more noise over the plain frame, if the last frame was noisy
         self._excused, self._excused_where, self._excused_until = -math.inf, -1, 0
         self._where = -1
         self._crossed: tuple[Group, ...] = ()
@@ -151,6 +154,7 @@ class DataCheck:
         last = self._last
         if last is not None and last.noise_factor != solved.field.noise_factor:
             self._list.reset()  # what contradicted the stated noise may not contradict the actual noise
+            self._lead = 0.0
         if self._list.mask is None and self._is_clean(solved):
             field = amended(solved.field, distrust="", wires_trusted=self._all_trusted)
             self._last = field
@@ -179,7 +183,7 @@ class DataCheck:
         if before:
             self._follow(solved)
         faults = self._list.faults + passing
-        contradiction = bool(found) or self._doubtful
+        contradiction = CONTRADICTION if found or self._doubtful else NOISIER if self._noisy else ""
         reason, wires = assess(solved.field.status, solved.used, faults, contradiction=contradiction)
         field = amended(solved.field, faults=faults, distrust=reason, wires_trusted=wires)
         self._last = field
@@ -211,18 +215,19 @@ class DataCheck:
     def _needs_no_explanation(self, gain: float) -> bool:
         """Return whether a gain is small, or hardly larger than one that loads explained just before.
 
-        The latter only if the likeliest wrong reading is that one: another may be wrong under a press.
+        Never after a noisy frame. The latter only if the likeliest wrong reading is that one: another may be
+        wrong under a press.
         """
         excused = (
             self._frame < self._excused_until
             and gain < self._excused + EXCUSED
             and self._where == self._excused_where
         )
-        return gain < SUSPICIOUS or excused
+        return not self._lead and (gain < SUSPICIOUS or excused)
 
     def _find(self, solved: Solved) -> tuple[Group, ...]:
         """Return the readings that contradict the others; none if there are none."""
-        self._doubtful = False
+        self._doubtful = self._noisy = False
         status = np.array(solved.field.status)
         enough = solved.used.mean(axis=1) >= OF_WIRE
         unsolved = np.flatnonzero(enough & (status != Status.CONVERGED) & (status != Status.DEADLINE))
@@ -240,15 +245,38 @@ class DataCheck:
         gain, where = max(of_readings, of_wires), self._where
         if self._needs_no_explanation(gain):
             return ()
+        noisier = self._noisier()
+        lead = noisier - float(self._evidence[best])
+        if lead > 0.5 * self._lead > 0.0:
+            self._noisy, self._lead = True, lead
+            return ()
         found = self._explainer.wrong_readings(
-            self._z, present, self._evidence, best, cost, sigma, whole_wires_only=of_readings < SUSPICIOUS
-        )
+            self._z, present, self._evidence, best, cost, sigma, noisier,
+            whole_wires_only=of_readings < SUSPICIOUS,
+        )  # fmt: skip
         found = self._with_both_crossed(found)
         self._doubtful = self._explainer.margin > DOUBT and not found
-        if self._explainer.margin < CLEAR:
+        self._noisy = self._explainer.is_noisier and not found
+        self._lead = lead if self._noisy else 0.0
+        if self._explainer.margin < CLEAR and not self._noisy:
             self._excused, self._excused_where = gain, where
             self._excused_until = self._frame + EXCUSED_FRAMES
         return found
+
+    def _noisier(self) -> float:
+        """Return the log evidence of the frame if all its readings are noisier than stated.
+
+        It is that of z divided by the ratio of the noise, minus ln of that ratio for each reading.
+        """
+        model, z = self._model, self._z.ravel()
+        most = -math.inf
+        for ratio in NOISE_RATIOS:
+            np.divide(z, ratio, out=self._alpha)
+            best = evidences(
+                model.vectors_t, model.shrink, model.log_det, self._alpha, self._c, self._of_noise
+            )
+            most = max(most, float(self._of_noise[best]) - z.size * math.log(ratio))
+        return most - math.log(len(NOISE_RATIOS))
 
     def _with_both_crossed(self, found: tuple[Group, ...]) -> tuple[Group, ...]:
         """Return both of two wires that were exchanged just before if one of them is found alone."""

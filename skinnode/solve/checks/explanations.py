@@ -93,7 +93,9 @@ class Explainer:
         self._kind, self._number = np.empty((2, LOADS), np.int64)
         self._gain = np.empty(LOADS)
         self.margin = -math.inf
-        """Log evidence by which faults explained the last frame better than loads alone, nats."""
+        """Log evidence by which faults explained the last frame better than loads or noise alone, nats."""
+        self.is_noisier = False
+        """Whether more noise than stated explained the last frame better than loads."""
 
     def wrong_readings(  # noqa: PLR0913 - the frame, and what is known of it
         self,
@@ -103,6 +105,7 @@ class Explainer:
         best: int,
         cost: float,
         sigma: float,
+        noisier: float = -math.inf,
         whole_wires_only: bool = False,
     ) -> tuple[Group, ...]:
         """Return the groups of readings that are wrong; none if loads explain the frame as well.
@@ -114,6 +117,7 @@ class Explainer:
             best: Index of the κ that fits the frame as it is.
             cost: Cost of a wrong reading: ln of the ratio between its expected error and the noise.
             sigma: Relative noise of the readings.
+            noisier: Log evidence of the frame without loads or faults, if all its readings are noisier.
             whole_wires_only: Look only for a wire that does not fit, not for wrong or exchanged readings.
         """
         by_loads, by_faults = -math.inf, -math.inf
@@ -125,6 +129,8 @@ class Explainer:
                 if total > by_faults:
                     by_faults, groups = total, self._groups()
             by_loads = max(by_loads, start + self._explain(level, z, present, cost, faults=False))
+        self.is_noisier = noisier > by_loads + DOUBT
+        by_loads = max(by_loads, noisier)
         level = self._model.level(best)
         multiply_vector(level.precision, z.ravel(), self._alpha)
         alpha = self._alpha.copy()

@@ -22,12 +22,13 @@ lower wire of the reference patch may be missing (0.77), three upper wires may n
 OF_WIRE: Final = 0.8
 """Share of a wire's readings that a trusted wire needs."""
 CONTRADICTION: Final = "the readings contradict each other, and no wire or crossing explains it"
+NOISIER: Final = "the readings are noisier than stated"
 
 Mask = NDArray[np.bool_]
 
 
 def assess(
-    status: Sequence[Status], used: Mask, faults: Sequence[DataFault], *, contradiction: bool
+    status: Sequence[Status], used: Mask, faults: Sequence[DataFault], *, contradiction: str
 ) -> tuple[str, Mask]:
     """Return why a field is not trusted, in words, and which of its wires are.
 
@@ -35,7 +36,7 @@ def assess(
         status: Status of each of the U wires.
         used: (U, K) readings used.
         faults: What was found and left out.
-        contradiction: Whether the readings used still contradict each other.
+        contradiction: What the readings used still contradict, in words; empty if nothing.
 
     Returns:
         The reason, empty if the field is trusted, and (U,) wires that are trusted.
@@ -44,7 +45,7 @@ def assess(
     converged = np.array([each is Status.CONVERGED for each in status])
     trusted = converged & (share >= OF_WIRE)
     if contradiction:
-        return CONTRADICTION, np.zeros_like(trusted)
+        return contradiction, np.zeros_like(trusted)
     left_out = np.zeros_like(trusted)
     for fault in faults:
         if fault.upper is not None and fault.lower is None:

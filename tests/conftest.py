@@ -41,6 +41,14 @@ def pytest_addoption(parser: pytest.Parser, pluginmanager: pytest.PytestPluginMa
     parser.addoption("--injection-seed", type=int, default=0, help="which calls, where not every one")
 
 
+def pytest_configure() -> None:
+    """Let Ctrl-C end the programs that tests start.
+
+    A script starts a program in the background with SIGINT ignored, which all its descendants inherit."""
+    if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
 @pytest.fixture
 def fuzz_frames(request: pytest.FixtureRequest) -> int:
     """How many frames a node is fuzzed with."""

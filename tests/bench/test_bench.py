@@ -22,7 +22,7 @@ def figures(tmp_path, name: str) -> tuple[str, dict]:
     return result.output, json.loads(file.read_text(encoding="utf-8"))
 
 
-@pytest.mark.long
+@pytest.mark.release
 def test_kernel_compares_with_numpy(tmp_path):
     output, data = figures(tmp_path, "kernel")
     peers: dict[str, set[str]] = {}

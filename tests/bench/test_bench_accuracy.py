@@ -168,7 +168,7 @@ def test_lines_are_judged_by_their_limits() -> None:
     assert [row["absolute"] for row in requirements] == 6 * [False] + [True]
 
 
-@pytest.mark.long
+@pytest.mark.release
 def test_the_command_prints_and_writes_every_table(monkeypatch, tmp_path) -> None:
     monkeypatch.setattr(front, "SCENES", (("staggered", 0.5, 0.3),))
     monkeypatch.setattr(front, "TOLERANCES", (1e-10,))

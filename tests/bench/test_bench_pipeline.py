@@ -12,7 +12,7 @@ from skinnode.cli.bench import app
 
 
 @pytest.mark.real_time
-@pytest.mark.long
+@pytest.mark.release
 def test_pipeline_accounts_for_every_frame_of_a_full_hand(tmp_path):
     file = tmp_path / "figures.json"
     options = ["--seconds", "1", "--short", "--json", str(file), "--plot", str(tmp_path / "figures.png")]

@@ -72,7 +72,7 @@ def alarms(noise: float, stated: float, hours: float, seed: int) -> list[str]:
     return found
 
 
-@pytest.mark.long
+@pytest.mark.release
 @pytest.mark.parametrize(("noise", "stated"), [(2e-6, 3e-6), (3e-6, 3e-6), (1e-6, 1e-5), (0.0, 3e-6)])
 def test_no_live_patch_is_called_frozen(noise: float, stated: float) -> None:
     assert alarms(noise, stated, 0.25, seed=4) == []

@@ -156,11 +156,6 @@ class Kept:
             with self._path.open("a", encoding="utf-8") as file:
                 file.write(line + "\n")
 
-    def forget(self) -> None:
-        """Remove the file."""
-        if self._path is not None:
-            self._path.unlink(missing_ok=True)
-
 
 def _solve_all(
     work: Sequence[Item], seed: int, jobs: int, progress: Callable[[str], object], kept: Kept
@@ -207,7 +202,7 @@ def run(  # noqa: PLR0913 - options of a command
         settings: Layouts and noises; default: all.
         jobs: Number of processes; it does not affect the streams.
         progress: Called with a line from time to time.
-        kept: File that keeps the score of each stream until the run is complete; a run continues from it.
+        kept: File to which the score of each stream is appended; a run continues from it.
     """
     chosen = all_settings() if settings is None else settings
     work = [
@@ -219,7 +214,6 @@ def run(  # noqa: PLR0913 - options of a command
     before = Kept(kept, seed)
     for item, score in _solve_all(work, seed, jobs, progress, before):
         cells[item.section, item.row].setdefault(item.setting.name, Score()).add(score)
-    before.forget()
     rows = [_row(section, row, found) for (section, row), found in cells.items()]
     return {
         "benchmark": "trust",

@@ -152,6 +152,8 @@ def trust(
         typer.echo(line)
     _print_machine(figures)
     _write(json, figures)
+    if kept is not None:
+        kept.unlink(missing_ok=True)  # only now: also the parts that are not streams may be interrupted
     if not all(row["reached"] for row in figures["must"]):
         raise typer.Exit(1)
 

@@ -350,6 +350,10 @@ def test_a_row_that_does_not_exist_is_refused(monkeypatch) -> None:
     assert result.exit_code != 0
 
 
+def _interrupt(*_: object) -> None:
+    raise KeyboardInterrupt
+
+
 def test_an_interrupted_run_continues_where_it_stopped(monkeypatch, tmp_path) -> None:
     file, solved = tmp_path / "figures.json", []
 
@@ -364,6 +368,9 @@ def test_an_interrupted_run_continues_where_it_stopped(monkeypatch, tmp_path) ->
     assert CliRunner().invoke(app, command).exit_code != 0
     assert len(solved) == 4
     solved.append("")
+    with monkeypatch.context() as interrupted:
+        interrupted.setattr(_bench_trust, "with_parts", _interrupt)  # when all streams are solved
+        assert CliRunner().invoke(app, [*command, "--resume"]).exit_code != 0
     result = CliRunner().invoke(app, [*command, "--resume"])
     assert result.exit_code == 0, result.output
     figures = json.loads(file.read_text(encoding="utf-8"))

@@ -321,7 +321,8 @@ def exact_data(figures: dict[str, Any]) -> str:
 
 
 def trust(figures: dict[str, Any]) -> str:
-    return f"{machine(figures)}\n\n```text\n" + "\n".join(trust_report.lines(figures)) + "\n```"
+    command = f"Output of `skinnode bench trust --seed {figures['seed']}`. {machine(figures)}"
+    return f"{command}\n\n```text\n" + "\n".join(trust_report.lines(figures)) + "\n```"
 
 
 MADE: dict[str, dict[str, Callable[[dict[str, Any]], str]]] = {

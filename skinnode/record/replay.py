@@ -19,7 +19,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
-from skinnode.canopen.indices import SYNC_COB_ID
+from skinnode.canopen import indices as od
+from skinnode.canopen.nmt import NmtCommand, NmtState
 from skinnode.config import BusConfig
 from skinnode.errors import ConfigError
 from skinnode.host.containment import Defects
@@ -258,23 +259,45 @@ class _Bus:
         self._events = deque(events)
         self._solvers: dict[str, ScanSolver | None] = {}
         self._received = self._sent = 0
+        self._of_heartbeat = {
+            od.heartbeat_cob_id(patch.node_id): self.patches[patch.name].monitor
+            for patch in hand.patches_on(config.name)
+        }
+        self._stood_by: set[int] = set()  # COB-IDs of the heartbeats of nodes that the host shut down
 
     def take(self, frame: Any, *, sent: bool, whole: bool) -> None:
         """Process the next frame of the log; ``whole`` means that the log is undamaged so far."""
         if sent:
             self._sent += 1
             self._dispatcher.count_sent(frame.can_id, frame.data)
-            if frame.can_id == SYNC_COB_ID and not frame.extended:
+            if frame.can_id == od.SYNC_COB_ID and not frame.extended:
                 self._own_syncs.on_sync(frame.data, frame.t_ns)
+            if frame.can_id == od.NMT_COB_ID and not frame.extended:
+                self._on_command(frame.data)
             return
         while self._events and self._is_due(self._events[0], frame.t_ns, whole=whole):
             self._happen(self._events.popleft())
         self._received += 1
         self._dispatcher.dispatch((frame,))
+        if frame.can_id in self._stood_by:
+            monitor = self._of_heartbeat[frame.can_id]
+            if monitor.nmt_state == NmtState.PRE_OPERATIONAL:  # as commanded, which is no fault
+                monitor.nmt_state = NmtState.OPERATIONAL
         if not whole:
             for heard in self.patches.values():
                 heard.stream.poll(frame.t_ns)
         self._dispatcher.measure(frame.t_ns)
+
+    def _on_command(self, data: bytes) -> None:
+        """Process an NMT command of the host: it makes operational nodes pre-operational when it ends."""
+        if len(data) != 2:
+            return
+        cob_id = od.heartbeat_cob_id(data[1])
+        monitor = self._of_heartbeat.get(cob_id)
+        if monitor is None or data[0] == NmtCommand.START:
+            self._stood_by.discard(cob_id)
+        elif data[0] == NmtCommand.ENTER_PRE_OPERATIONAL and monitor.nmt_state == NmtState.OPERATIONAL:
+            self._stood_by.add(cob_id)
 
     def finish(self) -> None:
         """Apply the events after the last frame."""

@@ -222,10 +222,13 @@ def test_a_node_that_no_host_has_configured_is_no_fault(hand_file: HandFile, on:
     hand = load_hand(file)
     on(Fleet(hand))
     assert examine(file) == (0, {})
-    done = run(["doctor", file, "--json", "--active"])
-    what = {finding["what"] for finding in done.json["findings"]}
-    assert not what & {"a scan takes longer than a SYNC period", "scans end after the next has begun"}
-    assert not any("overrun" in finding["evidence"] for finding in done.json["findings"])
+    late = {"a scan takes longer than a SYNC period", "scans end after the next has begun"}
+    for _ in range(5):  # an inhibit time that is too long delays every scan; a busy machine delays some
+        findings = run(["doctor", file, "--json", "--active"]).json["findings"]
+        if not late & {finding["what"] for finding in findings}:
+            break
+    assert not late & {finding["what"] for finding in findings}
+    assert not any("overrun" in finding["evidence"] for finding in findings)
 
 
 def test_a_default_inhibit_time_is_a_fault_once_the_node_runs(hand_file: HandFile, on: On) -> None:

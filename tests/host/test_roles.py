@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import logging
 import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -137,6 +138,7 @@ def test_a_guest_that_joins_while_patches_run_tears_no_scan(
         assert eventually(lambda: {n.nmt_state for n in rack.nodes.values()} == {NmtState.OPERATIONAL})
         while tries < 8 or (joined == 0 and tries < 40):  # whether it comes during a scan depends on chance
             tries += 1
+            time.sleep(tries * 0.0618 % 0.1)  # at another phase of SYNC: each try ends with a scan
             with Host.from_config(hand) as host:
                 take(host.fields(timeout_s=10), 4)
                 assert eventually(functools.partial(all_operational, host))

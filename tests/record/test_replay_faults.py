@@ -17,7 +17,7 @@ import pytest
 
 from skinnode.cli._errors import run
 from skinnode.cli.main import app
-from skinnode.host import Host
+from skinnode.host import Condition, Host
 from skinnode.record import Recorder, replay
 from vcan_sim.fleet import Fleet
 
@@ -106,6 +106,22 @@ def test_an_error_frame_is_a_fault_as_it_is_live(recorded: Recorded, play: Play)
     played = play([*recorded.log[:middle], error, *recorded.log[middle:]], journal)
     assert (played.status, played.faults) == (1, ["can0: 1 error frame"])
     assert played.fields == whole.fields
+
+
+@pytest.mark.parametrize("commanded", [True, False])
+def test_a_node_that_the_host_shut_down_was_operational(
+    recorded: Recorded, play: Play, tmp_path: Path, commanded: bool
+) -> None:
+    """Its heartbeat may arrive before the host closes the bus."""
+    command = b" can0 000#8005 T\n"
+    assert sum(line.endswith(command) for line in recorded.log[-20:]) == 1
+    log = [line for line in recorded.log if commanded or not line.endswith(command)]
+    log.append(b" ".join((log[-1].split()[0], b"can0", b"705#7F", b"R")) + b"\n")
+    play(log, [*recorded.journal[:-1], recorded.journal[-1] | {"frames": len(log)}])
+    replayed = replay(tmp_path / "x.log")
+    assert len(list(replayed)) > 60
+    assert replayed.flaws == []
+    assert replayed.health("p0").condition is (Condition.OPERATIONAL if commanded else Condition.BOOTING)
 
 
 def test_a_log_cut_between_two_lines_lacks_frames(recorded: Recorded, play: Play) -> None:

@@ -5,6 +5,8 @@ The truth is Hertz's closed form, or a dent that no half-space forms; it does no
 
 from __future__ import annotations
 
+import time
+
 import numpy as np
 import pytest
 
@@ -12,7 +14,10 @@ import skinnode as sk
 from skinnode.bench.truth import RUBBER
 from skinnode.model.elastic import HertzContact
 from skinnode.model.layout import Float
+from skinnode.solve.checks import data_check
+from skinnode.solve.checks.data_check import PATIENCE
 from skinnode.solve.checks.fault_list import ADMIT, FRAMES
+from skinnode.solve.checks.trust import UNEXAMINED
 from tests.solve.press import dent, noisy
 
 LAYOUT = sk.PatchLayout.preset("staggered")
@@ -71,6 +76,38 @@ def test_wrong_readings_under_a_press_are_named_and_the_rest_goes_on(kind: str, 
         assert fault.lower == lower or (kind == "crossing" and fault.lower is None)
     first = {(fault.upper, fault.lower): fault.since for fault in field.faults}
     assert all(4 < since <= 4 + FRAMES for since in first.values())
+
+
+def test_a_fault_is_named_although_the_deadline_never_leaves_time_to_examine_it(monkeypatch) -> None:
+    """Until then, no field with the wrong reading is trusted; afterwards all are."""
+    monkeypatch.setattr(data_check, "perf_counter", lambda: time.perf_counter() + 1.0)
+    rng = np.random.default_rng(3)
+    tracker = sk.Tracker(LAYOUT, method="exact", relative_noise=NOISE, deadline_us=500_000)
+    rest = sk.resistance_ohm(LAYOUT, LAYOUT.upper_m)
+    for share in (0.0, 0.05, 0.1):
+        assert tracker.update(readings(press(share) if share else np.zeros_like(LAYOUT.upper_m), rng)).trusted
+    fields = []
+    for _ in range(PATIENCE * FRAMES + 4):
+        frame = readings(press(0.1), rng)
+        spoil("crossing", frame, rest)
+        fields.append(tracker.update(frame))
+    assert UNEXAMINED in {field.distrust for field in fields}
+    assert not any(field.trusted and not field.faults for field in fields)
+    assert [fault.upper for fault in fields[-1].faults] == [4]  # the crossing or its whole wire
+    for field in fields[PATIENCE * FRAMES :]:
+        assert field.trusted
+        assert off(field, press(0.1)) < 5.0
+
+
+def test_a_patch_that_keeps_still_is_examined_when_there_is_time(monkeypatch) -> None:
+    tracker = sk.Tracker(LAYOUT, method="exact", relative_noise=NOISE, deadline_us=500_000)
+    frame = readings(press(0.1), np.random.default_rng(3))
+    spoil("crossing", frame, sk.resistance_ohm(LAYOUT, LAYOUT.upper_m))
+    with monkeypatch.context() as late:
+        late.setattr(data_check, "perf_counter", lambda: time.perf_counter() + 1.0)
+        assert tracker.update(frame).distrust == UNEXAMINED
+    field = tracker.update(frame)
+    assert [fault.upper for fault in field.faults] == [4]
 
 
 def test_named_readings_that_agree_again_are_admitted() -> None:

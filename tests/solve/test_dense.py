@@ -9,6 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from skinnode.solve.linalg import cholesky as dense
+from skinnode.solve.linalg.vectors import orthonormalise
 
 EPS = np.finfo(float).eps
 SIZES = st.sampled_from([1, 3, 29, 30, 31, 90, 300]) | st.integers(1, 70)
@@ -115,6 +116,27 @@ def test_products(m, k, n, seed):
     v, one = rng.normal(size=k), np.full(m, np.nan)
     dense.multiply_vector(a, v, one)
     assert (np.abs(one - a @ v) <= 2 * k * EPS * (np.abs(a) @ np.abs(v))).all()
+
+
+@FEW
+@given(st.integers(1, 40), st.integers(1, 40), st.integers(1, 80), SEEDS)
+def test_a_product_is_subtracted(m, k, n, seed):
+    rng = np.random.default_rng(seed)
+    a, b, c = rng.normal(size=(m, k)), rng.normal(size=(k, n)), rng.normal(size=(m, n))
+    expected, size = c - a @ b, np.abs(c) + np.abs(a) @ np.abs(b)
+    dense.subtract_product(a, b, c)
+    assert (np.abs(c - expected) <= 2 * (k + 1) * EPS * size).all()
+
+
+@FEW
+@given(st.integers(1, 20), st.integers(0, 30), st.integers(0, 6), SEEDS)
+def test_orthonormal_rows_span_the_rows_however_close_these_are(n, more, tilt, seed):
+    rng = np.random.default_rng(seed)
+    rows = rng.normal(size=(n, n + more)) + 10.0**tilt * rng.normal(size=n + more)
+    q = rows.copy()
+    orthonormalise(q)
+    np.testing.assert_allclose(q @ q.T, np.eye(n), atol=1e-13 * n)
+    np.testing.assert_allclose(rows @ q.T @ q, rows, atol=1e-12 * np.abs(rows).max())
 
 
 def test_no_split_of_the_work_changes_a_bit():

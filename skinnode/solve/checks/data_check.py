@@ -23,12 +23,18 @@ from skinnode.model.kernels import potential
 from skinnode.model.layout import Float
 from skinnode.model.status import Status
 from skinnode.solve.checks.crossed_wires import likeliest
-from skinnode.solve.checks.explanations import DOUBT, Explainer, Group, crossing_gain
+from skinnode.solve.checks.explanations import DOUBT, Explainer, Group
 from skinnode.solve.checks.fault_list import FaultList, agree
+from skinnode.solve.checks.greedy_search import crossing_gain
 from skinnode.solve.checks.reading_model import ReadingModel, changes, evidences
-from skinnode.solve.checks.trust import CONTRADICTION, NOISIER, OF_WIRE, assess
+from skinnode.solve.checks.trust import CONTRADICTION, NOISIER, OF_WIRE, UNEXAMINED, assess
 from skinnode.solve.checks.wire_tests import GAIN_STD, LEAST, least_fitting
-from skinnode.solve.linalg.cholesky import multiply_vector
+from skinnode.solve.linalg.cholesky import (
+    cholesky,
+    multiply_vector,
+    solve_lower_transposed_vector,
+    solve_lower_vector,
+)
 from skinnode.solve.wires.problem import PatchProblem
 
 ROUNDS: Final = 3
@@ -47,10 +53,13 @@ EXCUSED: Final = 10.0
 """Rise of the gain after such a frame that makes a frame suspicious again, nats."""
 EXCUSED_FRAMES: Final = 8
 """Number of frames after such a frame that need no explanation; finding one takes 9 ms."""
+PATIENCE: Final = 4
+"""Number of successive suspicious frames of which one is examined although its deadline does not permit it: a
+fault stays suspicious, a press seldom does."""
+EXAMINATION_S: Final = 3e-3
+"""Expected time of the first examination, s."""
 CROSSED_FRAMES: Final = 5
 """Number of frames after one with two exchanged wires in which finding one of them means both."""
-USUAL: Final = (-11, -3)
-"""Range of log2 s, s in pitches, whose tables are prepared in advance; others are computed when needed."""
 NOISE_RATIOS: Final = (2.0, 4.0, 8.0, 16.0)
 """Ratios of the actual to the stated noise that are considered in a suspicious frame."""
 COARSE: Final = 0.1
@@ -111,10 +120,8 @@ class DataCheck:
         self._all_trusted = np.ones(shape[0], bool)
         self._all_trusted.setflags(write=False)
         self.scan: int | None = None
-        octaves = np.log2(self._model.kappa * sigma)
-        usual = np.flatnonzero((octaves >= USUAL[0]) & (octaves <= USUAL[1])).tolist()
-        for number in usual:
-            self._model.level(number)
+        self._examination_s = EXAMINATION_S
+        usual = self._model.prepare(sigma)
         every = np.ones(shape, bool)
         at_rest = np.zeros((shape[0], 3 * problem.layout.upper_m.shape[1]))
         changes(self._model.jacobian, at_rest, 1.0, self._z)
@@ -133,6 +140,8 @@ class DataCheck:
         self._crossed: tuple[Group, ...] = ()
         self._crossed_until = 0
         self._last: FieldFrame | None = None
+        self._unexamined, self._overdue, self._waiting = False, False, 0
+        self._faultless = 0.0, -1, -EXCUSED_FRAMES  # gain, reading and frame of the last examination
 
     @property
     def left_out(self) -> Mask | None:
@@ -147,8 +156,9 @@ class DataCheck:
         Args:
             solved: The frame, solved without the readings of :attr:`left_out`.
             solve_without: Solves the frame without these readings (U, K) and those of :attr:`left_out`.
-            until: Value of :func:`time.perf_counter` from which the frame is not solved again; −inf if some
-                of its wires are unsolved for lack of time, which proves nothing.
+            until: Value of :func:`time.perf_counter` by which this should return; −inf if some wires are
+                unsolved for lack of time, which proves nothing. A suspicious frame that cannot be examined by
+                then is not trusted; every :data:`PATIENCE` frames in succession one takes longer.
         """
         self._frame += 1
         last = self._last
@@ -158,8 +168,10 @@ class DataCheck:
         if self._list.mask is None and self._is_clean(solved):
             field = amended(solved.field, distrust="", wires_trusted=self._all_trusted)
             self._last = field
+            self._unexamined, self._waiting = False, 0
             return field
-        if last is not None and last.faults == self._list.faults and _still(solved, last):
+        known = last is not None and last.faults == self._list.faults and not self._unexamined
+        if last is not None and known and _still(solved, last):
             if last.faults:
                 self._follow(solved)
             return amended(
@@ -169,14 +181,18 @@ class DataCheck:
         without = np.zeros(layout.shape, bool)
         solved, groups = _spared(solved)
         self._coarse: tuple[Group, ...] = ()
-        found = self._find(solved) if until > -math.inf else ()
-        while found and len(groups) < ROUNDS and perf_counter() < until:
+        self._overdue = self._unexamined = False
+        found = self._find(solved, until) if until > -math.inf else ()
+        while found and len(groups) < ROUNDS:
+            if not self._in_time(0.0, until):
+                self._unexamined = True
+                break
             groups += found
             for group in found:
                 without |= group.mask(layout.shape)
             solved, spared = _spared(solve_without(without))
             groups += spared
-            found = self._find(solved)
+            found = self._find(solved, until)
         scan = self._frame if self.scan is None else self.scan
         before = self._list.faults
         passing = self._list.add([] if found else self._contradicting(groups, solved), self._frame, scan)
@@ -184,6 +200,7 @@ class DataCheck:
             self._follow(solved)
         faults = self._list.faults + passing
         contradiction = CONTRADICTION if found or self._doubtful else NOISIER if self._noisy else ""
+        contradiction = UNEXAMINED if self._unexamined else contradiction
         reason, wires = assess(solved.field.status, solved.used, faults, contradiction=contradiction)
         field = amended(solved.field, faults=faults, distrust=reason, wires_trusted=wires)
         self._last = field
@@ -225,9 +242,9 @@ class DataCheck:
         )
         return not self._lead and (gain < SUSPICIOUS or excused)
 
-    def _find(self, solved: Solved) -> tuple[Group, ...]:
+    def _find(self, solved: Solved, until: float) -> tuple[Group, ...]:
         """Return the readings that contradict the others; none if there are none."""
-        self._doubtful = self._noisy = False
+        self._doubtful = self._noisy = self._unexamined = False
         status = np.array(solved.field.status)
         enough = solved.used.mean(axis=1) >= OF_WIRE
         unsolved = np.flatnonzero(enough & (status != Status.CONVERGED) & (status != Status.DEADLINE))
@@ -244,24 +261,56 @@ class DataCheck:
         of_readings, of_wires = self._largest_gains(present, best, cost, sigma)
         gain, where = max(of_readings, of_wires), self._where
         if self._needs_no_explanation(gain):
+            self._waiting = 0
             return ()
         noisier = self._noisier()
         lead = noisier - float(self._evidence[best])
         if lead > 0.5 * self._lead > 0.0:
             self._noisy, self._lead = True, lead
             return ()
+        if not self._may_examine(gain, until):
+            return ()
+        start = perf_counter()
         found = self._explainer.wrong_readings(
             self._z, present, self._evidence, best, cost, sigma, noisier,
             whole_wires_only=of_readings < SUSPICIOUS,
         )  # fmt: skip
+        self._examination_s = max(perf_counter() - start, 0.8 * self._examination_s)
         found = self._with_both_crossed(found)
         self._doubtful = self._explainer.margin > DOUBT and not found
         self._noisy = self._explainer.is_noisier and not found
         self._lead = lead if self._noisy else 0.0
+        if not (found or self._doubtful or self._noisy):
+            self._faultless = gain, where, self._frame
         if self._explainer.margin < CLEAR and not self._noisy:
             self._excused, self._excused_where = gain, where
             self._excused_until = self._frame + EXCUSED_FRAMES
         return found
+
+    def _may_examine(self, gain: float, until: float) -> bool:
+        """Return whether a suspicious frame is examined.
+
+        Without time for that, it is unexamined, unless it resembles one examined just before.
+        """
+        if self._overdue or perf_counter() + self._examination_s <= until:
+            return True
+        last, where, frame = self._faultless
+        if where == self._where and gain < last + EXCUSED:
+            if self._frame - frame < EXCUSED_FRAMES:
+                return False
+            self._waiting = PATIENCE  # it is time for another examination
+        self._unexamined = not self._in_time(self._examination_s, until)
+        return not self._unexamined
+
+    def _in_time(self, seconds: float, until: float) -> bool:
+        """Return whether to take ``seconds`` for a suspicious frame: if there is time, or others had none."""
+        if self._overdue or perf_counter() + seconds <= until:
+            return True
+        self._waiting += 1
+        self._overdue = self._waiting >= PATIENCE
+        if self._overdue:
+            self._waiting = 0
+        return self._overdue
 
     def _noisier(self) -> float:
         """Return the log evidence of the frame if all its readings are noisier than stated.
@@ -335,8 +384,14 @@ class DataCheck:
         best = evidences(model.vectors_t, model.shrink, model.log_det, z, self._c, self._evidence)
         missing = np.flatnonzero(~present) if present is not self._present else ()
         if len(missing):  # with their expectation, given the others
-            p = model.level(best).precision[missing]
-            z[missing] = -np.linalg.solve(p[:, missing] + LEAST * np.eye(len(missing)), p @ z)
+            p, count = model.level(best).precision[missing], len(missing)
+            block, unknown = np.ascontiguousarray(p[:, missing]), np.empty(count)
+            block.flat[:: count + 1] += LEAST
+            multiply_vector(p, z, unknown)
+            cholesky(block, count)
+            solve_lower_vector(block, unknown, count)
+            solve_lower_transposed_vector(block, unknown, count)
+            z[missing] = -unknown
             best = evidences(model.vectors_t, model.shrink, model.log_det, z, self._c, self._evidence)
         return best
 
@@ -350,7 +405,7 @@ class DataCheck:
             level = self._model.level(number)
             p = level.precision
             multiply_vector(p, z, self._alpha)
-            gain, where = crossing_gain(p, self._alpha, present.ravel(), cost)
+            gain, where = crossing_gain(level.diagonal, self._alpha, present.ravel(), cost)
             gain += float(self._evidence[number] - self._evidence[best])
             if gain > most:
                 most, self._where = gain, where

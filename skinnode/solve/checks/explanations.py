@@ -18,40 +18,34 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from skinnode.compiled.jit import njit
 from skinnode.model.data_fault import FaultKind, FaultyPart
 from skinnode.model.layout import Float
 from skinnode.solve.checks.crossed_wires import WirePair, exchanged, likeliest
+from skinnode.solve.checks.greedy_search import CROSSING, LOAD, LOWER, UPPER, GreedySearch, crossing_gain
 from skinnode.solve.checks.reading_model import Level, ReadingModel, evidences
 from skinnode.solve.checks.wire_tests import GAIN_STD, LEAST, WireFinding, least_fitting
 from skinnode.solve.linalg.cholesky import multiply_vector
-from skinnode.solve.linalg.vectors import Index, dot
 
 MARGIN: Final = 20.0
-"""Log evidence by which faults must explain a frame better than loads alone to be named, nats. With
-:data:`LOADS` loads, none of 6,800 frames of deep slides at a noise of 3e-6, and of 270 frames of presses of
-six kinds at 1e-5, was taken for a fault."""
+"""Log evidence by which faults must explain a frame better than loads alone to be named, nats. None
+of 6,800 frames of deep slides at a noise of 3e-6, and of 270 frames of presses of six kinds at 1e-5, was then
+taken for a fault."""
 MARGIN_OF_READING: Final = 50.0
 """The same for a single reading that is compared at every scale: under a narrow load at the edge of a patch,
 a reading that is right reached 29 nats in 36,000 frames (``bench trust --seed 1 --only hours``)."""
 DOUBT: Final = 5.0
 """Log evidence by which faults must explain a frame better than loads alone to make it doubtful, nats. The
-largest of 144 healthy frames was 0, with 8 loads in place of :data:`LOADS`."""
-STEPS: Final = 8
-"""Maximum number of loads and groups of readings in an explanation with faults."""
-LOADS: Final = 60
-"""Maximum number of loads in an explanation by loads alone: a contact covers up to twenty cells, with three
-loads each. With 8, at a noise of 3e-6, half of all healthy frames of a deep slide were taken for faults."""
-STRIDE: Final = 2
-"""Step in log2 κ between the scales at which explanations are sought."""
+largest of 144 healthy frames was 0, with up to 8 loads in the explanation by loads."""
 SCALES: Final = 4
 """Number of scales, from the one that fits the frame as it is downwards: a wrong reading inflates the scale
 by up to 2⁴, a narrow contact by up to 2³."""
-ENOUGH: Final = 1.0
-"""Gain below which a load or fault is not worth adding, nats."""
+STRIDE: Final = 2
+"""Step in log2 κ between the scales at which explanations are sought."""
+HOPELESS: Final = 150.0
+"""Log evidence by which loads alone explain a frame better than faults at one scale, nats, from which faults
+are not sought at the next. Of 163 frames with a fault, the largest was 114."""
 
-_LOAD, _CROSSING, _LOWER, _UPPER = range(4)
-_PARTS: Final = {_CROSSING: FaultyPart.CROSSING, _LOWER: FaultyPart.LOWER, _UPPER: FaultyPart.UPPER}
+_PARTS: Final = {CROSSING: FaultyPart.CROSSING, LOWER: FaultyPart.LOWER, UPPER: FaultyPart.UPPER}
 
 Mask = NDArray[np.bool_]
 
@@ -84,14 +78,8 @@ class Explainer:
 
     def __init__(self, model: ReadingModel) -> None:
         self._model = model
-        m, loads = model.response.shape
-        self._response_t = np.ascontiguousarray(model.response.T)
-        self._p, self._alpha, self._stiffness = np.empty((m, m)), np.empty(m), np.empty(loads)
-        self._work, self._by_load = np.empty(m), np.empty(loads)
-        widest = max(model.shape) + 1
-        self._block, self._row = np.empty((widest, widest)), np.empty(widest)
-        self._kind, self._number = np.empty((2, LOADS), np.int64)
-        self._gain = np.empty(LOADS)
+        self._search = GreedySearch(model)
+        self._alpha, self._row = np.empty(len(model.response)), np.empty(max(model.shape) + 1)
         self.margin = -math.inf
         """Log evidence by which faults explained the last frame better than loads or noise alone, nats."""
         self.is_noisier = False
@@ -122,13 +110,16 @@ class Explainer:
         """
         by_loads, by_faults = -math.inf, -math.inf
         groups: tuple[Group, ...] = ()
-        for number in range(best, max(best - STRIDE * SCALES, -1), -STRIDE):
-            level, start = self._model.level(number), float(evidence[number])
-            if not whole_wires_only:
-                total = start + self._explain(level, z, present, cost, faults=True)
+        with_faults = not whole_wires_only
+        for number in _scales(best):
+            start = float(evidence[number])
+            loads = start + self._search.run(number, z, present, cost, faults=False)
+            by_loads = max(by_loads, loads)
+            if with_faults:
+                total = start + self._search.run(number, z, present, cost, faults=True)
                 if total > by_faults:
                     by_faults, groups = total, self._groups()
-            by_loads = max(by_loads, start + self._explain(level, z, present, cost, faults=False))
+                with_faults = total > loads - HOPELESS
         self.is_noisier = noisier > by_loads + DOUBT
         by_loads = max(by_loads, noisier)
         level = self._model.level(best)
@@ -161,8 +152,8 @@ class Explainer:
         most = -math.inf
         groups: tuple[Group, ...] = ()
         for number in range(best, -1, -STRIDE):
-            level = self._model.level(number)
-            total = float(evidence[number]) + self._explain(level, z, present, cost, faults=True, loads=False)
+            total = float(evidence[number])
+            total += self._search.run(number, z, present, cost, faults=True, loads=False)
             if total > most:
                 most, groups = total, self._groups()
         return groups
@@ -174,20 +165,20 @@ class Explainer:
 
         A search that adds the best group at each step would leave out its whole wire first at small scales.
         """
-        p = self._model.level(best).precision
-        multiply_vector(p, z.ravel(), self._alpha)
-        gain, number = crossing_gain(p, self._alpha, present.ravel(), cost)
+        level = self._model.level(best)
+        multiply_vector(level.precision, z.ravel(), self._alpha)
+        gain, number = crossing_gain(level.diagonal, self._alpha, present.ravel(), cost)
         most = -math.inf
         if gain < DOUBT:
             return most, number
         without = present.copy()
         without.ravel()[number] = False
-        for scale in range(best, max(best - STRIDE * SCALES, -1), -STRIDE):
+        for scale in _scales(best):
             level = self._model.level(scale)
             d = max(float(level.precision[number, number]), LEAST)
             alpha = float(level.precision[number] @ z.ravel())
             gain = 0.5 * alpha * alpha / d - 0.5 * math.log(d) - cost - math.log(z.size)
-            total = float(evidence[scale]) + gain + self._explain(level, z, without, cost, faults=False)
+            total = float(evidence[scale]) + gain + self._search.run(scale, z, without, cost, faults=False)
             most = max(most, total)
         return most, number
 
@@ -246,8 +237,8 @@ class Explainer:
         return max(
             float(evidence[number])
             + extra(model.level(number))
-            + self._explain(model.level(number), z, present, cost, faults=False)
-            for number in range(best, max(best - STRIDE * SCALES, -1), -STRIDE)
+            + self._search.run(number, z, present, cost, faults=False)
+            for number in _scales(best)
         )
 
     def _wire(self, wire: int, gain: float) -> Group:
@@ -257,35 +248,28 @@ class Explainer:
             return Group(FaultyPart.UPPER, wire, None, gain)
         return Group(FaultyPart.LOWER, None, wire - upper, gain)
 
-    def _explain(  # noqa: PLR0913 - the frame, and which explanations are allowed
-        self, level: Level, z: Float, present: Mask, cost: float, *, faults: bool, loads: bool = True
-    ) -> float:
-        """Return the gain in log evidence of the best explanation; its parts stay in the arrays."""
-        self._kind[:] = -1
-        self._p[:], self._stiffness[:] = level.precision, level.stiffness
-        return _explain(
-            z.ravel(), present.ravel().copy(), *self._model.shape, cost, loads, faults,
-            LEAST * float(level.stiffness.max()), self._response_t, self._p, self._alpha, self._stiffness,
-            self._work, self._by_load, self._block, self._kind, self._number, self._gain,
-            STEPS if faults else LOADS,
-        )  # fmt: skip
-
     def _groups(self) -> tuple[Group, ...]:
-        found = []
+        """Return the groups of readings found by the last search."""
+        found, search = [], self._search
         for kind, number, gain in zip(
-            self._kind.tolist(), self._number.tolist(), self._gain.tolist(), strict=True
+            search.kinds.tolist(), search.numbers.tolist(), search.gains.tolist(), strict=True
         ):
-            if kind > _LOAD:
-                upper, lower = divmod(number, self._model.shape[1]) if kind == _CROSSING else (number, number)
+            if kind > LOAD:
+                upper, lower = divmod(number, self._model.shape[1]) if kind == CROSSING else (number, number)
                 found.append(
                     Group(
                         _PARTS[kind],
-                        None if kind == _LOWER else upper,
-                        None if kind == _UPPER else lower,
+                        None if kind == LOWER else upper,
+                        None if kind == UPPER else lower,
                         gain,
                     )
                 )
         return tuple(found)
+
+
+def _scales(best: int) -> range:
+    """Return the indices of κ at which explanations are sought, from the one that fits a frame downwards."""
+    return range(best, max(best - STRIDE * SCALES, -1), -STRIDE)
 
 
 def _crossed(pair: WirePair, gain: float) -> tuple[Group, ...]:
@@ -294,189 +278,3 @@ def _crossed(pair: WirePair, gain: float) -> tuple[Group, ...]:
     if pair.part is FaultyPart.UPPER:
         return tuple(Group(pair.part, wire, None, gain, FaultKind.CROSSED) for wire in wires)
     return tuple(Group(pair.part, None, wire, gain, FaultKind.CROSSED) for wire in wires)
-
-
-@njit
-def crossing_gain(p: Float, alpha: Float, present: Mask, cost: float) -> tuple[float, int]:
-    """Return the largest gain from treating a reading as wrong, nats, and the number of the reading."""
-    best, where = -math.inf, -1
-    for i in range(alpha.size):
-        if present[i]:
-            d = max(p[i, i], LEAST)
-            gain = 0.5 * alpha[i] * alpha[i] / d - 0.5 * math.log(d)
-            if gain > best:
-                best, where = gain, i
-    return best - cost - math.log(alpha.size), where
-
-
-@njit
-def group_gain(  # noqa: PLR0913 - a kernel: arrays by name, a Cholesky factorisation as loops
-    p: Float, alpha: Float, present: Mask, first: int, step: int, count: int, cost: float, block: Float
-) -> float:
-    """Return the gain from treating the readings first, first + step, … as wrong; −inf if fewer than two.
-
-    ``block`` is scratch. The gain is ½ α_Gᵀ P_GG⁻¹ α_G − ½ ln det P_GG minus the cost of each reading.
-    """
-    here = 0
-    gain = 0.0
-    for i in range(count):
-        a = first + i * step
-        here += present[a]
-        for j in range(i + 1):
-            b = first + j * step
-            value = p[a, b]
-            if i == j:
-                value += LEAST if present[a] else 1.0
-            for q in range(j):
-                value -= block[i, q] * block[j, q]
-            if i == j:
-                block[i, i] = math.sqrt(max(value, LEAST))
-            else:
-                block[i, j] = value / block[j, j]
-    if here < 2:
-        return -math.inf
-    square = 0.0
-    for i in range(count):
-        value = alpha[first + i * step]
-        for q in range(i):
-            value -= block[i, q] * block[count, q]
-        block[count, i] = value / block[i, i]
-        square += block[count, i] * block[count, i]
-        gain -= math.log(block[i, i])
-    return gain + 0.5 * square - cost * here
-
-
-@njit
-def best_group(  # noqa: PLR0913 - a kernel: arrays by name
-    p: Float, alpha: Float, present: Mask, upper: int, lower: int, cost: float, block: Float
-) -> tuple[float, int, int]:
-    """Return the largest gain from treating a group of readings as wrong, its kind and its number.
-
-    The choice among n groups of a kind costs ln n. ``block`` (n + 1, n + 1), n = max(U, K), is scratch.
-    """
-    gain, kind, number = -math.inf, _CROSSING, 0
-    choice = math.log(upper * lower)
-    for i in range(upper * lower):
-        if present[i]:
-            d = max(p[i, i], LEAST)
-            value = 0.5 * alpha[i] * alpha[i] / d - 0.5 * math.log(d) - cost - choice
-            if value > gain:
-                gain, kind, number = value, _CROSSING, i
-    for k in range(lower):
-        value = group_gain(p, alpha, present, k, lower, upper, cost, block) - math.log(lower)
-        if value > gain:
-            gain, kind, number = value, _LOWER, k
-    for u in range(upper):
-        value = group_gain(p, alpha, present, u * lower, 1, lower, cost, block) - math.log(upper)
-        if value > gain:
-            gain, kind, number = value, _UPPER, u
-    return gain, kind, number
-
-
-@njit
-def _condition(  # noqa: PLR0913 - a kernel: arrays by name
-    row: int, response_t: Float, p: Float, alpha: Float, stiffness: Float, work: Float, by_load: Float
-) -> None:
-    """Remove the reading ``row`` from the data."""
-    m = alpha.size
-    for i in range(m):
-        work[i] = p[row, i]
-    factor = 1.0 / (work[row] + LEAST)
-    multiply_vector(response_t, work, by_load)
-    for j in range(stiffness.size):
-        stiffness[j] -= factor * by_load[j] * by_load[j]
-    shared = factor * alpha[row]
-    for i in range(m):
-        alpha[i] -= shared * work[i]
-        value, line = factor * work[i], p[i]
-        for j in range(m):
-            line[j] -= value * work[j]
-    for i in range(m):
-        p[row, i], p[i, row] = 0.0, 0.0
-    alpha[row] = 0.0
-
-
-@njit
-def _add_load(  # noqa: PLR0913 - a kernel: arrays by name
-    load: int, response_t: Float, p: Float, alpha: Float, stiffness: Float, work: Float, by_load: Float
-) -> None:
-    """Add a load with its likeliest variance, (b² − h) / h²."""
-    response = response_t[load]
-    multiply_vector(p, response, work)
-    h = max(stiffness[load], LEAST)
-    b = dot(response, alpha)
-    share = 1.0 / (h * h / max(b * b - h, LEAST * h) + h)
-    multiply_vector(response_t, work, by_load)
-    for j in range(stiffness.size):
-        stiffness[j] -= share * by_load[j] * by_load[j]
-    for i in range(alpha.size):
-        alpha[i] -= share * b * work[i]
-        value, line = share * work[i], p[i]
-        for j in range(alpha.size):
-            line[j] -= value * work[j]
-
-
-@njit
-def _explain(  # noqa: PLR0913, C901 - a kernel: arrays by name, a greedy search
-    z: Float,
-    present: Mask,
-    upper: int,
-    lower: int,
-    cost: float,
-    with_loads: bool,
-    faults: bool,
-    least: float,
-    response_t: Float,
-    p: Float,
-    alpha: Float,
-    stiffness: Float,
-    work: Float,
-    by_load: Float,
-    block: Float,
-    kinds: Index,
-    numbers: Index,
-    gains: Float,
-    steps: int,
-) -> float:
-    """Write the best explanation of ``z`` (m,) into the last three arrays; return its gain.
-
-    ``p`` (m, m) and ``stiffness`` (3Q,) are those of a level on entry and are changed, as is ``present``.
-    """
-    multiply_vector(p, z, alpha)
-    for i in range(present.size):
-        if not present[i]:
-            _condition(i, response_t, p, alpha, stiffness, work, by_load)
-    total = 0.0
-    for step in range(steps):
-        multiply_vector(response_t, alpha, by_load)
-        gain, kind, number = 0.0, _LOAD, -1
-        for j in range(stiffness.size if with_loads else 0):
-            if stiffness[j] > least:
-                ratio = by_load[j] * by_load[j] / stiffness[j]
-                if ratio > 1.0:
-                    value = 0.5 * (ratio - 1.0 - math.log(ratio)) - math.log(stiffness.size)
-                    if value > gain:
-                        gain, number = value, j
-        if faults:
-            by_fault, fault, which = best_group(p, alpha, present, upper, lower, cost, block)
-            if by_fault > gain:
-                gain, kind, number = by_fault, fault, which
-        if gain < ENOUGH or number < 0:
-            break
-        total += gain
-        kinds[step], numbers[step], gains[step] = kind, number, gain
-        if kind == _LOAD:
-            _add_load(number, response_t, p, alpha, stiffness, work, by_load)
-            continue
-        for u in range(upper):
-            for k in range(lower):
-                i = u * lower + k
-                chosen = (
-                    (kind == _CROSSING and i == number)
-                    or (kind == _LOWER and k == number)
-                    or (kind == _UPPER and u == number)
-                )
-                if chosen and present[i]:
-                    present[i] = False
-                    _condition(i, response_t, p, alpha, stiffness, work, by_load)
-    return total

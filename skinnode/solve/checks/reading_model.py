@@ -22,6 +22,14 @@ from skinnode.solve.checks.wire_tests import WireTables
 from skinnode.solve.linalg.cholesky import multiply, multiply_vector
 from skinnode.solve.posterior.elastic_prior import ElasticPrior
 
+USUAL: Final = (-17, -3)
+"""Range of log2 s, s in pitches, whose tables for loads are prepared in advance; others are computed when
+needed."""
+MOST_USUAL: Final = 9
+"""Number of the largest of these scales that are prepared for a large patch."""
+STORED: Final = 10**8
+"""Most bytes of tables that are computed in advance: computed in the stream, they would delay the first touch
+by up to 0.1 s. The reference patch takes 85 MB. Larger patches compute products with loads when needed."""
 OCTAVES: Final = (-7, 21)
 """Range of log2 κ: noise from 1e-6 to 1e-2 and prior scales from 1e-4 to 1 pitch."""
 
@@ -32,10 +40,22 @@ class Level:
 
     precision: Float
     """(m, m) P."""
-    stiffness: Float
-    """(3Q,) bᵀ P b for the response b of the readings to each load."""
+    diagonal: Float
+    """(m,) diagonal of P."""
     wires: WireTables
     """Factors of the wires' blocks of P and S."""
+
+
+@dataclass(frozen=True, eq=False)
+class LoadTables:
+    """Products of P at one κ with the responses b of the readings to the loads, the columns of B."""
+
+    diagonal: Float
+    """(m + 3Q,) diagonals of P and of Bᵀ P B."""
+    moved: Float
+    """(m, 3Q) P B; empty, as is ``gram``, if the tables would exceed :data:`STORED`."""
+    gram: Float
+    """(3Q, 3Q) Bᵀ P B."""
 
 
 class ReadingModel:
@@ -46,7 +66,8 @@ class ReadingModel:
 
     Attributes:
         jacobian: (U, K, 3N) ∂(ln F)/∂x at rest, 1/pitch.
-        response: (m, 3Q) change of the readings per load of the elastic prior.
+        response: (m, 3Q) change of the readings per load of the elastic prior, B.
+        response_t: (3Q, m) Bᵀ.
         kappa: (L,) values of κ.
         log_det: (L,) ln det S.
         shrink: (L, m) 1 / (1 + κ² λ) for each eigenvalue λ.
@@ -62,6 +83,7 @@ class ReadingModel:
         free = self.jacobian.shape[2]
         by_load = [self.jacobian[u] @ prior.response[u * free : (u + 1) * free] for u in range(upper)]
         self.response = np.ascontiguousarray(np.concatenate(by_load))
+        self.response_t = np.ascontiguousarray(self.response.T)
         covariance = np.empty((upper * lower, upper * lower))
         for u in range(upper):
             for v in range(upper):
@@ -77,6 +99,10 @@ class ReadingModel:
         self.shrink = 1.0 / (1.0 + spread)
         self.log_det = np.log1p(spread).sum(axis=1)
         self._levels: dict[int, Level] = {}
+        self._loads: dict[int, LoadTables] = {}
+        m, loads = self.response.shape
+        usual = USUAL[1] - USUAL[0] + 1
+        self._stores = 8 * (len(self.kappa) * m**2 + usual * loads * (m + loads)) <= STORED
 
     @classmethod
     def of(cls, layout: PatchLayout) -> ReadingModel:
@@ -90,6 +116,35 @@ class ReadingModel:
             found = self._levels[number] = self._compute(number)
         return found
 
+    def loads(self, number: int) -> LoadTables:
+        """Return what the loads need of :meth:`level`, computed on first use."""
+        found = self._loads.get(number)
+        if found is None:
+            found = self._loads[number] = self._load_tables(number)
+        return found
+
+    def prepare(self, sigma: float) -> list[int]:
+        """Compute the tables for the noise ``sigma`` in advance; return the indices of the usual κ."""
+        octaves = np.log2(self.kappa * sigma)
+        usual: list[int] = np.flatnonzero((octaves >= USUAL[0]) & (octaves <= USUAL[1])).tolist()
+        for number in range(len(self.kappa)) if self._stores else usual[-MOST_USUAL:]:
+            self.level(number)
+        for number in usual if self._stores else ():
+            self.loads(number)
+        return usual
+
+    def _load_tables(self, number: int) -> LoadTables:
+        precision, (m, loads) = self.level(number).precision, self.response.shape
+        moved, gram = np.empty((m, loads)), np.empty((0, 0))
+        multiply(precision, self.response, moved)
+        stiffness = np.einsum("mj,mj->j", self.response, moved)
+        diagonal = np.concatenate([precision.diagonal(), stiffness])
+        if not self._stores:
+            return LoadTables(diagonal, gram, gram)
+        gram = np.empty((loads, loads))
+        multiply(self.response_t, moved, gram)
+        return LoadTables(diagonal, moved, gram)
+
     def _compute(self, number: int) -> Level:
         upper, lower = self.shape
         m = upper * lower
@@ -99,16 +154,14 @@ class ReadingModel:
         multiply(vectors, weighted, covariance)
         np.multiply(self.vectors_t, self.shrink[number][:, None], out=weighted)
         multiply(vectors, weighted, precision)
-        moved = np.empty_like(self.response)
-        multiply(precision, self.response, moved)
         return Level(
             precision=precision,
-            stiffness=np.einsum("mj,mj->j", self.response, moved),
+            diagonal=precision.diagonal().copy(),
             wires=WireTables.of(precision, covariance, self.shape),
         )
 
 
-@functools.lru_cache(maxsize=16)
+@functools.lru_cache(maxsize=4)
 def _model(layout: PatchLayout) -> ReadingModel:
     return ReadingModel(layout)
 

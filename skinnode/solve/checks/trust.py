@@ -22,6 +22,9 @@ lower wire of the reference patch may be missing (0.77), three upper wires may n
 OF_WIRE: Final = 0.8
 """Share of a wire's readings that a trusted wire needs."""
 CONTRADICTION: Final = "the readings contradict each other, and no wire or crossing explains it"
+UNEXAMINED: Final = (
+    "the readings seem to contradict each other, and the deadline left no time to examine them"
+)
 NOISIER: Final = "the readings are noisier than stated"
 
 Mask = NDArray[np.bool_]

@@ -31,7 +31,15 @@ from skinnode.model.elastic import Rubber
 from skinnode.model.forward import jacobian
 from skinnode.model.frames import Contact, FieldFrame
 from skinnode.model.layout import Float, PatchLayout
-from skinnode.solve.linalg.vectors import Index
+from skinnode.solve.linalg.cholesky import (
+    cholesky,
+    multiply,
+    multiply_vector,
+    solve_lower_transposed_vector,
+    solve_lower_vector,
+    subtract_product,
+)
+from skinnode.solve.linalg.vectors import Index, orthonormalise
 from skinnode.solve.options import TrackerOptions
 from skinnode.solve.posterior.contacts import ContactFinder, LoadEstimate
 from skinnode.solve.posterior.elastic_prior import SLACK, ElasticPrior
@@ -101,6 +109,7 @@ class ExactContacts:
             np.empty(loads),
         )
         self._share = np.ones(loads // 3)
+        self._rows = np.empty((n, loads))
         self._stiff = options.stiffness_n_per_m is not None
         self._field = np.empty((2, layout.upper_m.size))
         self._ratio, self._sorted = np.empty((2, layout.upper_m.shape[0]))
@@ -112,7 +121,9 @@ class ExactContacts:
         self.reset()
         solved = np.full(n, 1e-3)
         self._finder.warm_up(self._estimate(solved, 1.0))
-        self._find(np.zeros(layout.upper_m.shape), np.ones(layout.upper_m.shape))  # compiles the test
+        # compiles what a stream needs
+        self._find(np.zeros(layout.upper_m.shape), np.ones(layout.upper_m.shape))
+        self._estimate_without(np.arange(len(layout.upper_m)) == 0, 1.0)
         self.reset()
 
     def reset(self) -> None:
@@ -120,7 +131,7 @@ class ExactContacts:
         self._finder.reset()
         self._scale2 = 1e-4
         self._force, self._contacts, self._known = self.no_force_n, self._no_contacts, False
-        self._without: tuple[bytes, float, float, Float, Float] | None = None
+        self._without: tuple[bytes, float, float, Float] | None = None
 
     def add(self, field: FieldFrame) -> FieldFrame:
         """Return the field with its contacts and, unless the paper's law gave them, its forces.
@@ -178,12 +189,19 @@ class ExactContacts:
         """
         factors, gone = self._factors, left_out[self._wire]
         moved = np.where(gone, 0.0, self._moved)
-        columns = factors.whitening[gone].T  # (n, of these wires)
-        seen = factors.whitening[~gone].T @ moved[~gone]
+        columns_t = np.ascontiguousarray(factors.whitening[gone])  # (coordinates of these wires, n)
+        columns, weighted = np.ascontiguousarray(columns_t.T), np.empty_like(columns_t)
+        size, n = columns_t.shape
+        precision, unknown, seen = np.empty((size, size)), np.empty(size), np.empty(n)
+        multiply(moved[None], factors.whitening, seen[None])
         for _ in range(2):
-            weight = 1.0 / (self._scale2 * factors.gain + level)
-            precision = columns.T @ (weight[:, None] * columns)
-            moved[gone] = -np.linalg.solve(precision, columns.T @ (weight * seen))
+            np.divide(columns_t, self._scale2 * factors.gain + level, out=weighted)
+            multiply(weighted, columns, precision)
+            multiply_vector(weighted, seen, unknown)
+            cholesky(precision, size)
+            solve_lower_vector(precision, unknown, size)
+            solve_lower_transposed_vector(precision, unknown, size)
+            moved[gone] = -unknown
             self._estimate(moved, level)
         key = left_out.tobytes()
         known = self._without
@@ -194,15 +212,25 @@ class ExactContacts:
             or abs(known[2] / level - 1) > 0.25
         ):
             root = 1.0 / np.sqrt(self._scale2 * factors.gain + level)
-            basis = np.linalg.qr(root[:, None] * columns)[0]
-            rows = root[:, None] * factors.rows
-            rows -= basis @ (basis.T @ rows)
-            known = self._without = key, self._scale2, level, rows, basis
-        _, scale2, level, rows, basis = known
+            basis_t = columns_t * root
+            orthonormalise(basis_t)
+            basis, rows, shared = (
+                np.ascontiguousarray(basis_t.T),
+                self._rows,
+                np.empty((size, self._load.size)),
+            )
+            np.multiply(root[:, None], factors.rows, out=rows)
+            multiply(basis_t, rows, shared)
+            subtract_product(basis, shared, rows)
+            known = self._without = key, self._scale2, level, basis_t
+        _, scale2, level, basis_t = known
         y = seen / np.sqrt(scale2 * factors.gain + level)
-        y -= basis @ (basis.T @ y)
-        q = scale2 * (y @ rows)
-        return LoadEstimate(q.reshape(-1, 3), rows, np.ones(len(rows)), self._share, scale2)
+        part, q = np.empty(size), np.empty(self._load.size)
+        multiply_vector(basis_t, y, part)
+        subtract_product(part[None], basis_t, y[None])
+        multiply(y[None], self._rows, q[None])
+        q *= scale2
+        return LoadEstimate(q.reshape(-1, 3), self._rows, np.ones(n), self._share, scale2)
 
 
 @functools.lru_cache(maxsize=32)

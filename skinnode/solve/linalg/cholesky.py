@@ -216,6 +216,16 @@ def multiply(a: Float, b: Float, c: Float) -> None:
 
 
 @njit
+def subtract_product(a: Float, b: Float, c: Float) -> None:
+    """Subtract ``a`` (m, k) · ``b`` (k, n) from ``c`` (m, n)."""
+    (rows, inner), cols = a.shape, b.shape[1]
+    first: Any = np.int64(0)
+    for col in range(0, cols, TILE):
+        for r in range(0, rows, ROWS):
+            _tile(c, r, min(ROWS, rows - r), a, b, first, inner, col, min(TILE, cols - col), True)
+
+
+@njit
 def multiply_vector(a: Float, v: Float, out: Float) -> None:
     """Write ``a`` (m, n) · ``v`` (n,) into ``out`` (m,)."""
     n = v.size

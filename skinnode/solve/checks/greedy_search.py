@@ -1,0 +1,340 @@
+"""Greedy search for the loads and the wrong readings that explain a frame.
+
+Let A = [I B], with a column for each of the m readings and for the response to each of the 3Q loads. The
+search needs the diagonal of the Gram matrix E = Aᵀ P A, and Aᵀ P z. A load that is added, or a reading that
+is left out, changes P by a matrix of rank one, P' = P − share · v vᵀ: one vector Aᵀ v for each such step
+keeps both up to date, as in batch orthogonal matching pursuit. P' itself is not computed, except for the
+blocks of the wires, which tell whether all readings of a wire are wrong together.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skinnode.compiled.jit import njit
+from skinnode.model.layout import Float
+from skinnode.solve.checks.reading_model import ReadingModel
+from skinnode.solve.checks.wire_tests import LEAST
+from skinnode.solve.linalg.cholesky import cholesky, multiply_vector, solve_lower_vector
+from skinnode.solve.linalg.vectors import Index
+
+STEPS: Final = 8
+"""Maximum number of loads and groups of readings in an explanation with faults."""
+LOADS: Final = 60
+"""Maximum number of loads in an explanation by loads alone: a contact covers up to twenty cells, with three
+loads each. With 8, at a noise of 3e-6, half of all healthy frames of a deep slide were taken for faults."""
+ENOUGH: Final = 1.0
+"""Gain below which a load or fault is not worth adding, nats."""
+LOAD, CROSSING, LOWER, UPPER = range(4)
+"""Kinds of a step: a load is added; a reading, or all readings of a lower or upper wire, are left out."""
+
+Mask = NDArray[np.bool_]
+
+
+class GreedySearch:
+    """Search with its work arrays. Do not share an instance between owners.
+
+    Args:
+        model: Distribution of the readings.
+
+    Attributes:
+        kinds: (LOADS,) kinds of the steps of the last search; −1 after its last step.
+        numbers: (LOADS,) numbers of the loads, readings or wires.
+        gains: (LOADS,) gains in log evidence, nats.
+    """
+
+    def __init__(self, model: ReadingModel) -> None:
+        m, loads = model.response.shape
+        upper, lower = model.shape
+        self._model = model
+        self._weighted, self._diagonal = np.empty((2, m + loads))
+        self._vectors = np.empty((LOADS + m, m + loads))
+        self._share = np.empty(LOADS + m)
+        self._of_upper, self._of_lower = np.empty((upper, lower, lower)), np.empty((lower, upper, upper))
+        self._block, self._right = np.empty((max(model.shape),) * 2), np.empty(max(model.shape))
+        self.kinds, self.numbers = np.full((2, LOADS), -1)
+        self.gains = np.empty(LOADS)
+
+    def run(  # noqa: PLR0913 - the frame, and which explanations are allowed
+        self, number: int, z: Float, present: Mask, cost: float, *, faults: bool, loads: bool = True
+    ) -> float:
+        """Return the gain in log evidence of the best explanation found; its steps stay in the arrays.
+
+        Args:
+            number: Index of κ.
+            z: (U, K) changes of the readings since rest, in units of their noise.
+            present: (U, K) readings to be used.
+            cost: Cost of a wrong reading, nats.
+            faults: Whether readings may be wrong.
+            loads: Whether loads may be added.
+        """
+        self.kinds[:] = -1
+        m = z.size
+        level, tables = self._model.level(number), self._model.loads(number)
+        self._diagonal[:] = tables.diagonal
+        return _search(
+            z.ravel(), present.ravel().copy(), *self._model.shape, cost, loads, faults,
+            LEAST * float(tables.diagonal[m:].max()),
+            level.precision, tables.moved, tables.gram, self._model.response_t,
+            self._weighted, self._diagonal, self._vectors, self._share, self._of_upper, self._of_lower,
+            self._block, self._right, self.kinds, self.numbers, self.gains,
+        )  # fmt: skip
+
+
+@njit
+def crossing_gain(d: Float, alpha: Float, present: Mask, cost: float) -> tuple[float, int]:
+    """Return the largest gain from treating a reading as wrong, nats, and the number of the reading.
+
+    ``d`` is the diagonal of P; the choice among m readings costs ln m.
+    """
+    best, where = -math.inf, -1
+    for i in range(present.size):
+        if present[i]:
+            precision = max(d[i], LEAST)
+            gain = 0.5 * alpha[i] * alpha[i] / precision - 0.5 * math.log(precision)
+            if gain > best:
+                best, where = gain, i
+    return best - cost - math.log(present.size), where
+
+
+@njit
+def _group_gain(  # noqa: PLR0913 - a kernel: arrays by name
+    p: Float, alpha: Float, present: Mask, first: int, step: int, cost: float, block: Float, right: Float
+) -> float:
+    """Return the gain from treating the readings first, first + step, … as wrong; −inf if fewer than two.
+
+    ``p`` is their block of P; ``block`` and ``right`` are scratch. The gain is
+    ½ α_Gᵀ P_GG⁻¹ α_G − ½ ln det P_GG minus the cost of each reading.
+    """
+    n, here = len(p), 0
+    for i in range(n):
+        here += present[first + i * step]
+    if here < 2:
+        return -math.inf
+    for i in range(n):
+        exists = present[first + i * step]
+        right[i] = alpha[first + i * step] if exists else 0.0
+        for j in range(i, n):
+            block[i, j] = p[i, j] if exists and present[first + j * step] else 0.0
+        block[i, i] += LEAST if exists else 1.0
+    if not cholesky(block, n):
+        return -math.inf
+    solve_lower_vector(block, right, n)
+    gain = -cost * here
+    for i in range(n):
+        gain += 0.5 * right[i] * right[i] - math.log(block[i, i])
+    return gain
+
+
+@njit
+def _best_group(  # noqa: PLR0913 - a kernel: arrays by name
+    d: Float,
+    alpha: Float,
+    present: Mask,
+    of_upper: Float,
+    of_lower: Float,
+    cost: float,
+    block: Float,
+    right: Float,
+) -> tuple[float, int, int]:
+    """Return the largest gain from treating a group of readings as wrong, its kind and its number.
+
+    The choice among n groups of a kind costs ln n. ``block`` and ``right`` are scratch.
+    """
+    upper, lower = len(of_upper), len(of_lower)
+    gain, number = crossing_gain(d, alpha, present, cost)
+    kind = CROSSING
+    for k in range(lower):
+        value = _group_gain(of_lower[k], alpha, present, k, lower, cost, block, right) - math.log(lower)
+        if value > gain:
+            gain, kind, number = value, LOWER, k
+    for u in range(upper):
+        value = _group_gain(of_upper[u], alpha, present, u * lower, 1, cost, block, right) - math.log(upper)
+        if value > gain:
+            gain, kind, number = value, UPPER, u
+    return gain, kind, number
+
+
+@njit
+def _gram_row(  # noqa: PLR0913 - a kernel: arrays by name
+    item: int, p: Float, moved: Float, gram: Float, response_t: Float, row: Float
+) -> None:
+    """Write a row of E into ``row`` (m + 3Q,), from the matrices if there are any."""
+    m = len(p)
+    if item < m:
+        for j in range(m):
+            row[j] = p[item, j]
+    elif gram.size:
+        for i in range(m):
+            row[i] = moved[i, item - m]
+    else:
+        multiply_vector(p, response_t[item - m], row[:m])
+    if not gram.size:
+        multiply_vector(response_t, row[:m], row[m:])
+        return
+    by_load = moved[item] if item < m else gram[item - m]
+    for j in range(by_load.size):
+        row[m + j] = by_load[j]
+
+
+@njit
+def _update(  # noqa: PLR0913 - a kernel: arrays by name
+    item: int,
+    count: int,
+    first: int,
+    p: Float,
+    moved: Float,
+    gram: Float,
+    response_t: Float,
+    weighted: Float,
+    diagonal: Float,
+    vectors: Float,
+    share: Float,
+) -> None:
+    """Leave out a reading, or add a load with its likeliest variance, (b² − h) / h², as step ``count``.
+
+    Elements before ``first`` are not needed and not kept up to date.
+    """
+    row = vectors[count]
+    _gram_row(item, p, moved, gram, response_t, row)
+    size = row.size
+    for i in range(count):
+        earlier = vectors[i]
+        factor = share[i] * earlier[item]
+        for j in range(first, size):
+            row[j] -= factor * earlier[j]
+    b = weighted[item]
+    if item < len(p):
+        share[count] = 1.0 / (row[item] + LEAST)
+    else:
+        h = max(diagonal[item], LEAST)
+        share[count] = 1.0 / (h * h / max(b * b - h, LEAST * h) + h)
+    of_b, of_square = share[count] * b, share[count]
+    for j in range(first, size):
+        weighted[j] -= of_b * row[j]
+        diagonal[j] -= of_square * row[j] * row[j]
+    if item < len(p):
+        weighted[item] = 0.0
+
+
+@njit
+def _copy_blocks(p: Float, of_upper: Float, of_lower: Float) -> None:
+    """Copy the wires' blocks of P."""
+    upper, lower = len(of_upper), len(of_lower)
+    for u in range(upper):
+        for i in range(lower):
+            for j in range(lower):
+                of_upper[u, i, j] = p[u * lower + i, u * lower + j]
+    for k in range(lower):
+        for i in range(upper):
+            for j in range(upper):
+                of_lower[k, i, j] = p[i * lower + k, j * lower + k]
+
+
+@njit
+def _update_blocks(share: float, row: Float, of_upper: Float, of_lower: Float) -> None:
+    """Subtract share · v vᵀ from the blocks of the wires."""
+    upper, lower = len(of_upper), len(of_lower)
+    for u in range(upper):
+        block, first = of_upper[u], u * lower
+        for i in range(lower):
+            factor = share * row[first + i]
+            for j in range(lower):
+                block[i, j] -= factor * row[first + j]
+    for k in range(lower):
+        block = of_lower[k]
+        for i in range(upper):
+            factor = share * row[i * lower + k]
+            for j in range(upper):
+                block[i, j] -= factor * row[j * lower + k]
+
+
+@njit
+def _best_load(weighted: Float, diagonal: Float, m: int, least: float) -> tuple[float, int]:
+    """Return the largest gain from adding a load, and the number of the load; −1 if none gains."""
+    most, number = 1.0, -1
+    for j in range(m, diagonal.size):
+        if diagonal[j] > least:
+            ratio = weighted[j] * weighted[j] / diagonal[j]
+            if ratio > most:
+                most, number = ratio, j - m
+    return 0.5 * (most - 1.0 - math.log(most)) - math.log(diagonal.size - m), number
+
+
+@njit
+def _search(  # noqa: PLR0913, C901 - a kernel: arrays by name, a greedy search
+    z: Float,
+    present: Mask,
+    upper: int,
+    lower: int,
+    cost: float,
+    with_loads: bool,
+    faults: bool,
+    least: float,
+    p: Float,
+    moved: Float,
+    gram: Float,
+    response_t: Float,
+    weighted: Float,
+    diagonal: Float,
+    vectors: Float,
+    share: Float,
+    of_upper: Float,
+    of_lower: Float,
+    block: Float,
+    right: Float,
+    kinds: Index,
+    numbers: Index,
+    gains: Float,
+) -> float:
+    """Write the best explanation of ``z`` (m,) into the last three arrays; return its gain."""
+    m = z.size
+    multiply_vector(p, z, weighted[:m])
+    multiply_vector(response_t, weighted[:m], weighted[m:])
+    count = 0
+    for i in range(m):
+        if not present[i]:
+            _update(i, count, 0, p, moved, gram, response_t, weighted, diagonal, vectors, share)
+            count += 1
+    if faults:
+        _copy_blocks(p, of_upper, of_lower)
+        for i in range(count):
+            _update_blocks(share[i], vectors[i], of_upper, of_lower)
+    total = 0.0
+    for step in range(STEPS if faults else LOADS):
+        gain, kind, number = 0.0, LOAD, -1
+        if with_loads:
+            gain, number = _best_load(weighted, diagonal, m, least)
+        if faults:
+            by_fault, fault, which = _best_group(
+                diagonal, weighted, present, of_upper, of_lower, cost, block, right
+            )
+            if by_fault > gain or number < 0:
+                gain, kind, number = by_fault, fault, which
+        if gain < ENOUGH or number < 0:
+            break
+        total += gain
+        kinds[step], numbers[step], gains[step] = kind, number, gain
+        if kind == LOAD:
+            first = 0 if faults else m  # without faults, the readings themselves are not needed any more
+            _update(m + number, count, first, p, moved, gram, response_t, weighted, diagonal, vectors, share)
+            if faults:
+                _update_blocks(share[count], vectors[count], of_upper, of_lower)
+            count += 1
+            continue
+        for i in range(m):
+            chosen = (
+                (kind == CROSSING and i == number)
+                or (kind == LOWER and i % lower == number)
+                or (kind == UPPER and i // lower == number)
+            )
+            if chosen and present[i]:
+                present[i] = False
+                _update(i, count, 0, p, moved, gram, response_t, weighted, diagonal, vectors, share)
+                _update_blocks(share[count], vectors[count], of_upper, of_lower)
+                count += 1
+    return total

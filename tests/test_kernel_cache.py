@@ -178,6 +178,16 @@ def test_what_is_whole_but_cannot_be_loaded_is_compiled_anew(cache: Cache) -> No
     assert cache.run() == (2, [])
 
 
+def test_another_installation_of_the_same_code_shares_the_kernels(cache: Cache, tmp_path: Path) -> None:
+    """As when the tests of a checkout are run after the demo of an installation."""
+    (tmp_path / "elsewhere").mkdir()
+    moved = Cache(cache.folder, Path(shutil.copy(cache.program, tmp_path / "elsewhere")))
+    assert moved.run() == (2, [])
+    edited = moved.program.read_text().replace("/ 2", "* 0.5")
+    moved.program.write_text(edited)
+    assert moved.run() == (0, [])
+
+
 def test_two_processes_compile_into_an_empty_cache_at_once(cache: Cache) -> None:
     shutil.rmtree(cache.folder)
     both = [cache.start(), cache.start()]

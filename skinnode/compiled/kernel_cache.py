@@ -58,7 +58,8 @@ class KernelCache:
         file = inspect.getfile(function)
         self._folder = folder
         self._stem = f"{Path(file).stem}.{function.__qualname__}-{code.co_firstlineno}"
-        self._source = (sys.implementation.cache_tag, file, _file_digest(file), code.co_code.hex())
+        # not the path of the file: every installation of the same code shares the kernels
+        self._source = (sys.implementation.cache_tag, _file_digest(file), code.co_code.hex())
 
     @property
     def cache_path(self) -> str:

@@ -50,6 +50,7 @@ class ScanSolver:
             facts.config, config, relative_noise=facts.config.relative_noise, baseline_ohm=facts.baseline_ohm
         )
         self._tracker = Tracker(facts.layout, options, codes=self._codes)
+        self._tracker.prepare()
         self._decoder = Decoder(facts.baseline_ohm, scale)
 
     def decode(self, scan: Scan, stamp: ScanStamp) -> ResistanceFrame:
@@ -103,7 +104,7 @@ def tracker_options(
 
 
 def check_solvable(patch: PatchConfig, config: SolverConfig) -> None:
-    """Check that a layout can be solved, and compile the kernels or load them from the cache.
+    """Check that a layout can be solved, compile the kernels or load them from the cache, prepare tables.
 
     Call this function before a node waits for the host.
 
@@ -113,8 +114,14 @@ def check_solvable(patch: PatchConfig, config: SolverConfig) -> None:
     layout = patch.layout.build()
     try:
         made = tracker_options(patch, config, relative_noise=patch.relative_noise).tolerances
-        Tracker(layout, method=config.method, operator=config.operator, tolerances=made).update(
-            resistance_ohm(layout, layout.upper_m)
+        tracker = Tracker(
+            layout,
+            method=config.method,
+            operator=config.operator,
+            relative_noise=patch.relative_noise,
+            tolerances=made,
         )
+        tracker.update(resistance_ohm(layout, layout.upper_m))
+        tracker.prepare()
     except ValueError as error:
         raise ConfigError(f"patch {patch.name!r}", layout.name, str(error)) from None

@@ -96,6 +96,21 @@ def test_triangular_solves(n, cols, seed, size):
 
 @FEW
 @given(SIZES, SEEDS)
+def test_a_positive_definite_system_is_solved_and_another_refused(n, seed):
+    s, rng = spread(seed, n, 30.0), np.random.default_rng(seed)
+    x = rng.normal(size=n)
+    b = np.append(s @ x, np.nan)
+    assert dense.solve_positive(s.copy(), b, n)
+    np.testing.assert_allclose(b[:n], x, atol=1e-9 * np.abs(x).max())
+    assert np.isnan(b[n])
+    s[n - 1, n - 1] = -s[n - 1, n - 1]
+    before = b.copy()
+    assert not dense.solve_positive(s, b, n)
+    np.testing.assert_array_equal(b, before)
+
+
+@FEW
+@given(SIZES, SEEDS)
 def test_inverse_diagonal(n, seed):
     s = spread(seed, n, 30.0)
     l = factor(s)

@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 import skinnode as sk
 from skinnode.model.elastic import Rubber
 from skinnode.protocol.codes import MISSING, CodeScale, as_baseline, decode, encode
+from skinnode.solve.checks.reading_model import ReadingModel
 from skinnode.solve.exact.tracker import ExactTracker
 from skinnode.solve.inputs import CodeMap
 
@@ -44,6 +45,32 @@ def test_exact_method_is_the_exact_tracker(layout):
             assert field.status == expected.status
         tracker.reset()
         exact.reset()
+
+
+def test_a_stream_waits_for_no_table_after_preparation(monkeypatch):
+    """Touched, untouched, and with a wrong reading at which explanations are sought, at the stated noise."""
+    layout = sk.PatchLayout.preset("staggered", upper_wires=5, upper_electrodes=5, lower_electrodes=5)
+    plain, prepared = sk.Tracker(layout), sk.Tracker(layout)
+    prepared.prepare()
+    computed: list[int] = []
+    frames = []
+    for step in range(24):
+        frame = frame_ohm(layout, hertz_press(layout, 0.02 * max(0, min(step - 4, 24 - step))))
+        frames.append(frame * (1 + 1e-5 * np.random.default_rng(step).normal(size=layout.shape)))
+        frames[-1][2, 3] *= 1.2 if step % 5 == 4 else 1.0
+    for method in ("_compute", "_load_tables"):
+        original = getattr(ReadingModel, method)
+
+        def counted(self, number, original=original):
+            computed.append(number)
+            return original(self, number)
+
+        monkeypatch.setattr(ReadingModel, method, counted)
+    fields = [prepared.update(frame) for frame in frames]
+    assert not computed
+    assert any(field.faults for field in fields)
+    for field, frame in zip(fields, frames, strict=True):
+        np.testing.assert_array_equal(plain.update(frame).displacement_m, field.displacement_m)
 
 
 def test_unknown_method_is_named(layout):

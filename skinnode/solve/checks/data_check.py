@@ -29,12 +29,7 @@ from skinnode.solve.checks.greedy_search import crossing_gain
 from skinnode.solve.checks.reading_model import ReadingModel, changes, evidences
 from skinnode.solve.checks.trust import CONTRADICTION, NOISIER, OF_WIRE, UNEXAMINED, assess
 from skinnode.solve.checks.wire_tests import GAIN_STD, LEAST, least_fitting
-from skinnode.solve.linalg.cholesky import (
-    cholesky,
-    multiply_vector,
-    solve_lower_transposed_vector,
-    solve_lower_vector,
-)
+from skinnode.solve.linalg.cholesky import multiply_vector, solve_positive
 from skinnode.solve.wires.problem import PatchProblem
 
 ROUNDS: Final = 3
@@ -94,7 +89,7 @@ class DataCheck:
 
     Args:
         problem: The patch.
-        sigma: Usual noise of a reading, for which tables are prepared.
+        sigma: Usual noise of a reading, for :meth:`prepare`.
         model_std: Standard deviation of the forward model's error, relative to the largest change of a
             reading: 0 for a patch that equals its layout.
         drift: Gain errors that are expected and no fault: ``none``, ``patch`` or ``wire``.
@@ -106,7 +101,7 @@ class DataCheck:
     def __init__(
         self, problem: PatchProblem, sigma: float, model_std: float = 0.0, drift: str = "none"
     ) -> None:
-        self._problem, self._model_std, self._drift = problem, model_std, drift
+        self._problem, self._sigma, self._model_std, self._drift = problem, sigma, model_std, drift
         self._model = ReadingModel.of(problem.layout)
         self._explainer = Explainer(self._model)
         shape = problem.layout.shape
@@ -121,14 +116,17 @@ class DataCheck:
         self._all_trusted.setflags(write=False)
         self.scan: int | None = None
         self._examination_s = EXAMINATION_S
-        usual = self._model.prepare(sigma)
         every = np.ones(shape, bool)
         at_rest = np.zeros((shape[0], 3 * problem.layout.upper_m.shape[1]))
         changes(self._model.jacobian, at_rest, 1.0, self._z)
         self._residuals(at_rest, np.ones(shape), np.ones(shape[0], bool))
-        self._explainer.wrong_readings(self._z, every, self._evidence, usual[0], 1.0, 1.0)  # compiles
+        self._explainer.wrong_readings(self._z, every, self._evidence, 0, 1.0, 1.0)  # compiles the kernels
         self._largest_gains(every, self._evidences(every), 1.0, 1.0)
         self.reset()
+
+    def prepare(self) -> None:
+        """Compute tables that the first suspicious frames of a stream would otherwise wait for."""
+        self._model.prepare(self._sigma)
 
     def reset(self) -> None:
         """Forget the stream."""
@@ -388,11 +386,9 @@ class DataCheck:
             block, unknown = np.ascontiguousarray(p[:, missing]), np.empty(count)
             block.flat[:: count + 1] += LEAST
             multiply_vector(p, z, unknown)
-            cholesky(block, count)
-            solve_lower_vector(block, unknown, count)
-            solve_lower_transposed_vector(block, unknown, count)
-            z[missing] = -unknown
-            best = evidences(model.vectors_t, model.shrink, model.log_det, z, self._c, self._evidence)
+            if solve_positive(block, unknown, count):
+                z[missing] = -unknown
+                best = evidences(model.vectors_t, model.shrink, model.log_det, z, self._c, self._evidence)
         return best
 
     def _largest_gains(self, present: Mask, best: int, cost: float, sigma: float) -> tuple[float, float]:

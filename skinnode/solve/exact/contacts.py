@@ -31,14 +31,7 @@ from skinnode.model.elastic import Rubber
 from skinnode.model.forward import jacobian
 from skinnode.model.frames import Contact, FieldFrame
 from skinnode.model.layout import Float, PatchLayout
-from skinnode.solve.linalg.cholesky import (
-    cholesky,
-    multiply,
-    multiply_vector,
-    solve_lower_transposed_vector,
-    solve_lower_vector,
-    subtract_product,
-)
+from skinnode.solve.linalg.cholesky import multiply, multiply_vector, solve_positive, subtract_product
 from skinnode.solve.linalg.vectors import Index, orthonormalise
 from skinnode.solve.options import TrackerOptions
 from skinnode.solve.posterior.contacts import ContactFinder, LoadEstimate
@@ -198,10 +191,8 @@ class ExactContacts:
             np.divide(columns_t, self._scale2 * factors.gain + level, out=weighted)
             multiply(weighted, columns, precision)
             multiply_vector(weighted, seen, unknown)
-            cholesky(precision, size)
-            solve_lower_vector(precision, unknown, size)
-            solve_lower_transposed_vector(precision, unknown, size)
-            moved[gone] = -unknown
+            if solve_positive(precision, unknown, size):
+                moved[gone] = -unknown
             self._estimate(moved, level)
         key = left_out.tobytes()
         known = self._without

@@ -206,6 +206,19 @@ def solve_lower_transposed_vector(l: Float, v: Float, n: int) -> None:
 
 
 @njit
+def solve_positive(a: Float, b: Float, n: int) -> bool:
+    """Replace the leading n elements of ``b`` with A⁻¹ b, and ``a`` (n, n), symmetric, with its Cholesky factor.
+
+    Returns False, and leaves ``b`` as it was, if ``a`` is not positive definite.
+    """
+    if not cholesky(a, n):
+        return False
+    solve_lower_vector(a, b, n)
+    solve_lower_transposed_vector(a, b, n)
+    return True
+
+
+@njit
 def multiply(a: Float, b: Float, c: Float) -> None:
     """Write ``a`` (m, k) · ``b`` (k, n) into ``c`` (m, n)."""
     (rows, inner), cols = a.shape, b.shape[1]

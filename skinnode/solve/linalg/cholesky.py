@@ -207,7 +207,7 @@ def solve_lower_transposed_vector(l: Float, v: Float, n: int) -> None:
 
 @njit
 def solve_positive(a: Float, b: Float, n: int) -> bool:
-    """Replace the leading n elements of ``b`` with A⁻¹ b, and ``a`` (n, n), symmetric, with its Cholesky factor.
+    """Replace the leading n elements of ``b`` with A⁻¹ b, and the symmetric ``a`` (n, n) with its factor.
 
     Returns False, and leaves ``b`` as it was, if ``a`` is not positive definite.
     """

@@ -44,12 +44,17 @@ class Stopped(SystemExit):
 def main_of(module: str, argv: Sequence[str] | None = None) -> NoReturn:
     """Run a typer application and exit with its status. From this call on, signals end the process.
 
+    BLAS libraries get one thread, unless the environment says otherwise: their threads wait by spinning. Under
+    a real-time policy (``chrt -f``), spinning threads on every processor stopped a host for good.
+
     Args:
         module: Name of the module that defines the application as ``app``.
         argv: Command-line arguments; default: the arguments of the process.
     """
     _handle(_exit_at_once)
     atexit.register(_ignore_signals)
+    for name in ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+        os.environ.setdefault(name, "1")
     run: Callable[..., int] = import_module("skinnode.cli._errors").run
     app = import_module(module).app
     _handle(_stop)

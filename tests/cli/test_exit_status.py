@@ -299,3 +299,23 @@ def test_who_reads_may_go(folder: Path, arguments: list[str]) -> None:
         err = process.stderr.read()
         process.wait(timeout=30)
     assert (process.returncode, err) == (141, "")
+
+
+@pytest.mark.parametrize("program", PROGRAMS.values())
+def test_a_command_starts_no_threads_for_linear_algebra(program: str) -> None:
+    """They wait by spinning: on every processor, under a real-time policy, they stopped a host for good."""
+    code = (
+        "import atexit, os, sys\n"
+        "def count():\n"
+        "    import numpy\n"
+        "    numpy.ones((600, 600)) @ numpy.ones((600, 600))\n"
+        "    print(len(os.listdir('/proc/self/task')))\n"
+        "atexit.register(count)\n"
+        "sys.argv[1:] = ['--help']\n"
+        f"from {program} import main\n"
+        "main()\n"
+    )
+    environment = {name: value for name, value in os.environ.items() if not name.endswith("_NUM_THREADS")}
+    ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment)
+    assert ran.returncode == 0, ran.stderr
+    assert ran.stdout.split()[-1] == "1"

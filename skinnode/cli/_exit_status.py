@@ -44,8 +44,8 @@ class Stopped(SystemExit):
 def main_of(module: str, argv: Sequence[str] | None = None) -> NoReturn:
     """Run a typer application and exit with its status. From this call on, signals end the process.
 
-    BLAS libraries get one thread, unless the environment says otherwise: their threads wait by spinning. Under
-    a real-time policy (``chrt -f``), spinning threads on every processor stopped a host for good.
+    BLAS libraries get one thread, unless the environment says otherwise: their threads wait by spinning, and
+    under a real-time policy (``chrt -f``) threads that spun on every processor stopped a host for good.
 
     Args:
         module: Name of the module that defines the application as ``app``.

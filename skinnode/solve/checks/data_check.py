@@ -122,6 +122,8 @@ class DataCheck:
         self._residuals(at_rest, np.ones(shape), np.ones(shape[0], bool))
         self._explainer.wrong_readings(self._z, every, self._evidence, 0, 1.0, 1.0)  # compiles the kernels
         self._largest_gains(every, self._evidences(every), 1.0, 1.0)
+        every[0, 0] = False
+        self._evidences(every)
         self.reset()
 
     def prepare(self) -> None:

@@ -5,5 +5,6 @@
     scene (true deformation) -> sensor (resistances, wire faults) -> faulty_node (the real node)
         -> faulty_scans (scan faults) -> fleet (all nodes on their buses) -> command (vcan-sim)
 
-``faults`` declares the faults, ``injector`` draws and counts faults, ``tally`` counts frames by kind.
+``contact`` has contact mechanics on a bonded layer, apart from all models of the product; scenes do not use
+it yet. ``faults`` declares the faults, ``injector`` draws and counts faults, ``tally`` counts frames by kind.
 """

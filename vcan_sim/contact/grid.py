@@ -1,0 +1,70 @@
+"""Cells of equal size on the surface, and their displacement under tractions on all of them, by FFT.
+
+The convolution with the response of one cell is exact: padded with as many zeros as cells, the patch has no
+periodic neighbours (Liu, Wang and Liu, Wear 243, 101, 2000).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import fft
+
+from vcan_sim.contact.layer import Float, Layer, cell_response
+
+
+@dataclass(frozen=True, eq=False)
+class Grid:
+    """Response of a grid of square cells. Make one with :meth:`of`.
+
+    Attributes:
+        layer: The layer under the cells.
+        shape: Numbers of cells along x and y.
+        size_m: Side of a cell, metres.
+    """
+
+    layer: Layer
+    shape: tuple[int, int]
+    size_m: float
+    _padded: tuple[int, int]
+    _response: Float
+    """(3, 3, …) Fourier transform of the response of one cell."""
+
+    @classmethod
+    def of(cls, layer: Layer, shape: tuple[int, int], size_m: float) -> Grid:
+        """Compute the response of a grid.
+
+        Args:
+            layer: The layer under the cells.
+            shape: Numbers of cells along x and y.
+            size_m: Side of a cell, metres.
+        """
+        padded = (fft.next_fast_len(2 * shape[0], real=True), fft.next_fast_len(2 * shape[1], real=True))
+        steps = [(np.arange(n) + m - 1) % n - (m - 1) for n, m in zip(padded, shape, strict=True)]
+        offset = np.stack(np.meshgrid(*steps, indexing="ij"), axis=-1) * size_m
+        response = cell_response(layer, offset, size_m, float(np.hypot(*np.abs(offset).max(axis=(0, 1)))))
+        turned = np.ascontiguousarray(np.moveaxis(response, (2, 3), (0, 1)))
+        return cls(layer, shape, size_m, padded, fft.rfft2(turned))
+
+    def centres_m(self, origin_m: Float) -> Float:
+        """Return the centres (X, Y, 2) of the cells, metres, the first at ``origin_m`` (2,)."""
+        x, y = (np.arange(n) * self.size_m for n in self.shape)
+        return np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1) + origin_m
+
+    def displacement_m(self, traction_pa: Float) -> Float:
+        """Return the displacement (3, X, Y), metres, under tractions (3, X, Y), Pa."""
+        waves = fft.rfft2(traction_pa, self._padded)
+        moved = fft.irfft2(np.einsum("ijxy,jxy->ixy", self._response, waves), self._padded)
+        return np.asarray(moved[:, : self.shape[0], : self.shape[1]])
+
+    def normal_m(self, pressure_pa: Float) -> Float:
+        """Return how far the surface sinks (X, Y), metres, under a pressure (X, Y), Pa."""
+        waves = self._response[2, 2] * fft.rfft2(pressure_pa, self._padded)
+        return np.asarray(fft.irfft2(waves, self._padded)[: self.shape[0], : self.shape[1]])
+
+    def shear_m(self, traction_pa: Float) -> Float:
+        """Return the displacement along the surface (2, X, Y), metres, under a shear (2, X, Y), Pa."""
+        waves = fft.rfft2(traction_pa, self._padded)
+        moved = fft.irfft2(np.einsum("ijxy,jxy->ixy", self._response[:2, :2], waves), self._padded)
+        return np.asarray(moved[:, : self.shape[0], : self.shape[1]])

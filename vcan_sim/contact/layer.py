@@ -1,0 +1,199 @@
+"""Elastic layer bonded to a rigid base: displacement of its surface under tractions on its surface.
+
+For a wave number k and x = k h, a surface traction of unit amplitude moves the surface by
+
+    normal, from normal        (1 − ν) / (G k) · (2κ sinh 2x − 4x) / D
+    along k, from along k      (1 − ν) / (G k) · (2κ sinh 2x + 4x) / D
+    along k, from normal       1 / (G k) · (κ (1 − 2ν) (cosh 2x − 1) − 2x²) / D,  a quarter wave off
+    across k, from across k    tanh x / (G k)
+
+with κ = 3 − 4ν and D = 2κ cosh 2x + 4x² + 1 + κ²: the plane-strain solution of Navier's equations with a
+surface at z = h and no displacement at z = 0 (its first line: Johnson, Contact Mechanics, 1985, eq. 5.65, and
+Bentall and Johnson, Int. J. Mech. Sci. 10, 637, 1968). For h → ∞ it is the half-space.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
+from scipy.special import j0, j1
+
+Float = NDArray[np.float64]
+
+DEEPEST: Final = 14.0
+"""Largest x at which a layer differs from a half-space: by x² e^(−2x) < 2e-10."""
+STEPS: Final = 32
+"""Points of a table per thickness of the layer."""
+NODES: Final = 16
+"""Nodes of Gauss-Legendre quadrature per panel."""
+
+
+@dataclass(frozen=True, slots=True)
+class Layer:
+    """An isotropic elastic layer on a rigid base.
+
+    Args:
+        thickness_m: Thickness, metres; inf for a half-space.
+        young_pa: Young's modulus, Pa.
+        poisson: Poisson's ratio, at most 0.5.
+
+    Raises:
+        ValueError: If a value is out of range.
+    """
+
+    thickness_m: float
+    young_pa: float = 1e6
+    poisson: float = 0.5
+
+    def __post_init__(self) -> None:
+        for name, value, low, high in (
+            ("thickness_m", self.thickness_m, 0.0, math.inf),
+            ("young_pa", self.young_pa, 0.0, 1e13),
+        ):
+            if not low < value <= high:
+                raise ValueError(f"{name} is {value}, allowed: larger than {low:g}, at most {high:g}")
+        if not 0.0 <= self.poisson <= 0.5:
+            raise ValueError(f"poisson is {self.poisson}, allowed: 0 to 0.5")
+
+    @property
+    def shear_modulus_pa(self) -> float:
+        """Shear modulus G, Pa."""
+        return 0.5 * self.young_pa / (1.0 + self.poisson)
+
+    @property
+    def contact_modulus_pa(self) -> float:
+        """Contact modulus E* = E / (1 − ν²) of the layer against a rigid body, Pa."""
+        return self.young_pa / (1.0 - self.poisson**2)
+
+    def response(self, wave_number_per_m: Float) -> tuple[Float, Float, Float, Float]:
+        """Return the four responses of the module's docstring, k times each, in 1/Pa.
+
+        Args:
+            wave_number_per_m: Wave numbers k > 0, any shape.
+        """
+        nu, modulus = self.poisson, self.shear_modulus_pa
+        kappa = 3.0 - 4.0 * nu
+        x = np.minimum(wave_number_per_m * self.thickness_m, 300.0)
+        fall = np.exp(-2.0 * x)  # all terms times 2 e^(−2x), which avoids an overflow
+        sinh, cosh = 1.0 - fall**2, 1.0 + fall**2
+        below = 2.0 * kappa * cosh + 2.0 * fall * (4.0 * x**2 + 1.0 + kappa**2)
+        scale = (1.0 - nu) / modulus
+        normal = scale * (2.0 * kappa * sinh - 8.0 * x * fall) / below
+        along = scale * (2.0 * kappa * sinh + 8.0 * x * fall) / below
+        across = np.tanh(x) / modulus
+        crossed = (kappa * (1.0 - 2.0 * nu) * (cosh - 2.0 * fall) - 4.0 * x**2 * fall) / (modulus * below)
+        return normal, along, crossed, across
+
+
+class PointResponse:
+    """Displacement of the surface at a distance from a point force, apart from that of a half-space.
+
+    The difference between a layer and a half-space is smooth, so it is tabulated over the distance.
+
+    Args:
+        layer: The layer, of finite thickness.
+        reach_m: Largest distance, metres.
+    """
+
+    def __init__(self, layer: Layer, reach_m: float) -> None:
+        h = layer.thickness_m
+        r = np.linspace(0.0, reach_m, max(int(STEPS * reach_m / h), STEPS) + 1)
+        panels = math.ceil(DEEPEST * max(reach_m / h, 1.0) / 4.0)
+        nodes, weights = np.polynomial.legendre.leggauss(NODES)
+        edges = np.linspace(0.0, DEEPEST / h, panels + 1)
+        width = 0.5 * (edges[1] - edges[0])
+        k = (0.5 * (edges[:-1] + edges[1:])[:, None] + width * nodes).ravel()
+        step = np.tile(width * weights, panels)
+        half = Layer(math.inf, layer.young_pa, layer.poisson)
+        normal, along, crossed, across = (
+            step * (own - other)
+            for own, other in zip(layer.response(k), half.response(np.full_like(k, np.inf)), strict=True)
+        )
+        tables = np.empty((4, len(r)))
+        for start in range(0, len(r), 64):  # a part at a time: all waves at all distances may not fit
+            waves = np.outer(r[start : start + 64], k)
+            zeroth, first = j0(waves), j1(waves)
+            second = np.where(waves > 1e-4, 2.0 * first / np.maximum(waves, 1e-4) - zeroth, 0.0)
+            tables[0, start : start + 64] = zeroth @ normal / (2.0 * math.pi)
+            tables[1, start : start + 64] = zeroth @ (along + across) / (4.0 * math.pi)
+            tables[2, start : start + 64] = second @ (across - along) / (4.0 * math.pi)
+            tables[3, start : start + 64] = first @ crossed / (2.0 * math.pi)
+        self._splines = tuple(CubicSpline(r, table) for table in tables)
+
+    def __call__(self, distance_m: Float) -> tuple[Float, Float, Float, Float]:
+        """Return Z, A, B and K, m/N: u_z = Z f_z; u_x = (A + B cos 2θ) f_x + B sin 2θ f_y + K cos θ f_z."""
+        found = [np.asarray(spline(distance_m)) for spline in self._splines]
+        return found[0], found[1], found[2], found[3]
+
+
+def cell_response(layer: Layer, offset_m: Float, size_m: float, reach_m: float) -> Float:
+    """Return the displacement at places due to a uniform unit traction on a square cell at the origin.
+
+    On a half-space it is the closed form for a rectangle (Love, Phil. Trans. A 228, 377, 1929; Johnson,
+    eq. 3.25, for all directions): the integrals of 1/R, x²/R³, y²/R³, xy/R³, x/R² and y/R². The difference to
+    a layer is smooth and integrated over the cell by Gauss-Legendre quadrature.
+
+    Args:
+        layer: The layer.
+        offset_m: (…, 2) places relative to the centre of the cell, metres.
+        size_m: Side of the cell, metres.
+        reach_m: Largest distance of a place, metres.
+
+    Returns:
+        (…, 3, 3) displacement (first) per traction (last), m/Pa.
+    """
+    integrals = np.zeros((6, *offset_m.shape[:-1]))
+    for sign_x in (-1.0, 1.0):
+        for sign_y in (-1.0, 1.0):
+            x, y = offset_m[..., 0] + sign_x * size_m / 2, offset_m[..., 1] + sign_y * size_m / 2
+            r = np.hypot(x, y)
+            with np.errstate(divide="ignore", invalid="ignore"):
+                log_x = np.arctanh(np.clip(x / r, -1.0, 1.0))  # ln(x + R) − ln |y|; |y| cancels in the sum
+                log_y = np.arctanh(np.clip(y / r, -1.0, 1.0))
+                terms = (
+                    _product(x, log_y) + _product(y, log_x),
+                    _product(y, log_x),
+                    _product(x, log_y),
+                    -r,
+                    _product(y, np.log(r)) + _product(x, np.arctan(y / x)),
+                    _product(x, np.log(r)) + _product(y, np.arctan(x / y)),
+                )
+            for total, term in zip(integrals, terms, strict=True):
+                total += sign_x * sign_y * term
+    one, xx, yy, xy, x_r2, y_r2 = integrals
+    nu, scale = layer.poisson, 1.0 / (2.0 * math.pi * layer.shear_modulus_pa)
+    moved = np.empty((*offset_m.shape[:-1], 3, 3))
+    moved[..., 0, 0] = scale * ((1.0 - nu) * one + nu * xx)
+    moved[..., 1, 1] = scale * ((1.0 - nu) * one + nu * yy)
+    moved[..., 0, 1] = moved[..., 1, 0] = scale * nu * xy
+    moved[..., 2, 2] = scale * (1.0 - nu) * one
+    moved[..., 0, 2] = scale * (0.5 - nu) * x_r2
+    moved[..., 1, 2] = scale * (0.5 - nu) * y_r2
+    if math.isfinite(layer.thickness_m):
+        point = PointResponse(layer, reach_m + size_m)
+        places, weights = np.polynomial.legendre.leggauss(3)
+        for at_x, weight_x in zip(places, weights, strict=True):
+            for at_y, weight_y in zip(places, weights, strict=True):
+                x, y = offset_m[..., 0] + 0.5 * size_m * at_x, offset_m[..., 1] + 0.5 * size_m * at_y
+                area = 0.25 * weight_x * weight_y * size_m**2
+                normal, mean, twofold, outwards = (area * each for each in point(np.hypot(x, y)))
+                angle = np.arctan2(y, x)
+                moved[..., 0, 0] += mean + twofold * np.cos(2.0 * angle)
+                moved[..., 1, 1] += mean - twofold * np.cos(2.0 * angle)
+                moved[..., 0, 1] += twofold * np.sin(2.0 * angle)
+                moved[..., 2, 2] += normal
+                moved[..., 0, 2] += outwards * np.cos(angle)
+                moved[..., 1, 2] += outwards * np.sin(angle)
+    moved[..., 1, 0] = moved[..., 0, 1]
+    moved[..., 2, :2] = -moved[..., :2, 2]
+    return moved
+
+
+def _product(length: Float, logarithm: Float) -> Float:
+    """Return the product, with the limit 0 where the length is 0 and the logarithm infinite."""
+    return np.where(length == 0.0, 0.0, length * logarithm)

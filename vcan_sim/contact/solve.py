@@ -1,0 +1,184 @@
+"""Pressure and friction between a rigid body and the layer.
+
+Pressure: p ≥ 0 where the body touches, and no overlap elsewhere; the complementarity problem is solved by
+conjugate gradients on the cells in contact (Polonsky and Keer, Wear 231, 206, 1999). Friction: each cell in
+contact sticks, or slips with a shear of μ p against its slip (Coulomb). Given p, the shear minimises a convex
+function on discs of radius μ p, which is solved by accelerated projected gradients (Beck and Teboulle, SIAM
+Journal on Imaging Sciences 2, 183, 2009). Pressure and shear affect each other only a little; they are solved
+in turns.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from vcan_sim.contact.grid import Grid
+from vcan_sim.contact.layer import Float
+
+CLOSE: Final = 1e-6
+"""Largest overlap or gap of a cell in contact, relative to the largest overlap of the undeformed shapes."""
+STEPS: Final = 400
+"""Maximum number of iterations."""
+TURNS: Final = 12
+"""Maximum number of turns of pressure and shear."""
+
+
+class NoSolution(RuntimeError):
+    """The iteration did not reach its tolerance."""
+
+
+@dataclass(frozen=True, eq=False)
+class Contact:
+    """State of a contact.
+
+    Attributes:
+        traction_pa: (3, X, Y) tractions on the skin, Pa.
+        displacement_m: (3, X, Y) displacement of the surface, metres.
+        sticks: (X, Y) cells in contact that do not slip.
+    """
+
+    traction_pa: Float
+    displacement_m: Float
+    sticks: np.ndarray
+
+    def force_n(self, grid: Grid) -> Float:
+        """Return the force (3,) on the skin, N."""
+        return np.asarray(self.traction_pa.sum(axis=(1, 2)) * grid.size_m**2)
+
+
+def untouched(grid: Grid) -> Contact:
+    """Return the state of a skin that nothing touches."""
+    zero = np.zeros((3, *grid.shape))
+    return Contact(zero, zero, np.zeros(grid.shape, bool))
+
+
+def press(grid: Grid, overlap_m: Float, start_pa: Float | None = None) -> Float:
+    """Return the pressure (X, Y), Pa, of a body without friction.
+
+    Args:
+        grid: The cells.
+        overlap_m: (X, Y) how far the undeformed body would lie below the undeformed surface, metres; negative
+            outside.
+        start_pa: (X, Y) a pressure to start from, as of the step before.
+
+    Raises:
+        NoSolution: If the iteration does not converge.
+    """
+    largest = float(overlap_m.max())
+    pressure = np.zeros(grid.shape)
+    if largest <= 0.0:
+        return pressure
+    if start_pa is not None:
+        pressure = np.maximum(start_pa, 0.0)
+    if not pressure.any():
+        pressure = (
+            np.where(overlap_m > 0.0, overlap_m, 0.0)
+            * grid.layer.contact_modulus_pa
+            / (grid.size_m * np.sqrt(grid.shape[0] * grid.shape[1]))
+        )
+    direction, before, conjugate = np.zeros(grid.shape), 1.0, 0.0
+    for _ in range(STEPS):
+        gap = grid.normal_m(pressure) - overlap_m
+        active = pressure > 0.0
+        if max(float(np.abs(gap[active]).max(initial=0.0)), -float(gap.min())) < CLOSE * largest:
+            return pressure
+        square = float((gap[active] ** 2).sum())
+        direction = np.where(active, gap + conjugate * square / before * direction, 0.0)
+        before = square
+        moved = grid.normal_m(direction)
+        step = float((gap * direction)[active].sum()) / float((moved * direction)[active].sum())
+        pressure = np.maximum(pressure - step * direction, 0.0)
+        entered = (pressure == 0.0) & (gap < 0.0)
+        pressure[entered] -= step * gap[entered]
+        conjugate = 0.0 if entered.any() else 1.0
+    raise NoSolution(f"no pressure within {STEPS} iterations: gap {np.abs(gap[active]).max():.2g} m")
+
+
+def rub(grid: Grid, limit_pa: Float, target_m: Float, start_pa: Float) -> Float:
+    """Return the shear (2, X, Y), Pa, of at most ``limit_pa`` that comes closest to a displacement.
+
+    Args:
+        grid: The cells.
+        limit_pa: (X, Y) μ p.
+        target_m: (2, X, Y) displacement at which a cell sticks, metres.
+        start_pa: (2, X, Y) a shear to start from.
+
+    Raises:
+        NoSolution: If the iteration does not converge.
+    """
+    inside = limit_pa > 0.0
+    if not inside.any():
+        return np.zeros_like(start_pa)
+    stiffness = _largest(grid, inside)
+
+    def within(shear: Float) -> Float:
+        size = np.hypot(*shear)
+        return shear * np.where(size > limit_pa, limit_pa / np.maximum(size, 1e-300), 1.0)
+
+    shear = ahead = within(start_pa)
+    weight, scale = 1.0, float(limit_pa.max())
+    for _ in range(STEPS):
+        slip = np.where(inside, grid.shear_m(ahead) - target_m, 0.0)
+        after = within(ahead - slip / stiffness)
+        change = after - shear
+        if float(np.abs(after - ahead).max()) < 1e-7 * scale:
+            return after
+        if float((change * (ahead - after)).sum()) > 0.0:  # O'Donoghue and Candès (2015): restart
+            weight = 1.0
+        new = 0.5 * (1.0 + np.sqrt(1.0 + 4.0 * weight * weight))
+        ahead = after + (weight - 1.0) / new * change
+        shear, weight = after, new
+    raise NoSolution(f"no shear within {STEPS} iterations")
+
+
+def _largest(grid: Grid, inside: np.ndarray) -> float:
+    """Return a bound of the largest eigenvalue of the response to shear on some cells, m/Pa."""
+    vector = np.stack([inside, inside]).astype(float)
+    largest = 0.0
+    for _ in range(8):
+        vector = np.where(inside, vector, 0.0)
+        vector /= np.linalg.norm(vector)
+        moved = grid.shear_m(vector)
+        largest = float(np.linalg.norm(np.where(inside, moved, 0.0)))
+        vector = moved
+    return 1.1 * largest
+
+
+def advance(grid: Grid, last: Contact, overlap_m: Float, slide_m: Float, friction: float) -> Contact:
+    """Return the contact after a body moved a little.
+
+    Args:
+        grid: The cells.
+        last: State before.
+        overlap_m: (X, Y) overlap of the undeformed shapes after the move, metres.
+        slide_m: (2,) or (2, X, Y) move of the body's surface along the skin, metres; the latter if the body
+            turns.
+        friction: Coefficient of friction μ.
+
+    Raises:
+        NoSolution: If the iteration does not converge.
+    """
+    slide = slide_m.reshape(2, 1, 1) if slide_m.ndim == 1 else slide_m
+    scale = max(float(overlap_m.max()), 0.0)
+    none = np.zeros((3, *grid.shape))
+    shear, pressure = last.traction_pa[:2], -last.traction_pa[2]
+    if not friction:
+        shear = none[:2]
+    by_shear = grid.displacement_m(np.concatenate([shear, none[2:]]))
+    for _ in range(TURNS):
+        pressure = press(grid, overlap_m + by_shear[2], pressure)
+        by_pressure = grid.displacement_m(np.concatenate([none[:2], -pressure[None]]))
+        if not friction:
+            break
+        target = last.displacement_m[:2] + slide - by_pressure[:2]
+        shear, before = rub(grid, friction * pressure, target, shear), by_shear[2]
+        by_shear = grid.displacement_m(np.concatenate([shear, none[2:]]))
+        if float(np.abs(by_shear[2] - before).max()) <= 10.0 * CLOSE * scale:
+            break
+    else:
+        raise NoSolution(f"pressure and shear did not agree within {TURNS} turns")
+    sticks = (pressure > 0.0) & (np.hypot(*shear) < (1.0 - 1e-6) * friction * pressure)
+    return Contact(np.concatenate([shear, -pressure[None]]), by_pressure + by_shear, sticks)

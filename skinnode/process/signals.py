@@ -5,8 +5,39 @@ from __future__ import annotations
 import signal
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from queue import Empty, SimpleQueue
 from types import FrameType
+
+
+class SignalEvent(threading.Event):
+    """Event that a signal handler may set.
+
+    ``threading.Event.set`` takes a lock. If the interrupted thread holds that lock, in ``wait``, a handler that
+    sets the event waits forever. ``SimpleQueue.put`` is made for handlers.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._is_set = False
+        self._wake: SimpleQueue[None] = SimpleQueue()
+
+    def is_set(self) -> bool:
+        """Return whether the event was set."""
+        return self._is_set
+
+    def set(self) -> None:
+        """Set the event for good."""
+        self._is_set = True
+        self._wake.put(None)
+
+    def wait(self, timeout: float | None = None) -> bool:
+        """Wait until the event is set, or ``timeout`` seconds; return whether it is set."""
+        if not self._is_set:
+            with suppress(Empty):
+                self._wake.get(timeout=None if timeout is None else max(0.0, timeout))
+                self._wake.put(None)  # for other threads that wait
+        return self._is_set
 
 
 @contextmanager
@@ -19,7 +50,7 @@ def stop_on_signal() -> Iterator[threading.Event]:
     Raises:
         ValueError: if not called from the main thread, because no other thread can set signal handlers.
     """
-    stop = threading.Event()
+    stop = SignalEvent()
 
     def set_stop(_signal: int, _frame: FrameType | None) -> None:
         stop.set()

@@ -31,7 +31,7 @@ print("ended")
 
 
 def test_no_instant_of_a_signal_stops_the_program_for_good() -> None:
-    """With the lock of threading.Event, one signal in some hundreds came while the main thread held it."""
+    """With the lock of threading.Event, a signal soon came while the main thread held it."""
     ran = subprocess.run([sys.executable, "-c", PROGRAM], capture_output=True, text=True, timeout=60)
     assert (ran.returncode, ran.stdout, ran.stderr) == (0, "ended\n", "")
 

@@ -13,8 +13,8 @@ from types import FrameType
 class SignalEvent(threading.Event):
     """Event that a signal handler may set.
 
-    ``threading.Event.set`` takes a lock. If the interrupted thread holds that lock, in ``wait``, a handler that
-    sets the event waits forever. ``SimpleQueue.put`` is made for handlers.
+    ``threading.Event.set`` takes a lock. If the interrupted thread holds that lock, in ``wait``, a handler
+    that sets the event waits forever. ``SimpleQueue.put`` is made for handlers.
     """
 
     def __init__(self) -> None:

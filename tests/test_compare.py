@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from tools.compare.__main__ import report
+from tools.compare.speed import rows_of
 
 OLD = {
     "a: x: position": np.array([1.0, np.nan, -4.0]),
@@ -55,3 +56,16 @@ def test_a_difference_is_named(tmp_path: Path, new: dict[str, Any]) -> None:
 )
 def test_a_tolerance_is_of_finite_floats(tmp_path: Path, new: dict[str, Any], allowed: bool) -> None:
     assert compared(tmp_path, new, 1e-12)[1] is allowed
+
+
+def test_every_time_of_a_report_is_compared() -> None:
+    """Rows by their names, times further down by their place; nothing that describes the machine."""
+    times = rows_of(
+        {
+            "benchmark": "path",
+            "machine": {"tick_us": 1.0},
+            "rows": [{"name": "step", "compiled_us": 2.0, "error": 1e-9}],
+            "settings": [{"layout": "aligned", "operators": {"dogleg": [{"runtime_ms": 3.0}]}}],
+        }
+    )
+    assert times == {"step compiled_us": 2.0, "settings 0 operators dogleg 0 runtime_ms": 3.0}

@@ -25,11 +25,20 @@ from tools.compare.__main__ import tree_of
 def rows_of(report: Any) -> dict[str, float]:
     """Return every time in the JSON report of a benchmark, keyed by the names of its row and key."""
     found: dict[str, float] = {}
-    for index, row in enumerate(report["rows"]):
-        label = " ".join(str(value) for value in row.values() if isinstance(value, str)) or f"row {index}"
-        for key, value in row.items():
-            if isinstance(value, (int, float)) and key.split("_")[-1] in ("us", "ms", "µs"):
-                found[f"{label} {key}"] = float(value)
+
+    def collect(part: Any, label: str) -> None:
+        if isinstance(part, dict):
+            own = " ".join(str(value) for value in part.values() if isinstance(value, str))
+            for key, value in part.items():
+                if isinstance(value, (int, float)) and key.split("_")[-1] in ("us", "ms", "µs"):
+                    found[f"{own or label} {key}"] = float(value)
+                else:
+                    collect(value, f"{label} {key}".strip())
+        elif isinstance(part, list):
+            for index, each in enumerate(part):
+                collect(each, f"{label} {index}")
+
+    collect({key: value for key, value in report.items() if key != "machine"}, "")
     return found
 
 

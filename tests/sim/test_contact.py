@@ -68,7 +68,7 @@ def test_response_of_a_layer_solves_the_equations_of_elasticity(poisson: float, 
 
 @pytest.mark.parametrize("poisson", [0.2, 0.5])
 def test_point_loads_on_a_half_space(poisson: float) -> None:
-    """Far from a loaded cell: Boussinesq and Cerruti (Johnson, eqs. 3.17 and 3.75)."""
+    """Far from a loaded cell: Boussinesq and Cerruti (Johnson, sections 3.2 and 3.6)."""
     layer = Layer(math.inf, 1e6, poisson)
     grid, places = square(layer, 41, 41e-3)
     g = layer.shear_modulus_pa
@@ -112,6 +112,16 @@ def test_a_sphere_on_a_half_space_is_hertz() -> None:
     np.testing.assert_allclose(moved[inner], sphere(places)[inner], atol=1e-5 * DEPTH_M)
 
 
+def test_pressure_does_not_depend_on_where_the_search_starts() -> None:
+    """Not even from a press elsewhere, which the body has left altogether."""
+    grid, places = square(Layer(1e-3, 1e6, 0.5))
+    overlap = sphere(places - 0.5 * CONTACT_M, 0.2 * DEPTH_M)
+    expected = press(grid, overlap)
+    for start in (sphere(places + 0.6 * CONTACT_M, 0.1 * DEPTH_M), -overlap, np.eye(CELLS)):
+        found = press(grid, overlap, 1e9 * np.maximum(start, 0.0))
+        np.testing.assert_allclose(found, expected, atol=2e-3 * expected.max())
+
+
 def test_a_flat_punch() -> None:
     """The force of a cylinder is 2 a E* δ (Johnson, eq. 3.36); its rim is round only to half a cell."""
     layer = Layer(math.inf, 1e6, 0.5)
@@ -125,7 +135,7 @@ def test_a_flat_punch() -> None:
 
 
 def test_friction_of_a_sphere_is_that_of_cattaneo_and_mindlin() -> None:
-    """Shear force and stick radius for a shift of the sphere in three steps (Johnson, eqs. 7.39 to 7.42)."""
+    """Shear force and stick radius for a shift of the sphere in three steps (Johnson, section 7.2)."""
     layer, friction = Layer(math.inf, 1e6, 0.5), 0.5
     grid, places = square(layer)
     state = advance(grid, untouched(grid), sphere(places), np.zeros(2), friction)
@@ -152,24 +162,24 @@ def test_friction_points_against_the_slide_and_never_exceeds_its_limit() -> None
         shear, pressure = np.hypot(*state.traction_pa[:2]), -state.traction_pa[2]
         assert (pressure >= 0).all()
         assert (shear <= friction * pressure * (1 + 1e-9)).all()
-    slide = np.array([300e-6, 400e-6])
+    slide = np.array([3e-3, 4e-3])
     force = advance(grid, state, sphere(places), slide, friction).force_n(grid)
-    np.testing.assert_allclose(force[:2], -friction * force[2] * slide / 500e-6, rtol=0.03)
+    np.testing.assert_allclose(force[:2], -friction * force[2] * slide / 5e-3, rtol=0.005)
 
 
 def test_a_thin_bonded_film_presses_as_its_lubrication_equation() -> None:
-    """On an incompressible film much thinner than the contact, δ − r²/2R = −t³/(3G) ∇²p (Johnson, eq. 5.73).
+    """An incompressible film much thinner than the contact: δ − r²/2R = −t³/(3G) ∇²p (Johnson, section 5.8).
 
-    For a sphere p = 3G (a² − r²)² / (32 R t³) and δ = a²/4R: within the order of t/a."""
-    layer = Layer(50e-6, 1e6, 0.5)
-    grid, places = square(layer, 96)
+    For a sphere p = 3G (a² − r²)² / (32 R t³) and δ = a²/4R; at t = a/40 it is 0.7 % more."""
+    layer = Layer(25e-6, 1e6, 0.5)
+    grid, places = square(layer, 160)
     depth = CONTACT_M**2 / (4 * RADIUS_M)
     pressure = press(grid, sphere(places, depth))
     r2 = (places**2).sum(axis=-1)
     peak = 3 * layer.shear_modulus_pa / (32 * RADIUS_M * layer.thickness_m**3)
     expected = peak * np.maximum(CONTACT_M**2 - r2, 0) ** 2
     force = pressure.sum() * grid.size_m**2
-    assert force == pytest.approx(expected.sum() * grid.size_m**2, rel=3 * layer.thickness_m / CONTACT_M)
+    assert force == pytest.approx(expected.sum() * grid.size_m**2, rel=0.01)
 
 
 def test_a_layer_thicker_than_the_contact_is_nearly_a_half_space() -> None:

@@ -8,7 +8,7 @@ For a wave number k and x = k h, a surface traction of unit amplitude moves the 
     across k, from across k    tanh x / (G k)
 
 with κ = 3 − 4ν and D = 2κ cosh 2x + 4x² + 1 + κ²: the plane-strain solution of Navier's equations with a
-surface at z = h and no displacement at z = 0 (its first line: Johnson, Contact Mechanics, 1985, eq. 5.65, and
+surface at z = h and no displacement at z = 0 (Johnson, Contact Mechanics, 1985, section 5.8;
 Bentall and Johnson, Int. J. Mech. Sci. 10, 637, 1968). For h → ∞ it is the half-space.
 """
 

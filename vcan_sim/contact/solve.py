@@ -135,7 +135,7 @@ def rub(grid: Grid, limit_pa: Float, target_m: Float, start_pa: Float) -> Float:
 
 
 def _largest(grid: Grid, inside: np.ndarray) -> float:
-    """Return a bound of the largest eigenvalue of the response to shear on some cells, m/Pa."""
+    """Return the largest eigenvalue of the response to shear on some cells, and a tenth more, m/Pa."""
     vector = np.stack([inside, inside]).astype(float)
     largest = 0.0
     for _ in range(8):

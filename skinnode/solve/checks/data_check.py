@@ -123,7 +123,7 @@ class DataCheck:
         self._explainer.wrong_readings(self._z, every, self._evidence, 0, 1.0, 1.0)  # compiles the kernels
         self._largest_gains(every, self._evidences(every), 1.0, 1.0)
         every[0, 0] = False
-        self._evidences(every)
+        self._evidences(every)  # compiles what a missing reading needs
         self.reset()
 
     def prepare(self) -> None:

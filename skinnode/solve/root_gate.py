@@ -22,7 +22,7 @@ from skinnode.model.status import Status
 from skinnode.solve import roots
 from skinnode.solve.exact.tracker import ExactTracker
 from skinnode.solve.options import TrackerOptions
-from skinnode.solve.posterior.posterior import Posterior
+from skinnode.solve.posterior.frame_estimator import FrameEstimator
 from skinnode.solve.smoothness import Smoothness
 from skinnode.solve.wires.problem import PatchProblem
 from skinnode.solve.wires.root_check import SOME_ROUGH, SOME_SUSPECT, RootCheck, check_roots
@@ -52,7 +52,7 @@ class RootGate:
         options: Options of both estimators.
     """
 
-    def __init__(self, exact: ExactTracker, posterior: Posterior, options: TrackerOptions) -> None:
+    def __init__(self, exact: ExactTracker, posterior: FrameEstimator, options: TrackerOptions) -> None:
         layout = exact.layout
         problem = PatchProblem.of(layout, options.baseline_ohm)
         self._exact, self._posterior = exact, posterior

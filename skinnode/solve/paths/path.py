@@ -21,6 +21,7 @@ from skinnode.model.status import Status
 from skinnode.solve import roots
 from skinnode.solve.cramer_rao import wire_std
 from skinnode.solve.operators.system import operator_code
+from skinnode.solve.options import PosteriorOptions
 from skinnode.solve.paths.corrector import Accuracy
 from skinnode.solve.paths.path_tracker import PathTracker
 from skinnode.solve.paths.root_selection import (
@@ -31,7 +32,7 @@ from skinnode.solve.paths.root_selection import (
     keep_likeliest,
 )
 from skinnode.solve.paths.step_control import Schedule, Uniform
-from skinnode.solve.posterior.posterior import Posterior
+from skinnode.solve.posterior.frame_estimator import FrameEstimator
 from skinnode.solve.wires.problem import PatchProblem
 
 SELECTION: Final = Accuracy(tolerance=1e-12, max_steps=100)
@@ -152,8 +153,12 @@ def _ask_posterior(
     tracker: PathTracker, layout: PatchLayout, last_ohm: Float, baseline_ohm: ArrayLike | None
 ) -> PatchEstimate | None:
     """Select the roots at the last sample with the posterior; return its estimate, or None if untrusted."""
-    patch = Posterior(layout, relative_noise=roots.REFEREE_NOISE, baseline_ohm=baseline_ohm, hold=False)
-    field = patch.update(last_ohm)
+    options = PosteriorOptions(
+        relative_noise=roots.REFEREE_NOISE, baseline_ohm=baseline_ohm, hold=False, contacts=False,
+        follow_noise=False,
+    )  # fmt: skip
+    patch = FrameEstimator(layout, options)
+    field = patch.estimate(last_ohm, np.ones(last_ohm.shape, bool), roots.REFEREE_NOISE)
     if not field.trusted:
         return None
     shape = tracker.problem.rest.shape

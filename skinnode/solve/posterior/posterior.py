@@ -1,12 +1,7 @@
-"""Posterior of a patch, tracked through a stream of frames.
+"""Posterior of a patch: fields estimated from a stream of frames, with tests of their readings.
 
-gate      use the equations of wires whose resistances differ from those at rest by more than noise
-hold      if the last field explains the whole frame within noise, solve nothing
-track     take chord or Gauss-Newton steps from the last field; after a jump, anneal from rest
-          (``map_estimate``)
-adapt     set the prior's scale, the load locations and, on request, the noise from the evidence
-reject    mark a wire as INCONSISTENT if no deformation explains its residual, leave it out, and solve the
-          others again
+A frame is solved (``frame_estimator``) and its readings are tested against the field
+(:mod:`skinnode.solve.checks.data_check`), which may solve it again without some of them.
 """
 
 from __future__ import annotations
@@ -16,47 +11,20 @@ from time import perf_counter
 from typing import Final, Unpack
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from skinnode.model.forward import potential_per_m
-from skinnode.model.frames import Contact, FieldFrame, SolveStats
-from skinnode.model.layout import Float, PatchLayout, require_array
-from skinnode.model.status import Status, as_statuses
+from skinnode.model.frames import FieldFrame
+from skinnode.model.layout import Float, PatchLayout
 from skinnode.model.tolerances import EXACT
-from skinnode.solve import roots
 from skinnode.solve.checks.data_check import DataCheck, Solved
-from skinnode.solve.inputs import NOISE_MAX, broadcast_noise, checked_mask, checked_noise
-from skinnode.solve.linalg.vectors import Index
-from skinnode.solve.noise_estimate import NoiseEstimate
 from skinnode.solve.options import PosteriorArguments, PosteriorOptions, merged
-from skinnode.solve.posterior.contacts import ContactFinder
-from skinnode.solve.posterior.data_share import data_share
-from skinnode.solve.posterior.elastic_prior import ElasticPrior
-from skinnode.solve.posterior.gating import Fit, Gate
-from skinnode.solve.posterior.hyperparameters import Hyperparameters
-from skinnode.solve.posterior.map_estimate import MapEstimator
-from skinnode.solve.posterior.observation import Observation, ObservationModel, Readings
-from skinnode.solve.wires.decode import A_MAX, A_MIN
-from skinnode.solve.wires.problem import PatchProblem
-
-NOISE_LEAST: Final = 1e-6
-"""Smallest relative noise, a fifth of a 16-bit code; the forward model is no more accurate. Lower noise
-forces the field onto a root of F = b, which can be a wrong root. On layouts with folds, this happens even
-with up to ten times as much noise."""
-LEFT_OUT: Final = 3
-"""Maximum number of wires to leave out, one after another, before the whole frame is INCONSISTENT."""
-LEAST_STEPS: Final = 3.0
-"""Minimum time for a solve from rest, in factorisations of all wires including standard deviations; 11 to 20
-were measured for presses on 1 to 10 wires."""
+from skinnode.solve.posterior.frame_estimator import FrameEstimator, Mask
 
 PLACED: Final = 2.0
-"""Error of a reading, relative to the largest change, per pitch of misplacement; not
-measured."""
-
-Mask = NDArray[np.bool_]
+"""Error of a reading, relative to the largest change, per pitch of misplacement; not measured."""
 
 
-class Posterior:
+class Posterior(FrameEstimator):
     """Estimator of the displacement, loads and contacts of one patch, frame by frame.
 
     Do not share an instance between owners. Compiled code releases the GIL. The constructor compiles the
@@ -70,6 +38,7 @@ class Posterior:
     Attributes:
         layout: The patch.
         options: Options in effect.
+        check: Test of the readings.
         from_rest_s: Minimum time to solve a touched frame from rest, s; 0 without a deadline.
         noise_estimate: Estimate of the stream's noise, which scales the stated noise; None if the noise is
             taken as stated.
@@ -84,87 +53,15 @@ class Posterior:
         options: PosteriorOptions | None = None,
         **arguments: Unpack[PosteriorArguments],
     ) -> None:
-        self.options = options = merged(PosteriorOptions, options, arguments)
-        self.layout = layout
-        self._problem = PatchProblem.of(layout, options.baseline_ohm)
-        self._noise = checked_noise(options.relative_noise, layout)
-        wires, electrodes = layout.upper_m.shape[:2]
-        self._free = np.arange(2, 3 * electrodes, 3) if options.normal_only else np.arange(3 * electrodes)
-        elastic = ElasticPrior.of(layout, options.rubber)
-        self._seconds = options.deadline_s
-        self._until = math.inf
-        made = options.tolerances or EXACT
-        self._model = ObservationModel(
-            self._problem, options.drift, options.drift_std, options.model_error, made
-        )
-        self._estimator = MapEstimator(self._problem, elastic, self._free, self._model.fixed, made)
-        self._contacts: ContactFinder | None = None
-        if options.contacts:
-            self._contacts = ContactFinder(
-                elastic,
-                layout,
-                options.rubber,
-                calibrated=options.force_calibrated,
-                thickness=made.thickness,
-            )
-        self._gate = Gate(wires, layout.shape[1])
-        self._folded = float(roots.folded_wires(layout, options.normal_only).mean()) > 0.5
-        self._noise_least = roots.REFEREE_NOISE if self._folded else NOISE_LEAST
-        self._far = roots.FAR * float(self._problem.clearance.min())
-        scale2 = None if options.scale_m is None else (options.scale_m / layout.pitch_m) ** 2
-        height = float(np.median(self._problem.clearance))
-        self._hyper = Hyperparameters(self._estimator, height, scale2, options.estimate_noise)
-        self.check = DataCheck(
-            self._problem, float(np.median(self._noise)), _model_std(options), options.drift
-        )
-        self.noise_estimate: NoiseEstimate | None = None
-        self.reset()
-        self._warm_up()
-        self.reset()
-        self.from_rest_s = 0.0
-        if options.deadline_us is not None:
-            a = self._problem.a_rest
-            at_rest = self._observe(Readings(a, np.ones_like(a), np.ones_like(a, bool)))
-            self.from_rest_s = LEAST_STEPS * self._estimator.step_s(at_rest)
-            self.reset()
-        if options.follow_noise and not options.estimate_noise:
-            self.noise_estimate = NoiseEstimate(layout.shape)
-
-    def _warm_up(self) -> None:
-        """Solve a touched frame so that the first touch in a stream does not wait for the compiler."""
-        touched = self.layout.upper_m.copy()
-        touched[0, 0, 2] -= 0.1 * self._problem.clearance[0, 0] * self.layout.pitch_m
-        potential = potential_per_m(self.layout, touched) * self.layout.pitch_m
-        seconds, self._seconds = self._seconds, math.inf  # with a deadline, some kernels might not run
-        a = 1.0 / (potential * self._problem.gain)
-        self.estimate(a, np.ones(self.layout.shape, bool), 1e-4)
-        self._seconds = seconds
-        self._estimator.gamma()  # compile gamma now, not in the first untouched frame
-        if self._contacts is not None:
-            self._contacts.warm_up(self._hyper.loads.estimate())
+        super().__init__(layout, merged(PosteriorOptions, options, arguments))
+        noise = float(np.median(self._noise))
+        self.check = DataCheck(self._problem, noise, _model_std(self.options), self.options.drift)
+        self.warm_up()
 
     def reset(self) -> None:
         """Discard the state of the stream: the next frame is solved from the rest position."""
-        wires = self.layout.shape[0]
+        super().reset()
         self.check.reset()
-        if self.noise_estimate is not None:
-            self.noise_estimate.reset()
-        self._hyper.reset()
-        self._gate.reset()
-        self._members: Index = np.arange(0)
-        self._share = np.zeros_like(self._estimator.moved)
-        self._trusted = np.zeros_like(self._estimator.moved)  # last accepted field; its nuisances follow
-        self._trusted_g = np.zeros_like(self._estimator.g)
-        if self._contacts is not None:
-            self._contacts.reset()
-        self._contacts_found: tuple[Contact, ...] = ()
-        self._force = np.zeros((*self.layout.upper_m.shape,))
-        self._compared = np.zeros_like(self._trusted)  # field at the last comparison with an annealed field
-        self._annealed = False  # whether the current field was annealed from rest
-        self._known = False  # whether the estimator's factors belong to the trusted field
-        self._wires = np.arange(wires)
-        self._overlooked = np.zeros_like(self._estimator.std)
-        self._seen = np.zeros(self.layout.shape, bool)  # resistances used for the trusted field
 
     def update(
         self,
@@ -208,293 +105,6 @@ class Posterior:
             return Solved(field, a, self._hyper.noise_factor * kept.noise, kept.usable)
 
         return self.check.check(solve(), solve, start + self._seconds)
-
-    def estimate(self, frame_ohm: ArrayLike, valid: ArrayLike, relative_noise: ArrayLike) -> FieldFrame:
-        """Estimate the field of one frame as :meth:`update` does, without testing its readings."""
-        start = perf_counter()
-        return self._estimate(self._readings(frame_ohm, valid, relative_noise, None), start)
-
-    def _estimate(self, readings: Readings, start: float) -> FieldFrame:
-        estimator = self._estimator
-        estimator.evaluations = estimator.factorisations = 0
-        estimator.until = min(start + self._seconds, self._until)
-        estimator.moved[:], estimator.g[:] = self._trusted, self._trusted_g
-        observation = self._observe(readings)
-        self._hyper.set_least(observation)
-        if self._is_quiet(observation):
-            held = np.ones(len(self._wires), bool)
-            status = np.full(len(self._wires), Status.CONVERGED)
-        else:
-            try:
-                status, held = self._solve(observation, readings)
-            except TimeoutError:
-                known = self._known
-                status, held = self._give_up(Status.DEADLINE)
-                self._known = known  # the next frame starts where this frame did
-            observation = self._observe(readings)
-        return self._field(observation, status, held, start)
-
-    def stop_at(self, until: float) -> None:
-        """Set the deadline for subsequent updates, as a :func:`time.perf_counter` value; inf for no limit."""
-        self._until = until
-
-    def covariance_m2(self) -> Float:
-        """Return the covariance of the last frame's displacement, from that frame's factors.
-
-        The covariance does not include the allowance for errors of the prior (``PRIOR_DOUBT``).
-
-        Returns:
-            (3UN, 3UN) covariance, m²; 0 for coordinates that are not free.
-
-        Raises:
-            RuntimeError: If the last frame was not solved.
-        """
-        if not np.isfinite(self._estimator.std).all():
-            raise RuntimeError("covariance_m2: the last frame was not solved")
-        wires, coordinates = self._estimator.moved.shape
-        every = (self._wires[:, None] * coordinates + self._free).ravel()
-        full = np.zeros((wires * coordinates, wires * coordinates))
-        full[np.ix_(every, every)] = self._estimator.covariance() * self.layout.pitch_m**2
-        return full
-
-    def energy(self, moved: Float) -> float:
-        """Return uᵀ (s² C)⁻¹ u, which is −2 log of the last frame's prior density up to a constant.
-
-        Args:
-            moved: (U, 3N) displacement, pitches.
-        """
-        return self._estimator.roughness(moved) / self._estimator.load_prior.scale2
-
-    # -- one frame -------------------------------------------------------------------------------------
-
-    def _readings(
-        self,
-        frame_ohm: ArrayLike,
-        valid: ArrayLike | None,
-        relative_noise: ArrayLike | None,
-        rounding_ohm: Float | None,
-    ) -> Readings:
-        frame = require_array("frame_ohm", frame_ohm, self.layout.shape, finite=False)
-        noise = self._noise if relative_noise is None else broadcast_noise(relative_noise, self.layout)
-        mask = None if valid is None else checked_mask(valid, self.layout)
-        estimate = self.noise_estimate
-        if estimate is not None:
-            if estimate.see(frame, noise, rounding_ohm, mask):
-                self._seen = np.zeros_like(self._seen)  # the trusted field has the former deviations
-            if estimate.factor != 1.0:
-                noise = estimate.factor * noise
-        with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-            a = frame * self._problem.gain
-            if rounding_ohm is not None:
-                noise = np.hypot(noise, rounding_ohm / frame)
-        known = (noise > 0) & (noise < NOISE_MAX)
-        noise = np.where(known, np.maximum(noise, self._noise_least), 1.0)
-        usable = known & (a > A_MIN) & (a < A_MAX)
-        if mask is not None:
-            usable &= mask
-        return Readings(np.where(usable, a, self._problem.a_rest), noise, usable)
-
-    def _observe(self, readings: Readings) -> Observation:
-        return self._model.observe(readings, self._hyper.noise_factor)
-
-    def _beyond_prior(self, observation: Observation, deviations: float) -> bool:
-        # one of a hundred errors of the geometry may exceed three standard deviations
-        count = self._model.fixed if deviations < roots.BELIEVABLE else observation.d.size
-        return roots.beyond_prior(self._estimator.g[:count], observation.d[:count], deviations)
-
-    def _is_quiet(self, observation: Observation) -> bool:
-        """Return whether the last field explains the frame within noise.
-
-        The residual of a wire in use contains noise from two sources: this frame and the last field.
-        """
-        seen_before = self._known and np.array_equal(observation.weight > 0, self._seen)
-        if not (self.options.hold and seen_before):
-            return False  # with different resistances, the uncertainty of the field differs
-        if self._beyond_prior(observation, roots.SUSPICIOUS):
-            return False
-        noises = np.ones(len(self._wires))
-        noises[self._members] = 2.0
-        fit = self._estimator.fit(observation, self._trusted)
-        self._overlooked = fit.move
-        return not self._gate.moved(fit, observation.count, noises).any()
-
-    def _solve(self, observation: Observation, readings: Readings) -> tuple[NDArray[np.int64], Mask]:
-        """Solve a frame; return statuses (U,) and held wires (U,). On success, update the trusted field."""
-        if not readings.usable.any():
-            return self._give_up(Status.ILL_CONDITIONED)
-        status = np.full(len(self._wires), int(Status.CONVERGED))
-        self._gate.next_frame()
-        at_rest = self._estimator.fit(observation, None)
-        touched = self._gate.touched(at_rest, observation.count, self._members)
-        # only all wires together can show that nothing touches the patch
-        wanted = touched if self.options.hold and touched.size else self._wires
-        seen = readings.usable
-        for _ in range(LEFT_OUT + 3):
-            members = wanted[observation.count[wanted] > 0]
-            if not self._converge(observation, members):
-                lost = [u for u in members.tolist() if not self._converge(observation, np.array([u]))]
-                if not lost or len(lost) > min(LEFT_OUT, len(status) - 1):
-                    return self._give_up(Status.MAX_STEPS)
-                status[lost], readings = Status.MAX_STEPS, readings.without(lost)
-                observation = self._observe(readings)
-                continue
-            observation = self._refine(observation, readings, members, local=touched.size > 0)
-            if not np.isfinite(self._estimator.moved).all():
-                return self._give_up(Status.NON_FINITE)
-            fit = self._estimator.fit(observation, self._estimator.moved)
-            joining = self._joining(fit, observation, wanted)
-            if joining.size:
-                wanted = np.union1d(wanted, joining)
-                continue
-            if self._beyond_prior(observation, roots.BELIEVABLE):
-                return self._give_up(Status.INCONSISTENT)
-            excess = self._gate.excess(fit, observation.count)
-            if (excess <= 1.0).all():
-                return self._accept(status, members, seen)
-            worst = int(np.argmax(excess))
-            status[worst], readings = Status.INCONSISTENT, readings.without([worst])
-            observation = self._observe(readings)
-        return self._give_up(Status.INCONSISTENT)
-
-    def _joining(self, fit: Fit, observation: Observation, wanted: Index) -> Index:
-        """Find the wires outside ``wanted`` that contradict the other wires' field; keep and return them."""
-        moved = self._gate.moved(fit, observation.count)
-        moved[wanted] = False
-        joining = np.flatnonzero(moved)
-        self._gate.keep(joining)
-        return joining
-
-    def _accept(
-        self, status: NDArray[np.int64], members: Index, seen: Mask
-    ) -> tuple[NDArray[np.int64], Mask]:
-        """Trust the current field if it is within reach."""
-        estimator = self._estimator
-        if self._problem.out_of_reach(self._problem.rest + estimator.moved).any():
-            return self._give_up(Status.ILL_CONDITIONED)
-        self._trusted[:] = estimator.moved
-        self._trusted_g[:] = estimator.g
-        self._members, self._known, self._seen = members, True, seen
-        held = np.ones(len(status), bool)
-        held[members] = False
-        held &= seen.any(axis=1)  # the frame contains no information on a wire without resistances
-        return status, held
-
-    def _give_up(self, status: Status) -> tuple[NDArray[np.int64], Mask]:
-        self._known = False
-        self._seen = np.zeros_like(self._seen)
-        self._estimator.forget_factors()
-        return np.full(len(self._wires), int(status)), np.zeros(len(self._wires), bool)
-
-    # -- finding the maximum ---------------------------------------------------------------------------
-
-    def _converge(self, observation: Observation, members: Index) -> bool:
-        """Solve from the last trusted field or, if that fails, by annealing from rest."""
-        estimator = self._estimator
-        estimator.moved[:] = self._trusted
-        estimator.g[:] = self._trusted_g
-        self._annealed = False
-        hurry = self._seconds < math.inf  # annealing takes as long as solving several frames
-        if (self._known or hurry) and estimator.track(observation, members):
-            gone = float(np.abs(estimator.moved - self._compared).max())
-            far = gone >= self._far or self._beyond_prior(observation, roots.SUSPICIOUS)
-            if not far or hurry or self._anneal_and_compare(observation, members):
-                return True
-        self._hyper.spread(observation, members)
-        self._annealed = True
-        return estimator.anneal(observation, members)
-
-    def _anneal_and_compare(self, observation: Observation, members: Index) -> bool:
-        """Keep the likelier of the current field and the annealed field.
-
-        Far from the field of the last comparison, tracking may have found a wrong maximum.
-        """
-        estimator = self._estimator
-        self._compared[:] = estimator.moved
-        tracked = estimator.moved.copy(), estimator.g.copy()
-        self._hyper.spread_as_seen(observation, members)
-        annealed = estimator.anneal(observation, members)
-        self._annealed = annealed and (
-            estimator.objective(observation) <= estimator.objective(observation, *tracked)
-        )
-        if self._annealed:
-            return True
-        estimator.moved[:], estimator.g[:] = tracked
-        return estimator.track(observation, members)
-
-    def _refine(
-        self, observation: Observation, readings: Readings, members: Index, *, local: bool
-    ) -> Observation:
-        """Adapt the hyperparameters and, if the layout has folds, select the likelier of two maxima.
-
-        The prior that expects loads everywhere may have led to a wrong maximum. The field is therefore
-        annealed again with loads expected where they were found, and replaced if the new field is likelier
-        by :data:`skinnode.solve.roots.LIKELIER`.
-        """
-
-        def observe(noise_factor: float) -> Observation:
-            return self._model.observe(readings, noise_factor)
-
-        estimator = self._estimator
-        observation = self._hyper.adapt(observation, observe, members, local=local)
-        if not (self._folded and self._annealed and local and self._seconds == math.inf):
-            return observation
-        first, before = (estimator.moved.copy(), estimator.g.copy()), estimator.objective(observation)
-        annealed = estimator.anneal(observation, members)
-        if annealed and estimator.objective(observation) < before - roots.LIKELIER:
-            return self._hyper.adapt(observation, observe, members, local=True)
-        estimator.moved[:], estimator.g[:] = first
-        estimator.track(observation, members)
-        return observation
-
-    # -- the field -------------------------------------------------------------------------------------
-
-    def _data_share(self) -> Float:
-        """Return the share of the data in each coordinate, (U, 3N); 0 for coordinates that are not free."""
-        prior, share = self._estimator.load_prior, np.zeros_like(self._trusted)
-        variance = prior.scale2 * prior.covariance.diagonal()
-        share[:, self._free] = data_share(self._estimator.std, self._estimator.core, variance)
-        return share
-
-    def _field(
-        self, observation: Observation, status: NDArray[np.int64], held: Mask, start: float
-    ) -> FieldFrame:
-        estimator, problem, pitch = self._estimator, self._problem, self.layout.pitch_m
-        displacement = problem.displacement_m(problem.rest + self._trusted)
-        std, core = np.zeros_like(self._trusted), np.zeros_like(self._trusted)
-        std[:, self._free], core[:, self._free] = estimator.std, estimator.core
-        if held.all():  # cover half of the displacement that the gate may overlook
-            for each in (std, core):
-                each[:, self._free] = np.maximum(each[:, self._free], 0.5 * self._overlooked)
-        if self._contacts is not None and self._known and not held.all():
-            self._force, self._contacts_found = self._contacts.find(
-                self._hyper.loads.estimate(), displacement, (std * pitch).reshape(displacement.shape)
-            )
-        if not held.all():
-            self._share = self._data_share()
-        used = observation.weight > 0
-        r = estimator.residuals(observation, self._trusted) / np.where(used, observation.weight, np.inf)
-        rms = np.sqrt((r**2).sum(axis=1) / np.maximum(used.sum(axis=1), 1))
-        gains = self._trusted_g[: self._model.gains]
-        return FieldFrame(
-            displacement_m=displacement,
-            displacement_std_m=(std * pitch).reshape(displacement.shape),
-            core_std_m=(core * pitch).reshape(displacement.shape),
-            status=as_statuses(status.tolist()),
-            residual=np.where(used.any(axis=1), rms, np.inf),
-            stats=SolveStats(
-                estimator.evaluations, estimator.evaluations, estimator.factorisations, perf_counter() - start
-            ),
-            force_n=None if self._contacts is None else self._force,
-            held=held,
-            method="posterior",
-            by_prior=np.asarray(~used.any(axis=1)),
-            data_share=self._share.reshape(displacement.shape),
-            contacts=self._contacts_found if self._known else (),
-            gain=np.broadcast_to(gains, len(held)).copy() if self._model.gains else None,
-            noise_factor=self._hyper.noise_factor
-            if self.noise_estimate is None
-            else self.noise_estimate.factor,
-        )
 
 
 def _model_std(options: PosteriorOptions) -> float:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from types import TracebackType
@@ -21,6 +21,7 @@ from vcan_sim.faults import NO_FAULTS, OF_WIRES, Faults, Injected
 from vcan_sim.faulty_node import Emit, FaultyNode
 from vcan_sim.scene import Scene
 from vcan_sim.sensor import SimulatedPatch
+from vcan_sim.skin.imperfections import EXACT, Imperfections
 from vcan_sim.tally import Kind, Tally, kind_of
 
 
@@ -57,9 +58,12 @@ class Fleet:
         wire_up: Function that returns the source that a patch's converter reads; default: the simulated patch
             itself.
         unchecked: Names of patches with protocol revision 1.0, whose summaries carry no check.
+        imperfections: Departures of all patches from their layouts, or of each named patch. The draws differ
+            from patch to patch. Default: exact patches.
 
     Raises:
-        ConfigError: A channel is given for a hand with several buses.
+        ConfigError: A channel is given for a hand with several buses, imperfections name a patch that the
+            hand does not have, or the draws of a patch bring electrodes too close to each other.
     """
 
     def __init__(  # noqa: PLR0913 - keyword arguments, most of them rarely given
@@ -71,15 +75,20 @@ class Fleet:
         faults: Faults = NO_FAULTS,
         wire_up: Callable[[SimulatedPatch], ResistanceSource] = lambda patch: patch,
         unchecked: Collection[str] = (),
+        imperfections: Imperfections | Mapping[str, Imperfections] = EXACT,
     ) -> None:
         self.hand = hand.on(interface, channel)
+        sizes = _by_patch(imperfections, [patch.name for patch in hand.patches])
         self._stations = {
             patch.name: _Station(
                 patch,
                 replace(
                     PatchProfile.from_config(patch, hand.bus(patch.bus)), checked=patch.name not in unchecked
                 ),
-                SimulatedPatch(Scene(patch.layout.build(), hand.simulation, number)),
+                SimulatedPatch(
+                    Scene(patch.layout.build(), hand.simulation, number),
+                    imperfections=sizes.get(patch.name, EXACT),
+                ),
                 wire_up,
                 faults,
             )
@@ -162,18 +171,39 @@ class Fleet:
         self._ports[bus].off = off
 
     def truth_m(self, patch: str, device_time_us: int) -> Float:
-        """Return the true electrode positions (U, N, 3) in a scan, metres.
+        """Return the true electrode positions in a scan.
 
         Args:
             patch: Name of the patch.
             device_time_us: Device time in the scan's summary, µs.
 
+        Returns:
+            (U, N, 3) float64, m: positions of the electrodes as they lie, with the patch's imperfections.
+
         Raises:
             LookupError: The patch is not in the hand, or the scan was never sent or is too old.
         """
+        return self._at_scan(patch, device_time_us, SimulatedPatch.truth_m)
+
+    def displacement_m(self, patch: str, device_time_us: int) -> Float:
+        """Return the true displacement of the electrodes in a scan, which a host estimates.
+
+        Args:
+            patch: Name of the patch.
+            device_time_us: Device time in the scan's summary, µs.
+
+        Returns:
+            (U, N, 3) float64, m: :meth:`truth_m` minus the positions of the same electrodes at rest.
+
+        Raises:
+            LookupError: The patch is not in the hand, or the scan was never sent or is too old.
+        """
+        return self._at_scan(patch, device_time_us, SimulatedPatch.displacement_m)
+
+    def _at_scan(self, patch: str, device_time_us: int, at: Callable[[SimulatedPatch, int], Float]) -> Float:
         source = self._stations[patch].source
         try:
-            return source.truth_m(source.read_ns(device_time_us))
+            return at(source, source.read_ns(device_time_us))
         except LookupError as error:
             raise LookupError(f"{patch}: {error}") from None
 
@@ -185,6 +215,18 @@ class Fleet:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.stop()
+
+
+def _by_patch(
+    imperfections: Imperfections | Mapping[str, Imperfections], patches: list[str]
+) -> Mapping[str, Imperfections]:
+    """Return the imperfections by patch. Raises ConfigError for a patch that the hand does not have."""
+    if isinstance(imperfections, Imperfections):
+        return dict.fromkeys(patches, imperfections)
+    for name in imperfections:
+        if name not in patches:
+            raise ConfigError("imperfections", name, f"a patch of the hand: {', '.join(patches)}")
+    return imperfections
 
 
 class Passed:

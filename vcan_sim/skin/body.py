@@ -1,0 +1,121 @@
+"""Electrodes of a patch as they lie in the rubber, drawn from the imperfections."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from skinnode.errors import ConfigError
+from skinnode.model.layout import Float, PatchLayout
+from vcan_sim.skin.imperfections import Imperfections
+
+CLIPPED_AT: Final = 3.0
+"""Largest normal draw, standard deviations."""
+_CLOSEST: Final = 0.1
+"""Least distance between an upper and a lower electrode, as a fraction of the same distance in the layout."""
+
+
+@dataclass(frozen=True, eq=False)
+class Body:
+    """Positions of the electrodes at rest, as they are."""
+
+    upper_m: Float
+    """(U, N, 3) float64, m."""
+    lower_m: Float
+    """(K, M, 3) float64, m."""
+
+
+class Draws:
+    """Random draws of one patch, with a stream for each imperfection.
+
+    Args:
+        seed: Seed of the imperfections.
+        number: Number of the patch in the hand.
+    """
+
+    def __init__(self, seed: int, number: int) -> None:
+        self._seed, self._number = seed, number
+
+    def stream(self, name: str, *more: int) -> np.random.Generator:
+        """Return the generator of the imperfection ``name``, or of its occurrence number ``more``."""
+        return np.random.default_rng([self._seed, self._number, *name.encode(), *more])
+
+    def normal(self, name: str, *shape: int) -> Float:
+        """Return standard normal draws of a shape, clipped at :data:`CLIPPED_AT`."""
+        drawn = self.stream(name).standard_normal(shape)
+        return np.asarray(np.clip(drawn, -CLIPPED_AT, CLIPPED_AT))
+
+
+def made(layout: PatchLayout, imperfections: Imperfections, draws: Draws) -> Body:
+    """Return the electrodes of a patch as a workshop makes it.
+
+    Thickness and tilt move the upper electrodes along z by a fraction of their height over the nearest lower
+    electrode, on a curved patch too.
+
+    Args:
+        layout: Layout of the patch.
+        imperfections: Sizes of the errors.
+        draws: Random draws of the patch.
+
+    Returns:
+        The electrodes; the arrays of the layout where nothing moves them.
+
+    Raises:
+        ConfigError: The draws bring an upper and a lower electrode too close to each other.
+    """
+    sizes, upper, lower = imperfections, layout.upper_m, layout.lower_m
+    if sizes.thickness or sizes.tilt:
+        rise = sizes.thickness * float(draws.normal("thickness", 1)[0])
+        slope = sizes.tilt * draws.normal("tilt", 2)
+        across = _from_middle(layout.upper_m)
+        upper = upper.copy()
+        upper[..., 2] += _height_m(layout) * (rise + across @ slope)
+    if sizes.along:
+        size_m = sizes.along * layout.pitch_m
+        upper = upper + size_m * draws.normal("along upper", *upper.shape[:2], 1) * _direction(layout.upper_m)
+        lower = lower + size_m * draws.normal("along lower", *lower.shape[:2], 1) * _direction(layout.lower_m)
+    if sizes.placement:
+        size_m = sizes.placement * layout.pitch_m
+        upper = upper + size_m * draws.normal("placement upper", len(upper), 1, 3)
+        lower = lower + size_m * draws.normal("placement lower", len(lower), 1, 3)
+    if upper is not layout.upper_m or lower is not layout.lower_m:
+        planned_m, found_m = _closest_m(layout.upper_m, layout.lower_m), _closest_m(upper, lower)
+        if found_m < _CLOSEST * planned_m:
+            raise ConfigError(
+                "placement, along, thickness, tilt",
+                f"{found_m:.2g} m between an upper and a lower electrode",
+                f"draws that leave at least {_CLOSEST * planned_m:.2g} m: smaller sizes or another seed",
+            )
+    return Body(upper, lower)
+
+
+def _from_middle(points_m: Float) -> Float:
+    """Return x and y (U, N, 2) of points (U, N, 3), from −1 at one edge of the patch to 1 at the other."""
+    plane = points_m[..., :2]
+    low, high = plane.min(axis=(0, 1)), plane.max(axis=(0, 1))
+    half = 0.5 * (high - low)
+    return np.asarray((plane - 0.5 * (low + high)) / np.where(half > 0.0, half, 1.0))
+
+
+def _height_m(layout: PatchLayout) -> Float:
+    """Return the height (U, N) in m of each upper electrode over the nearest lower electrode, along z."""
+    lower = layout.lower_m.reshape(-1, 3)
+    gap = layout.upper_m[:, :, None] - lower
+    nearest = np.argmin((gap**2).sum(axis=-1), axis=-1)
+    return np.asarray(layout.upper_m[..., 2] - lower[nearest, 2])
+
+
+def _direction(wires_m: Float) -> Float:
+    """Return the unit vectors (W, E, 3) along wires (W, E, 3); zero for wires with a single electrode."""
+    if wires_m.shape[1] == 1:
+        return np.zeros_like(wires_m)
+    steps = np.gradient(wires_m, axis=1)
+    length = np.linalg.norm(steps, axis=2, keepdims=True)
+    return np.asarray(steps / np.where(length > 0.0, length, 1.0))
+
+
+def _closest_m(upper_m: Float, lower_m: Float) -> float:
+    gaps = upper_m.reshape(-1, 1, 3) - lower_m.reshape(1, -1, 3)
+    return float(np.sqrt(np.min(np.einsum("abi,abi->ab", gaps, gaps))))

@@ -1,0 +1,173 @@
+"""Resistances that a read-out of the crossbar measures, by nodal analysis of the whole network.
+
+The nodes are the electrodes of the wires that have a resistance along them, a ladder from the connector at
+their first electrode, and the wires themselves otherwise. Each path between an upper and a lower electrode is
+a conductance C. In series with each wire are its contact, and the multiplexer or the input of the amplifier.
+With the conductances T of the ladders and connectors, the voltages v of the upper and w of the lower nodes
+obey Kirchhoff's current law (Ho, Ruehli and Brennan, IEEE Trans. Circuits Syst. 22, 1975):
+
+    ⎡ A_u   −C ⎤ ⎡ v ⎤   ⎡ currents fed ⎤
+    ⎢          ⎥ ⎢   ⎥ = ⎢              ⎥,    A_u = diag(C 1) + T_u,    A_l = diag(Cᵀ 1) + T_l
+    ⎣ −Cᵀ  A_l ⎦ ⎣ w ⎦   ⎣ into nodes   ⎦
+
+A_l is tridiagonal, so w is eliminated first, and the Schur complement A_u − C A_l⁻¹ Cᵀ is solved for v.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import solveh_banded
+
+from skinnode.model.layout import Float
+
+
+@dataclass(frozen=True, eq=False)
+class Side:
+    """Wires of one layer of a crossbar.
+
+    Args:
+        series_ohm: (W,) float64, ohm: resistance between the connector's far end and the wire's ladder or,
+            without a ladder, the wire: contact plus multiplexer or amplifier.
+        wire_ohm: Resistance of the wire per pitch, ohm; 0 for a wire that is a single node.
+        electrodes: Number of electrodes per wire.
+    """
+
+    series_ohm: Float
+    wire_ohm: float
+    electrodes: int
+
+    @property
+    def nodes(self) -> int:
+        """Number of nodes per wire."""
+        return self.electrodes if self.wire_ohm else 1
+
+    @property
+    def feed_ohm(self) -> Float:
+        """Resistance (W,) in ohm between the source and the first node."""
+        return np.asarray(self.series_ohm + self.wire_ohm)
+
+    @property
+    def ideal(self) -> bool:
+        """Whether nothing separates the wires from their sources or amplifiers."""
+        return not self.feed_ohm.any()
+
+    def first(self) -> Float:
+        """Return the incidence (W nodes, W) of wires and their first nodes."""
+        wires = len(self.series_ohm)
+        found = np.zeros((wires * self.nodes, wires))
+        found[np.arange(wires) * self.nodes, np.arange(wires)] = 1.0
+        return found
+
+    def diagonals(self, sums: Float, feed: Float | float) -> tuple[Float, Float]:
+        """Return diag(sums) + T as a diagonal (n,) and its upper neighbour (n,), whose first entry is unused.
+
+        Args:
+            sums: (n,) float64, S: conductances of the paths at each node.
+            feed: (W,) float64, S: conductances of the connectors.
+        """
+        wires = len(self.series_ohm)
+        diagonal, beside = sums.reshape(wires, self.nodes).copy(), np.zeros((wires, self.nodes))
+        if self.nodes > 1:
+            step = 1.0 / self.wire_ohm
+            beside[:, 1:] = -step
+            diagonal[:, 1:] += step
+            diagonal[:, :-1] += step
+        diagonal[:, 0] += feed
+        return diagonal.ravel(), beside.ravel()
+
+
+def merged(paths: Float, upper: Side, lower: Side, electrodes: tuple[int, int, int, int]) -> Float:
+    """Return the conductances between the nodes of the two sides.
+
+    Args:
+        paths: (U N, K M) float64, S: conductances of the paths.
+        upper: Upper wires.
+        lower: Lower wires.
+        electrodes: (U, N, K, M).
+
+    Returns:
+        (U or U N, K or K M) float64, S.
+    """
+    axes = tuple(axis for axis, side in ((1, upper), (3, lower)) if side.nodes == 1)
+    whole = paths.reshape(electrodes).sum(axis=axes, keepdims=True)
+    return np.asarray(whole.reshape(whole.shape[0] * whole.shape[1], -1))
+
+
+def grounded_ohm(conductance: Float, upper: Side, lower: Side) -> Float:
+    """Return the resistances (U, K) in ohm that amplifiers at the lower wires measure.
+
+    One upper wire after another is driven while the others are connected to ground. A reading is the driving
+    voltage divided by the current into the amplifier of the lower wire. Without series and wire resistances,
+    it is the resistance of the crossing.
+
+    Args:
+        conductance: Conductances between the nodes, S, from :func:`merged`.
+        upper: Upper wires.
+        lower: Lower wires.
+    """
+    above, below = conductance.sum(axis=1), conductance.sum(axis=0)
+    if lower.ideal:  # every lower wire is at ground, so the upper wires do not influence each other
+        return np.asarray(1.0 / (_driven(above, upper).T @ conductance))
+    feed = 1.0 / lower.feed_ohm
+    if upper.ideal:
+        lowered = _tridiagonal(lower.diagonals(below, feed), conductance.T @ upper.first())
+    else:
+        across = _tridiagonal(lower.diagonals(below, feed), conductance.T)
+        schur = _dense(upper.diagonals(above, 1.0 / upper.feed_ohm)) - conductance @ across
+        lowered = across @ np.linalg.solve(schur, upper.first() / upper.feed_ohm)
+    current = feed[:, None] * lowered[:: lower.nodes]
+    return np.asarray(1.0 / current.T)
+
+
+def floating_ohm(conductance: Float, upper: Side, lower: Side) -> Float:
+    """Return the resistances (U, K) in ohm of each pair of wires while all other wires float.
+
+    That is the effective resistance between two nodes of the network, Z_uu + Z_kk − 2 Z_uk, with the inverse
+    Z of the nodes' conductance matrix (Klein and Randić, J. Math. Chem. 12, 1993), plus the resistances in
+    series with the two wires.
+
+    Args:
+        conductance: Conductances between the nodes, S, from :func:`merged`.
+        upper: Upper wires.
+        lower: Lower wires.
+    """
+    above, below = conductance.sum(axis=1), conductance.sum(axis=0)
+    ends = lower.first()
+    solved = _tridiagonal(lower.diagonals(below, 0.0), np.hstack([conductance.T, ends]))
+    across, own = np.split(solved, [len(above)], axis=1)
+    schur = _dense(upper.diagonals(above, 0.0)) - conductance @ across
+    # the network floats: a constant added to all elements fixes the mean of v, and no difference changes
+    schur += above.mean()
+    z = np.linalg.inv(schur)
+    between = across[:: lower.nodes] @ z  # (K, upper nodes): Z_lu
+    z_kk = np.einsum("kk->k", own[:: lower.nodes]) + np.einsum("kn,kn->k", between, across[:: lower.nodes])
+    z_uu = np.einsum("nn->n", z)[:: upper.nodes]
+    pairs = z_uu[:, None] + z_kk - 2.0 * between[:, :: upper.nodes].T
+    return np.asarray(pairs + upper.feed_ohm[:, None] + lower.feed_ohm)
+
+
+def _driven(above: Float, upper: Side) -> Float:
+    """Return the voltages (upper nodes, U) per volt of the driven wire, with all lower nodes at ground."""
+    if upper.ideal:
+        return upper.first()
+    feed = 1.0 / upper.feed_ohm
+    return _tridiagonal(upper.diagonals(above, feed), upper.first() * feed)
+
+
+def _tridiagonal(diagonals: tuple[Float, Float], right: Float) -> Float:
+    """Solve a symmetric positive definite system with a tridiagonal matrix for the columns of ``right``."""
+    diagonal, beside = diagonals
+    if not beside.any():
+        return np.asarray(right / diagonal[:, None])
+    return np.asarray(solveh_banded(np.stack([beside, diagonal]), right, check_finite=False))
+
+
+def _dense(diagonals: tuple[Float, Float]) -> Float:
+    diagonal, beside = diagonals
+    found = np.diag(diagonal)
+    if beside.any():
+        index = np.arange(len(diagonal) - 1)
+        found[index, index + 1] = found[index + 1, index] = beside[1:]
+    return found

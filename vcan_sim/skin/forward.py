@@ -1,0 +1,123 @@
+"""Conductances between the electrodes of a patch.
+
+The exact patch has point electrodes, and a path between two of them at distance d has the resistance ρ d, so
+its conductance is 1 / (ρ d): the potential of a point. The same direct summation as ever, in
+:class:`ExactForward`, serves the exact patch. :class:`Paths` departs from it in two ways:
+
+finite electrodes   A conducting disc of radius a has the potential arcsin(2a / (l₁ + l₂)) / a instead of 1/d,
+                    where l₁ and l₂ are the distances to the nearest and the farthest point of its rim
+                    (Weber 1873; Jackson, Classical Electrodynamics, 3rd ed., problem 3.3). The potential of a
+                    disc averaged over another parallel disc, with its own charge 1/√(a² − r²), is to order a²
+                    that of one disc of radius √2 a, because each of them adds (a²/6) ∇²(1/d), the Laplacian
+                    taken in the plane. The next order is (a/d)⁴.
+strain              ρ of a path becomes ρ (1 + β ε), with the strain ε = d/d₀ − 1 of the path since rest: the
+                    linear piezoresistive law (Smith, Phys. Rev. 94, 1954) for each path separately. That is
+                    a model; it neglects strain across the path.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from skinnode.model.layout import Float
+
+
+class ExactForward:
+    """Computes the resistances of a patch of point electrodes by direct summation.
+
+    It shares no code with the solver's kernels, so truth and solver cannot have a bug in common. It is six
+    times as fast as the reference model because it allocates no (…, 3) temporaries.
+
+    Args:
+        shape: (U, N, K, M): upper wires, electrodes per upper wire, lower wires, electrodes per lower wire.
+        lower_m: (K, M, 3) float64, m: lower electrodes.
+        resistivity_ohm_per_m: Resistance per metre between two electrodes, ohm/m.
+    """
+
+    def __init__(
+        self, shape: tuple[int, int, int, int], lower_m: Float, resistivity_ohm_per_m: float
+    ) -> None:
+        self._shape = shape
+        self._lower = np.ascontiguousarray(lower_m.reshape(-1, 3).T)
+        self._resistivity = resistivity_ohm_per_m
+
+    def __call__(self, upper_m: Float) -> Float:
+        """Return the resistances (U, K) in ohm for upper electrodes (U, N, 3) in m."""
+        distance = np.zeros((upper_m.size // 3, self._lower.shape[1]))
+        for here, there in zip(upper_m.reshape(-1, 3).T, self._lower, strict=True):
+            distance += (here[:, None] - there) ** 2
+        np.sqrt(distance, out=distance)
+        with np.errstate(divide="ignore"):
+            potential = (1.0 / distance).reshape(self._shape).sum(axis=(1, 3))
+        return np.asarray(self._resistivity / potential)
+
+
+class Paths:
+    """Conductances of all paths between an upper and a lower electrode, at unit resistivity.
+
+    Args:
+        upper_m: (U, N, 3) float64, m: upper electrodes at rest.
+        lower_m: (K, M, 3) float64, m: lower electrodes.
+        radius_m: Radius of the electrodes, m; 0 for points.
+        strain: β, relative change in resistivity per strain of a path.
+    """
+
+    def __init__(self, upper_m: Float, lower_m: Float, radius_m: float, strain: float) -> None:
+        self._lower = np.ascontiguousarray(lower_m.reshape(-1, 3).T)
+        self._radius_m = math.sqrt(2.0) * radius_m
+        self._strain = strain
+        self._per_m: Float | None = None
+        if strain:
+            plane, normal = self._squares(upper_m)
+            self._per_m = strain / np.sqrt(plane + normal)
+
+    def __call__(self, upper_m: Float) -> Float:
+        """Return the conductances (U N, K M) in 1/m for upper electrodes (U, N, 3) in m.
+
+        They become siemens when divided by the resistivity in ohm/m.
+        """
+        plane, normal = self._squares(upper_m)
+        square = plane + normal
+        with np.errstate(divide="ignore"):
+            found = _disc(plane, square, self._radius_m) if self._radius_m else 1.0 / np.sqrt(square)
+        if self._per_m is not None:
+            found /= 1.0 - self._strain + self._per_m * np.sqrt(square)
+        return found
+
+    def _squares(self, upper_m: Float) -> tuple[Float, Float]:
+        """Return the squared distances (U N, K M) in m², within the x-y plane and along z."""
+        dx, dy, dz = (
+            here[:, None] - there for here, there in zip(upper_m.reshape(-1, 3).T, self._lower, strict=True)
+        )
+        dx *= dx
+        dy *= dy
+        dz *= dz
+        dx += dy
+        return dx, dz
+
+
+def _disc(plane: Float, square: Float, radius_m: float) -> Float:
+    """Return the potential in 1/m of a conducting disc of unit charge.
+
+    (l₁ + l₂)² / 4 = (s + √(s² − 4 a² p)) / 2 with s = d² + a², as l₁² l₂² = s² − 4 a² p.
+
+    Args:
+        plane: p, squared distances in m² from the disc's axis.
+        square: d², squared distances in m² from the disc's centre.
+        radius_m: a, radius in m.
+    """
+    a2 = radius_m * radius_m
+    s = square + a2
+    root = s * s - 4.0 * a2 * plane
+    np.maximum(root, 0.0, out=root)
+    np.sqrt(root, out=root)
+    root += s
+    root *= 0.5
+    np.sqrt(root, out=root)
+    np.divide(radius_m, root, out=root)
+    np.minimum(root, 1.0, out=root)
+    np.arcsin(root, out=root)
+    root /= radius_m
+    return root

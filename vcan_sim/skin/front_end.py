@@ -1,0 +1,62 @@
+"""Amplifier and converter of a patch: gain, offset, noise and rounding."""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+import numpy as np
+
+from skinnode.model.layout import Float
+from vcan_sim.skin.body import Draws
+from vcan_sim.skin.imperfections import Imperfections
+
+FULL_SCALE: Final = 2.0
+"""Full scale of the converter, in largest resistances at rest."""
+
+
+class FrontEnd:
+    """Amplifier and converter of one patch.
+
+    The amplifier is balanced at rest, so its gain acts on the change in each resistance. A gain of the whole
+    reading would do nothing: nodes send R divided by the R of their tare.
+
+    Args:
+        imperfections: Sizes of the errors.
+        draws: Random draws of the patch.
+        rest_ohm: (U, K) float64, ohm: resistances at rest, as they reach the amplifier.
+    """
+
+    def __init__(self, imperfections: Imperfections, draws: Draws, rest_ohm: Float) -> None:
+        wires = len(rest_ohm)
+        common, own = draws.normal("gain", 1), draws.normal("gain of wires", wires, 1)
+        self._gain = imperfections.gain * math.sqrt(0.5) * (common + own)
+        self._offset_ohm = (
+            imperfections.offset * float(np.median(rest_ohm)) * draws.normal("offset", wires, 1)
+        )
+        self._rest_ohm = rest_ohm
+        self._full_ohm = FULL_SCALE * float(rest_ohm.max())
+        self._noise_ohm = imperfections.noise * self._full_ohm
+        self._step_ohm = self._full_ohm / 2**imperfections.bits if imperfections.bits else 0.0
+        self._draws = draws
+        self._amplifies = bool(imperfections.gain or imperfections.offset)
+
+    def amplified_ohm(self, ohm: Float) -> Float:
+        """Return the resistances (U, K) in ohm that the converter's input stands for."""
+        if not self._amplifies:
+            return ohm
+        return np.asarray(ohm + self._gain * (ohm - self._rest_ohm) + self._offset_ohm)
+
+    def converted_ohm(self, ohm: Float, reading: int) -> Float:
+        """Return the resistances (U, K) in ohm that the converter returns.
+
+        Args:
+            ohm: (U, K) float64, ohm: input of the converter.
+            reading: Number of the reading, at least 0, which decides the noise.
+        """
+        if self._noise_ohm:
+            ohm = ohm + self._noise_ohm * self._draws.stream("noise", reading).standard_normal(ohm.shape)
+        if self._step_ohm:
+            code = np.rint(ohm / self._step_ohm)
+            ohm = np.clip(code, 0.0, self._full_ohm / self._step_ohm - 1.0) * self._step_ohm
+        return ohm

@@ -1,0 +1,144 @@
+"""Hysteresis and creep of the rubber: the displacement that a load causes depends on earlier loads.
+
+Both act on every coordinate of every electrode's displacement, hysteresis first:
+
+hysteresis   the fraction w of the displacement passes through play operators in parallel, each of which
+             follows its input only outside a band of ±r: p ← max(s − r, min(s + r, p)), p = 0 at first. The
+             loop does not depend on the rate (Prandtl-Ishlinskii operator; Brokate and Sprekels, Hysteresis
+             and Phase Transitions, 1996, section 2.3).
+creep        d = s + c₁ q₁ + c₂ q₂ with τᵢ dqᵢ/dt = s − qᵢ: a Prony series, that of two Kelvin-Voigt elements
+             (Findley, Lai and Onaran, Creep and Relaxation of Nonlinear Viscoelastic Materials, 1976,
+             section 5.5). A step of s gives s (1 + Σ cᵢ (1 − exp(−t/τᵢ))).
+
+The electrodes move so: the result is their true displacement. The state advances at steps of
+:data:`STEP_S` from time 0, between which the output of the hysteresis is taken as linear; a time inside a
+step is reached by a partial step that is not kept. The result therefore depends on the time alone, not on the
+times that were asked before.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections import OrderedDict
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from skinnode.model.layout import Float
+from vcan_sim.skin.imperfections import Imperfections
+
+STEP_S: Final = 1.0 / 64.0
+"""Time step of the state, s; a power of two, so that the times of the steps are exact."""
+THRESHOLDS: Final = (0.0025, 0.005, 0.01, 0.02)
+"""Thresholds r of the play operators, clearances; the operators have equal weights."""
+_RECENT: Final = 256
+"""Number of states of consecutive steps that are kept."""
+_KEPT_EVERY: Final = 128
+"""Number of steps between the states that are kept longer: 2 s."""
+_KEPT: Final = 300
+"""Number of these states that are kept, for ten minutes; of the older ones, every ``_THINNED`` th."""
+_THINNED: Final = 64
+
+Load = Callable[[float], "Float | None"]
+"""Function of the time in s that returns the displacement (U, N, 3) in m that a rubber without memory would
+have, or None at rest."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class State:
+    """State of the rubber at one time; shapes start with that of the displacement (U, N, 3), in m."""
+
+    play: Float
+    """(P, U, N, 3): outputs of the play operators."""
+    followed: Float
+    """(U, N, 3): displacement with hysteresis."""
+    delayed: Float
+    """(2, U, N, 3): q of the two terms of creep."""
+
+
+class History:
+    """Displacement of the rubber's surface under a load that varies with time.
+
+    Args:
+        imperfections: Sizes of hysteresis and creep.
+        clearance_m: Clearance of the layout, m, which scales the thresholds of the hysteresis.
+    """
+
+    def __init__(self, imperfections: Imperfections, clearance_m: float) -> None:
+        self._share = imperfections.hysteresis
+        self._thresholds_m = np.reshape(THRESHOLDS if self._share else (), (-1, 1, 1, 1)) * clearance_m
+        self._creep = np.array(imperfections.creep)
+        self._creep_s = np.reshape(imperfections.creep_s, (2, 1, 1, 1))
+        self._load: Load | None = None
+        self._kept: dict[int, State | None] = {}
+        self._recent: OrderedDict[int, State | None] = OrderedDict()
+        self._lock = threading.Lock()  # a node reads while another thread asks for the truth
+
+    def displacement_m(self, t_s: float, load: Load) -> Float | None:
+        """Return the displacement (U, N, 3) in m at ``t_s``, or None if nothing has happened yet.
+
+        Args:
+            t_s: Time since the start, s. Before 0 there is no history.
+            load: Displacement without memory, a pure function. Another function starts another history.
+        """
+        if t_s < 0.0:
+            return load(t_s)
+        with self._lock:
+            if load != self._load:
+                self._load = load
+                self._kept, self._recent = {}, OrderedDict()
+            step = int(t_s // STEP_S)
+            state, since_s = self._at(step, load), t_s - step * STEP_S
+            if since_s > 0.0:
+                state = self._advanced(state, load(t_s), since_s)
+        if state is None:
+            return None
+        return np.asarray(state.followed + np.tensordot(self._creep, state.delayed, axes=1))
+
+    def _at(self, step: int, load: Load) -> State | None:
+        """Return the state at a step, advanced from the nearest earlier state that is stored."""
+        known = step
+        while known >= 0 and known not in self._recent and known not in self._kept:
+            known -= 1
+        if known < 0:
+            state, known = self._advanced(None, load(0.0), 0.0), 0
+            self._store(0, state)
+        else:
+            state = self._recent[known] if known in self._recent else self._kept[known]
+        for number in range(known + 1, step + 1):
+            state = self._advanced(state, load(number * STEP_S), STEP_S)
+            self._store(number, state)
+        return state
+
+    def _store(self, step: int, state: State | None) -> None:
+        if step % _KEPT_EVERY == 0:
+            self._kept[step] = state
+            old = step - _KEPT * _KEPT_EVERY
+            if old % (_THINNED * _KEPT_EVERY):
+                self._kept.pop(old, None)
+        self._recent[step] = state
+        if len(self._recent) > _RECENT:
+            self._recent.popitem(last=False)
+
+    def _advanced(self, state: State | None, load_m: Float | None, dt_s: float) -> State | None:
+        """Return the state ``dt_s`` later, at which the load is ``load_m``."""
+        if state is None:
+            if load_m is None:
+                return None
+            state = State(
+                np.zeros((len(self._thresholds_m), *load_m.shape)),
+                np.zeros_like(load_m),
+                np.zeros((2, *load_m.shape)),
+            )
+        s = np.zeros_like(state.followed) if load_m is None else load_m
+        play = np.maximum(s - self._thresholds_m, np.minimum(s + self._thresholds_m, state.play))
+        followed = s + self._share * (play.mean(axis=0) - s) if self._share else s
+        if dt_s == 0.0 or not self._creep.any():
+            return State(play, followed, state.delayed)
+        risen = -np.expm1(-dt_s / self._creep_s)
+        lag = (followed - state.followed) * (self._creep_s / dt_s)
+        # exact for a load that is linear within the step
+        delayed = followed - lag * risen + (state.delayed - state.followed) * (1.0 - risen)
+        return State(play, followed, delayed)

@@ -1,0 +1,224 @@
+"""Sizes of all imperfections of a patch, as data."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Final, Literal, Self, get_args
+
+from skinnode.errors import ConfigError, Shown
+
+Readout = Literal["ideal", "grounded", "floating"]
+
+_LIMITS: Final[dict[str, tuple[float, float, str]]] = {
+    "placement": (0.0, 0.15, "pitches"),
+    "along": (0.0, 0.15, "pitches"),
+    "thickness": (0.0, 0.25, "clearances"),
+    "tilt": (0.0, 0.25, "clearances"),
+    "electrode_radius": (0.0, 0.45, "pitches"),
+    "strain": (-0.5, 0.5, ""),
+    "warming_k": (-100.0, 100.0, "K"),
+    "temperature_per_k": (-0.005, 0.005, "1/K"),
+    "warming_s": (1e-3, 1e6, "s"),
+    "gain": (0.0, 0.25, ""),
+    "offset": (0.0, 0.1, ""),
+    "creep": (0.0, 0.5, ""),
+    "creep_s": (1e-2, 1e5, "s"),
+    "hysteresis": (0.0, 0.5, ""),
+    "contact_ohm": (0.0, 1e6, "ohm"),
+    "upper_wire_ohm": (0.0, 1e6, "ohm"),
+    "lower_wire_ohm": (0.0, 1e6, "ohm"),
+    "multiplexer_ohm": (0.0, 1e6, "ohm"),
+    "virtual_ground_ohm": (0.0, 1e6, "ohm"),
+    "row_time_s": (0.0, 1.0, "s"),
+    "noise": (0.0, 0.01, ""),
+}
+"""Least value, greatest value and unit of each number."""
+_OF_NETWORK: Final = (
+    "contact_ohm",
+    "upper_wire_ohm",
+    "lower_wire_ohm",
+    "multiplexer_ohm",
+    "virtual_ground_ohm",
+)
+"""Resistances that exist only in a read-out through the network."""
+_WITHOUT_SIZE: Final = ("seed", "temperature_per_k", "warming_s", "creep_s")
+"""Fields that change nothing while every size is zero."""
+_BITS: Final = (8, 32)
+
+
+@dataclass(frozen=True, slots=True)
+class Imperfections:
+    """Sizes by which a simulated patch departs from its layout; all zero means exact.
+
+    A size that is *drawn* is the standard deviation of normal draws, which are clipped at three standard
+    deviations. Each imperfection has its own random stream, so that switching one on does not change the
+    others.
+
+    Raises:
+        ConfigError: A value is of the wrong type or out of range, or a resistance of the network is given
+            with the read-out ``ideal``.
+    """
+
+    seed: int = 1
+    """Random seed. The patches of a hand differ although they have the same seed."""
+
+    # --- geometry
+    placement: float = 0.0
+    """Position of each upper and lower wire along x, y and z, pitches; drawn."""
+    along: float = 0.0
+    """Position of each electrode along its wire, pitches; drawn."""
+    thickness: float = 0.0
+    """Thickness of the layer, as a fraction of the clearance; drawn."""
+    tilt: float = 0.0
+    """Rise of the upper layer from the middle of the patch to its edge, along x and along y, as a fraction of
+    the clearance; drawn."""
+    electrode_radius: float = 0.0
+    """Radius of the electrodes, which are conducting discs parallel to the x-y plane, pitches."""
+
+    # --- rubber
+    strain: float = 0.0
+    """Relative change in resistivity per strain of a path between two electrodes."""
+    warming_k: float = 0.0
+    """Final rise in temperature since the scene's start, K; approached exponentially."""
+    temperature_per_k: float = 2e-3
+    """Relative change in resistivity per kelvin; acts with ``warming_k``."""
+    warming_s: float = 300.0
+    """Time constant of the rise in temperature, s."""
+    creep: tuple[float, float] = (0.0, 0.0)
+    """Delayed displacement of the fast and the slow term, as fractions of the immediate displacement."""
+    creep_s: tuple[float, float] = (0.3, 10.0)
+    """Time constants of the two terms of creep, s."""
+    hysteresis: float = 0.0
+    """Fraction of the displacement that passes through play operators."""
+
+    # --- read-out
+    gain: float = 0.0
+    """Gain of the amplifier, as a fraction of the change in each resistance since rest; drawn: half of the
+    variance is common to the patch, half independent for each upper wire."""
+    offset: float = 0.0
+    """Offset of the readings of each upper wire, as a fraction of the median resistance at rest; drawn."""
+    readout: Readout = "ideal"
+    """``ideal``: each pair of wires is measured as if it were alone. ``grounded``: one upper wire is driven,
+    the others are at ground, and every lower wire ends in an amplifier. ``floating``: one pair of wires is
+    measured while all other wires float, so that sneak paths are in parallel to the pair."""
+    contact_ohm: float = 0.0
+    """Mean contact resistance at the connector of each wire; a wire's is drawn uniformly from half to one and
+    a half times the mean."""
+    upper_wire_ohm: float = 0.0
+    """Resistance of an upper wire per electrode pitch, and from the connector to the first electrode."""
+    lower_wire_ohm: float = 0.0
+    """Resistance of a lower wire per electrode pitch, and from the connector to the first electrode."""
+    multiplexer_ohm: float = 0.0
+    """On-resistance of the multiplexer that connects each upper wire."""
+    virtual_ground_ohm: float = 0.0
+    """Input resistance of the amplifier at each lower wire; an ideal virtual ground has none."""
+    row_time_s: float = 0.0
+    """Time between the samples of neighbouring upper wires, s."""
+    noise: float = 0.0
+    """Standard deviation of the converter's noise, as a fraction of its full scale; adds to the noise of the
+    scene, which is relative to the reading."""
+    bits: int = 0
+    """Resolution of the converter, from 8 to 32 bits; 0: no rounding."""
+
+    def __post_init__(self) -> None:
+        for name in ("seed", "bits"):
+            value = getattr(self, name)
+            if type(value) is not int or value < 0:
+                raise ConfigError(name, value, "an integer of at least 0")
+        if self.bits and not _BITS[0] <= self.bits <= _BITS[1]:
+            raise ConfigError("bits", self.bits, f"0, or an integer from {_BITS[0]} to {_BITS[1]}")
+        if self.readout not in get_args(Readout):
+            raise ConfigError("readout", self.readout, " or ".join(get_args(Readout)))
+        for name, limits in _LIMITS.items():
+            object.__setattr__(self, name, _checked(name, getattr(self, name), *limits))
+        if self.readout == "ideal":
+            for name in _OF_NETWORK:
+                if getattr(self, name):
+                    raise ConfigError(name, getattr(self, name), "0 unless readout is grounded or floating")
+
+    @property
+    def exact(self) -> bool:
+        """Whether every size is zero, so that the patch equals its layout."""
+        unsized = {name: getattr(EXACT, name) for name in _WITHOUT_SIZE}
+        return dataclasses.replace(self, **unsized) == EXACT
+
+    @classmethod
+    def ordinary(cls, seed: int = 1) -> Self:
+        """Return the sizes of a patch from a good workshop, as ``tolerances = "ordinary"`` states them.
+
+        The gain, the placement, the thickness and the radius are those of
+        :data:`skinnode.model.tolerances.ORDINARY`; creep and hysteresis are typical of filled silicone. The
+        temperature is constant, because a host without ``drift`` would see displacement in it.
+
+        Args:
+            seed: Random seed.
+
+        Raises:
+            ConfigError: The seed is not an integer of at least 0.
+        """
+        return cls(
+            seed=seed,
+            placement=0.02,
+            along=0.002,
+            thickness=0.05,
+            tilt=0.01,
+            electrode_radius=0.05,
+            creep=(0.02, 0.03),
+            hysteresis=0.05,
+            gain=0.02,
+            offset=1e-3,
+            row_time_s=1e-4,
+            noise=1e-6,
+            bits=24,
+        )
+
+    @classmethod
+    def from_table(cls, table: Mapping[str, Any], key: str = "imperfections") -> Self:
+        """Return the imperfections of a TOML table.
+
+        Args:
+            table: Fields by name. ``ordinary = true`` starts from :meth:`ordinary` instead of zero.
+            key: Path of the table, for messages.
+
+        Raises:
+            ConfigError: A key is unknown, or a value is invalid.
+        """
+        names = [field.name for field in dataclasses.fields(cls)]
+        values = dict(table)
+        start = values.pop("ordinary", False)
+        if not isinstance(start, bool):
+            raise ConfigError(f"{key}.ordinary", start, "true or false")
+        for name in values:
+            if name not in names:
+                raise ConfigError(
+                    f"{key}.{name}",
+                    Shown("an unknown key"),
+                    f"a key of this table: ordinary, {', '.join(names)}",
+                )
+        try:
+            return dataclasses.replace(cls.ordinary() if start else cls(), **values)
+        except ConfigError as error:
+            raise ConfigError(f"{key}.{error.key}", error.got, error.allowed) from None
+
+
+def _checked(name: str, value: object, least: float, greatest: float, unit: str) -> object:
+    """Return a number as a float, or a pair of them as a tuple. Raises ConfigError if it is not allowed."""
+    allowed = f"a number from {least:g} to {greatest:g} {unit}".rstrip()
+    if not name.startswith("creep"):
+        return _number(name, value, least, greatest, allowed)
+    if not (isinstance(value, tuple | list) and len(value) == 2):
+        raise ConfigError(name, value, f"two numbers, each {allowed}")
+    return tuple(_number(f"{name}[{i}]", each, least, greatest, allowed) for i, each in enumerate(value))
+
+
+def _number(name: str, value: object, least: float, greatest: float, allowed: str) -> float:
+    """Return a value as a float. Raises ConfigError if it is not a number from ``least`` to ``greatest``."""
+    if isinstance(value, bool) or not isinstance(value, int | float) or not least <= value <= greatest:
+        raise ConfigError(name, value, allowed)
+    return float(value)
+
+
+EXACT: Final = Imperfections()
+"""A patch that equals its layout."""

@@ -1,0 +1,200 @@
+"""Resistances of a patch as it was made, at any time of a scene."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Final
+
+import numpy as np
+
+from skinnode.model.layout import Float, PatchLayout
+from vcan_sim.skin.body import Draws, made
+from vcan_sim.skin.crossbar import Side, floating_ohm, grounded_ohm, merged
+from vcan_sim.skin.forward import ExactForward, Paths
+from vcan_sim.skin.front_end import FrontEnd
+from vcan_sim.skin.history import History
+from vcan_sim.skin.imperfections import EXACT, Imperfections
+
+ROW_STEP_S: Final = 1e-3
+"""Maximum time over which the motion between the samples of two upper wires is taken as linear, s."""
+
+Surface = Callable[[float], Float]
+"""Function of the time in s that returns the upper electrodes (U, N, 3) in m of a patch that equals its
+layout: ``layout.upper_m`` itself at rest, as :meth:`vcan_sim.scene.Scene.upper_m` does."""
+
+
+class PhysicalPatch:
+    """A patch as it was made, and its read-out.
+
+    An electrode moves as the same electrode of the exact patch does, although the body lies elsewhere by its
+    placement; hysteresis and creep change that motion. The same arguments give the same bytes in whatever
+    order times are asked. With exact imperfections, the resistances are those of :class:`ExactForward`, to
+    the bit and at its cost.
+
+    In a read-out through the network, the paths of each upper wire are those at the time of its own sample;
+    while another upper wire is sampled, they differ by the motion in the meantime, which changes sneak
+    currents only.
+
+    Args:
+        layout: Layout of the patch, which a host knows.
+        imperfections: Departures from the layout.
+        number: Number of the patch in the hand; each number has its own draws.
+
+    Raises:
+        ConfigError: The draws bring an upper and a lower electrode too close to each other.
+    """
+
+    def __init__(self, layout: PatchLayout, imperfections: Imperfections = EXACT, number: int = 0) -> None:
+        self.layout, self.imperfections = layout, imperfections
+        draws = Draws(imperfections.seed, number)
+        body = made(layout, imperfections, draws)
+        self.rest_m: Final = body.upper_m
+        """(U, N, 3) float64, m: upper electrodes at rest, as they lie."""
+        self.lower_m: Final = body.lower_m
+        """(K, M, 3) float64, m: lower electrodes, as they lie."""
+        self._electrodes = (*layout.upper_m.shape[:2], *layout.lower_m.shape[:2])
+        self._exact = ExactForward(self._electrodes, body.lower_m, layout.resistivity_ohm_per_m)
+        self._pointlike = not (
+            imperfections.electrode_radius or imperfections.strain or imperfections.readout != "ideal"
+        )
+        radius_m = imperfections.electrode_radius * layout.pitch_m
+        self._paths = Paths(body.upper_m, body.lower_m, radius_m, imperfections.strain)
+        self._sides = self._network(draws)
+        remembers = any(imperfections.creep) or imperfections.hysteresis
+        self._history = History(imperfections, layout.height_m) if remembers else None
+        wires = self._electrodes[0]
+        self._row_s = imperfections.row_time_s * np.arange(wires)
+        cold = np.ones((wires, 1))
+        at_rest_ohm = self._network_ohm(body.upper_m, cold)
+        self._front_end = FrontEnd(imperfections, draws, at_rest_ohm)
+        self.rest_ohm: Final = self._front_end.amplified_ohm(at_rest_ohm)
+        """(U, K) float64, ohm: resistances at rest at time 0, before the converter."""
+
+    def upper_m(self, t_s: float, upper_m_at: Surface) -> Float:
+        """Return the true positions of the upper electrodes while the patch is scanned.
+
+        Args:
+            t_s: Time of the scan since the scene's start, s: the sample of the first upper wire.
+            upper_m_at: Motion of the exact patch, a pure function.
+
+        Returns:
+            (U, N, 3) float64, m: upper wire u at ``t_s + u · row_time_s``; ``layout.upper_m`` itself if the
+            patch lies exactly and rests. Subtract :attr:`rest_m` for the displacement, which a solver
+            estimates; the positions themselves depend on the placement, which no solver knows.
+        """
+        if not self.imperfections.row_time_s:
+            return self._upper_m(t_s, upper_m_at)
+        spans = max(1, math.ceil(self._row_s[-1] / ROW_STEP_S))
+        knots = np.linspace(0.0, self._row_s[-1], spans + 1)
+        at = [self._upper_m(t_s + float(knot), upper_m_at) for knot in knots]
+        if all(each is self.rest_m for each in at):
+            return self.rest_m
+        span = np.clip(np.searchsorted(knots, self._row_s, side="right") - 1, 0, spans - 1)
+        share = ((self._row_s - knots[span]) / (knots[1] - knots[0]))[:, None, None]
+        wires, every = np.arange(len(self._row_s)), np.stack(at)
+        return np.asarray((1.0 - share) * every[span, wires] + share * every[span + 1, wires])
+
+    def analogue_ohm(self, t_s: float, upper_m_at: Surface) -> Float:
+        """Return the resistances (U, K) in ohm that the converter's input stands for.
+
+        Args:
+            t_s: Time of the scan since the scene's start, s.
+            upper_m_at: Motion of the exact patch, a pure function.
+        """
+        upper_m = self.upper_m(t_s, upper_m_at)
+        if upper_m is self.rest_m and not self.imperfections.warming_k:
+            return self.rest_ohm
+        return self._front_end.amplified_ohm(self._network_ohm(upper_m, self._warmth(t_s)))
+
+    def converted_ohm(self, analogue_ohm: Float, reading: int) -> Float:
+        """Return what the converter makes of the resistances at its input.
+
+        Args:
+            analogue_ohm: (U, K) float64, ohm.
+            reading: Number of the reading, at least 0, which decides the noise.
+
+        Returns:
+            (U, K) float64, ohm; the same array if the converter is exact.
+        """
+        return self._front_end.converted_ohm(analogue_ohm, reading)
+
+    def resistance_ohm(self, t_s: float, upper_m_at: Surface) -> Float:
+        """Return the resistances (U, K) in ohm that the converter returns for a scan.
+
+        The noise is decided by the time in whole nanoseconds.
+
+        Args:
+            t_s: Time of the scan since the scene's start, s.
+            upper_m_at: Motion of the exact patch, a pure function.
+        """
+        return self.converted_ohm(self.analogue_ohm(t_s, upper_m_at), abs(round(t_s * 1e9)))
+
+    def _upper_m(self, t_s: float, upper_m_at: Surface) -> Float:
+        """Return the true positions (U, N, 3) at one time; ``rest_m`` itself at rest."""
+        layout_m = self.layout.upper_m
+        if self._history is None:
+            upper = upper_m_at(t_s)
+            if self.rest_m is layout_m or upper is layout_m:
+                return self.rest_m if upper is layout_m else upper
+            return np.asarray(self.rest_m + (upper - layout_m))
+        moved = self._history.displacement_m(t_s, _Motion(upper_m_at, layout_m))
+        return self.rest_m if moved is None else np.asarray(self.rest_m + moved)
+
+    def _warmth(self, t_s: float) -> Float:
+        """Return the resistivity (U, 1) of the paths of each upper wire at its sample, relative to time 0."""
+        sizes = self.imperfections
+        since_s = np.maximum(t_s + self._row_s, 0.0)
+        risen_k = -sizes.warming_k * np.expm1(-since_s / sizes.warming_s)
+        return np.asarray(1.0 + sizes.temperature_per_k * risen_k)[:, None]
+
+    def _network(self, draws: Draws) -> tuple[Side, Side]:
+        """Return the upper and the lower wires with their resistances."""
+        sizes = self.imperfections
+        upper, per_upper, lower, per_lower = self._electrodes
+        contact_ohm = sizes.contact_ohm * draws.stream("contacts").uniform(0.5, 1.5, upper + lower)
+        return (
+            Side(contact_ohm[:upper] + sizes.multiplexer_ohm, sizes.upper_wire_ohm, per_upper),
+            Side(contact_ohm[upper:] + sizes.virtual_ground_ohm, sizes.lower_wire_ohm, per_lower),
+        )
+
+    def _network_ohm(self, upper_m: Float, warmth: Float) -> Float:
+        """Return the resistances (U, K) in ohm that reach the amplifier.
+
+        Args:
+            upper_m: (U, N, 3) float64, m: upper electrodes.
+            warmth: (U, 1) float64: resistivity relative to the layout's.
+        """
+        if self._pointlike:
+            exact_ohm = self._exact(upper_m)
+            return exact_ohm * warmth if self.imperfections.warming_k else exact_ohm
+        paths = self._paths(upper_m)
+        resistivity = self.layout.resistivity_ohm_per_m * np.repeat(warmth, self._electrodes[1], axis=0)
+        if self.imperfections.readout == "ideal":
+            potential = paths.reshape(self._electrodes).sum(axis=(1, 3))
+            return np.asarray(self.layout.resistivity_ohm_per_m * warmth / potential)
+        upper, lower = self._sides
+        conductance = merged(paths / resistivity, upper, lower, self._electrodes)
+        solve = grounded_ohm if self.imperfections.readout == "grounded" else floating_ohm
+        return solve(conductance, upper, lower)
+
+
+class _Motion:
+    """Displacement of the exact patch as a function of time; None at rest.
+
+    Two motions are equal if they wrap the same function, so that the history knows a new scene.
+    """
+
+    __slots__ = ("_layout_m", "_upper_m_at")
+
+    def __init__(self, upper_m_at: Surface, layout_m: Float) -> None:
+        self._upper_m_at, self._layout_m = upper_m_at, layout_m
+
+    def __call__(self, t_s: float) -> Float | None:
+        upper = self._upper_m_at(t_s)
+        return None if upper is self._layout_m else np.asarray(upper - self._layout_m)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Motion) and self._upper_m_at == other._upper_m_at
+
+    __hash__ = None  # type: ignore[assignment]  # equal by a function that need not be hashable

@@ -2,8 +2,9 @@
 
 ::
 
-    scene (true deformation) -> sensor (resistances, wire faults) -> faulty_node (the real node)
-        -> faulty_scans (scan faults) -> fleet (all nodes on their buses) -> command (vcan-sim)
+    scene (true deformation) -> skin (the patch as made and read out) -> sensor (readings, wire faults)
+        -> faulty_node (the real node) -> faulty_scans (scan faults) -> fleet (all nodes on their buses)
+        -> command (vcan-sim)
 
 ``contact`` has contact mechanics on a bonded layer, apart from all models of the product; scenes do not use
 it yet. ``faults`` declares the faults, ``injector`` draws and counts faults, ``tally`` counts frames by kind.

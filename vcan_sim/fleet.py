@@ -63,7 +63,7 @@ class Fleet:
 
     Raises:
         ConfigError: A channel is given for a hand with several buses, imperfections name a patch that the
-            hand does not have, or the draws of a patch bring electrodes too close to each other.
+            hand does not have, or the draws of a patch leave too small a gap between electrodes.
     """
 
     def __init__(  # noqa: PLR0913 - keyword arguments, most of them rarely given

@@ -38,7 +38,7 @@ class SimulatedPatch:
         imperfections: Departures of the patch from its layout; drawn for the scene's number.
 
     Raises:
-        ConfigError: The draws bring an upper and a lower electrode too close to each other.
+        ConfigError: The draws leave too small a gap between an upper and a lower electrode.
     """
 
     def __init__(

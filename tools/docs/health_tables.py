@@ -11,6 +11,7 @@ import markdown_text as md
 
 from skinnode.host.health import Condition
 from vcan_sim.faults import OF_CHUNKS, OF_SCANS, OF_WIRES, Faults
+from vcan_sim.skin.imperfections import Imperfections
 
 _PLAIN: Final = {
     "NEVER_SEEN": "No frame from the patch has arrived since the host started.",
@@ -47,4 +48,24 @@ def faults() -> str:
     return md.table(("fault", "value", "what happens"), rows)
 
 
-TABLES: Final[dict[str, Callable[[], str]]] = {"conditions": conditions, "injected-faults": faults}
+def imperfections() -> str:
+    """Return the table of the imperfections of a simulated patch, with the sizes of an ordinary patch."""
+    docs, ordinary = md.member_docs(Imperfections), Imperfections.ordinary()
+    rows = [
+        (md.code(name), docs[name], _size(getattr(ordinary, name)))
+        for name in inspect.get_annotations(Imperfections)
+    ]
+    return md.table(("name", "what it is", "ordinary"), rows)
+
+
+def _size(value: object) -> str:
+    if isinstance(value, tuple):
+        return ", ".join(map(_size, value))
+    return f"{value:g}" if isinstance(value, float) else str(value)
+
+
+TABLES: Final[dict[str, Callable[[], str]]] = {
+    "conditions": conditions,
+    "injected-faults": faults,
+    "imperfections": imperfections,
+}

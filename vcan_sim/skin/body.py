@@ -6,15 +6,16 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
-from skinnode.errors import ConfigError
+from skinnode.errors import ConfigError, Shown
 from skinnode.model.layout import Float, PatchLayout
 from vcan_sim.skin.imperfections import Imperfections
 
 CLIPPED_AT: Final = 3.0
 """Largest normal draw, standard deviations."""
-_CLOSEST: Final = 0.1
-"""Least distance between an upper and a lower electrode, as a fraction of the same distance in the layout."""
+_LEAST_LEFT: Final = 0.1
+"""Least fraction of the gap between an upper electrode and the nearest lower electrode that must be left."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,15 +64,19 @@ def made(layout: PatchLayout, imperfections: Imperfections, draws: Draws) -> Bod
         The electrodes; the arrays of the layout where nothing moves them.
 
     Raises:
-        ConfigError: The draws bring an upper and a lower electrode too close to each other.
+        ConfigError: The draws leave too small a gap between an upper and a lower electrode.
     """
     sizes, upper, lower = imperfections, layout.upper_m, layout.lower_m
+    if not (sizes.placement or sizes.along or sizes.thickness or sizes.tilt):
+        return Body(upper, lower)
+    nearest = _nearest(layout)
+    gap = upper - lower.reshape(-1, 3)[nearest]
     if sizes.thickness or sizes.tilt:
         rise = sizes.thickness * float(draws.normal("thickness", 1)[0])
         slope = sizes.tilt * draws.normal("tilt", 2)
         across = _from_middle(layout.upper_m)
         upper = upper.copy()
-        upper[..., 2] += _height_m(layout) * (rise + across @ slope)
+        upper[..., 2] += gap[..., 2] * (rise + across @ slope)
     if sizes.along:
         size_m = sizes.along * layout.pitch_m
         upper = upper + size_m * draws.normal("along upper", *upper.shape[:2], 1) * _direction(layout.upper_m)
@@ -80,14 +85,13 @@ def made(layout: PatchLayout, imperfections: Imperfections, draws: Draws) -> Bod
         size_m = sizes.placement * layout.pitch_m
         upper = upper + size_m * draws.normal("placement upper", len(upper), 1, 3)
         lower = lower + size_m * draws.normal("placement lower", len(lower), 1, 3)
-    if upper is not layout.upper_m or lower is not layout.lower_m:
-        planned_m, found_m = _closest_m(layout.upper_m, layout.lower_m), _closest_m(upper, lower)
-        if found_m < _CLOSEST * planned_m:
-            raise ConfigError(
-                "placement, along, thickness, tilt",
-                f"{found_m:.2g} m between an upper and a lower electrode",
-                f"draws that leave at least {_CLOSEST * planned_m:.2g} m: smaller sizes or another seed",
-            )
+    left = ((upper - lower.reshape(-1, 3)[nearest]) * gap).sum(axis=-1) / (gap**2).sum(axis=-1)
+    if left.min() < _LEAST_LEFT:
+        raise ConfigError(
+            "placement, along, thickness, tilt",
+            Shown(f"draws that leave {left.min():.0%} of the gap at an electrode"),
+            f"at least {_LEAST_LEFT:.0%}; use smaller sizes or another seed",
+        )
     return Body(upper, lower)
 
 
@@ -99,12 +103,10 @@ def _from_middle(points_m: Float) -> Float:
     return np.asarray((plane - 0.5 * (low + high)) / np.where(half > 0.0, half, 1.0))
 
 
-def _height_m(layout: PatchLayout) -> Float:
-    """Return the height (U, N) in m of each upper electrode over the nearest lower electrode, along z."""
-    lower = layout.lower_m.reshape(-1, 3)
-    gap = layout.upper_m[:, :, None] - lower
-    nearest = np.argmin((gap**2).sum(axis=-1), axis=-1)
-    return np.asarray(layout.upper_m[..., 2] - lower[nearest, 2])
+def _nearest(layout: PatchLayout) -> NDArray[np.intp]:
+    """Return the index (U, N) of the lower electrode, among all K M, that is nearest to each upper one."""
+    gap = layout.upper_m[:, :, None] - layout.lower_m.reshape(-1, 3)
+    return np.asarray(np.argmin((gap**2).sum(axis=-1), axis=-1))
 
 
 def _direction(wires_m: Float) -> Float:
@@ -114,8 +116,3 @@ def _direction(wires_m: Float) -> Float:
     steps = np.gradient(wires_m, axis=1)
     length = np.linalg.norm(steps, axis=2, keepdims=True)
     return np.asarray(steps / np.where(length > 0.0, length, 1.0))
-
-
-def _closest_m(upper_m: Float, lower_m: Float) -> float:
-    gaps = upper_m.reshape(-1, 1, 3) - lower_m.reshape(1, -1, 3)
-    return float(np.sqrt(np.min(np.einsum("abi,abi->ab", gaps, gaps))))

@@ -78,23 +78,6 @@ class Side:
         return diagonal.ravel(), beside.ravel()
 
 
-def merged(paths: Float, upper: Side, lower: Side, electrodes: tuple[int, int, int, int]) -> Float:
-    """Return the conductances between the nodes of the two sides.
-
-    Args:
-        paths: (U N, K M) float64, S: conductances of the paths.
-        upper: Upper wires.
-        lower: Lower wires.
-        electrodes: (U, N, K, M).
-
-    Returns:
-        (U or U N, K or K M) float64, S.
-    """
-    axes = tuple(axis for axis, side in ((1, upper), (3, lower)) if side.nodes == 1)
-    whole = paths.reshape(electrodes).sum(axis=axes, keepdims=True)
-    return np.asarray(whole.reshape(whole.shape[0] * whole.shape[1], -1))
-
-
 def grounded_ohm(conductance: Float, upper: Side, lower: Side) -> Float:
     """Return the resistances (U, K) in ohm that amplifiers at the lower wires measure.
 
@@ -103,7 +86,7 @@ def grounded_ohm(conductance: Float, upper: Side, lower: Side) -> Float:
     it is the resistance of the crossing.
 
     Args:
-        conductance: Conductances between the nodes, S, from :func:`merged`.
+        conductance: Conductances (upper nodes, lower nodes) of the paths between nodes, S.
         upper: Upper wires.
         lower: Lower wires.
     """
@@ -129,7 +112,7 @@ def floating_ohm(conductance: Float, upper: Side, lower: Side) -> Float:
     series with the two wires.
 
     Args:
-        conductance: Conductances between the nodes, S, from :func:`merged`.
+        conductance: Conductances (upper nodes, lower nodes) of the paths between nodes, S.
         upper: Upper wires.
         lower: Lower wires.
     """

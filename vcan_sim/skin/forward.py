@@ -18,6 +18,7 @@ strain              ρ of a path becomes ρ (1 + β ε), with the strain ε = d/
 from __future__ import annotations
 
 import math
+import threading
 
 import numpy as np
 
@@ -68,38 +69,57 @@ class Paths:
         self._lower = np.ascontiguousarray(lower_m.reshape(-1, 3).T)
         self._radius_m = math.sqrt(2.0) * radius_m
         self._strain = strain
+        # new arrays of this size would cost more time than the arithmetic, by mapping their pages
+        self._work = np.empty((3, upper_m.size // 3, self._lower.shape[1]))
+        self._lock = threading.Lock()
         self._per_m: Float | None = None
         if strain:
-            plane, normal = self._squares(upper_m)
-            self._per_m = strain / np.sqrt(plane + normal)
+            self._per_m = strain / np.sqrt(self._squares(upper_m)[1])
 
-    def __call__(self, upper_m: Float) -> Float:
-        """Return the conductances (U N, K M) in 1/m for upper electrodes (U, N, 3) in m.
+    def sums(self, upper_m: Float, shape: tuple[int, ...], axes: tuple[int, ...]) -> Float:
+        """Return sums of the conductances of paths.
 
-        They become siemens when divided by the resistivity in ohm/m.
+        Args:
+            upper_m: (U, N, 3) float64, m: upper electrodes.
+            shape: (U, N, K, M).
+            axes: Axes to sum over, among 1 and 3.
+
+        Returns:
+            (U, N or 1, K, M or 1) float64, 1/m; siemens when divided by the resistivity in ohm/m.
         """
-        plane, normal = self._squares(upper_m)
-        square = plane + normal
+        with self._lock:
+            return np.asarray(self._each(upper_m).reshape(shape).sum(axis=axes, keepdims=True))
+
+    def _each(self, upper_m: Float) -> Float:
+        """Return the conductances (U N, K M) in 1/m, in an array that the next call overwrites."""
+        plane, square = self._squares(upper_m)
+        found: Float = self._work[2]
         with np.errstate(divide="ignore"):
-            found = _disc(plane, square, self._radius_m) if self._radius_m else 1.0 / np.sqrt(square)
+            if self._radius_m:
+                _disc(plane, square, self._radius_m, out=found)
+            else:
+                np.divide(1.0, np.sqrt(square, out=found), out=found)
         if self._per_m is not None:
-            found /= 1.0 - self._strain + self._per_m * np.sqrt(square)
+            factor = np.sqrt(square, out=plane)
+            factor *= self._per_m
+            factor += 1.0 - self._strain
+            found /= factor
         return found
 
     def _squares(self, upper_m: Float) -> tuple[Float, Float]:
-        """Return the squared distances (U N, K M) in m², within the x-y plane and along z."""
-        dx, dy, dz = (
-            here[:, None] - there for here, there in zip(upper_m.reshape(-1, 3).T, self._lower, strict=True)
-        )
-        dx *= dx
-        dy *= dy
-        dz *= dz
-        dx += dy
-        return dx, dz
+        """Return the squared distances (U N, K M) in m², within the x-y plane and in all, in work arrays."""
+        here, there = np.ascontiguousarray(upper_m.reshape(-1, 3).T), self._lower
+        plane, square, gap = self._work
+        for axis, out in ((0, plane), (1, gap), (2, square)):
+            np.subtract(here[axis][:, None], there[axis], out=out)
+            np.multiply(out, out, out=out)
+        plane += gap
+        square += plane
+        return plane, square
 
 
-def _disc(plane: Float, square: Float, radius_m: float) -> Float:
-    """Return the potential in 1/m of a conducting disc of unit charge.
+def _disc(plane: Float, square: Float, radius_m: float, out: Float) -> None:
+    """Write the potential in 1/m of a conducting disc of unit charge; overwrites ``plane``.
 
     (l₁ + l₂)² / 4 = (s + √(s² − 4 a² p)) / 2 with s = d² + a², as l₁² l₂² = s² − 4 a² p.
 
@@ -107,17 +127,20 @@ def _disc(plane: Float, square: Float, radius_m: float) -> Float:
         plane: p, squared distances in m² from the disc's axis.
         square: d², squared distances in m² from the disc's centre.
         radius_m: a, radius in m.
+        out: Receives the potentials.
     """
     a2 = radius_m * radius_m
-    s = square + a2
-    root = s * s - 4.0 * a2 * plane
-    np.maximum(root, 0.0, out=root)
-    np.sqrt(root, out=root)
-    root += s
-    root *= 0.5
-    np.sqrt(root, out=root)
-    np.divide(radius_m, root, out=root)
-    np.minimum(root, 1.0, out=root)
-    np.arcsin(root, out=root)
-    root /= radius_m
-    return root
+    np.multiply(plane, 4.0 * a2, out=plane)
+    np.add(square, a2, out=out)
+    np.multiply(out, out, out=out)
+    out -= plane
+    np.maximum(out, 0.0, out=out)
+    np.sqrt(out, out=out)
+    out += square
+    out += a2
+    out *= 0.5
+    np.sqrt(out, out=out)
+    np.divide(radius_m, out, out=out)
+    np.minimum(out, 1.0, out=out)
+    np.arcsin(out, out=out)
+    out /= radius_m

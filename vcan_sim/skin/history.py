@@ -29,13 +29,13 @@ import numpy as np
 from skinnode.model.layout import Float
 from vcan_sim.skin.imperfections import Imperfections
 
-STEP_S: Final = 1.0 / 64.0
+STEP_S: Final = 1.0 / 32.0
 """Time step of the state, s; a power of two, so that the times of the steps are exact."""
 THRESHOLDS: Final = (0.0025, 0.005, 0.01, 0.02)
 """Thresholds r of the play operators, clearances; the operators have equal weights."""
-_RECENT: Final = 256
+_RECENT: Final = 128
 """Number of states of consecutive steps that are kept."""
-_KEPT_EVERY: Final = 128
+_KEPT_EVERY: Final = 64
 """Number of steps between the states that are kept longer: 2 s."""
 _KEPT: Final = 300
 """Number of these states that are kept, for ten minutes; of the older ones, every ``_THINNED`` th."""

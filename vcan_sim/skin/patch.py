@@ -10,7 +10,7 @@ import numpy as np
 
 from skinnode.model.layout import Float, PatchLayout
 from vcan_sim.skin.body import Draws, made
-from vcan_sim.skin.crossbar import Side, floating_ohm, grounded_ohm, merged
+from vcan_sim.skin.crossbar import Side, floating_ohm, grounded_ohm
 from vcan_sim.skin.forward import ExactForward, Paths
 from vcan_sim.skin.front_end import FrontEnd
 from vcan_sim.skin.history import History
@@ -42,7 +42,7 @@ class PhysicalPatch:
         number: Number of the patch in the hand; each number has its own draws.
 
     Raises:
-        ConfigError: The draws bring an upper and a lower electrode too close to each other.
+        ConfigError: The draws leave too small a gap between an upper and a lower electrode.
     """
 
     def __init__(self, layout: PatchLayout, imperfections: Imperfections = EXACT, number: int = 0) -> None:
@@ -168,13 +168,13 @@ class PhysicalPatch:
         if self._pointlike:
             exact_ohm = self._exact(upper_m)
             return exact_ohm * warmth if self.imperfections.warming_k else exact_ohm
-        paths = self._paths(upper_m)
-        resistivity = self.layout.resistivity_ohm_per_m * np.repeat(warmth, self._electrodes[1], axis=0)
+        resistivity = self.layout.resistivity_ohm_per_m * warmth
         if self.imperfections.readout == "ideal":
-            potential = paths.reshape(self._electrodes).sum(axis=(1, 3))
-            return np.asarray(self.layout.resistivity_ohm_per_m * warmth / potential)
+            return np.asarray(resistivity / self._paths.sums(upper_m, self._electrodes, (1, 3))[:, 0, :, 0])
         upper, lower = self._sides
-        conductance = merged(paths / resistivity, upper, lower, self._electrodes)
+        alone = tuple(axis for axis, side in ((1, upper), (3, lower)) if side.nodes == 1)
+        paths = self._paths.sums(upper_m, self._electrodes, alone) / resistivity[..., None, None]
+        conductance = paths.reshape(paths.shape[0] * paths.shape[1], -1)
         solve = grounded_ohm if self.imperfections.readout == "grounded" else floating_ohm
         return solve(conductance, upper, lower)
 

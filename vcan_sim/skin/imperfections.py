@@ -149,8 +149,8 @@ class Imperfections:
         """Return the sizes of a patch from a good workshop, as ``tolerances = "ordinary"`` states them.
 
         The gain, the placement, the thickness and the radius are those of
-        :data:`skinnode.model.tolerances.ORDINARY`; creep and hysteresis are typical of filled silicone. The
-        temperature is constant, because a host without ``drift`` would see displacement in it.
+        :data:`skinnode.model.tolerances.ORDINARY`; the other sizes are assumptions. The temperature is
+        constant and the read-out ideal, because the tolerances do not cover their effects.
 
         Args:
             seed: Random seed.

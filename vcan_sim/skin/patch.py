@@ -69,7 +69,9 @@ class PhysicalPatch:
         at_rest_ohm = self._network_ohm(body.upper_m, cold)
         self._front_end = FrontEnd(imperfections, draws, at_rest_ohm)
         self.rest_ohm: Final = self._front_end.amplified_ohm(at_rest_ohm)
-        """(U, K) float64, ohm: resistances at rest at time 0, before the converter."""
+        """(U, K) float64, ohm: resistances at rest at time 0, before the converter; read-only."""
+        for shared in (self.rest_m, self.lower_m, self.rest_ohm):
+            shared.setflags(write=False)
 
     def upper_m(self, t_s: float, upper_m_at: Surface) -> Float:
         """Return the true positions of the upper electrodes while the patch is scanned.

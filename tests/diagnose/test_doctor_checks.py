@@ -169,7 +169,7 @@ def stroked(layout: PatchLayout, seed: int, period_s: float = 0.08, **simulation
     skin = SimulatedPatch(scene)
     skin.start(0)
     times_ns = (1e9 * (1.0 + 0.37 * seed % 4.0 + period_s * np.arange(50))).astype(np.int64)
-    ratio = np.stack([skin.read(int(t_ns)) for t_ns in times_ns]) / SimulatedPatch(scene)._rest_ohm
+    ratio = np.stack([skin.read(int(t_ns)) for t_ns in times_ns]) / SimulatedPatch(scene).skin.rest_ohm
     return np.asarray(np.rint(ratio / STEP) * STEP)
 
 

@@ -375,6 +375,8 @@ def test_a_time_long_ago_gives_the_same_bytes() -> None:
     times = (3.3, 131.7, 700.0)
     found = [skin.upper_m(t_s, motion).tobytes() for t_s in times]
     assert [skin.upper_m(t_s, motion).tobytes() for t_s in reversed(times)] == found[::-1]
+    assert skin._history is not None
+    assert len(skin._history._kept) < 310  # of 22,400 states
 
 
 def test_another_motion_starts_another_history() -> None:
@@ -465,6 +467,25 @@ def test_each_upper_wire_is_read_at_its_own_time(row_time_s: float) -> None:
                 np.testing.assert_allclose(found[u], exact.resistance_ohm(at, motion)[u], rtol=within)
                 np.testing.assert_allclose(truth[u], motion(at)[u], atol=1e-3 * within)
     assert skin.upper_m(0.0, at_rest) is LAYOUT.upper_m
+
+
+@pytest.mark.parametrize("row_time_s", [0.3e-3, 0.7e-3, 5e-3])
+def test_motion_between_rows_is_linear_over_a_millisecond_at_most(row_time_s: float) -> None:
+    """Under a constant acceleration a, the chord of an interval h is at most a h²/8 off."""
+    skin, acceleration = PhysicalPatch(LAYOUT, Imperfections(row_time_s=row_time_s)), -2.0
+    motion = moved_to(lambda t_s: 0.5 * acceleration * t_s * t_s)
+    truth = skin.upper_m(0.01, motion)
+    off = [float(np.abs(truth[u] - motion(0.01 + u * row_time_s)[u]).max()) for u in range(4)]
+    assert max(off) <= abs(acceleration) * 1e-6 / 8
+    assert off[0] < 1e-17
+    assert off[3] < 1e-17
+
+
+def test_each_upper_wire_has_the_temperature_of_its_own_time() -> None:
+    sizes = Imperfections(warming_k=20.0, temperature_per_k=5e-3, warming_s=0.1, row_time_s=0.02)
+    found = PhysicalPatch(LAYOUT, sizes).resistance_ohm(0.05, at_rest) / direct_sum(LAYOUT, LAYOUT.upper_m)
+    expected = 1.0 + 0.1 * (1.0 - np.exp(-(0.05 + 0.02 * np.arange(4)) / 0.1))
+    np.testing.assert_allclose(found, np.broadcast_to(expected[:, None], found.shape), rtol=1e-13)
 
 
 # --- seeds

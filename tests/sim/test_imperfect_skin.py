@@ -469,14 +469,15 @@ def test_each_upper_wire_is_read_at_its_own_time(row_time_s: float) -> None:
     assert skin.upper_m(0.0, at_rest) is LAYOUT.upper_m
 
 
-@pytest.mark.parametrize("row_time_s", [0.3e-3, 0.7e-3, 5e-3])
+@pytest.mark.parametrize("row_time_s", [0.3e-3, 0.4e-3, 1.2e-3])
 def test_motion_between_rows_is_linear_over_a_millisecond_at_most(row_time_s: float) -> None:
     """Under a constant acceleration a, the chord of an interval h is at most a h²/8 off."""
     skin, acceleration = PhysicalPatch(LAYOUT, Imperfections(row_time_s=row_time_s)), -2.0
     motion = moved_to(lambda t_s: 0.5 * acceleration * t_s * t_s)
     truth = skin.upper_m(0.01, motion)
     off = [float(np.abs(truth[u] - motion(0.01 + u * row_time_s)[u]).max()) for u in range(4)]
-    assert max(off) <= abs(acceleration) * 1e-6 / 8
+    interval_s = 3 * row_time_s / math.ceil(3 * row_time_s / 1e-3)
+    assert max(off) <= abs(acceleration) * interval_s**2 / 8
     assert off[0] < 1e-17
     assert off[3] < 1e-17
 

@@ -9,8 +9,8 @@ CRC and stuffing are computed bytewise with tables. The head of a frame is padde
 For the CRC, the padding consists of zeros, which leave the CRC at 0. For stuffing, it consists of alternating
 bits that end in a 1, so the dominant start of frame begins a new run.
 
-All CAN FD frames considered here have an 11-bit identifier and switch the bit rate. Bit stuffing follows the
-same rule up to the end of the data. The CRC field holds a 4-bit stuff count, 17 CRC bits (21 for more than 16
+The CAN FD frames of a hand have an 11-bit identifier and switch the bit rate; only :func:`exact_fd_bits` counts
+other CAN FD frames. Bit stuffing follows the same rule up to the end of the data. The CRC field holds a 4-bit stuff count, 17 CRC bits (21 for more than 16
 data bytes), and fixed stuff bits: one at the start of the field and one after every 4 bits. The bits from ESI
 to the CRC delimiter are sent at the data bit rate. The 17 bits before them and the 12 bits after them (ACK
 slot, ACK delimiter, 7-bit end of frame and 3-bit inter-frame space) are sent at the nominal bit rate.
@@ -40,6 +40,8 @@ from skinnode.errors import ConfigError
 from skinnode.text.words import counted
 
 _EXTENDED_HEAD_BITS: Final = 39  # SOF, 11-bit base ID, SRR, IDE, 18-bit extension, RTR, r1, r0, 4-bit DLC
+_EXTENDED_FD_NOMINAL_BITS: Final = FD_NOMINAL_BITS + 19  # SRR, 18-bit extension
+_FD_CODES: Final = {length: code for code, length in enumerate(FD_LENGTHS)}
 _RUN: Final = 5
 _NO_RUN: Final = 0
 _Int = NDArray[np.int64]
@@ -110,6 +112,58 @@ def exact_bits(
         stuff += stuffed[at]
         run = next_run[at]
     return n_bits + stuff + TAIL_BITS
+
+
+def exact_fd_bits(
+    can_id: int, data: bytes, *, extended: bool = False, brs: bool = True, esi: bool = False
+) -> tuple[int, int]:
+    """Return the number of bits that a CAN FD frame takes on the bus, including the inter-frame space.
+
+    Args:
+        can_id: identifier.
+        data: data bytes.
+        extended: whether the identifier has 29 bits.
+        brs: whether the frame switches to the data bit rate; otherwise all bits have the nominal bit rate.
+        esi: whether the error state indicator is recessive, as sent by an error-passive node.
+
+    Returns:
+        Bits at the nominal and at the data bit rate.
+
+    Raises:
+        ValueError: if the identifier does not fit, or the length is not valid in CAN FD.
+    """
+    if not 0 <= can_id < 1 << (29 if extended else 11):
+        raise ValueError(f"can_id: got 0x{can_id:X}, must fit {29 if extended else 11} bits")
+    code = _FD_CODES.get(len(data))
+    if code is None:
+        raise ValueError(f"data: got {counted(len(data), 'byte')}, must be one of {FD_LENGTHS}")
+    # FDF, res, BRS, ESI and the length code are the last byte of the head. FDF and res differ, and so do res
+    # and BRS if the bit rate is switched, so no stuff bit falls between FDF and ESI.
+    last = 0x80 | brs << 5 | esi << 4 | code
+    if extended:  # filler, SOF, base identifier, SRR, IDE, identifier extension, RRS
+        before = (0b1010101 << 33 | (can_id >> 18) << 21 | 0b11 << 19 | (can_id & 0x3FFFF) << 1).to_bytes(5)
+        nominal = _EXTENDED_FD_NOMINAL_BITS
+    else:  # filler, SOF, identifier, RRS, IDE
+        before = (0b01 << 14 | can_id << 2).to_bytes(2)
+        nominal = FD_NOMINAL_BITS
+    _, next_run, stuffed = tables()
+    run, stuff = _NO_RUN, 0
+    for byte in before:
+        at = run << 8 | byte
+        stuff += stuffed[at]
+        run = next_run[at]
+    nominal += stuff
+    stuff = 0
+    for byte in (last, *data):
+        at = run << 8 | byte
+        stuff += stuffed[at]
+        run = next_run[at]
+    # A stuff bit due after the last bit is not sent, because the first fixed stuff bit replaces it.
+    if run - 1 >> 2 != ((data[-1] if data else code) & 1):
+        stuff -= 1
+    crc_bits, fixed = (17, 6) if len(data) <= 16 else (21, 7)
+    fast = 1 + 4 + 8 * len(data) + 4 + crc_bits + fixed + 1 + stuff
+    return (nominal, fast) if brs else (nominal + fast, 0)
 
 
 def fd_bits(can_id: ArrayLike, data: ArrayLike) -> tuple[_Int, _Int]:

@@ -1,0 +1,64 @@
+"""Bit rates, and the unit of time in which all bit times are whole numbers."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import Final
+
+from skinnode.errors import ConfigError
+
+NOMINAL_BPS: Final = range(10_000, 1_000_001)
+"""Nominal bit rates of a high-speed CAN bus, bit/s."""
+
+MAX_DATA_BPS: Final = 8_000_000
+"""Maximum bit rate of the data phase of CAN FD, bit/s."""
+
+
+@dataclass(frozen=True, slots=True)
+class BitRates:
+    """Bit rates of a bus.
+
+    Time is counted in ticks of 1/``ticks_per_s`` s, the longest unit in which a nanosecond, a nominal bit and a
+    data bit are all whole numbers. Time therefore does not drift, however long the bus runs. A tick is 1 ns if
+    both bit times are whole nanoseconds.
+
+    Raises:
+        ConfigError: if a bit rate is out of range.
+    """
+
+    nominal_bps: int = 1_000_000
+    """Nominal bit rate, bit/s."""
+    data_bps: int | None = None
+    """Bit rate of the data phase, bit/s; None for a bus without CAN FD."""
+    ticks_per_s: int = field(init=False)
+    ticks_per_ns: int = field(init=False)
+    nominal_ticks: int = field(init=False)
+    """Nominal bit time, ticks."""
+    data_ticks: int = field(init=False)
+    """Bit time of the data phase, ticks; the nominal bit time on a bus without CAN FD."""
+
+    def __post_init__(self) -> None:
+        if self.nominal_bps not in NOMINAL_BPS:
+            allowed = f"{NOMINAL_BPS.start} to {NOMINAL_BPS.stop - 1} bit/s"
+            raise ConfigError("nominal_bps", self.nominal_bps, allowed)
+        if self.data_bps is not None and not self.nominal_bps <= self.data_bps <= MAX_DATA_BPS:
+            allowed = f"{self.nominal_bps} (nominal_bps) to {MAX_DATA_BPS} bit/s, or None"
+            raise ConfigError("data_bps", self.data_bps, allowed)
+        data_bps = self.data_bps or self.nominal_bps
+        ticks_per_s = math.lcm(10**9, self.nominal_bps, data_bps)
+        for name, value in (
+            ("ticks_per_s", ticks_per_s),
+            ("ticks_per_ns", ticks_per_s // 10**9),
+            ("nominal_ticks", ticks_per_s // self.nominal_bps),
+            ("data_ticks", ticks_per_s // data_bps),
+        ):
+            object.__setattr__(self, name, value)
+
+    def ticks(self, bits: tuple[int, int]) -> int:
+        """Return the duration of a number of nominal bits and a number of data bits, ticks."""
+        return bits[0] * self.nominal_ticks + bits[1] * self.data_ticks
+
+    def ceil_ns(self, ticks: int) -> int:
+        """Return a time in ns, rounded up: an event is never reported before it happens."""
+        return -(-ticks // self.ticks_per_ns)

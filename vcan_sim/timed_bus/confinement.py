@@ -1,0 +1,102 @@
+"""Fault confinement: error counters and error states of a station (ISO 11898-1:2015, 12.1.4)."""
+
+from __future__ import annotations
+
+import enum
+from dataclasses import dataclass
+from typing import Final
+
+PASSIVE_FROM: Final = 128
+"""Lowest value of an error counter that makes a station error-passive."""
+
+BUS_OFF_FROM: Final = 256
+"""Lowest value of the transmit error counter that puts a station in the bus-off state."""
+
+MAX_RECEIVE_ERRORS: Final = 255
+"""Maximum of the receive error counter; the standard sets no limit, controllers count in 7 or 8 bits."""
+
+_BACK_TO_ACTIVE: Final = 119
+"""Receive error counter after a successful reception by a receiver above 127; the standard allows 119 to 127."""
+
+RECOVERY_RUNS: Final = 128
+"""Number of runs of recessive bits that end the bus-off state."""
+
+RECOVERY_RUN_BITS: Final = 11
+"""Length of such a run, bits."""
+
+SUSPEND_BITS: Final = 8
+"""Pause of an error-passive station after its own frame, beyond the intermission, bits."""
+
+
+class ErrorState(enum.StrEnum):
+    """Error state of a station."""
+
+    ACTIVE = "error-active"
+    PASSIVE = "error-passive"
+    BUS_OFF = "bus-off"
+
+
+@dataclass(frozen=True, slots=True)
+class Counters:
+    """Error counters of a station."""
+
+    tec: int = 0
+    """Transmit error counter."""
+    rec: int = 0
+    """Receive error counter."""
+
+    @property
+    def state(self) -> ErrorState:
+        """Error state that results from the counters."""
+        if self.tec >= BUS_OFF_FROM:
+            return ErrorState.BUS_OFF
+        if self.tec >= PASSIVE_FROM or self.rec >= PASSIVE_FROM:
+            return ErrorState.PASSIVE
+        return ErrorState.ACTIVE
+
+
+ZERO: Final = Counters()
+"""Counters of a station after its start or its recovery from bus-off."""
+
+
+def transmission_failed(counters: Counters, *, unanswered: bool = False) -> Counters:
+    """Return the counters of a transmitter that sends an error flag (rule c).
+
+    Args:
+        counters: the counters before.
+        unanswered: whether the error is a missing acknowledgement and no other station sends a dominant bit
+            during the error flag; an error-passive transmitter does not count such an error.
+
+    Returns:
+        The counters after.
+    """
+    if unanswered and counters.state is ErrorState.PASSIVE:
+        return counters
+    return Counters(counters.tec + 8, counters.rec)
+
+
+def reception_failed(counters: Counters, *, first: bool = False) -> Counters:
+    """Return the counters of a receiver that detects an error (rules a and b).
+
+    Args:
+        counters: the counters before.
+        first: whether the receiver detected the error before all other stations, so that it sees a dominant
+            bit after its own error flag.
+
+    Returns:
+        The counters after.
+    """
+    return Counters(counters.tec, min(MAX_RECEIVE_ERRORS, counters.rec + (9 if first else 1)))
+
+
+def transmission_succeeded(counters: Counters) -> Counters:
+    """Return the counters of a transmitter after a successful transmission (rule g)."""
+    return Counters(counters.tec - 1, counters.rec) if counters.tec else counters
+
+
+def reception_succeeded(counters: Counters) -> Counters:
+    """Return the counters of a receiver after a successful reception (rule h)."""
+    if not counters.rec:
+        return counters
+    rec = _BACK_TO_ACTIVE if counters.rec >= PASSIVE_FROM else counters.rec - 1
+    return Counters(counters.tec, rec)

@@ -1,0 +1,94 @@
+"""CAN frames as a station hands them to its controller."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+from skinnode.bus_load.timing import exact_bits, exact_fd_bits
+from skinnode.canopen.data_length import FD_LENGTHS
+
+_VALID_FD_LENGTHS: Final = frozenset(FD_LENGTHS)
+
+
+@dataclass(frozen=True, slots=True)
+class CanFrame:
+    """Data frame or remote frame, classic or CAN FD.
+
+    The error state indicator of a CAN FD frame is not part of it: the controller sends ESI dominant while its
+    station is error-active, and recessive while its station is error-passive.
+
+    Raises:
+        ValueError: if the identifier, the length or the combination of flags is not valid.
+    """
+
+    can_id: int
+    """Identifier of 11 bits, or of 29 bits if ``extended``."""
+    data: bytes = b""
+    """Data, 0 to 8 bytes; CAN FD also 12, 16, 20, 24, 32, 48 or 64 bytes; empty for a remote frame."""
+    extended: bool = False
+    remote: bool = False
+    dlc: int = 0
+    """Length code of a remote frame, 0 to 8; data frames ignore it."""
+    fd: bool = False
+    brs: bool = False
+    """Whether a CAN FD frame switches to the data bit rate."""
+
+    def __post_init__(self) -> None:
+        width = 29 if self.extended else 11
+        if not 0 <= self.can_id < 1 << width:
+            raise ValueError(f"can_id: got 0x{self.can_id:X}, must fit {width} bits")
+        length = len(self.data)
+        if self.fd:
+            if self.remote:
+                raise ValueError("remote: got a remote CAN FD frame, must be a classic frame")
+            if length not in _VALID_FD_LENGTHS:
+                raise ValueError(f"data: got {length} bytes, must be one of {FD_LENGTHS}")
+            return
+        if self.brs:
+            raise ValueError("brs: got a classic frame that switches the bit rate, must be a CAN FD frame")
+        if length > 8:
+            raise ValueError(f"data: got {length} bytes, must be at most 8")
+        if self.remote and length:
+            raise ValueError(f"data: got {length} bytes in a remote frame, must be none")
+        if not 0 <= self.dlc <= 8:
+            raise ValueError(f"dlc: got {self.dlc}, must be 0 to 8")
+
+
+def arbitration_key(frame: CanFrame) -> int:
+    """Return the bits of the arbitration field as a number: the frame with the lowest number wins.
+
+    The order is that of the bits on the bus, dominant before recessive: base identifier, RTR or SRR, IDE,
+    identifier extension, RTR (ISO 11898-1:2015, 10.4.2 and 10.8.2). A base frame has zeros in the place of the
+    extension, which no extended frame reaches without losing at IDE.
+
+    Args:
+        frame: the frame.
+
+    Returns:
+        32-bit number.
+    """
+    if frame.extended:
+        base, extension = frame.can_id >> 18, frame.can_id & 0x3FFFF
+        return base << 21 | 0b11 << 19 | extension << 1 | frame.remote
+    return frame.can_id << 21 | frame.remote << 20
+
+
+def frame_bits(frame: CanFrame, esi: bool = False) -> tuple[int, int]:
+    """Return the exact number of bits of a frame, from start of frame to the end of the inter-frame space.
+
+    Args:
+        frame: the frame.
+        esi: whether the error state indicator of a CAN FD frame is recessive.
+
+    Returns:
+        Bits at the nominal and at the data bit rate. The bit rate changes at the sample points of BRS and of
+        the CRC delimiter; BRS counts as one nominal bit and the delimiter as one data bit, which gives the
+        same total.
+    """
+    if frame.fd:
+        return exact_fd_bits(frame.can_id, frame.data, extended=frame.extended, brs=frame.brs, esi=esi)
+    return (
+        exact_bits(frame.can_id, frame.data, extended=frame.extended, remote=frame.remote, dlc=frame.dlc),
+        0,
+    )

@@ -1,0 +1,54 @@
+"""Intervals in which a bus was busy, and its load in any interval."""
+
+from __future__ import annotations
+
+import bisect
+from array import array
+
+
+class Occupancy:
+    """Record of busy intervals. Adjacent intervals are merged, so a saturated bus takes one entry.
+
+    An entry takes 24 bytes; :meth:`forget` limits the memory of a long run.
+    """
+
+    def __init__(self) -> None:
+        self._starts = array("q")
+        self._ends = array("q")
+        self._busy_before = array("q")
+
+    def add(self, start_ns: int, end_ns: int) -> None:
+        """Add a busy interval that starts at or after the end of the last one.
+
+        Args:
+            start_ns: start, ns.
+            end_ns: end, ns.
+        """
+        ends = self._ends
+        if ends and ends[-1] == start_ns:
+            ends[-1] = end_ns
+            return
+        before = self._busy_before[-1] + ends[-1] - self._starts[-1] if ends else 0
+        self._starts.append(start_ns)
+        ends.append(end_ns)
+        self._busy_before.append(before)
+
+    def end_last_at(self, end_ns: int) -> None:
+        """Change the end of the last interval, ns."""
+        self._ends[-1] = end_ns
+
+    def busy_ns(self, from_ns: int, to_ns: int) -> int:
+        """Return the busy time between two times, ns."""
+        return self._busy_until(to_ns) - self._busy_until(from_ns)
+
+    def forget(self, before_ns: int) -> None:
+        """Drop all intervals that ended before a time, ns; later queries must start at or after it."""
+        n = bisect.bisect_left(self._ends, before_ns)
+        for column in (self._starts, self._ends, self._busy_before):
+            del column[:n]
+
+    def _busy_until(self, time_ns: int) -> int:
+        at = bisect.bisect_right(self._starts, time_ns) - 1
+        if at < 0:
+            return self._busy_before[0] if self._busy_before else 0
+        return self._busy_before[at] + min(time_ns, self._ends[at]) - self._starts[at]

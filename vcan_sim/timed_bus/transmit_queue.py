@@ -1,0 +1,99 @@
+"""Transmit queues of a station."""
+
+from __future__ import annotations
+
+import heapq
+from collections import deque
+from typing import NamedTuple, Protocol
+
+from vcan_sim.timed_bus.frame import CanFrame
+
+
+class Waiting(NamedTuple):
+    """Frame in a transmit queue; sorts by priority, then by age."""
+
+    key: int
+    """Arbitration key, as :func:`vcan_sim.timed_bus.frame.arbitration_key` gives it."""
+    number: int
+    """Sequence number on the bus."""
+    queued_ns: int
+    frame: CanFrame
+
+
+class TransmitQueue(Protocol):
+    """Queue of one station; the frame being sent is not in it."""
+
+    def push(self, waiting: Waiting) -> None:
+        """Add a frame."""
+
+    def put_back(self, waiting: Waiting) -> None:
+        """Return a frame that was popped but not sent."""
+
+    def head(self) -> Waiting:
+        """Return the frame to send next. The queue must not be empty."""
+
+    def pop(self) -> Waiting:
+        """Remove and return the frame to send next. The queue must not be empty."""
+
+    def clear(self) -> None:
+        """Remove all frames."""
+
+    def __len__(self) -> int: ...
+
+
+class FifoQueue:
+    """Queue that sends frames in the order in which they were handed in, as a SocketCAN interface does."""
+
+    def __init__(self) -> None:
+        self._frames: deque[Waiting] = deque()
+
+    def push(self, waiting: Waiting) -> None:
+        """Add a frame."""
+        self._frames.append(waiting)
+
+    def put_back(self, waiting: Waiting) -> None:
+        """Return a frame that was popped but not sent."""
+        self._frames.appendleft(waiting)
+
+    def head(self) -> Waiting:
+        """Return the oldest frame."""
+        return self._frames[0]
+
+    def pop(self) -> Waiting:
+        """Remove and return the oldest frame."""
+        return self._frames.popleft()
+
+    def clear(self) -> None:
+        """Remove all frames."""
+        self._frames.clear()
+
+    def __len__(self) -> int:
+        return len(self._frames)
+
+
+class PriorityQueue:
+    """Queue that sends the frame with the highest priority first, and equal priorities in order."""
+
+    def __init__(self) -> None:
+        self._frames: list[Waiting] = []
+
+    def push(self, waiting: Waiting) -> None:
+        """Add a frame."""
+        heapq.heappush(self._frames, waiting)
+
+    put_back = push
+
+    def head(self) -> Waiting:
+        """Return the frame with the highest priority."""
+        return self._frames[0]
+
+    def pop(self) -> Waiting:
+        """Remove and return the frame with the highest priority."""
+        return heapq.heappop(self._frames)
+
+    def clear(self) -> None:
+        """Remove all frames."""
+        self._frames.clear()
+
+    def __len__(self) -> int:
+        return len(self._frames)

@@ -1,0 +1,186 @@
+"""Frames bit by bit, to place errors in them (ISO 11898-1:2015).
+
+This is the slow path: :mod:`vcan_sim.timed_bus.bus` builds the bits of a frame only if an error destroys it or
+two stations send the same identifier.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+from skinnode.canopen.data_length import FD_LENGTHS
+from vcan_sim.timed_bus.frame import CanFrame
+
+FLAG_BITS: Final = 6
+"""Length of one station's error flag, bits; also the length of a run that violates the stuff rule."""
+
+ACK_TO_END_BITS: Final = 9
+"""Length of ACK slot, ACK delimiter and end of frame, bits."""
+
+_STUFF_AFTER: Final = 5
+_CRC_15: Final = 0x4599
+_CRC_17: Final = 0x1685B
+_CRC_21: Final = 0x102899
+
+
+@dataclass(frozen=True, slots=True)
+class WireFrame:
+    """Acknowledged frame as its bits on the bus, stuff bits included; 0 is dominant."""
+
+    bits: tuple[int, ...]
+    """All bits from start of frame to the last bit of the end of frame."""
+    stuffed_end: int
+    """Number of bits that follow the stuff rule: up to the CRC sequence, CAN FD up to the data."""
+    fixed_stuff: tuple[int, ...]
+    """Positions of the fixed stuff bits of CAN FD."""
+    delimiter: int
+    """Position of the CRC delimiter."""
+    data_phase: range
+    """Positions of the bits at the data bit rate; empty if the frame does not switch the bit rate."""
+
+    @property
+    def ack_slot(self) -> int:
+        """Position of the ACK slot."""
+        return self.delimiter + 1
+
+    def bits_through(self, position: int) -> tuple[int, int]:
+        """Return the number of nominal and of data bits from start of frame to a position, inclusive."""
+        fast = max(0, min(position + 1, self.data_phase.stop) - self.data_phase.start)
+        return position + 1 - fast, fast
+
+
+def wire_frame(frame: CanFrame, esi: bool = False) -> WireFrame:
+    """Build the bits of a frame.
+
+    Args:
+        frame: the frame.
+        esi: whether the error state indicator of a CAN FD frame is recessive.
+
+    Returns:
+        The frame on the bus, with a dominant ACK slot.
+    """
+    tail = (1, 0, 1, *(1,) * 7)  # CRC delimiter, ACK slot, ACK delimiter, end of frame
+    head = tuple(_head(frame, esi))
+    payload = tuple(byte >> shift & 1 for byte in frame.data for shift in range(7, -1, -1))
+    if not frame.fd:
+        crc = _crc((*head, *payload), 15, _CRC_15, 0)
+        stuffed, _ = _stuffed((*head, *payload, *crc))
+        n = len(stuffed)
+        return WireFrame((*stuffed, *tail), n, (), n, range(0))
+
+    stuffed, places = _stuffed((*head, *payload))
+    if places[-1:] == [len(stuffed) - 1]:  # the first fixed stuff bit takes the place of this one
+        del stuffed[-1], places[-1]
+    count = len(places) % 8
+    gray = count ^ count >> 1
+    checked = [gray >> 2 & 1, gray >> 1 & 1, gray & 1, gray.bit_count() & 1]
+    width, polynomial = (17, _CRC_17) if len(frame.data) <= 16 else (21, _CRC_21)
+    checked += _crc((*stuffed, *checked), width, polynomial, 1 << width - 1)
+    bits, fixed = list(stuffed), []
+    for number, bit in enumerate(checked):
+        if number % 4 == 0:
+            fixed.append(len(bits))
+            bits.append(1 - bits[-1])
+        bits.append(bit)
+    delimiter = len(bits)
+    phase = range(0)
+    if frame.brs:
+        esi_place = len(head) - 5
+        phase = range(_with_stuff_bits(esi_place, places), delimiter + 1)
+    return WireFrame((*bits, *tail), len(stuffed), tuple(fixed), delimiter, phase)
+
+
+def receiver_lag(wire: WireFrame, position: int, seen: int, flag: int) -> int:
+    """Return how many bits of an error flag a receiver sees before it detects an error itself.
+
+    The flag starts after ``position``. It violates the stuff rule with the sixth equal bit, the rule for fixed
+    stuff bits, or the form of the delimiters (ISO 11898-1:2015, 10.9 and 10.11).
+
+    Args:
+        wire: the frame.
+        position: position of the bit in which the first station detects the error.
+        seen: value of this bit as the receiver sees it.
+        flag: 0 for an active error flag, 1 for a passive error flag.
+
+    Returns:
+        Number of bits, 0 to 6; 0 if the bit itself is an error for the receiver.
+    """
+    lag = FLAG_BITS
+    if position < wire.stuffed_end:
+        run, at = 1, position - 1
+        while at >= 0 and wire.bits[at] == seen:
+            run, at = run + 1, at - 1
+        if run >= FLAG_BITS:
+            return 0
+        if seen == flag:
+            lag = FLAG_BITS - run
+    elif seen != wire.bits[position] and (position in wire.fixed_stuff or position >= wire.delimiter):
+        return 1 if position == wire.ack_slot else 0
+    for place in wire.fixed_stuff:
+        before = seen if place - 1 == position else flag
+        if place > position and before == flag:
+            lag = min(lag, place - position)
+            break
+    recessive_from = wire.delimiter if flag == 0 else wire.ack_slot
+    first = next(
+        (at for at in range(recessive_from, len(wire.bits)) if at > position and wire.bits[at] != flag),
+        len(wire.bits),
+    )
+    return min(lag, first - position)
+
+
+def _head(frame: CanFrame, esi: bool) -> Iterator[int]:
+    """Yield the bits from start of frame to the length code."""
+
+    def field(value: int, width: int) -> Iterator[int]:
+        return (value >> shift & 1 for shift in range(width - 1, -1, -1))
+
+    yield 0
+    if frame.extended:
+        yield from field(frame.can_id >> 18, 11)
+        yield from (1, 1)  # SRR, IDE
+        yield from field(frame.can_id, 18)
+        yield int(frame.remote)
+    else:
+        yield from field(frame.can_id, 11)
+        yield from (int(frame.remote), 0)  # RTR or RRS, IDE
+    if frame.fd:
+        yield from (1, 0, int(frame.brs), int(esi))  # FDF, res, BRS, ESI
+        yield from field(FD_LENGTHS.index(len(frame.data)), 4)
+        return
+    yield from (0, 0) if frame.extended else (0,)  # FDF and r0; a base frame has FDF only
+    yield from field(frame.dlc if frame.remote else len(frame.data), 4)
+
+
+def _stuffed(bits: Sequence[int]) -> tuple[list[int], list[int]]:
+    """Return the bits with stuff bits, and the positions of the stuff bits."""
+    out: list[int] = []
+    places: list[int] = []
+    run = 0
+    for bit in bits:
+        run = run + 1 if out and out[-1] == bit else 1
+        out.append(bit)
+        if run == _STUFF_AFTER:
+            places.append(len(out))
+            out.append(1 - bit)
+            run = 1
+    return out, places
+
+
+def _with_stuff_bits(place: int, stuff_places: Sequence[int]) -> int:
+    """Return the position on the bus of the bit at ``place`` in the unstuffed frame."""
+    for stuff in stuff_places:
+        if stuff > place:
+            break
+        place += 1
+    return place
+
+
+def _crc(bits: Sequence[int], width: int, polynomial: int, register: int) -> list[int]:
+    top, mask = width - 1, (1 << width) - 1
+    for bit in bits:
+        feedback = bit ^ register >> top
+        register = (register << 1 & mask) ^ (polynomial if feedback else 0)
+    return [register >> shift & 1 for shift in range(top, -1, -1)]

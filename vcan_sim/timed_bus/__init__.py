@@ -1,0 +1,47 @@
+"""CAN bus with exact times, as a deterministic model without threads and without a clock of its own.
+
+::
+
+    frame (what a station hands in) -> transmit_queue (FIFO or by priority)
+        -> bus (arbitration, bits on the bus, acknowledgement, retransmission) -> events
+    disturbances (rules that inject errors) -> wire_frame (bits of a frame) -> bus
+    confinement (error counters and states), bit_rates (exact times), occupancy (bus load) <- bus
+
+The caller owns time. ``TimedBus.send`` hands in a frame at a time, ``TimedBus.advance`` returns the events up
+to a time, and ``TimedBus.next_event_ns`` says when to advance next. The same calls give the same events.
+"""
+
+from vcan_sim.timed_bus.bit_rates import BitRates
+from vcan_sim.timed_bus.bus import StationOptions, TimedBus
+from vcan_sim.timed_bus.confinement import Counters, ErrorState
+from vcan_sim.timed_bus.disturbances import AtTime, Disturbance, NthFrame, RandomShare
+from vcan_sim.timed_bus.events import (
+    BusOff,
+    Cause,
+    CountersChanged,
+    Delivered,
+    ErrorFrame,
+    Event,
+    Recovered,
+)
+from vcan_sim.timed_bus.frame import CanFrame
+
+__all__ = [
+    "AtTime",
+    "BitRates",
+    "BusOff",
+    "CanFrame",
+    "Cause",
+    "Counters",
+    "CountersChanged",
+    "Delivered",
+    "Disturbance",
+    "ErrorFrame",
+    "ErrorState",
+    "Event",
+    "NthFrame",
+    "RandomShare",
+    "Recovered",
+    "StationOptions",
+    "TimedBus",
+]

@@ -1,0 +1,254 @@
+"""Course of one attempt to send a frame: delivered, or destroyed by an error frame, and when.
+
+:func:`undisturbed` covers the common case with the bit counts alone; :func:`disturbed` follows the bits.
+
+Error frames (ISO 11898-1:2015, 10.4.4 and 10.11). The first station to detect an error starts an error flag of 6
+bits in the next bit. The other stations start theirs when they detect the first flag as an error, up to 6 bits
+later, so the superposed flags are 6 to 12 bits long. An error delimiter of 8 recessive bits and the
+intermission of 3 bits follow. Flags have the nominal bit rate; the delay of the second flag has the bit rate
+of the phase in which the error occurs.
+
+Simplifications: a disturbance that all stations see destroys the frame, even if it inverts a recessive bit of the
+arbitration field; error flags and delimiters are not disturbed; passive error flags end with the superposed
+flags; there are no overload frames.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+from vcan_sim.timed_bus.bit_rates import BitRates
+from vcan_sim.timed_bus.disturbances import Hit
+from vcan_sim.timed_bus.events import Cause
+from vcan_sim.timed_bus.frame import CanFrame, frame_bits
+from vcan_sim.timed_bus.wire_frame import (
+    ACK_TO_END_BITS,
+    FLAG_BITS,
+    WireFrame,
+    receiver_lag,
+    wire_frame,
+)
+
+INTERMISSION_BITS: Final = 3
+ERROR_DELIMITER_BITS: Final = 8
+_AFTER_FLAG_BITS: Final = ERROR_DELIMITER_BITS + INTERMISSION_BITS
+_ACTIVE, _PASSIVE = 0, 1
+
+
+@dataclass(frozen=True, slots=True)
+class Participant:
+    """Station in an attempt."""
+
+    station: int
+    passive: bool
+    """Whether the station is error-passive."""
+    frame: CanFrame | None = None
+    """Frame that the station sends; None for a receiver."""
+
+
+@dataclass(frozen=True, slots=True)
+class BitError:
+    """Error in an attempt. Times are ticks from the start of frame."""
+
+    ticks: int
+    """Start of the first error flag."""
+    bit: int
+    cause: Cause
+    detected_by: tuple[int, ...]
+    """Stations that detect the error in this bit."""
+
+
+@dataclass(frozen=True, slots=True)
+class Course:
+    """Course of an attempt. Times are ticks from the start of frame."""
+
+    senders: tuple[int, ...]
+    """Stations whose frame is delivered or destroyed at the end."""
+    end: int
+    """End of the last bit of the end of frame, or start of the first error flag."""
+    recessive: int
+    """Time from which the bus stays recessive."""
+    free: int
+    """End of the intermission."""
+    error: BitError | None = None
+    """Error that destroys the frame; None if the frame is delivered."""
+    side_errors: tuple[BitError, ...] = ()
+    """Errors of error-passive stations that do not destroy the frame, in order of time."""
+
+
+def undisturbed(senders: tuple[int, ...], frame: CanFrame, esi: bool, rates: BitRates) -> Course:
+    """Return the course of an attempt that is acknowledged and not disturbed.
+
+    Args:
+        senders: stations that send the frame.
+        frame: the frame.
+        esi: whether the senders are error-passive.
+        rates: bit rates of the bus.
+    """
+    free = rates.ticks(frame_bits(frame, esi))
+    end = free - INTERMISSION_BITS * rates.nominal_ticks
+    return Course(senders, end, end - (ACK_TO_END_BITS - 1) * rates.nominal_ticks, free)
+
+
+def disturbed(
+    senders: Sequence[Participant], receivers: Sequence[Participant], hit: Hit | None, rates: BitRates
+) -> Course:
+    """Return the course of an attempt that is disturbed, not acknowledged, or in which senders collide.
+
+    Args:
+        senders: stations that send frames with the same arbitration field.
+        receivers: all other stations on the bus.
+        hit: the disturbed bit, or None.
+        rates: bit rates of the bus.
+    """
+    wires = {each.station: wire_frame(each.frame, each.passive) for each in senders if each.frame}
+    receiving = {each.station: each for each in receivers}
+    sending = {each.station: each for each in senders}
+    side_errors: list[BitError] = []
+    while True:
+        wire = next(wires[station] for station in sending)
+        collision = _first_difference([wires[station].bits for station in sending])
+        if hit is not None and (collision is None or hit.bit <= collision):
+            if hit.station == -1 or hit.station in sending:
+                return _destroyed_by_hit(hit, wire, sending, receiving, side_errors, rates)
+            receiver = receiving.get(hit.station)
+            if receiver is not None:
+                if not receiver.passive:
+                    return _destroyed_by_receiver(hit, wire, sending, receiving, side_errors, rates)
+                side_errors.append(_bit_error(wire, hit.bit, Cause.DISTURBED, (hit.station,), rates))
+                del receiving[hit.station]  # it sees no valid frame, and does not acknowledge
+            hit = None
+            continue
+        if collision is None:
+            break
+        losers = [station for station in sending if wires[station].bits[collision]]
+        if not all(sending[station].passive for station in losers):
+            return _collided(collision, losers, wires, sending, receiving, side_errors, rates)
+        loser_wire = wires[losers[0]]
+        side_errors.append(_bit_error(loser_wire, collision, Cause.COLLISION, tuple(losers), rates))
+        for station in losers:
+            del sending[station]
+    if not receiving:
+        error = _bit_error(wire, wire.ack_slot, Cause.NO_ACK, tuple(sending), rates)
+        return _destroyed(error, 0, sending, receiving, side_errors, rates)
+    end = rates.ticks(wire.bits_through(len(wire.bits) - 1))
+    recessive = end - (ACK_TO_END_BITS - 1) * rates.nominal_ticks
+    free = end + INTERMISSION_BITS * rates.nominal_ticks
+    return Course(tuple(sending), end, recessive, free, None, tuple(side_errors))
+
+
+def cut_off(
+    frame: CanFrame,
+    esi: bool,
+    bit: int,
+    receivers: Sequence[Participant],
+    rates: BitRates,
+) -> Course:
+    """Return the course of an attempt whose only sender is disconnected.
+
+    Args:
+        frame: the frame.
+        esi: whether the sender is error-passive.
+        bit: position of the last bit that is sent.
+        receivers: all other stations on the bus.
+        rates: bit rates of the bus.
+    """
+    wire = wire_frame(frame, esi)
+    lag = receiver_lag(wire, bit, wire.bits[bit], _PASSIVE)
+    detected = min(bit + lag, len(wire.bits) - 1)
+    receiving = {each.station: each for each in receivers}
+    error = _bit_error(wire, detected, Cause.CUT_OFF, tuple(receiving), rates)
+    return _destroyed(error, 0, {}, receiving, [], rates)
+
+
+_Stations = dict[int, Participant]
+
+
+def _destroyed_by_hit(
+    hit: Hit,
+    wire: WireFrame,
+    sending: _Stations,
+    receiving: _Stations,
+    side_errors: list[BitError],
+    rates: BitRates,
+) -> Course:
+    detecting = tuple(sending) if hit.station == -1 else (hit.station,)
+    flag = _PASSIVE if all(sending[station].passive for station in detecting) else _ACTIVE
+    seen = wire.bits[hit.bit] ^ (hit.station == -1)
+    lag = receiver_lag(wire, hit.bit, seen, flag) if receiving else 0
+    if hit.station == -1 and lag == 0:  # the bit itself is an error for the receivers
+        detecting += tuple(receiving)
+    error = _bit_error(wire, hit.bit, Cause.DISTURBED, detecting, rates)
+    return _destroyed(error, _lag_ticks(wire, hit.bit, lag, rates), sending, receiving, side_errors, rates)
+
+
+def _destroyed_by_receiver(
+    hit: Hit,
+    wire: WireFrame,
+    sending: _Stations,
+    receiving: _Stations,
+    side_errors: list[BitError],
+    rates: BitRates,
+) -> Course:
+    error = _bit_error(wire, hit.bit, Cause.DISTURBED, (hit.station,), rates)
+    lag = max(_sender_lag(wire, hit.bit), receiver_lag(wire, hit.bit, wire.bits[hit.bit], _ACTIVE))
+    return _destroyed(error, _lag_ticks(wire, hit.bit, lag, rates), sending, receiving, side_errors, rates)
+
+
+def _collided(
+    bit: int,
+    losers: list[int],
+    wires: dict[int, WireFrame],
+    sending: _Stations,
+    receiving: _Stations,
+    side_errors: list[BitError],
+    rates: BitRates,
+) -> Course:
+    dominant = [wires[station] for station in sending if station not in losers]
+    lag = max(_sender_lag(wire, bit) for wire in dominant)
+    if receiving:
+        lag = max(lag, receiver_lag(dominant[0], bit, 0, _ACTIVE))
+    loser = wires[losers[0]]
+    error = _bit_error(loser, bit, Cause.COLLISION, tuple(losers), rates)
+    return _destroyed(error, _lag_ticks(loser, bit, lag, rates), sending, receiving, side_errors, rates)
+
+
+def _destroyed(
+    error: BitError,
+    lag_ticks: int,
+    sending: _Stations,
+    receiving: _Stations,
+    side_errors: list[BitError],
+    rates: BitRates,
+) -> Course:
+    free = error.ticks + lag_ticks + (FLAG_BITS + _AFTER_FLAG_BITS) * rates.nominal_ticks
+    everyone = (*sending.values(), *receiving.values())
+    flags_are_passive = all(each.passive for each in everyone)
+    recessive = error.ticks if flags_are_passive else free - _AFTER_FLAG_BITS * rates.nominal_ticks
+    return Course(tuple(sending), error.ticks, recessive, free, error, tuple(side_errors))
+
+
+def _bit_error(
+    wire: WireFrame, bit: int, cause: Cause, detecting: tuple[int, ...], rates: BitRates
+) -> BitError:
+    return BitError(rates.ticks(wire.bits_through(bit)), bit, cause, detecting)
+
+
+def _lag_ticks(wire: WireFrame, bit: int, lag: int, rates: BitRates) -> int:
+    return lag * (rates.data_ticks if bit in wire.data_phase else rates.nominal_ticks)
+
+
+def _sender_lag(wire: WireFrame, bit: int) -> int:
+    """Return the number of bits of an active error flag until a sender sends a recessive bit, at most 6."""
+    later = wire.bits[bit + 1 : bit + 1 + FLAG_BITS]
+    return later.index(1) + 1 if 1 in later else FLAG_BITS
+
+
+def _first_difference(streams: Sequence[tuple[int, ...]]) -> int | None:
+    """Return the first position at which the frames of several senders differ, or None."""
+    for position, bits in enumerate(zip(*streams, strict=False)):
+        if 0 < sum(bits) < len(bits):
+            return position
+    return None

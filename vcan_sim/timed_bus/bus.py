@@ -1,0 +1,682 @@
+"""The bus: arbitration between the stations, courses of attempts, error counters, and the events.
+
+Stations start a frame at once on an idle bus, otherwise at the end of the intermission. A frame that is handed in
+less than one bit after a start of frame still takes part in the arbitration (Davis, Burns, Bril, Lukkien,
+"Controller Area Network (CAN) schedulability analysis", 2007, section 3). The bus therefore decides each
+arbitration one bit after the start of frame.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from types import MappingProxyType
+from typing import Literal
+
+from skinnode.errors import ConfigError
+from vcan_sim.timed_bus.attempt import BitError, Course, Participant, cut_off, disturbed, undisturbed
+from vcan_sim.timed_bus.bit_rates import BitRates
+from vcan_sim.timed_bus.confinement import (
+    RECOVERY_RUN_BITS,
+    RECOVERY_RUNS,
+    SUSPEND_BITS,
+    ZERO,
+    Counters,
+    ErrorState,
+    reception_failed,
+    reception_succeeded,
+    transmission_failed,
+    transmission_succeeded,
+)
+from vcan_sim.timed_bus.disturbances import Attempt, Disturbance, Disturbances
+from vcan_sim.timed_bus.events import (
+    BusOff,
+    Cause,
+    CountersChanged,
+    Delivered,
+    ErrorFrame,
+    Event,
+    Recovered,
+)
+from vcan_sim.timed_bus.frame import CanFrame, arbitration_key
+from vcan_sim.timed_bus.occupancy import Occupancy
+from vcan_sim.timed_bus.transmit_queue import FifoQueue, PriorityQueue, TransmitQueue, Waiting
+from vcan_sim.timed_bus.wire_frame import wire_frame
+
+
+@dataclass(frozen=True, slots=True)
+class StationOptions:
+    """Properties of a station's controller.
+
+    Raises:
+        ConfigError: if an option is not valid.
+    """
+
+    queue: Literal["fifo", "priority"] = "fifo"
+    """Order of transmission: as handed in, as a SocketCAN interface does, or the highest priority first."""
+    capacity: int | None = None
+    """Maximum number of frames to send, including the frame being sent; None for no limit."""
+    restart_ns: int | None = 0
+    """Time from bus-off to the start of the recovery, ns; None to wait for :meth:`TimedBus.restart`."""
+
+    def __post_init__(self) -> None:
+        if self.queue not in ("fifo", "priority"):
+            raise ConfigError("queue", self.queue, "fifo or priority")
+        if self.capacity is not None and self.capacity < 1:
+            raise ConfigError("capacity", self.capacity, "at least 1 frame, or None")
+        if self.restart_ns is not None and self.restart_ns < 0:
+            raise ConfigError("restart_ns", self.restart_ns, "at least 0 ns, or None")
+
+
+class _Station:
+    """State of a station."""
+
+    __slots__ = (
+        "connected",
+        "counters",
+        "index",
+        "options",
+        "passive",
+        "queue",
+        "ready",
+        "recovers_from",
+        "runs_seen",
+        "sending",
+    )
+
+    def __init__(self, index: int, options: StationOptions) -> None:
+        self.index = index
+        self.options = options
+        self.queue: TransmitQueue = FifoQueue() if options.queue == "fifo" else PriorityQueue()
+        self.sending: Waiting | None = None
+        self.counters = ZERO
+        self.passive = False
+        self.connected = True
+        self.ready = 0
+        """Earliest start of the station's next frame, ticks."""
+        self.recovers_from: int | None = None
+        """Start of the recovery from bus-off, ticks; None if the station is not recovering."""
+        self.runs_seen = 0
+        """Number of complete recessive runs seen during the recovery, until the last start of frame."""
+
+    @property
+    def on_bus(self) -> bool:
+        return self.connected and self.counters.state is not ErrorState.BUS_OFF
+
+
+class _Flight:
+    """Attempt in progress."""
+
+    __slots__ = ("course", "receivers", "side", "start", "waiting")
+
+    def __init__(
+        self, start: int, course: Course, waiting: dict[int, Waiting], receivers: tuple[int, ...]
+    ) -> None:
+        self.start = start
+        self.course = course
+        self.waiting = waiting
+        """Frames that the attempt sends, by station."""
+        self.receivers = receivers
+        """Stations on the bus at the start of frame that do not send."""
+        self.side = 0
+        """Number of side errors that have occurred."""
+
+    @property
+    def next(self) -> int:
+        """Time of the next event of the attempt, ticks."""
+        side = self.course.side_errors
+        return self.start + (side[self.side].ticks if self.side < len(side) else self.course.end)
+
+
+class TimedBus:
+    """CAN bus with its stations. Times passed to its methods must not decrease.
+
+    Args:
+        stations: the stations, which the methods name by their position in this sequence.
+        rates: bit rates.
+        disturbances: errors to inject.
+
+    Raises:
+        ConfigError: if a disturbance names a station that does not exist.
+    """
+
+    def __init__(
+        self,
+        stations: Sequence[StationOptions],
+        rates: BitRates | None = None,
+        disturbances: Sequence[Disturbance] = (),
+    ) -> None:
+        self._rates = rates or BitRates()
+        self._stations = [_Station(index, options) for index, options in enumerate(stations)]
+        self._disturbances = Disturbances()
+        self._now = 0
+        self._free = 0
+        self._recessive_from = 0
+        self._start: int | None = None
+        self._flight: _Flight | None = None
+        self._next: int | None = None
+        self._pending: dict[int, _Station] = {}
+        self._recovering: list[_Station] = []
+        self._receivers: dict[tuple[int, ...], tuple[int, ...]] = {}
+        self._counts_are_zero = True
+        self._number = 0
+        self._events: list[Event] = []
+        self._frames: dict[tuple[int, bool], int] = {}
+        self._occupancy = Occupancy()
+        for rule in disturbances:
+            self.disturb(rule)
+
+    # --- what stations do
+
+    def send(self, time_ns: int, station: int, frame: CanFrame) -> bool:
+        """Hand in a frame.
+
+        Args:
+            time_ns: time, ns.
+            station: the station that sends it.
+            frame: the frame.
+
+        Returns:
+            Whether the station accepts the frame; it does not if its queue is full.
+
+        Raises:
+            ValueError: if the time is before that of an earlier call, or a CAN FD frame is sent on a bus
+                without a data bit rate.
+            IndexError: if the station does not exist.
+        """
+        sender = self._at(time_ns, station)
+        if frame.fd and self._rates.data_bps is None:
+            raise ValueError("frame: got a CAN FD frame, must be a classic frame because data_bps is None")
+        capacity = sender.options.capacity
+        if capacity is not None and len(sender.queue) + (sender.sending is not None) >= capacity:
+            return False
+        self._number += 1
+        sender.queue.push(Waiting(arbitration_key(frame), self._number, time_ns, frame))
+        self._offer(sender)
+        return True
+
+    def clear(self, time_ns: int, station: int) -> None:
+        """Drop all frames in a station's queue; the frame being sent goes on.
+
+        Args:
+            time_ns: time, ns.
+            station: the station.
+
+        Raises:
+            ValueError: if the time is before that of an earlier call.
+            IndexError: if the station does not exist.
+        """
+        sender = self._at(time_ns, station)
+        sender.queue.clear()
+        self._withdraw(sender)
+
+    def disconnect(self, time_ns: int, station: int) -> None:
+        """Disconnect a station. A frame that it is sending ends in an error frame; its queue is kept.
+
+        Args:
+            time_ns: time, ns.
+            station: the station.
+
+        Raises:
+            ValueError: if the time is before that of an earlier call.
+            IndexError: if the station does not exist.
+        """
+        leaving = self._at(time_ns, station)
+        if not leaving.connected:
+            return
+        leaving.connected = False
+        self._receivers.clear()
+        if leaving in self._recovering:
+            self._recovering.remove(leaving)
+        if self._flight is not None:
+            self._leave(leaving, self._flight)
+        self._withdraw(leaving)
+
+    def connect(self, time_ns: int, station: int) -> None:
+        """Connect a station again, with both error counters at 0.
+
+        Args:
+            time_ns: time, ns.
+            station: the station.
+
+        Raises:
+            ValueError: if the time is before that of an earlier call.
+            IndexError: if the station does not exist.
+        """
+        joining = self._at(time_ns, station)
+        if joining.connected:
+            return
+        joining.connected = True
+        joining.recovers_from = None
+        # A station takes part after 11 recessive bits (ISO 11898-1:2015, bus integration).
+        integration = RECOVERY_RUN_BITS * self._rates.nominal_ticks
+        joining.ready = max(self._now, self._recessive_from) + integration
+        self._receivers.clear()
+        self._set_counters(self._now, joining, ZERO)
+        self._offer(joining)
+
+    def restart(self, time_ns: int, station: int) -> None:
+        """Start the recovery of a station from bus-off; no effect in any other state.
+
+        Args:
+            time_ns: time, ns.
+            station: the station.
+
+        Raises:
+            ValueError: if the time is before that of an earlier call.
+            IndexError: if the station does not exist.
+        """
+        stopped = self._at(time_ns, station)
+        if stopped.counters.state is ErrorState.BUS_OFF and stopped.connected:
+            if stopped.recovers_from is None or stopped.recovers_from > self._now:
+                self._begin_recovery(stopped, self._now)
+            self._plan()
+
+    def disturb(self, rule: Disturbance) -> None:
+        """Add a rule that injects errors from the next arbitration on.
+
+        Args:
+            rule: the rule.
+
+        Raises:
+            ConfigError: if the rule names a station that does not exist.
+        """
+        if rule.station is not None and not 0 <= rule.station < len(self._stations):
+            allowed = f"0 to {len(self._stations) - 1}, or None"
+            raise ConfigError("disturbances.station", rule.station, allowed)
+        self._disturbances.add(rule)
+
+    # --- time
+
+    @property
+    def next_event_ns(self) -> int | None:
+        """Time to which the caller must advance next, ns; None if nothing will happen on its own.
+
+        Some of these times are decisions inside the bus, at which :meth:`advance` returns no event.
+        """
+        if self._events:
+            return self._rates.ceil_ns(self._now)
+        return None if self._next is None else self._rates.ceil_ns(self._next)
+
+    def advance(self, time_ns: int) -> list[Event]:
+        """Return all events up to a time that have not been returned yet, in order.
+
+        Args:
+            time_ns: time, ns.
+
+        Raises:
+            ValueError: if the time is before that of an earlier call.
+        """
+        self._advance(time_ns)
+        events, self._events = self._events, []
+        return events
+
+    # --- what can be read
+
+    def counters(self, station: int) -> Counters:
+        """Return the error counters of a station, which give its error state.
+
+        Args:
+            station: the station.
+        """
+        return self._stations[station].counters
+
+    def waiting(self, station: int) -> int:
+        """Return the number of frames that a station has to send, including the frame being sent.
+
+        Args:
+            station: the station.
+        """
+        sender = self._stations[station]
+        return len(sender.queue) + (sender.sending is not None)
+
+    @property
+    def frames(self) -> Mapping[tuple[int, bool], int]:
+        """Number of delivered frames by identifier and whether it is extended."""
+        return MappingProxyType(self._frames)
+
+    def busy_share(self, from_ns: int, to_ns: int) -> float:
+        """Return the share of time in which the bus was busy with frames, error frames and intermissions.
+
+        Args:
+            from_ns: start of the interval, ns.
+            to_ns: end of the interval, ns; at most the time of the last call.
+
+        Raises:
+            ValueError: if the interval is empty or ends in the future.
+        """
+        if not from_ns < to_ns <= self._rates.ceil_ns(self._now):
+            now_ns = self._rates.ceil_ns(self._now)
+            raise ValueError(
+                f"interval: got {from_ns} to {to_ns} ns, must end after its start, by {now_ns} ns"
+            )
+        busy_ns = self._occupancy.busy_ns(from_ns, to_ns)
+        if self._flight is None and self._start is not None:  # start of frame sent, arbitration not decided
+            busy_ns += max(0, to_ns - max(from_ns, self._rates.ceil_ns(self._start)))
+        return busy_ns / (to_ns - from_ns)
+
+    def forget_load(self, before_ns: int) -> None:
+        """Free the memory of :meth:`busy_share` for the time before an instant.
+
+        Args:
+            before_ns: the instant, ns; later intervals must not start before it.
+        """
+        self._occupancy.forget(before_ns)
+
+    # --- the course of time inside
+
+    def _at(self, time_ns: int, station: int) -> _Station:
+        if not 0 <= station < len(self._stations):
+            raise IndexError(f"station: got {station}, must be 0 to {len(self._stations) - 1}")
+        self._advance(time_ns)
+        return self._stations[station]
+
+    def _advance(self, time_ns: int) -> None:
+        ticks = time_ns * self._rates.ticks_per_ns
+        if ticks < self._now:
+            now_ns = self._rates.ceil_ns(self._now)
+            raise ValueError(f"time_ns: got {time_ns}, must be at least {now_ns}, the time of the last call")
+        while self._next is not None and self._next <= ticks:
+            self._step(self._next)
+        self._now = ticks
+
+    def _step(self, now: int) -> None:
+        flight = self._flight
+        if flight is not None:
+            if flight.side < len(flight.course.side_errors):
+                self._side_error(now, flight)
+            elif flight.course.error is None:
+                self._deliver(now, flight)
+            else:
+                self._destroy(now, flight, flight.course.error)
+        elif self._recovering and self._recover(now):
+            pass
+        else:
+            self._arbitrate(now)
+        self._plan()
+
+    def _plan(self) -> None:
+        """Set the time of the next step."""
+        if self._flight is not None:
+            self._next = self._flight.next
+            return
+        due = None if self._start is None else self._start + self._rates.nominal_ticks
+        for station in self._recovering:
+            at = self._recovery_end(station)
+            # A start of frame before this time interrupts the recessive run.
+            if (self._start is None or at <= self._start) and (due is None or at < due):
+                due = at
+        self._next = due
+
+    def _offer(self, sender: _Station) -> None:
+        """Let a station take part in the next arbitration if it has a frame to send."""
+        if not len(sender.queue) or not sender.on_bus:
+            return
+        self._pending[sender.index] = sender
+        if self._flight is None:
+            start = max(self._now, self._free, sender.ready)
+            if self._start is None or start < self._start:
+                self._start = start
+                self._plan()
+
+    def _withdraw(self, sender: _Station) -> None:
+        """Update the next start of frame after a station can no longer send."""
+        if self._pending.pop(sender.index, None) and self._flight is None:
+            started = self._start is not None and self._start <= self._now
+            if not started:
+                self._choose_start(self._now)
+        self._plan()
+
+    def _choose_start(self, now: int) -> None:
+        earliest = min((station.ready for station in self._pending.values()), default=None)
+        self._start = None if earliest is None else max(now, self._free, earliest)
+
+    # --- arbitration
+
+    def _arbitrate(self, now: int) -> None:
+        start = now - self._rates.nominal_ticks
+        self._start = None
+        contenders = [station for station in self._pending.values() if station.ready <= start]
+        if not contenders:  # withdrawn since the start of frame
+            self._choose_start(now)
+            return
+        if len(contenders) == 1:
+            winners = contenders
+        else:
+            heads = [station.queue.head().key for station in contenders]
+            lowest = min(heads)
+            winners = [station for station, key in zip(contenders, heads, strict=True) if key == lowest]
+        for station in self._recovering:
+            station.runs_seen += self._runs(station, start)
+        self._flight = self._take_off(start, winners)
+        self._recessive_from = start + self._flight.course.recessive
+        ceil_ns = self._rates.ceil_ns
+        self._occupancy.add(ceil_ns(start), ceil_ns(start + self._flight.course.free))
+
+    def _take_off(self, start: int, winners: list[_Station]) -> _Flight:
+        waiting = {}
+        for station in winners:
+            station.sending = waiting[station.index] = station.queue.pop()
+            if not len(station.queue):
+                del self._pending[station.index]
+        first = winners[0]
+        senders = tuple(waiting)
+        frame = waiting[first.index].frame
+        receivers = self._receivers_of(senders)
+        hit = None
+        if self._disturbances:
+            hit = self._disturbances.hit(self._attempt(frame, first.passive, start))
+        if len(winners) == 1 and hit is None and receivers:
+            course = undisturbed(senders, frame, first.passive, self._rates)
+        else:
+            sending = [
+                Participant(station.index, station.passive, waiting[station.index].frame)
+                for station in winners
+            ]
+            course = disturbed(sending, self._participants(receivers), hit, self._rates)
+        return _Flight(start, course, waiting, receivers)
+
+    def _attempt(self, frame: CanFrame, esi: bool, start: int) -> Attempt:
+        def n_bits() -> int:
+            return len(wire_frame(frame, esi).bits) - 1  # receivers accept the frame before its last bit
+
+        def bit_at(time_ns: int) -> int | None:
+            return self._bit_at(frame, esi, time_ns * self._rates.ticks_per_ns - start)
+
+        return Attempt(frame, n_bits, bit_at)
+
+    def _bit_at(self, frame: CanFrame, esi: bool, ticks: int) -> int | None:
+        """Return the position of the bit on the bus a time after the start of frame, or None."""
+        if ticks < 0 or ticks >= undisturbed((), frame, esi, self._rates).end:
+            return None
+        wire = wire_frame(frame, esi)
+        return next(bit for bit in range(len(wire.bits)) if self._rates.ticks(wire.bits_through(bit)) > ticks)
+
+    def _receivers_of(self, senders: tuple[int, ...]) -> tuple[int, ...]:
+        found = self._receivers.get(senders)
+        if found is None:
+            found = tuple(each.index for each in self._stations if each.on_bus and each.index not in senders)
+            self._receivers[senders] = found
+        return found
+
+    def _participants(self, stations: Sequence[int]) -> list[Participant]:
+        return [Participant(index, self._stations[index].passive) for index in stations]
+
+    # --- outcomes
+
+    def _deliver(self, now: int, flight: _Flight) -> None:
+        course, ceil_ns = flight.course, self._rates.ceil_ns
+        time_ns, started_ns = ceil_ns(now), ceil_ns(flight.start)
+        receivers = self._still_receiving(flight)
+        heard = receivers
+        for index in course.senders:
+            sent = flight.waiting[index]
+            self._events.append(Delivered(time_ns, index, sent.frame, heard, sent.queued_ns, started_ns))
+            self._stations[index].sending = None
+            heard = ()
+        identifier = (sent.frame.can_id, sent.frame.extended)
+        self._frames[identifier] = self._frames.get(identifier, 0) + 1
+        if not self._counts_are_zero:
+            for index in course.senders:
+                self._set_counters(now, self._stations[index], transmission_succeeded(self.counters(index)))
+            for index in receivers:
+                self._set_counters(now, self._stations[index], reception_succeeded(self.counters(index)))
+            self._counts_are_zero = all(station.counters == ZERO for station in self._stations)
+        self._land(now, flight)
+
+    def _destroy(self, now: int, flight: _Flight, error: BitError) -> None:
+        senders = flight.course.senders
+        frames = tuple(flight.waiting[index].frame for index in senders or flight.waiting)
+        time_ns = self._rates.ceil_ns(now)
+        self._events.append(
+            ErrorFrame(time_ns, senders, frames, error.bit, error.cause, error.detected_by, True)
+        )
+        receivers = self._still_receiving(flight)
+        for index in senders:
+            unanswered = error.cause is Cause.NO_ACK and not receivers
+            counters = transmission_failed(self.counters(index), unanswered=unanswered)
+            self._set_counters(now, self._stations[index], counters)
+        for index in receivers:
+            first = error.cause is Cause.DISTURBED and error.detected_by == (index,)
+            self._set_counters(
+                now, self._stations[index], reception_failed(self.counters(index), first=first)
+            )
+        for index in senders:
+            self._return(self._stations[index])
+        self._land(now, flight)
+
+    def _side_error(self, now: int, flight: _Flight) -> None:
+        error = flight.course.side_errors[flight.side]
+        flight.side += 1
+        senders = tuple(index for index in error.detected_by if index in flight.waiting)
+        frames = tuple(flight.waiting[index].frame for index in senders)
+        if not frames:
+            frames = (flight.waiting[flight.course.senders[0]].frame,)
+        time_ns = self._rates.ceil_ns(now)
+        self._events.append(
+            ErrorFrame(time_ns, senders, frames, error.bit, error.cause, error.detected_by, False)
+        )
+        for index in error.detected_by:
+            station = self._stations[index]
+            if index in senders:
+                self._set_counters(now, station, transmission_failed(station.counters))
+                self._return(station)
+                self._suspend(station, flight)
+            else:
+                self._set_counters(now, station, reception_failed(station.counters))
+
+    def _still_receiving(self, flight: _Flight) -> tuple[int, ...]:
+        """Return the stations that have followed an attempt from its start of frame until now."""
+        receivers, side_errors = flight.receivers, flight.course.side_errors
+        if not side_errors and self._receivers.get(tuple(flight.waiting)) is receivers:
+            return receivers
+        lost = {station for error in side_errors for station in error.detected_by}
+        return tuple(index for index in receivers if self._stations[index].on_bus and index not in lost)
+
+    def _land(self, now: int, flight: _Flight) -> None:
+        """End an attempt: the bus is free after the intermission."""
+        self._flight = None
+        self._free = flight.start + flight.course.free
+        for index in flight.course.senders:
+            self._suspend(self._stations[index], flight)
+        self._choose_start(now)
+
+    def _return(self, station: _Station) -> None:
+        """Put the frame that a station was sending back into its queue."""
+        if station.sending is not None:
+            station.queue.put_back(station.sending)
+            station.sending = None
+        if station.on_bus and len(station.queue):
+            self._pending[station.index] = station
+
+    def _suspend(self, station: _Station, flight: _Flight) -> None:
+        """Let an error-passive transmitter pause after its frame (ISO 11898-1:2015, 10.4.6.4)."""
+        if station.passive:
+            free = flight.start + flight.course.free
+            station.ready = free + SUSPEND_BITS * self._rates.nominal_ticks
+
+    def _leave(self, leaving: _Station, flight: _Flight) -> None:
+        """Change the course of the attempt in progress after a station has been disconnected."""
+        course = flight.course
+        if course.error is not None:
+            return
+        if leaving.index in course.senders and len(course.senders) > 1:  # others send the same bits
+            flight.course = replace(
+                course, senders=tuple(each for each in course.senders if each != leaving.index)
+            )
+            self._return(leaving)
+            return
+        sender = self._stations[course.senders[0]]
+        frame = flight.waiting[sender.index].frame
+        bit = self._bit_at(frame, sender.passive, self._now - flight.start)
+        if bit is None or bit > wire_frame(frame, sender.passive).ack_slot:
+            return  # the receivers have acknowledged the frame
+        receivers = self._participants(self._still_receiving(flight))
+        if leaving is sender:
+            changed = cut_off(frame, sender.passive, bit, receivers, self._rates)
+            self._return(leaving)
+        elif not receivers:
+            sending = [
+                Participant(index, self._stations[index].passive, flight.waiting[index].frame)
+                for index in course.senders
+            ]
+            changed = disturbed(sending, [], None, self._rates)
+        else:
+            return
+        flight.course, flight.side = changed, 0
+        self._recessive_from = flight.start + changed.recessive
+        self._occupancy.end_last_at(self._rates.ceil_ns(flight.start + changed.free))
+
+    # --- fault confinement
+
+    def _set_counters(self, now: int, station: _Station, counters: Counters) -> None:
+        if counters == station.counters:
+            return
+        before = station.counters.state
+        station.counters = counters
+        station.passive = counters.state is ErrorState.PASSIVE
+        self._counts_are_zero = False
+        time_ns = self._rates.ceil_ns(now)
+        self._events.append(CountersChanged(time_ns, station.index, counters))
+        if counters.state is ErrorState.BUS_OFF and before is not ErrorState.BUS_OFF:
+            self._events.append(BusOff(time_ns, station.index))
+            self._pending.pop(station.index, None)
+            self._receivers.clear()
+            if station.options.restart_ns is not None:
+                self._begin_recovery(station, now + station.options.restart_ns * self._rates.ticks_per_ns)
+
+    def _begin_recovery(self, station: _Station, at: int) -> None:
+        station.recovers_from, station.runs_seen = at, 0
+        if station not in self._recovering:
+            self._recovering.append(station)
+
+    def _runs(self, station: _Station, until: int) -> int:
+        """Return the number of complete recessive runs between the last dominant bit and a time."""
+        assert station.recovers_from is not None
+        since = max(station.recovers_from, self._recessive_from)
+        return max(0, until - since) // (RECOVERY_RUN_BITS * self._rates.nominal_ticks)
+
+    def _recovery_end(self, station: _Station) -> int:
+        """Return the end of a recovery if the bus stays recessive, ticks."""
+        assert station.recovers_from is not None
+        since = max(station.recovers_from, self._recessive_from)
+        missing = (RECOVERY_RUNS - station.runs_seen) * RECOVERY_RUN_BITS
+        return since + missing * self._rates.nominal_ticks
+
+    def _recover(self, now: int) -> bool:
+        """End the recoveries that are complete; return whether there was one."""
+        complete = [station for station in self._recovering if self._recovery_end(station) == now]
+        if self._start is not None and self._start < now:
+            return False
+        for station in complete:
+            self._recovering.remove(station)
+            station.recovers_from = None
+            self._receivers.clear()
+            self._set_counters(now, station, ZERO)
+            self._events.append(Recovered(self._rates.ceil_ns(now), station.index))
+            station.ready = now
+            if len(station.queue):
+                self._pending[station.index] = station
+        if complete:
+            self._choose_start(now)
+        return bool(complete)

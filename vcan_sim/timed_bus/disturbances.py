@@ -1,0 +1,185 @@
+"""Rules that inject bit errors, and the bits that they hit.
+
+A disturbance inverts one bit of a frame for all stations, or for one station only. Rules count every attempt
+to send a frame, so a rule can also destroy retransmissions.
+"""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+from skinnode.errors import ConfigError
+from vcan_sim.timed_bus.frame import CanFrame
+
+
+@dataclass(frozen=True, slots=True)
+class NthFrame:
+    """Disturb consecutive attempts to send an identifier.
+
+    Raises:
+        ConfigError: if a number is out of range.
+    """
+
+    can_id: int
+    first: int
+    """Number of the first disturbed attempt, counted from 1."""
+    attempts: int = 1
+    """Number of disturbed attempts."""
+    bit: int = 20
+    """Position of the disturbed bit, counted from the start of frame at 0, stuff bits included. A position
+    beyond the last but one bit of the end of frame means that bit."""
+    extended: bool = False
+    station: int | None = None
+    """Station that alone sees the disturbance; None if all stations see it."""
+
+    def __post_init__(self) -> None:
+        for name, least in (("first", 1), ("attempts", 1), ("bit", 0)):
+            if getattr(self, name) < least:
+                raise ConfigError(f"disturbances.{name}", getattr(self, name), f"at least {least}")
+
+
+@dataclass(frozen=True, slots=True)
+class RandomShare:
+    """Disturb a share of all attempts, at random.
+
+    Raises:
+        ConfigError: if the share is not a probability, or the position is negative.
+    """
+
+    share: float
+    """Probability that an attempt is disturbed, 0 to 1."""
+    seed: int
+    can_id: int | None = None
+    """Identifier of the disturbed frames; None for all frames."""
+    bit: int | None = None
+    """Position of the disturbed bit, as in :class:`NthFrame`; None for a uniformly distributed position."""
+    extended: bool = False
+    station: int | None = None
+    """Station that alone sees the disturbance; None if all stations see it."""
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.share <= 1:
+            raise ConfigError("disturbances.share", self.share, "0 to 1")
+        if self.bit is not None and self.bit < 0:
+            raise ConfigError("disturbances.bit", self.bit, "at least 0")
+
+
+@dataclass(frozen=True, slots=True)
+class AtTime:
+    """Disturb the bit on the bus at a time; no effect if the bus is idle then.
+
+    Raises:
+        ConfigError: if the time is negative.
+    """
+
+    time_ns: int
+    station: int | None = None
+    """Station that alone sees the disturbance; None if all stations see it."""
+
+    def __post_init__(self) -> None:
+        if self.time_ns < 0:
+            raise ConfigError("disturbances.time_ns", self.time_ns, "at least 0 ns")
+
+
+Disturbance = NthFrame | RandomShare | AtTime
+
+
+class Attempt(NamedTuple):
+    """Attempt to send a frame, as the rules see it."""
+
+    frame: CanFrame
+    n_bits: Callable[[], int]
+    """Return the number of positions at which the frame can be disturbed."""
+    bit_at: Callable[[int], int | None]
+    """Return the position of the bit on the bus at a time in ns; None if the frame is not on the bus then."""
+
+
+class Hit(NamedTuple):
+    """Disturbed bit; the earliest position sorts first."""
+
+    bit: int
+    station: int
+    """Station that alone sees the disturbance; -1 if all stations see it."""
+
+
+Rule = Callable[[Attempt], int | None]
+
+
+class Disturbances:
+    """Rules in force, with their counts and random numbers.
+
+    Args:
+        rules: the rules.
+    """
+
+    def __init__(self, rules: Sequence[Disturbance] = ()) -> None:
+        self._rules: list[tuple[int, Rule]] = []
+        for rule in rules:
+            self.add(rule)
+
+    def __bool__(self) -> bool:
+        return bool(self._rules)
+
+    def add(self, rule: Disturbance) -> None:
+        """Add a rule, which counts attempts from now on.
+
+        Args:
+            rule: the rule.
+        """
+        station = -1 if rule.station is None else rule.station
+        self._rules.append((station, _compiled(rule)))
+
+    def hit(self, attempt: Attempt) -> Hit | None:
+        """Return the first bit of an attempt that a rule disturbs, or None.
+
+        Call once for each attempt, because the rules count attempts.
+
+        Args:
+            attempt: the attempt.
+        """
+        hits = []
+        for station, rule in self._rules:
+            bit = rule(attempt)
+            if bit is not None:
+                hits.append(Hit(min(bit, attempt.n_bits() - 1), station))
+        return min(hits, default=None)
+
+
+def _compiled(rule: Disturbance) -> Rule:
+    match rule:
+        case NthFrame():
+            return _nth_frame(rule)
+        case RandomShare():
+            return _random_share(rule)
+        case AtTime():
+            return lambda attempt: attempt.bit_at(rule.time_ns)
+
+
+def _nth_frame(rule: NthFrame) -> Rule:
+    count = 0
+
+    def bit_of(attempt: Attempt) -> int | None:
+        nonlocal count
+        if attempt.frame.can_id != rule.can_id or attempt.frame.extended != rule.extended:
+            return None
+        count += 1
+        return rule.bit if rule.first <= count < rule.first + rule.attempts else None
+
+    return bit_of
+
+
+def _random_share(rule: RandomShare) -> Rule:
+    rng = random.Random(rule.seed)
+
+    def bit_of(attempt: Attempt) -> int | None:
+        frame = attempt.frame
+        if rule.can_id is not None and (frame.can_id, frame.extended) != (rule.can_id, rule.extended):
+            return None
+        if rng.random() >= rule.share:
+            return None
+        return rng.randrange(attempt.n_bits()) if rule.bit is None else rule.bit
+
+    return bit_of

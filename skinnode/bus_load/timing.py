@@ -10,11 +10,11 @@ For the CRC, the padding consists of zeros, which leave the CRC at 0. For stuffi
 bits that end in a 1, so the dominant start of frame begins a new run.
 
 The CAN FD frames of a hand have an 11-bit identifier and switch the bit rate; only :func:`exact_fd_bits`
-counts other CAN FD frames. Bit stuffing follows the same rule up to the end of the data. The CRC field holds a
-4-bit stuff count, 17 CRC bits (21 for more than 16 data bytes), and fixed stuff bits: one at the start of the
-field and one after every 4 bits. The bits from ESI to the CRC delimiter are sent at the data bit rate. The 17
-bits before them (36 bits with a 29-bit identifier) and the 12 bits after them (ACK slot, ACK delimiter, 7-bit
-end of frame and 3-bit inter-frame space) are sent at the nominal bit rate.
+counts other CAN FD frames. Bit stuffing follows the same rule up to the end of the data. The CRC field holds
+a 4-bit stuff count, 17 CRC bits (21 for more than 16 data bytes), and fixed stuff bits: one at the start of
+the field and one after every 4 bits. The bits from ESI to the CRC delimiter are sent at the data bit rate.
+The 17 bits before them (36 bits with a 29-bit identifier) and the 12 bits after them (ACK slot, ACK
+delimiter, 7-bit end of frame and 3-bit inter-frame space) are sent at the nominal bit rate.
 """
 
 from __future__ import annotations

@@ -8,7 +8,8 @@
     confinement (error counters and states), bit_rates (exact times), occupancy (bus load) <- bus
 
 The caller owns time. ``TimedBus.send`` hands in a frame at a time, ``TimedBus.advance`` returns the events up
-to a time, and ``TimedBus.next_event_ns`` says when to advance next. The same calls give the same events.
+to a time, and ``TimedBus.next_event_ns`` says when to advance next. The same calls give the same events. The
+docstrings of ``bus``, ``attempt`` and ``confinement`` list what the model leaves out.
 """
 
 from vcan_sim.timed_bus.bit_rates import BitRates

@@ -2,21 +2,21 @@
 
 :func:`undisturbed` covers the common case with the bit counts alone; :func:`disturbed` follows the bits.
 
-Error frames (ISO 11898-1:2015, 10.4.4 and 10.11). The first station to detect an error starts an error flag of 6
-bits in the next bit. The other stations start theirs when they detect the first flag as an error, up to 6 bits
-later, so the superposed flags are 6 to 12 bits long. An error delimiter of 8 recessive bits and the
-intermission of 3 bits follow. Flags have the nominal bit rate; the delay of the second flag has the bit rate
-of the phase in which the error occurs.
+Error frames (ISO 11898-1:2015; Bosch CAN 2.0, part B, sections 3.1.3 and 7). The first station to detect an
+error starts an error flag of 6 bits in the next bit. The other stations start theirs when they detect the
+first flag as an error, up to 6 bits later, so the superposed flags are 6 to 12 bits long. An error delimiter
+of 8 recessive bits and the intermission of 3 bits follow. Flags have the nominal bit rate; the delay of the
+second flag has the bit rate of the phase in which the error occurs.
 
-Simplifications: a disturbance that all stations see destroys the frame, even if it inverts a recessive bit of the
-arbitration field; error flags and delimiters are not disturbed; passive error flags end with the superposed
-flags; there are no overload frames.
+Simplifications: a disturbance that all stations see destroys the frame, even if it inverts a recessive bit of
+the arbitration field; error flags and delimiters are not disturbed; passive error flags end with the
+superposed flags; there are no overload frames.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Final
 
 from vcan_sim.timed_bus.bit_rates import BitRates
@@ -104,39 +104,37 @@ def disturbed(
         rates: bit rates of the bus.
     """
     wires = {each.station: wire_frame(each.frame, each.passive) for each in senders if each.frame}
-    receiving = {each.station: each for each in receivers}
-    sending = {each.station: each for each in senders}
-    side_errors: list[BitError] = []
+    bus = _OnBus({each.station: each for each in senders}, {each.station: each for each in receivers}, rates)
     while True:
-        wire = next(wires[station] for station in sending)
-        collision = _first_difference([wires[station].bits for station in sending])
+        wire = next(wires[station] for station in bus.sending)
+        collision = _first_difference([wires[station].bits for station in bus.sending])
         if hit is not None and (collision is None or hit.bit <= collision):
-            if hit.station == -1 or hit.station in sending:
-                return _destroyed_by_hit(hit, wire, sending, receiving, side_errors, rates)
-            receiver = receiving.get(hit.station)
-            if receiver is not None:
-                if not receiver.passive:
-                    return _destroyed_by_receiver(hit, wire, sending, receiving, side_errors, rates)
-                side_errors.append(_bit_error(wire, hit.bit, Cause.DISTURBED, (hit.station,), rates))
-                del receiving[hit.station]  # it sees no valid frame, and does not acknowledge
+            if hit.station == -1 or hit.station in bus.sending:
+                return _destroyed_by_hit(hit, wire, bus)
+            receiver = bus.receiving.get(hit.station)
+            if receiver is not None and not receiver.passive:
+                return _destroyed_by_receiver(hit, wire, bus)
+            if receiver is not None:  # it sees no valid frame, and does not acknowledge
+                bus.side_errors.append(_bit_error(wire, hit.bit, Cause.DISTURBED, (hit.station,), rates))
+                del bus.receiving[hit.station]
             hit = None
             continue
         if collision is None:
             break
-        losers = [station for station in sending if wires[station].bits[collision]]
-        if not all(sending[station].passive for station in losers):
-            return _collided(collision, losers, wires, sending, receiving, side_errors, rates)
-        loser_wire = wires[losers[0]]
-        side_errors.append(_bit_error(loser_wire, collision, Cause.COLLISION, tuple(losers), rates))
+        losers = [station for station in bus.sending if wires[station].bits[collision]]
+        if not all(bus.sending[station].passive for station in losers):
+            return _collided(collision, losers, wires, bus)
+        error = _bit_error(wires[losers[0]], collision, Cause.COLLISION, tuple(losers), rates)
+        bus.side_errors.append(error)
         for station in losers:
-            del sending[station]
-    if not receiving:
-        error = _bit_error(wire, wire.ack_slot, Cause.NO_ACK, tuple(sending), rates)
-        return _destroyed(error, 0, sending, receiving, side_errors, rates)
+            del bus.sending[station]
+    if not bus.receiving:
+        error = _bit_error(wire, wire.ack_slot, Cause.NO_ACK, tuple(bus.sending), rates)
+        return _destroyed(error, 0, bus)
     end = rates.ticks(wire.bits_through(len(wire.bits) - 1))
     recessive = end - (ACK_TO_END_BITS - 1) * rates.nominal_ticks
     free = end + INTERMISSION_BITS * rates.nominal_ticks
-    return Course(tuple(sending), end, recessive, free, None, tuple(side_errors))
+    return Course(tuple(bus.sending), end, recessive, free, None, tuple(bus.side_errors))
 
 
 def cut_off(
@@ -158,76 +156,53 @@ def cut_off(
     wire = wire_frame(frame, esi)
     lag = receiver_lag(wire, bit, wire.bits[bit], _PASSIVE)
     detected = min(bit + lag, len(wire.bits) - 1)
-    receiving = {each.station: each for each in receivers}
-    error = _bit_error(wire, detected, Cause.CUT_OFF, tuple(receiving), rates)
-    return _destroyed(error, 0, {}, receiving, [], rates)
+    bus = _OnBus({}, {each.station: each for each in receivers}, rates)
+    error = _bit_error(wire, detected, Cause.CUT_OFF, tuple(bus.receiving), rates)
+    return _destroyed(error, 0, bus)
 
 
-_Stations = dict[int, Participant]
+@dataclass(slots=True)
+class _OnBus:
+    """Stations on the bus in the course of an attempt."""
+
+    sending: dict[int, Participant]
+    receiving: dict[int, Participant]
+    rates: BitRates
+    side_errors: list[BitError] = field(default_factory=list)
 
 
-def _destroyed_by_hit(
-    hit: Hit,
-    wire: WireFrame,
-    sending: _Stations,
-    receiving: _Stations,
-    side_errors: list[BitError],
-    rates: BitRates,
-) -> Course:
-    detecting = tuple(sending) if hit.station == -1 else (hit.station,)
-    flag = _PASSIVE if all(sending[station].passive for station in detecting) else _ACTIVE
+def _destroyed_by_hit(hit: Hit, wire: WireFrame, bus: _OnBus) -> Course:
+    detecting = tuple(bus.sending) if hit.station == -1 else (hit.station,)
+    flag = _PASSIVE if all(bus.sending[station].passive for station in detecting) else _ACTIVE
     seen = wire.bits[hit.bit] ^ (hit.station == -1)
-    lag = receiver_lag(wire, hit.bit, seen, flag) if receiving else 0
+    lag = receiver_lag(wire, hit.bit, seen, flag) if bus.receiving else 0
     if hit.station == -1 and lag == 0:  # the bit itself is an error for the receivers
-        detecting += tuple(receiving)
-    error = _bit_error(wire, hit.bit, Cause.DISTURBED, detecting, rates)
-    return _destroyed(error, _lag_ticks(wire, hit.bit, lag, rates), sending, receiving, side_errors, rates)
+        detecting += tuple(bus.receiving)
+    error = _bit_error(wire, hit.bit, Cause.DISTURBED, detecting, bus.rates)
+    return _destroyed(error, _lag_ticks(wire, hit.bit, lag, bus.rates), bus)
 
 
-def _destroyed_by_receiver(
-    hit: Hit,
-    wire: WireFrame,
-    sending: _Stations,
-    receiving: _Stations,
-    side_errors: list[BitError],
-    rates: BitRates,
-) -> Course:
-    error = _bit_error(wire, hit.bit, Cause.DISTURBED, (hit.station,), rates)
+def _destroyed_by_receiver(hit: Hit, wire: WireFrame, bus: _OnBus) -> Course:
+    error = _bit_error(wire, hit.bit, Cause.DISTURBED, (hit.station,), bus.rates)
     lag = max(_sender_lag(wire, hit.bit), receiver_lag(wire, hit.bit, wire.bits[hit.bit], _ACTIVE))
-    return _destroyed(error, _lag_ticks(wire, hit.bit, lag, rates), sending, receiving, side_errors, rates)
+    return _destroyed(error, _lag_ticks(wire, hit.bit, lag, bus.rates), bus)
 
 
-def _collided(
-    bit: int,
-    losers: list[int],
-    wires: dict[int, WireFrame],
-    sending: _Stations,
-    receiving: _Stations,
-    side_errors: list[BitError],
-    rates: BitRates,
-) -> Course:
-    dominant = [wires[station] for station in sending if station not in losers]
+def _collided(bit: int, losers: list[int], wires: dict[int, WireFrame], bus: _OnBus) -> Course:
+    dominant = [wires[station] for station in bus.sending if station not in losers]
     lag = max(_sender_lag(wire, bit) for wire in dominant)
-    if receiving:
+    if bus.receiving:
         lag = max(lag, receiver_lag(dominant[0], bit, 0, _ACTIVE))
     loser = wires[losers[0]]
-    error = _bit_error(loser, bit, Cause.COLLISION, tuple(losers), rates)
-    return _destroyed(error, _lag_ticks(loser, bit, lag, rates), sending, receiving, side_errors, rates)
+    error = _bit_error(loser, bit, Cause.COLLISION, tuple(losers), bus.rates)
+    return _destroyed(error, _lag_ticks(loser, bit, lag, bus.rates), bus)
 
 
-def _destroyed(
-    error: BitError,
-    lag_ticks: int,
-    sending: _Stations,
-    receiving: _Stations,
-    side_errors: list[BitError],
-    rates: BitRates,
-) -> Course:
-    free = error.ticks + lag_ticks + (FLAG_BITS + _AFTER_FLAG_BITS) * rates.nominal_ticks
-    everyone = (*sending.values(), *receiving.values())
-    flags_are_passive = all(each.passive for each in everyone)
-    recessive = error.ticks if flags_are_passive else free - _AFTER_FLAG_BITS * rates.nominal_ticks
-    return Course(tuple(sending), error.ticks, recessive, free, error, tuple(side_errors))
+def _destroyed(error: BitError, lag_ticks: int, bus: _OnBus) -> Course:
+    free = error.ticks + lag_ticks + (FLAG_BITS + _AFTER_FLAG_BITS) * bus.rates.nominal_ticks
+    flags_are_passive = all(each.passive for each in (*bus.sending.values(), *bus.receiving.values()))
+    recessive = error.ticks if flags_are_passive else free - _AFTER_FLAG_BITS * bus.rates.nominal_ticks
+    return Course(tuple(bus.sending), error.ticks, recessive, free, error, tuple(bus.side_errors))
 
 
 def _bit_error(

@@ -19,9 +19,9 @@ MAX_DATA_BPS: Final = 8_000_000
 class BitRates:
     """Bit rates of a bus.
 
-    Time is counted in ticks of 1/``ticks_per_s`` s, the longest unit in which a nanosecond, a nominal bit and a
-    data bit are all whole numbers. Time therefore does not drift, however long the bus runs. A tick is 1 ns if
-    both bit times are whole nanoseconds.
+    Time is counted in ticks of 1/``ticks_per_s`` s, the longest unit in which a nanosecond, a nominal bit and
+    a data bit are all whole numbers. Time therefore does not drift, however long the bus runs. A tick is 1 ns
+    if both bit times are whole nanoseconds. Only reported times are rounded, each on its own.
 
     Raises:
         ConfigError: if a bit rate is out of range.

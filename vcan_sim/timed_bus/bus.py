@@ -1,9 +1,11 @@
 """The bus: arbitration between the stations, courses of attempts, error counters, and the events.
 
-Stations start a frame at once on an idle bus, otherwise at the end of the intermission. A frame that is handed in
-less than one bit after a start of frame still takes part in the arbitration (Davis, Burns, Bril, Lukkien,
-"Controller Area Network (CAN) schedulability analysis", 2007, section 3). The bus therefore decides each
-arbitration one bit after the start of frame.
+Stations start a frame at once on an idle bus, otherwise at the end of the intermission. A frame that is
+handed in less than one bit after a start of frame still takes part in the arbitration (Davis, Burns, Bril,
+Lukkien, "Controller Area Network (CAN) schedulability analysis", 2007, section 3). The bus therefore decides
+each arbitration one bit after the start of frame.
+
+All stations see each bit at the same time: cables have no delay, and all controllers have the same bit time.
 """
 
 from __future__ import annotations
@@ -590,7 +592,7 @@ class TimedBus:
             self._pending[station.index] = station
 
     def _suspend(self, station: _Station, flight: _Flight) -> None:
-        """Let an error-passive transmitter pause after its frame (ISO 11898-1:2015, 10.4.6.4)."""
+        """Let an error-passive transmitter pause after its frame (Bosch CAN 2.0, part B, section 3.1.5)."""
         if station.passive:
             free = flight.start + flight.course.free
             station.ready = free + SUSPEND_BITS * self._rates.nominal_ticks

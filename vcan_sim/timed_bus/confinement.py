@@ -1,4 +1,8 @@
-"""Fault confinement: error counters and error states of a station (ISO 11898-1:2015, 12.1.4)."""
+"""Fault confinement: error counters and error states of a station (ISO 11898-1:2015).
+
+The numbers of the rules are those of Bosch CAN 2.0, part B, section 8. Rules 4 to 6 and exception 2 of rule 3
+concern disturbed error flags and stuff errors during arbitration, which the bus does not model.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +20,7 @@ MAX_RECEIVE_ERRORS: Final = 255
 """Maximum of the receive error counter; the standard sets no limit, controllers count in 7 or 8 bits."""
 
 _BACK_TO_ACTIVE: Final = 119
-"""Receive error counter after a successful reception by a receiver above 127; the standard allows 119 to 127."""
+"""Receive error counter after a reception by a receiver above 127; the standard allows 119 to 127."""
 
 RECOVERY_RUNS: Final = 128
 """Number of runs of recessive bits that end the bus-off state."""
@@ -60,7 +64,7 @@ ZERO: Final = Counters()
 
 
 def transmission_failed(counters: Counters, *, unanswered: bool = False) -> Counters:
-    """Return the counters of a transmitter that sends an error flag (rule c).
+    """Return the counters of a transmitter that sends an error flag (rule 3).
 
     Args:
         counters: the counters before.
@@ -76,7 +80,7 @@ def transmission_failed(counters: Counters, *, unanswered: bool = False) -> Coun
 
 
 def reception_failed(counters: Counters, *, first: bool = False) -> Counters:
-    """Return the counters of a receiver that detects an error (rules a and b).
+    """Return the counters of a receiver that detects an error (rules 1 and 2).
 
     Args:
         counters: the counters before.
@@ -90,12 +94,12 @@ def reception_failed(counters: Counters, *, first: bool = False) -> Counters:
 
 
 def transmission_succeeded(counters: Counters) -> Counters:
-    """Return the counters of a transmitter after a successful transmission (rule g)."""
+    """Return the counters of a transmitter after a successful transmission (rule 7)."""
     return Counters(counters.tec - 1, counters.rec) if counters.tec else counters
 
 
 def reception_succeeded(counters: Counters) -> Counters:
-    """Return the counters of a receiver after a successful reception (rule h)."""
+    """Return the counters of a receiver after a successful reception (rule 8)."""
     if not counters.rec:
         return counters
     rec = _BACK_TO_ACTIVE if counters.rec >= PASSIVE_FROM else counters.rec - 1

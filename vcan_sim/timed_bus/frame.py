@@ -7,6 +7,7 @@ from typing import Final
 
 from skinnode.bus_load.timing import exact_bits, exact_fd_bits
 from skinnode.canopen.data_length import FD_LENGTHS
+from skinnode.text.words import counted
 
 _VALID_FD_LENGTHS: Final = frozenset(FD_LENGTHS)
 
@@ -43,14 +44,14 @@ class CanFrame:
             if self.remote:
                 raise ValueError("remote: got a remote CAN FD frame, must be a classic frame")
             if length not in _VALID_FD_LENGTHS:
-                raise ValueError(f"data: got {length} bytes, must be one of {FD_LENGTHS}")
+                raise ValueError(f"data: got {counted(length, 'byte')}, must be one of {FD_LENGTHS}")
             return
         if self.brs:
             raise ValueError("brs: got a classic frame that switches the bit rate, must be a CAN FD frame")
         if length > 8:
-            raise ValueError(f"data: got {length} bytes, must be at most 8")
+            raise ValueError(f"data: got {counted(length, 'byte')}, must be at most 8")
         if self.remote and length:
-            raise ValueError(f"data: got {length} bytes in a remote frame, must be none")
+            raise ValueError(f"data: got {counted(length, 'byte')} in a remote frame, must be none")
         if not 0 <= self.dlc <= 8:
             raise ValueError(f"dlc: got {self.dlc}, must be 0 to 8")
 
@@ -59,8 +60,8 @@ def arbitration_key(frame: CanFrame) -> int:
     """Return the bits of the arbitration field as a number: the frame with the lowest number wins.
 
     The order is that of the bits on the bus, dominant before recessive: base identifier, RTR or SRR, IDE,
-    identifier extension, RTR (ISO 11898-1:2015, 10.4.2 and 10.8.2). A base frame has zeros in the place of the
-    extension, which no extended frame reaches without losing at IDE.
+    identifier extension, RTR (ISO 11898-1:2015). A base frame has zeros in the place of the extension;
+    against a base frame, an extended frame loses at SRR or IDE at the latest.
 
     Args:
         frame: the frame.

@@ -1,7 +1,7 @@
 """Frames bit by bit, to place errors in them (ISO 11898-1:2015).
 
-This is the slow path: :mod:`vcan_sim.timed_bus.bus` builds the bits of a frame only if an error destroys it or
-two stations send the same identifier.
+This is the slow path: :mod:`vcan_sim.timed_bus.bus` builds the bits of a frame only if a rule disturbs it,
+no station acknowledges it, or two stations send the same identifier.
 """
 
 from __future__ import annotations
@@ -95,8 +95,8 @@ def wire_frame(frame: CanFrame, esi: bool = False) -> WireFrame:
 def receiver_lag(wire: WireFrame, position: int, seen: int, flag: int) -> int:
     """Return how many bits of an error flag a receiver sees before it detects an error itself.
 
-    The flag starts after ``position``. It violates the stuff rule with the sixth equal bit, the rule for fixed
-    stuff bits, or the form of the delimiters (ISO 11898-1:2015, 10.9 and 10.11).
+    The flag starts after ``position``. It violates the stuff rule with the sixth equal bit, the rule for
+    fixed stuff bits, or the form of the delimiters (ISO 11898-1:2015).
 
     Args:
         wire: the frame.
@@ -123,12 +123,10 @@ def receiver_lag(wire: WireFrame, position: int, seen: int, flag: int) -> int:
         if place > position and before == flag:
             lag = min(lag, place - position)
             break
-    recessive_from = wire.delimiter if flag == 0 else wire.ack_slot
-    first = next(
-        (at for at in range(recessive_from, len(wire.bits)) if at > position and wire.bits[at] != flag),
-        len(wire.bits),
-    )
-    return min(lag, first - position)
+    if flag:  # a wrong CRC shows after the ACK delimiter
+        return min(lag, max(0, wire.ack_slot + 1 - position))
+    recessive = (at for at in range(max(position + 1, wire.delimiter), len(wire.bits)) if wire.bits[at])
+    return min(lag, next(recessive, position) - position)
 
 
 def _head(frame: CanFrame, esi: bool) -> Iterator[int]:

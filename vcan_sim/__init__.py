@@ -8,5 +8,6 @@
 
 ``contact`` has contact mechanics on a bonded layer, apart from all models of the product; scenes do not use
 it yet. ``timed_bus`` is a CAN bus with exact times, arbitration, errors and error counters; the nodes do not
-use it yet. ``faults`` declares the faults, ``injector`` draws and counts faults, ``tally`` counts frames by kind.
+use it yet. ``faults`` declares the faults, ``injector`` draws and counts faults, ``tally`` counts frames by
+kind.
 """

@@ -24,6 +24,8 @@ class Drawn:
     """For each bit whether it has the data bit rate."""
     stuffed: int
     """How many bits follow the stuff rule."""
+    plain: int
+    """How many of them are not stuff bits."""
     fixed: list[int]
     """Where the fixed stuff bits are."""
 
@@ -88,20 +90,26 @@ def draw(frame: CanFrame, esi: bool = False) -> Drawn:
             bits.append(bit)
     fast += [is_fast] * (len(bits) + 1 - len(fast))
     tail = "1" + "0" + "1" + "1" * 7  # CRC delimiter, ACK slot, ACK delimiter, end of frame
-    return Drawn("".join(bits) + tail, fast + [False] * 9, stuffed, fixed)
+    return Drawn("".join(bits) + tail, fast + [False] * 9, stuffed, len(plain), fixed)
 
 
-def error_seen_at(drawn: Drawn, seen: str) -> int | None:
-    """Place of the bit in which a receiver that sees these bits detects an error by stuffing or form."""
-    last, run = "", 0
-    tail = len(drawn.bits) - 10
-    for place, bit in enumerate(seen):
-        run = run + 1 if bit == last else 1
-        if place < drawn.stuffed and run == 6:
+def error_seen_at(drawn: Drawn, bit: int, value: str, flag: str) -> int:
+    """Place of the bit in which a receiver detects an error by stuffing, by form or, at the ACK delimiter, by
+    the CRC, if it sees ``value`` in place of a bit and an error flag after it."""
+    seen = drawn.bits[:bit] + value + flag * 50
+    field = len(drawn.bits) - 10 - drawn.stuffed  # CRC field of CAN FD
+    taken, place = 0, 0
+    while True:
+        stuff_bit_is_due = seen[max(0, place - 5) : place] in ("0" * 5, "1" * 5)
+        if taken == drawn.plain and (field or not stuff_bit_is_due):
+            break
+        if stuff_bit_is_due and seen[place] == seen[place - 1]:
             return place
-        if place in drawn.fixed and bit == last:
-            return place
-        if place >= tail and place != tail + 1 and bit == "0":
-            return place
-        last = bit
-    return None
+        taken += not stuff_bit_is_due
+        place += 1
+    for fixed in range(place, place + field, 5):
+        if seen[fixed] == seen[fixed - 1]:
+            return fixed
+    place += field
+    wrong = [at for at in range(place, len(seen)) if at == place + 2 or (seen[at] == "0" and at != place + 1)]
+    return next(at for at in wrong if at >= bit)

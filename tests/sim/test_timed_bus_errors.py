@@ -75,9 +75,7 @@ def naive_retry_bits(frame: CanFrame, bit: int) -> tuple[int, int, bool]:
     flags of a sender and its receivers, to the next start; whether the receivers see an error in that bit."""
     drawn = draw(frame)
     inverted = "10"[int(drawn.bits[bit])]
-    place = error_seen_at(drawn, drawn.bits[:bit] + inverted + "0" * 6)
-    assert place is not None
-    assert place >= bit
+    place = error_seen_at(drawn, bit, inverted, "0")
     fast = sum(drawn.at_data_rate[: bit + 1])
     lag = place - bit
     nominal = bit + 1 - fast + 6 + 8 + 3
@@ -112,6 +110,22 @@ def test_error_flags_end_with_those_of_the_receivers(can_id: int, data: bytes, f
         assert 6 + 8 + 3 <= nominal - (bit + 1 - before) <= 12 + 8 + 3
 
 
+@settings(deadline=None, max_examples=60)
+@given(st.integers(0, 0x7FF), st.binary(max_size=2), st.integers(0, 10**6) | st.integers(-30, -1))
+def test_passive_error_flag_is_noticed_as_missing_stuff_bits(can_id: int, data: bytes, bit: int) -> None:
+    """A receiver that sees no violation finds the CRC wrong, which shows after the ACK delimiter."""
+    frame = CanFrame(can_id, data)
+    drawn = draw(frame)
+    bit %= len(drawn.bits) - 1
+    bus = bus_of(2, NthFrame(can_id, 1, attempts=16), NthFrame(can_id, 17, bit=bit))
+    bus.send(0, 0, frame)
+    events = bus.advance(FOREVER)
+    inverted = "10"[int(drawn.bits[bit])]
+    lag = error_seen_at(drawn, bit, inverted, "1") - bit
+    pause = delivered(events)[0].started_ns - errors(events)[16].time_ns
+    assert pause == (lag + 6 + 8 + 3 + 8) * US
+
+
 def test_stuff_bit_inverted_is_an_error_for_all() -> None:
     # Identifier 0: the sixth bit is the first stuff bit. Inverted, it is the sixth dominant bit for all.
     bus = bus_of(2, NthFrame(0, 1, bit=5))
@@ -133,9 +147,7 @@ def test_receiver_alone_sees_an_error() -> None:
     assert first == {0: Counters(8, 0), 1: Counters(0, 1), 2: Counters(0, 9), 3: Counters(0, 1)}
     assert [bus.counters(n) for n in range(4)] == [Counters(7, 0), Counters(), Counters(0, 8), Counters()]
     flag_at = errors(events)[0].time_ns // US
-    seen = draw(FRAME).bits[:26] + "0" * 6
-    by_stuffing = error_seen_at(draw(FRAME), seen)
-    assert by_stuffing is not None
+    by_stuffing = error_seen_at(draw(FRAME), 25, draw(FRAME).bits[25], "0")
     assert delivered(events)[0].started_ns // US - flag_at == by_stuffing - 25 + 6 + 8 + 3
 
 
@@ -184,6 +196,50 @@ def test_bus_off_after_32_errors_and_back_on_an_idle_bus() -> None:
     assert [counters.state for counters in states] == (
         [ErrorState.ACTIVE] * 15 + [ErrorState.PASSIVE] * 16 + [ErrorState.BUS_OFF, ErrorState.ACTIVE]
     )
+
+
+def test_frame_half_a_bit_before_the_end_of_a_recovery_delays_it() -> None:
+    bus = bus_of(3, NthFrame(0, 1, attempts=32, bit=5))
+    bus.send(0, 0, CanFrame(0))
+    events: list[Event] = []
+    while not only(events, BusOff):
+        events += bus.advance(bus.next_event_ns or 0)
+    due = events[-1].time_ns + (6 + 128 * 11) * US
+    bus.send(due - 500, 1, ANOTHER)
+    events = bus.advance(FOREVER)
+    end = due - 500 + (len(draw(ANOTHER).bits) + 3) * US  # 127 runs before the frame, and the gap after it
+    assert only(events, Recovered) == [Recovered(end, 0)]
+    assert delivered(events)[0].receivers == (2,)
+
+
+def test_recovery_counts_recessive_bits_of_passive_flags() -> None:
+    """The only other station gets no acknowledgement. Once it is error-passive, its flag (6), delimiter (8),
+    intermission (3) and suspension (8) are two runs of 11; before, delimiter and intermission are one."""
+    bus = bus_of(2, NthFrame(0, 1, attempts=32, bit=5))
+    bus.send(0, 0, CanFrame(0))
+    events: list[Event] = []
+    while not only(events, BusOff):
+        events += bus.advance(bus.next_event_ns or 0)
+    bus.send(events[-1].time_ns, 1, ANOTHER)
+    events = bus.advance(FOREVER)
+    before = events[: events.index(only(events, Recovered)[0])]
+    # 1 run before the first attempt, 1 after each of 16, then 2 after each: 17 + 2 * 56 = 129 > 127
+    assert len(errors(before)) == 16 + 56
+    assert only(events, Recovered)[0].time_ns == errors(before)[-1].time_ns + 11 * US
+
+
+def test_recovery_after_a_frame_that_was_cut_off() -> None:
+    bus = bus_of(3, NthFrame(0, 1, attempts=32, bit=5))
+    bus.send(0, 0, CanFrame(0))
+    events: list[Event] = []
+    while not only(events, BusOff):
+        events += bus.advance(bus.next_event_ns or 0)
+    begin = events[-1].time_ns + (6 + 11) * US
+    bus.send(begin, 1, FRAME)
+    bus.disconnect(begin + 20 * US, 1)
+    events = bus.advance(FOREVER)
+    flag_end = errors(events)[0].time_ns + 6 * US
+    assert only(events, Recovered) == [Recovered(flag_end + 127 * 11 * US, 0)]
 
 
 def test_recovery_counts_one_gap_between_frames_of_a_full_bus() -> None:
@@ -236,6 +292,15 @@ def test_error_passive_sender_lets_others_go_first() -> None:
     bus.send(0, 1, CanFrame(0x700))
     frames = [event.frame.can_id for event in delivered(bus.advance(FOREVER))]
     assert frames == [0x700, 0, 0, 0, 0]
+
+
+def test_suspended_sender_that_becomes_ready_in_a_start_of_frame_waits() -> None:
+    bus = bus_of(3, NthFrame(0, 1, attempts=17, bit=5))
+    bus.send(0, 0, CanFrame(0))
+    bus.send(0, 0, CanFrame(0, b"\1"))
+    (sent,) = delivered(until_delivered(bus, 1))
+    bus.send(sent.time_ns + (3 + 8) * US - 500, 1, CanFrame(0x700))
+    assert [event.frame.can_id for event in delivered(bus.advance(FOREVER))] == [0x700, 0]
 
 
 def test_receiver_above_127_falls_to_119() -> None:
@@ -301,6 +366,21 @@ def test_same_identifier_and_different_data_collide() -> None:
     assert bus.counters(2) == Counters(0, 14)
 
 
+@pytest.mark.parametrize("stations", [2, 3])
+def test_stations_that_collide_start_again_together(stations: int) -> None:
+    ours, theirs = CanFrame(0x123, b"\x01\x02"), CanFrame(0x123, b"\x01\x82")
+    bus = bus_of(stations)
+    bus.send(0, 0, ours)
+    bus.send(0, 1, theirs)
+    first, second = errors(bus.advance(300 * US))[:2]
+    drawn = draw(ours)
+    # The sender of the dominant bit sees the flag in its next recessive bit, the receiver by stuffing.
+    lag = drawn.bits.index("1", first.bit + 1) - first.bit
+    if stations == 3:
+        lag = max(lag, error_seen_at(drawn, first.bit, "0", "0") - first.bit)
+    assert second.time_ns - first.time_ns == (lag + 6 + 8 + 3 + first.bit + 1) * US
+
+
 def test_same_bits_at_the_same_time_pass_as_one_frame() -> None:
     bus = bus_of(3)
     for station in (0, 1):
@@ -309,6 +389,12 @@ def test_same_bits_at_the_same_time_pass_as_one_frame() -> None:
     assert (first.time_ns, first.station, first.receivers) == (second.time_ns, 0, (2,))
     assert (second.station, second.receivers) == (1, ())
     assert bus.frames == {(0x123, False): 1}
+    bus = bus_of(3)  # one of them is disconnected: the other goes on
+    for station in (0, 1):
+        bus.send(0, station, FRAME)
+    bus.disconnect(20 * US, 0)
+    assert [(event.station, event.receivers) for event in delivered(bus.advance(FOREVER))] == [(1, (2,))]
+    assert (bus.waiting(0), bus.waiting(1)) == (1, 0)
     alone = bus_of(2)  # two that send do not acknowledge each other
     for station in (0, 1):
         alone.send(0, station, FRAME)
@@ -343,6 +429,12 @@ def test_time_hits_the_bit_on_the_bus() -> None:
         bus = bus_of(2, AtTime(time_ns), rates=BitRates(500_000, 2_000_000))
         bus.send(0, 0, fd)
         assert errors(bus.advance(FOREVER))[0].bit == bit
+
+
+def test_earliest_of_several_disturbances_destroys_the_frame() -> None:
+    bus = bus_of(3, NthFrame(0x123, 1, bit=40), NthFrame(0x123, 1, bit=30), NthFrame(0x123, 1, bit=35))
+    bus.send(0, 0, FRAME)
+    assert [error.bit for error in errors(bus.advance(FOREVER))] == [30]
 
 
 @pytest.mark.parametrize("share", [0.0, 0.2, 1.0])
@@ -406,8 +498,7 @@ def test_sender_that_is_disconnected_leaves_an_error_frame() -> None:
     bus.send(0, 1, ANOTHER)
     bus.disconnect(bit * US + 500, 0)
     events = bus.advance(FOREVER)
-    place = error_seen_at(drawn, drawn.bits[: bit + 1] + "1" * 6)
-    assert place is not None
+    place = error_seen_at(drawn, bit, drawn.bits[bit], "1")
     (error,) = errors(events)
     assert (error.bit, error.cause, error.stations) == (place, Cause.CUT_OFF, ())
     assert error.time_ns == (place + 1) * US

@@ -250,9 +250,9 @@ class TimedBus:
             return
         joining.connected = True
         joining.recovers_from = None
-        # A station takes part after 11 recessive bits (ISO 11898-1:2015, bus integration).
-        integration = RECOVERY_RUN_BITS * self._rates.nominal_ticks
-        joining.ready = max(self._now, self._recessive_from) + integration
+        # A station takes part after 11 recessive bits (ISO 11898-1:2015, bus integration). During a frame,
+        # these are the last 11 bits before the bus is free.
+        joining.ready = self._now + RECOVERY_RUN_BITS * self._rates.nominal_ticks
         self._receivers.clear()
         self._set_counters(self._now, joining, ZERO)
         self._offer(joining)
@@ -676,7 +676,6 @@ class TimedBus:
             self._receivers.clear()
             self._set_counters(now, station, ZERO)
             self._events.append(Recovered(self._rates.ceil_ns(now), station.index))
-            station.ready = now
             if len(station.queue):
                 self._pending[station.index] = station
         if complete:

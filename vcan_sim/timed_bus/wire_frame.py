@@ -20,6 +20,8 @@ ACK_TO_END_BITS: Final = 9
 """Length of ACK slot, ACK delimiter and end of frame, bits."""
 
 _STUFF_AFTER: Final = 5
+_FIXED_STUFF_SPACING: Final = 5
+_MAX_LAG: Final = 7  # four recessive bits of the CRC, CRC delimiter, ACK slot and ACK delimiter
 _CRC_15: Final = 0x4599
 _CRC_17: Final = 0x1685B
 _CRC_21: Final = 0x102899
@@ -33,6 +35,8 @@ class WireFrame:
     """All bits from start of frame to the last bit of the end of frame."""
     stuffed_end: int
     """Number of bits that follow the stuff rule: up to the CRC sequence, CAN FD up to the data."""
+    plain: int
+    """Number of these bits without the stuff bits."""
     fixed_stuff: tuple[int, ...]
     """Positions of the fixed stuff bits of CAN FD."""
     delimiter: int
@@ -66,9 +70,9 @@ def wire_frame(frame: CanFrame, esi: bool = False) -> WireFrame:
     payload = tuple(byte >> shift & 1 for byte in frame.data for shift in range(7, -1, -1))
     if not frame.fd:
         crc = _crc((*head, *payload), 15, _CRC_15, 0)
-        stuffed, _ = _stuffed((*head, *payload, *crc))
+        stuffed, places = _stuffed((*head, *payload, *crc))
         n = len(stuffed)
-        return WireFrame((*stuffed, *tail), n, (), n, range(0))
+        return WireFrame((*stuffed, *tail), n, n - len(places), (), n, range(0))
 
     stuffed, places = _stuffed((*head, *payload))
     if places[-1:] == [len(stuffed) - 1]:  # the first fixed stuff bit takes the place of this one
@@ -89,14 +93,16 @@ def wire_frame(frame: CanFrame, esi: bool = False) -> WireFrame:
     if frame.brs:
         esi_place = len(head) - 5
         phase = range(_with_stuff_bits(esi_place, places), delimiter + 1)
-    return WireFrame((*bits, *tail), len(stuffed), tuple(fixed), delimiter, phase)
+    plain = len(head) + len(payload)
+    return WireFrame((*bits, *tail), len(stuffed), plain, tuple(fixed), delimiter, phase)
 
 
 def receiver_lag(wire: WireFrame, position: int, seen: int, flag: int) -> int:
     """Return how many bits of an error flag a receiver sees before it detects an error itself.
 
-    The flag starts after ``position``. It violates the stuff rule with the sixth equal bit, the rule for
-    fixed stuff bits, or the form of the delimiters (ISO 11898-1:2015).
+    The flag starts after ``position``. It violates the stuff rule, the rule for fixed stuff bits, or the form
+    of the delimiters and the end of frame; otherwise the CRC is wrong, which a receiver reports after the ACK
+    delimiter (ISO 11898-1:2015). The receiver removes the stuff bits that it sees itself.
 
     Args:
         wire: the frame.
@@ -105,28 +111,38 @@ def receiver_lag(wire: WireFrame, position: int, seen: int, flag: int) -> int:
         flag: 0 for an active error flag, 1 for a passive error flag.
 
     Returns:
-        Number of bits, 0 to 6; 0 if the bit itself is an error for the receiver.
+        Number of bits, 0 to 6 for an active and 0 to 7 for a passive error flag; 0 if the bit itself is an
+        error for the receiver.
     """
-    lag = FLAG_BITS
-    if position < wire.stuffed_end:
-        run, at = 1, position - 1
-        while at >= 0 and wire.bits[at] == seen:
-            run, at = run + 1, at - 1
-        if run >= FLAG_BITS:
-            return 0
-        if seen == flag:
-            lag = FLAG_BITS - run
-    elif seen != wire.bits[position] and (position in wire.fixed_stuff or position >= wire.delimiter):
-        return 1 if position == wire.ack_slot else 0
-    for place in wire.fixed_stuff:
-        before = seen if place - 1 == position else flag
-        if place > position and before == flag:
-            lag = min(lag, place - position)
+    stream = (*wire.bits[:position], seen, *(flag,) * _MAX_LAG)
+    last = run = plain = 0
+    start = 0
+    for at, bit in enumerate(stream):
+        if plain == wire.plain and (wire.fixed_stuff or run < _STUFF_AFTER):
+            start = at
             break
-    if flag:  # a wrong CRC shows after the ACK delimiter
-        return min(lag, max(0, wire.ack_slot + 1 - position))
-    recessive = (at for at in range(max(position + 1, wire.delimiter), len(wire.bits)) if wire.bits[at])
-    return min(lag, next(recessive, position) - position)
+        if run == _STUFF_AFTER:  # a stuff bit is due
+            if bit == last:
+                return at - position
+            run = 1
+        else:
+            plain += 1
+            run = run + 1 if bit == last and run else 1
+        last = bit
+    else:
+        return _MAX_LAG
+    delimiter = start + wire.delimiter - wire.stuffed_end
+    for at in range(start, len(stream)):
+        before, bit = stream[at - 1], stream[at]
+        if at < delimiter:
+            wrong = bool(wire.fixed_stuff) and (at - start) % _FIXED_STUFF_SPACING == 0 and bit == before
+        elif at == delimiter + 2:
+            wrong = bit == 0 or at > position  # form error, or wrong CRC
+        else:
+            wrong = bit == 0 and at != delimiter + 1
+        if wrong and at >= position:
+            return at - position
+    return 0
 
 
 def _head(frame: CanFrame, esi: bool) -> Iterator[int]:

@@ -163,6 +163,14 @@ def test_cleared_frames_are_not_sent() -> None:
     assert bus.waiting(0) == 0
 
 
+def test_frame_cleared_in_the_start_of_frame_does_not_delay_the_others() -> None:
+    bus = bus_of(3)
+    for station in (0, 1):
+        bus.send(0, station, CanFrame(station))
+    bus.clear(500, 0)
+    assert [(event.station, event.started_ns) for event in delivered(bus)] == [(1, 0)]
+
+
 def test_times_are_exact_after_many_frames() -> None:
     """Bits of 3 1/3 and 1/3 microseconds: a sum of rounded times would be off by milliseconds."""
     rates, rng = BitRates(300_000, 3_000_000), random.Random(5)

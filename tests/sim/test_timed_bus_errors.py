@@ -111,7 +111,7 @@ def test_error_flags_end_with_those_of_the_receivers(can_id: int, data: bytes, f
 
 
 @settings(deadline=None, max_examples=60)
-@given(st.integers(0, 0x7FF), st.binary(max_size=2), st.integers(0, 10**6) | st.integers(-30, -1))
+@given(st.integers(0, 0x7FF), st.binary(max_size=2), st.integers(0, 10**6) | st.integers(-16, -10))
 def test_passive_error_flag_is_noticed_as_missing_stuff_bits(can_id: int, data: bytes, bit: int) -> None:
     """A receiver that sees no violation finds the CRC wrong, which shows after the ACK delimiter."""
     frame = CanFrame(can_id, data)
@@ -511,6 +511,14 @@ def test_sender_that_is_disconnected_leaves_an_error_frame() -> None:
     bus.connect(FOREVER + 1, 0)
     (again,) = delivered(bus.advance(2 * FOREVER))
     assert (again.frame, again.queued_ns, again.started_ns) == (FRAME, 0, FOREVER + 1 + 11 * US)
+
+
+def test_only_receiver_counts_a_frame_cut_off_as_any_receiver() -> None:
+    bus = bus_of(2)
+    bus.send(0, 0, FRAME)
+    bus.disconnect(40 * US, 0)
+    bus.advance(FOREVER)
+    assert bus.counters(1) == Counters(0, 1)
 
 
 def test_receiver_that_leaves_or_joins_during_a_frame() -> None:

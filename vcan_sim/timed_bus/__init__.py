@@ -2,10 +2,11 @@
 
 ::
 
-    frame (what a station hands in) -> transmit_queue (FIFO or by priority)
-        -> bus (arbitration, bits on the bus, acknowledgement, retransmission) -> events
-    disturbances (rules that inject errors) -> wire_frame (bits of a frame) -> bus
-    confinement (error counters and states), bit_rates (exact times), occupancy (bus load) <- bus
+    frame (a frame and its length) -> transmit_queue (FIFO or by priority) -> station (options, state)
+        -> bus (arbitration, retransmission, recovery) -> events
+    disturbances (rules that inject errors) -> wire_frame (the bits of a frame)
+        -> attempt (delivered or destroyed, and when) -> bus
+    confinement (error counters and states), bit_rates (exact times), occupancy (bus load) -> bus
 
 The caller owns time. ``TimedBus.send`` hands in a frame at a time, ``TimedBus.advance`` returns the events up
 to a time, and ``TimedBus.next_event_ns`` says when to advance next. The same calls give the same events. The
@@ -13,7 +14,7 @@ docstrings of ``bus``, ``attempt`` and ``confinement`` list what the model leave
 """
 
 from vcan_sim.timed_bus.bit_rates import BitRates
-from vcan_sim.timed_bus.bus import StationOptions, TimedBus
+from vcan_sim.timed_bus.bus import TimedBus
 from vcan_sim.timed_bus.confinement import Counters, ErrorState
 from vcan_sim.timed_bus.disturbances import AtTime, Disturbance, NthFrame, RandomShare
 from vcan_sim.timed_bus.events import (
@@ -26,6 +27,7 @@ from vcan_sim.timed_bus.events import (
     Recovered,
 )
 from vcan_sim.timed_bus.frame import CanFrame
+from vcan_sim.timed_bus.station import StationOptions
 
 __all__ = [
     "AtTime",

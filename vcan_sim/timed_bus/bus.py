@@ -11,12 +11,11 @@ All stations see each bit at the same time: cables have no delay, and all contro
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from types import MappingProxyType
-from typing import Literal
 
 from skinnode.errors import ConfigError
-from vcan_sim.timed_bus.attempt import BitError, Course, Participant, cut_off, disturbed, undisturbed
+from vcan_sim.timed_bus.attempt import BitError, Participant, cut_off, disturbed, undisturbed
 from vcan_sim.timed_bus.bit_rates import BitRates
 from vcan_sim.timed_bus.confinement import (
     RECOVERY_RUN_BITS,
@@ -42,92 +41,9 @@ from vcan_sim.timed_bus.events import (
 )
 from vcan_sim.timed_bus.frame import CanFrame, arbitration_key
 from vcan_sim.timed_bus.occupancy import Occupancy
-from vcan_sim.timed_bus.transmit_queue import FifoQueue, PriorityQueue, TransmitQueue, Waiting
+from vcan_sim.timed_bus.station import Flight, Station, StationOptions
+from vcan_sim.timed_bus.transmit_queue import Waiting
 from vcan_sim.timed_bus.wire_frame import wire_frame
-
-
-@dataclass(frozen=True, slots=True)
-class StationOptions:
-    """Properties of a station's controller.
-
-    Raises:
-        ConfigError: if an option is not valid.
-    """
-
-    queue: Literal["fifo", "priority"] = "fifo"
-    """Order of transmission: as handed in, as a SocketCAN interface does, or the highest priority first."""
-    capacity: int | None = None
-    """Maximum number of frames to send, including the frame being sent; None for no limit."""
-    restart_ns: int | None = 0
-    """Time from bus-off to the start of the recovery, ns; None to wait for :meth:`TimedBus.restart`."""
-
-    def __post_init__(self) -> None:
-        if self.queue not in ("fifo", "priority"):
-            raise ConfigError("queue", self.queue, "fifo or priority")
-        if self.capacity is not None and self.capacity < 1:
-            raise ConfigError("capacity", self.capacity, "at least 1 frame, or None")
-        if self.restart_ns is not None and self.restart_ns < 0:
-            raise ConfigError("restart_ns", self.restart_ns, "at least 0 ns, or None")
-
-
-class _Station:
-    """State of a station."""
-
-    __slots__ = (
-        "connected",
-        "counters",
-        "index",
-        "options",
-        "passive",
-        "queue",
-        "ready",
-        "recovers_from",
-        "runs_seen",
-        "sending",
-    )
-
-    def __init__(self, index: int, options: StationOptions) -> None:
-        self.index = index
-        self.options = options
-        self.queue: TransmitQueue = FifoQueue() if options.queue == "fifo" else PriorityQueue()
-        self.sending: Waiting | None = None
-        self.counters = ZERO
-        self.passive = False
-        self.connected = True
-        self.ready = 0
-        """Earliest start of the station's next frame, ticks."""
-        self.recovers_from: int | None = None
-        """Start of the recovery from bus-off, ticks; None if the station is not recovering."""
-        self.runs_seen = 0
-        """Number of complete recessive runs seen during the recovery, until the last start of frame."""
-
-    @property
-    def on_bus(self) -> bool:
-        return self.connected and self.counters.state is not ErrorState.BUS_OFF
-
-
-class _Flight:
-    """Attempt in progress."""
-
-    __slots__ = ("course", "receivers", "side", "start", "waiting")
-
-    def __init__(
-        self, start: int, course: Course, waiting: dict[int, Waiting], receivers: tuple[int, ...]
-    ) -> None:
-        self.start = start
-        self.course = course
-        self.waiting = waiting
-        """Frames that the attempt sends, by station."""
-        self.receivers = receivers
-        """Stations on the bus at the start of frame that do not send."""
-        self.side = 0
-        """Number of side errors that have occurred."""
-
-    @property
-    def next(self) -> int:
-        """Time of the next event of the attempt, ticks."""
-        side = self.course.side_errors
-        return self.start + (side[self.side].ticks if self.side < len(side) else self.course.end)
 
 
 class TimedBus:
@@ -149,16 +65,16 @@ class TimedBus:
         disturbances: Sequence[Disturbance] = (),
     ) -> None:
         self._rates = rates or BitRates()
-        self._stations = [_Station(index, options) for index, options in enumerate(stations)]
+        self._stations = [Station(index, options) for index, options in enumerate(stations)]
         self._disturbances = Disturbances()
         self._now = 0
         self._free = 0
         self._recessive_from = 0
         self._start: int | None = None
-        self._flight: _Flight | None = None
+        self._flight: Flight | None = None
         self._next: int | None = None
-        self._pending: dict[int, _Station] = {}
-        self._recovering: list[_Station] = []
+        self._pending: dict[int, Station] = {}
+        self._recovering: list[Station] = []
         self._receivers: dict[tuple[int, ...], tuple[int, ...]] = {}
         self._counts_are_zero = True
         self._number = 0
@@ -367,7 +283,7 @@ class TimedBus:
 
     # --- the course of time inside
 
-    def _at(self, time_ns: int, station: int) -> _Station:
+    def _at(self, time_ns: int, station: int) -> Station:
         if not 0 <= station < len(self._stations):
             raise IndexError(f"station: got {station}, must be 0 to {len(self._stations) - 1}")
         self._advance(time_ns)
@@ -410,7 +326,7 @@ class TimedBus:
                 due = at
         self._next = due
 
-    def _offer(self, sender: _Station) -> None:
+    def _offer(self, sender: Station) -> None:
         """Let a station take part in the next arbitration if it has a frame to send."""
         if not len(sender.queue) or not sender.on_bus:
             return
@@ -421,7 +337,7 @@ class TimedBus:
                 self._start = start
                 self._plan()
 
-    def _withdraw(self, sender: _Station) -> None:
+    def _withdraw(self, sender: Station) -> None:
         """Update the next start of frame after a station can no longer send."""
         if self._pending.pop(sender.index, None) and self._flight is None:
             started = self._start is not None and self._start <= self._now
@@ -455,7 +371,7 @@ class TimedBus:
         ceil_ns = self._rates.ceil_ns
         self._occupancy.add(ceil_ns(start), ceil_ns(start + self._flight.course.free))
 
-    def _take_off(self, start: int, winners: list[_Station]) -> _Flight:
+    def _take_off(self, start: int, winners: list[Station]) -> Flight:
         waiting = {}
         for station in winners:
             station.sending = waiting[station.index] = station.queue.pop()
@@ -476,7 +392,7 @@ class TimedBus:
                 for station in winners
             ]
             course = disturbed(sending, self._participants(receivers), hit, self._rates)
-        return _Flight(start, course, waiting, receivers)
+        return Flight(start, course, waiting, receivers)
 
     def _attempt(self, frame: CanFrame, esi: bool, start: int) -> Attempt:
         def n_bits() -> int:
@@ -506,7 +422,7 @@ class TimedBus:
 
     # --- outcomes
 
-    def _deliver(self, now: int, flight: _Flight) -> None:
+    def _deliver(self, now: int, flight: Flight) -> None:
         course, ceil_ns = flight.course, self._rates.ceil_ns
         time_ns, started_ns = ceil_ns(now), ceil_ns(flight.start)
         receivers = self._still_receiving(flight)
@@ -526,7 +442,7 @@ class TimedBus:
             self._counts_are_zero = all(station.counters == ZERO for station in self._stations)
         self._land(now, flight)
 
-    def _destroy(self, now: int, flight: _Flight, error: BitError) -> None:
+    def _destroy(self, now: int, flight: Flight, error: BitError) -> None:
         senders = flight.course.senders
         frames = tuple(flight.waiting[index].frame for index in senders or flight.waiting)
         time_ns = self._rates.ceil_ns(now)
@@ -547,7 +463,7 @@ class TimedBus:
             self._return(self._stations[index])
         self._land(now, flight)
 
-    def _side_error(self, now: int, flight: _Flight) -> None:
+    def _side_error(self, now: int, flight: Flight) -> None:
         error = flight.course.side_errors[flight.side]
         flight.side += 1
         senders = tuple(index for index in error.detected_by if index in flight.waiting)
@@ -567,7 +483,7 @@ class TimedBus:
             else:
                 self._set_counters(now, station, reception_failed(station.counters))
 
-    def _still_receiving(self, flight: _Flight) -> tuple[int, ...]:
+    def _still_receiving(self, flight: Flight) -> tuple[int, ...]:
         """Return the stations that have followed an attempt from its start of frame until now."""
         receivers, side_errors = flight.receivers, flight.course.side_errors
         if not side_errors and self._receivers.get(tuple(flight.waiting)) is receivers:
@@ -575,7 +491,7 @@ class TimedBus:
         lost = {station for error in side_errors for station in error.detected_by}
         return tuple(index for index in receivers if self._stations[index].on_bus and index not in lost)
 
-    def _land(self, now: int, flight: _Flight) -> None:
+    def _land(self, now: int, flight: Flight) -> None:
         """End an attempt: the bus is free after the intermission."""
         self._flight = None
         self._free = flight.start + flight.course.free
@@ -583,7 +499,7 @@ class TimedBus:
             self._suspend(self._stations[index], flight)
         self._choose_start(now)
 
-    def _return(self, station: _Station) -> None:
+    def _return(self, station: Station) -> None:
         """Put the frame that a station was sending back into its queue."""
         if station.sending is not None:
             station.queue.put_back(station.sending)
@@ -591,13 +507,13 @@ class TimedBus:
         if station.on_bus and len(station.queue):
             self._pending[station.index] = station
 
-    def _suspend(self, station: _Station, flight: _Flight) -> None:
+    def _suspend(self, station: Station, flight: Flight) -> None:
         """Let an error-passive transmitter pause after its frame (Bosch CAN 2.0, part B, section 3.1.5)."""
         if station.passive:
             free = flight.start + flight.course.free
             station.ready = free + SUSPEND_BITS * self._rates.nominal_ticks
 
-    def _leave(self, leaving: _Station, flight: _Flight) -> None:
+    def _leave(self, leaving: Station, flight: Flight) -> None:
         """Change the course of the attempt in progress after a station has been disconnected."""
         course = flight.course
         if course.error is not None:
@@ -631,7 +547,7 @@ class TimedBus:
 
     # --- fault confinement
 
-    def _set_counters(self, now: int, station: _Station, counters: Counters) -> None:
+    def _set_counters(self, now: int, station: Station, counters: Counters) -> None:
         if counters == station.counters:
             return
         before = station.counters.state
@@ -647,18 +563,18 @@ class TimedBus:
             if station.options.restart_ns is not None:
                 self._begin_recovery(station, now + station.options.restart_ns * self._rates.ticks_per_ns)
 
-    def _begin_recovery(self, station: _Station, at: int) -> None:
+    def _begin_recovery(self, station: Station, at: int) -> None:
         station.recovers_from, station.runs_seen = at, 0
         if station not in self._recovering:
             self._recovering.append(station)
 
-    def _runs(self, station: _Station, until: int) -> int:
+    def _runs(self, station: Station, until: int) -> int:
         """Return the number of complete recessive runs between the last dominant bit and a time."""
         assert station.recovers_from is not None
         since = max(station.recovers_from, self._recessive_from)
         return max(0, until - since) // (RECOVERY_RUN_BITS * self._rates.nominal_ticks)
 
-    def _recovery_end(self, station: _Station) -> int:
+    def _recovery_end(self, station: Station) -> int:
         """Return the end of a recovery if the bus stays recessive, ticks."""
         assert station.recovers_from is not None
         since = max(station.recovers_from, self._recessive_from)

@@ -1,0 +1,100 @@
+"""Stations of the bus: options of their controllers, their state, and the attempt in progress.
+
+Only :mod:`vcan_sim.timed_bus.bus` changes the state.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+from skinnode.errors import ConfigError
+from vcan_sim.timed_bus.attempt import Course
+from vcan_sim.timed_bus.confinement import ZERO, ErrorState
+from vcan_sim.timed_bus.transmit_queue import FifoQueue, PriorityQueue, TransmitQueue, Waiting
+
+
+@dataclass(frozen=True, slots=True)
+class StationOptions:
+    """Properties of a station's controller.
+
+    Raises:
+        ConfigError: if an option is not valid.
+    """
+
+    queue: Literal["fifo", "priority"] = "fifo"
+    """Order of transmission: as handed in, as a SocketCAN interface does, or the highest priority first."""
+    capacity: int | None = None
+    """Maximum number of frames to send, including the frame being sent; None for no limit."""
+    restart_ns: int | None = 0
+    """Time from bus-off to the start of the recovery, ns; None to wait for
+    :meth:`vcan_sim.timed_bus.bus.TimedBus.restart`."""
+
+    def __post_init__(self) -> None:
+        if self.queue not in ("fifo", "priority"):
+            raise ConfigError("queue", self.queue, "fifo or priority")
+        if self.capacity is not None and self.capacity < 1:
+            raise ConfigError("capacity", self.capacity, "at least 1 frame, or None")
+        if self.restart_ns is not None and self.restart_ns < 0:
+            raise ConfigError("restart_ns", self.restart_ns, "at least 0 ns, or None")
+
+
+class Station:
+    """State of a station."""
+
+    __slots__ = (
+        "connected",
+        "counters",
+        "index",
+        "options",
+        "passive",
+        "queue",
+        "ready",
+        "recovers_from",
+        "runs_seen",
+        "sending",
+    )
+
+    def __init__(self, index: int, options: StationOptions) -> None:
+        self.index = index
+        self.options = options
+        self.queue: TransmitQueue = FifoQueue() if options.queue == "fifo" else PriorityQueue()
+        self.sending: Waiting | None = None
+        self.counters = ZERO
+        self.passive = False
+        self.connected = True
+        self.ready = 0
+        """Earliest start of the station's next frame, ticks."""
+        self.recovers_from: int | None = None
+        """Start of the recovery from bus-off, ticks; None if the station is not recovering."""
+        self.runs_seen = 0
+        """Number of complete recessive runs seen during the recovery, until the last start of frame."""
+
+    @property
+    def on_bus(self) -> bool:
+        """Whether the station is connected and not bus-off."""
+        return self.connected and self.counters.state is not ErrorState.BUS_OFF
+
+
+class Flight:
+    """Attempt in progress."""
+
+    __slots__ = ("course", "receivers", "side", "start", "waiting")
+
+    def __init__(
+        self, start: int, course: Course, waiting: dict[int, Waiting], receivers: tuple[int, ...]
+    ) -> None:
+        self.start = start
+        self.course = course
+        self.waiting = waiting
+        """Frames that the attempt sends, by station."""
+        self.receivers = receivers
+        """Stations on the bus at the start of frame that do not send."""
+        self.side = 0
+        """Number of side errors that have occurred."""
+
+    @property
+    def next(self) -> int:
+        """Time of the next event of the attempt, ticks."""
+        side = self.course.side_errors
+        return self.start + (side[self.side].ticks if self.side < len(side) else self.course.end)

@@ -21,15 +21,13 @@ import numpy as np
 from skinnode.config import SimulationConfig
 from skinnode.model.elastic import HertzContact, Rubber
 from skinnode.model.layout import Float, PatchLayout
+from vcan_sim.smooth import GLIDE_RAMP, ease, glide
 
 LEAD_S: Final = 0.8
 """Duration of rest before the first press, s; leaves time to measure the baseline and to open a viewer."""
 
 PRESS, SLIDE, LIFT = 0.36, 0.40, 0.14
 """Fractions of a cycle; the skin is at rest for the remainder. In a 4 s cycle a press takes 1.4 s."""
-
-_RAMP: Final = 0.2
-"""Fraction of a slide in which the sphere accelerates, equal to the fraction in which it decelerates."""
 
 _GOLDEN: Final = 0.5 * (math.sqrt(5.0) - 1.0)
 
@@ -51,12 +49,12 @@ class Stroke:
     def contact(self, rubber: Rubber, t_s: float) -> HertzContact | None:
         """Return the contact at ``t_s``, or None if the sphere does not touch the skin."""
         lifting = t_s - self.press_s - self.slide_s
-        depth = self.depth_m * _ease(t_s / self.press_s) * (1.0 - _ease(lifting / self.lift_s))
+        depth = self.depth_m * ease(t_s / self.press_s) * (1.0 - ease(lifting / self.lift_s))
         if depth <= 0.0:
             return None
         sliding = (t_s - self.press_s) / self.slide_s
-        way = self.slide_m * _glide(sliding)
-        shear = self.friction * _ease(sliding / _RAMP) if self.slide_m > 0.0 else 0.0
+        way = self.slide_m * glide(sliding)
+        shear = self.friction * ease(sliding / GLIDE_RAMP) if self.slide_m > 0.0 else 0.0
         return HertzContact(
             rubber,
             self.radius_m,
@@ -98,7 +96,7 @@ class Scene:
         heading = np.array([math.cos(angle), math.sin(angle)])
         with np.errstate(divide="ignore"):
             room = float(np.min((high - low) / np.abs(heading)))
-        slide_m = min(options.slide_speed_m_per_s * (1.0 - _RAMP) * slide_s, room)
+        slide_m = min(options.slide_speed_m_per_s * (1.0 - GLIDE_RAMP) * slide_s, room)
         way = slide_m * heading
         first, last = low - np.minimum(way, 0.0), high - np.maximum(way, 0.0)
         start = random.uniform(first, np.maximum(first, last))  # rounding may put `first` above `last`
@@ -144,19 +142,3 @@ class Scene:
         low, high = self._surface_m.min(axis=0), self._surface_m.max(axis=0)
         inset = np.minimum(self.layout.pitch_m, 0.5 * (high - low))
         return low + inset, high - inset
-
-
-def _ease(share: float) -> float:
-    """Rise from 0 to 1 with zero speed and acceleration at both ends: minimum jerk (Flash and Hogan 1985)."""
-    s = min(max(share, 0.0), 1.0)
-    return s * s * s * (10.0 + s * (6.0 * s - 15.0))
-
-
-def _glide(share: float) -> float:
-    """Rise from 0 to 1 at constant speed, with smooth ramps of length ``_RAMP`` at both ends."""
-    s = min(max(share, 0.0), 1.0)
-    if s > 0.5:
-        return 1.0 - _glide(1.0 - s)
-    ramped = min(s / _RAMP, 1.0)
-    gained = _RAMP * ramped**3 * (1.0 - 0.5 * ramped)  # integral of the speed, which is 3 s² − 2 s³
-    return (gained + max(s - _RAMP, 0.0)) / (1.0 - _RAMP)

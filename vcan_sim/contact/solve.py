@@ -19,7 +19,7 @@ from vcan_sim.contact.grid import Grid
 from vcan_sim.contact.layer import Float
 
 CLOSE: Final = 1e-6
-"""Largest overlap or gap of a cell in contact, relative to the largest overlap of the undeformed shapes."""
+"""Default tolerance: largest overlap or gap of a cell in contact, relative to the largest overlap of the undeformed shapes."""
 STEPS: Final = 400
 """Maximum number of iterations."""
 TURNS: Final = 12
@@ -55,7 +55,9 @@ def untouched(grid: Grid) -> Contact:
     return Contact(zero, zero, np.zeros(grid.shape, bool))
 
 
-def press(grid: Grid, overlap_m: Float, start_pa: Float | None = None) -> Float:
+def press(
+    grid: Grid, overlap_m: Float, start_pa: Float | None = None, *, close: float = CLOSE
+) -> Float:
     """Return the pressure (X, Y), Pa, of a body without friction.
 
     Args:
@@ -63,6 +65,7 @@ def press(grid: Grid, overlap_m: Float, start_pa: Float | None = None) -> Float:
         overlap_m: (X, Y) how far the undeformed body would lie below the undeformed surface, metres; negative
             outside.
         start_pa: (X, Y) a pressure to start from, as of the step before.
+        close: Tolerance: largest overlap or gap of a cell in contact, relative to the largest overlap.
 
     Raises:
         NoSolution: If the iteration does not converge.
@@ -83,7 +86,7 @@ def press(grid: Grid, overlap_m: Float, start_pa: Float | None = None) -> Float:
     for _ in range(STEPS):
         gap = grid.normal_m(pressure) - overlap_m
         active = pressure > 0.0
-        if max(float(np.abs(gap[active]).max(initial=0.0)), -float(gap.min())) < CLOSE * largest:
+        if max(float(np.abs(gap[active]).max(initial=0.0)), -float(gap.min())) < close * largest:
             return pressure
         square = float((gap[active] ** 2).sum())
         direction = np.where(active, gap + conjugate * square / before * direction, 0.0)
@@ -97,7 +100,9 @@ def press(grid: Grid, overlap_m: Float, start_pa: Float | None = None) -> Float:
     raise NoSolution(f"no pressure within {STEPS} iterations: gap {np.abs(gap[active]).max():.2g} m")
 
 
-def rub(grid: Grid, limit_pa: Float, target_m: Float, start_pa: Float) -> Float:
+def rub(  # noqa: PLR0913 - the last is a tolerance
+    grid: Grid, limit_pa: Float, target_m: Float, start_pa: Float, *, close: float = CLOSE
+) -> Float:
     """Return the shear (2, X, Y), Pa, of at most ``limit_pa`` that comes closest to a displacement.
 
     Args:
@@ -105,6 +110,7 @@ def rub(grid: Grid, limit_pa: Float, target_m: Float, start_pa: Float) -> Float:
         limit_pa: (X, Y) μ p.
         target_m: (2, X, Y) displacement at which a cell sticks, metres.
         start_pa: (2, X, Y) a shear to start from.
+        close: Ten times the largest change of a shear in the last iteration, relative to the largest limit.
 
     Raises:
         NoSolution: If the iteration does not converge.
@@ -124,7 +130,7 @@ def rub(grid: Grid, limit_pa: Float, target_m: Float, start_pa: Float) -> Float:
         slip = np.where(inside, grid.shear_m(ahead) - target_m, 0.0)
         after = within(ahead - slip / stiffness)
         change = after - shear
-        if float(np.abs(after - ahead).max()) < 1e-7 * scale:
+        if float(np.abs(after - ahead).max()) < 0.1 * close * scale:
             return after
         if float((change * (ahead - after)).sum()) > 0.0:  # O'Donoghue and Candès (2015): restart
             weight = 1.0
@@ -147,7 +153,16 @@ def _largest(grid: Grid, inside: np.ndarray) -> float:
     return 1.1 * largest
 
 
-def advance(grid: Grid, last: Contact, overlap_m: Float, slide_m: Float, friction: float) -> Contact:
+def advance(  # noqa: PLR0913 - the last two steer the search
+    grid: Grid,
+    last: Contact,
+    overlap_m: Float,
+    slide_m: Float,
+    friction: float,
+    *,
+    start: Contact | None = None,
+    close: float = CLOSE,
+) -> Contact:
     """Return the contact after a body moved a little.
 
     Args:
@@ -157,6 +172,8 @@ def advance(grid: Grid, last: Contact, overlap_m: Float, slide_m: Float, frictio
         slide_m: (2,) or (2, X, Y) move of the body's surface along the skin, metres; the latter if the body
             turns.
         friction: Coefficient of friction μ.
+        start: State to start the search from; default: ``last``. The result does not depend on it.
+        close: Tolerance of :func:`press` and :func:`rub`.
 
     Raises:
         NoSolution: If the iteration does not converge.
@@ -164,19 +181,20 @@ def advance(grid: Grid, last: Contact, overlap_m: Float, slide_m: Float, frictio
     slide = slide_m.reshape(2, 1, 1) if slide_m.ndim == 1 else slide_m
     scale = max(float(overlap_m.max()), 0.0)
     none = np.zeros((3, *grid.shape))
-    shear, pressure = last.traction_pa[:2], -last.traction_pa[2]
+    start = last if start is None else start
+    shear, pressure = start.traction_pa[:2], -start.traction_pa[2]
     if not friction:
         shear = none[:2]
     by_shear = grid.displacement_m(np.concatenate([shear, none[2:]]))
     for _ in range(TURNS):
-        pressure = press(grid, overlap_m + by_shear[2], pressure)
+        pressure = press(grid, overlap_m + by_shear[2], pressure, close=close)
         by_pressure = grid.displacement_m(np.concatenate([none[:2], -pressure[None]]))
         if not friction:
             break
         target = last.displacement_m[:2] + slide - by_pressure[:2]
-        shear, before = rub(grid, friction * pressure, target, shear), by_shear[2]
+        shear, before = rub(grid, friction * pressure, target, shear, close=close), by_shear[2]
         by_shear = grid.displacement_m(np.concatenate([shear, none[2:]]))
-        if float(np.abs(by_shear[2] - before).max()) <= 10.0 * CLOSE * scale:
+        if float(np.abs(by_shear[2] - before).max()) <= 10.0 * close * scale:
             break
     else:
         raise NoSolution(f"pressure and shear did not agree within {TURNS} turns")

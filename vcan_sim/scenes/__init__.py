@@ -1,0 +1,40 @@
+"""Scenes as data: bodies that press, slide, roll, shear, turn, tap and walk on the patches of a hand.
+
+::
+
+    scene file -> tables (keys, checks) -> bind (checks with the hand) -> PatchScene of each patch
+    shapes, motions (body at a time) -> window (cells under the body) -> history (contact at each step)
+        -> response (displacement of the electrodes) -> patch (state at any time) -> truth
+
+The contact mechanics is that of :mod:`vcan_sim.contact`, which shares no code with the solvers. A scene is a
+function of scene time: each touch starts and ends with an untouched skin and is computed at fixed steps in
+order, so that the state at a time does not depend on the order in which times are asked for.
+"""
+
+from vcan_sim.scenes.bind import bind_scene, load_scene
+from vcan_sim.scenes.patch import PatchScene
+from vcan_sim.scenes.tables import (
+    BodyConfig,
+    MotionConfig,
+    SceneConfig,
+    SkinConfig,
+    TouchConfig,
+    parse_scene,
+    read_scene,
+)
+from vcan_sim.scenes.truth import BodyContact, PatchTruth
+
+__all__ = [
+    "BodyConfig",
+    "BodyContact",
+    "MotionConfig",
+    "PatchScene",
+    "PatchTruth",
+    "SceneConfig",
+    "SkinConfig",
+    "TouchConfig",
+    "bind_scene",
+    "load_scene",
+    "parse_scene",
+    "read_scene",
+]

@@ -1,0 +1,109 @@
+"""Motion of a body in a touch, as a pure function of scene time."""
+
+from __future__ import annotations
+
+import functools
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from vcan_sim.scenes.tables import MotionConfig, TouchConfig
+from vcan_sim.smooth import ease, glide
+
+_EVERY_S = 0.5
+"""Default time between two targets of a walk, s."""
+
+
+@dataclass(frozen=True, slots=True)
+class Pose:
+    """Pose of a body at one time.
+
+    Attributes:
+        place_m: Lowest point of the body, metres: (x, y) in the frame of the patch.
+        slid_m: Way of the body's surface along the skin since the touch began, metres: (x, y). A rolling body
+            moves without a way of its surface.
+        yaw_rad: Rotation about z, rad.
+        level: Depth in metres or normal force in N, as the touch is controlled; 0 without contact.
+    """
+
+    place_m: tuple[float, float]
+    slid_m: tuple[float, float]
+    yaw_rad: float
+    level: float
+
+
+def pose_at(touch: TouchConfig, t_s: float) -> Pose:
+    """Return the pose of a touch's body.
+
+    Args:
+        touch: The touch.
+        t_s: Scene time, s.
+    """
+    x, y = touch.at_m
+    slid_x = slid_y = 0.0
+    yaw = touch.yaw_rad
+    level = touch.force_n if touch.force_n is not None else touch.depth_m or 0.0
+    for motion in touch.motions:
+        share = (t_s - motion.from_s) / (motion.to_s - motion.from_s)
+        if motion.kind == "turn":
+            yaw += (motion.by_rad or 0.0) * ease(share)
+        elif motion.kind == "press":
+            target = motion.force_n if touch.by_force else motion.depth_m
+            level += ((target or 0.0) - level) * ease(share)
+        else:
+            way_x, way_y = _way_m(motion, share, t_s)
+            x, y = x + way_x, y + way_y
+            if motion.kind != "roll":
+                slid_x, slid_y = slid_x + way_x, slid_y + way_y
+    down = ease((t_s - touch.from_s) / touch.ramp_s)
+    lifted = ease((t_s - (touch.to_s - touch.ramp_s)) / touch.ramp_s)
+    return Pose((x, y), (slid_x, slid_y), yaw, level * down * (1.0 - lifted))
+
+
+def highest_level(touch: TouchConfig) -> float:
+    """Return the largest depth in metres or the largest normal force in N of a touch, as it is controlled."""
+    levels = [touch.force_n if touch.by_force else touch.depth_m]
+    levels += [motion.force_n if touch.by_force else motion.depth_m for motion in touch.motions]
+    return max(level for level in levels if level is not None)
+
+
+def yaws_rad(touch: TouchConfig) -> tuple[float, ...]:
+    """Return yaw angles that a touch passes through, rad, in steps of at most a quarter radian."""
+    turned = sum(abs(motion.by_rad or 0.0) for motion in touch.motions)
+    if not turned:
+        return (touch.yaw_rad,)
+    return tuple(float(each) for each in touch.yaw_rad + np.linspace(-turned, turned, 2 + int(8 * turned)))
+
+
+def _way_m(motion: MotionConfig, share: float, t_s: float) -> tuple[float, float]:
+    """Return the way (x, y) of a motion along the skin so far, metres."""
+    if motion.kind == "walk":
+        return _walked_m(motion, t_s)
+    way_x, way_y = motion.by_m or (0.0, 0.0)
+    if motion.kind == "shear":
+        gone = ease(2.0 * share) - ease(2.0 * share - 1.0)
+    else:
+        gone = glide(share)
+    return way_x * gone, way_y * gone
+
+
+def _walked_m(motion: MotionConfig, t_s: float) -> tuple[float, float]:
+    """Return the way (x, y) of a random walk so far, metres: minimum jerk from target to target."""
+    targets = _targets_m(motion)
+    elapsed = min(max(t_s, motion.from_s), motion.to_s) - motion.from_s
+    step_s = (motion.to_s - motion.from_s) / (len(targets) - 1)
+    index = min(int(elapsed / step_s), len(targets) - 2)
+    share = ease(elapsed / step_s - index)
+    (x0, y0), (x1, y1) = targets[index], targets[index + 1]
+    return x0 + (x1 - x0) * share, y0 + (y1 - y0) * share
+
+
+@functools.lru_cache(maxsize=256)
+def _targets_m(motion: MotionConfig) -> tuple[tuple[float, float], ...]:
+    """Return the targets of a walk, metres, uniform in a disc of radius ``reach_m``; the first is its centre."""
+    count = max(1, round((motion.to_s - motion.from_s) / (motion.every_s or _EVERY_S)))
+    random = np.random.default_rng(1 if motion.seed is None else motion.seed)
+    r = (motion.reach_m or 0.0) * np.sqrt(random.uniform(0.0, 1.0, count))
+    angle = random.uniform(0.0, 2.0 * math.pi, count)
+    return ((0.0, 0.0), *((float(x), float(y)) for x, y in zip(r * np.cos(angle), r * np.sin(angle), strict=True)))

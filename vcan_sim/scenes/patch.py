@@ -1,0 +1,129 @@
+"""Scene of one patch: state of its skin at any time, interpolated between the steps of its touches.
+
+The state at a time is the mean of the four nearest steps, weighted by the uniform cubic B-spline (de Boor, A
+Practical Guide to Splines, 1978, chapter IX). The weights are positive and sum to 1, so that the mean keeps
+what every step has: pressure is not negative, shear is at most friction times pressure, the force is the
+integral of the tractions, and the displacement is the layer's response to them. All are twice continuously
+differentiable in time. A motion shorter than four steps is blurred.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from skinnode.config import SimulationConfig
+from skinnode.model.layout import PatchLayout
+from vcan_sim.scenes.history import History, Step
+from vcan_sim.scenes.shapes import Float
+from vcan_sim.scenes.truth import BodyContact, PatchTruth
+
+Weighted = list[tuple[float, Step]]
+
+
+@dataclass(frozen=True, eq=False)
+class PatchScene:
+    """Skin of one patch in a scene. Made by :func:`vcan_sim.scenes.bind_scene`.
+
+    Attributes:
+        layout: The patch at rest. Its electrodes lie on the surface of the layer; a curved skin is treated as
+            its projection onto the x-y plane.
+        simulation: Seed and noise of the converter.
+        number: Number of the patch in the hand.
+        step_s: Step of the contact mechanics, s.
+        repeat_s: Period of the scene, s; None if the scene plays once.
+        histories: Touches of the patch.
+    """
+
+    layout: PatchLayout
+    simulation: SimulationConfig
+    number: int
+    step_s: float
+    repeat_s: float | None
+    histories: tuple[History, ...]
+
+    @property
+    def end_s(self) -> float:
+        """Scene time at which the last touch of this patch ends, s; 0 if nothing touches the patch."""
+        return max((history.touch.to_s for history in self.histories), default=0.0)
+
+    def upper_m(self, t_s: float) -> Float:
+        """Return the electrodes (U, N, 3), metres, at scene time ``t_s``; ``layout.upper_m`` while at rest.
+
+        Args:
+            t_s: Scene time, s.
+        """
+        moved = None
+        for _, steps in self._touching(t_s):
+            for weight, step in steps:
+                part = weight * step.electrodes_m
+                moved = part if moved is None else moved + part
+        if moved is None:
+            return self.layout.upper_m
+        return np.asarray(self.layout.upper_m + moved.reshape(self.layout.upper_m.shape))
+
+    def truth(self, t_s: float) -> PatchTruth:
+        """Return the ground truth at scene time ``t_s``.
+
+        Args:
+            t_s: Scene time, s.
+        """
+        contacts, moved, wrench = [], np.zeros((self.layout.upper_m.size // 3, 3)), np.zeros(6)
+        for history, steps in self._touching(t_s):
+            contacts.append(_contact(history, steps))
+            for weight, step in steps:
+                moved += weight * step.electrodes_m
+                wrench += weight * np.concatenate([step.force_n, step.moment_nm])
+        return PatchTruth(t_s, moved.reshape(self.layout.upper_m.shape), tuple(contacts), wrench)
+
+    def prepare(self) -> None:
+        """Compute all steps of all touches now, instead of when they are needed."""
+        for history in self.histories:
+            history.step(history.last)
+
+    def _touching(self, t_s: float) -> Iterator[tuple[History, Weighted]]:
+        """Yield each touch that contributes at a time, with its steps and their weights."""
+        t_s = t_s if self.repeat_s is None or t_s < 0.0 else math.fmod(t_s, self.repeat_s)
+        low = math.floor(t_s / self.step_s)
+        weights = _spline(t_s / self.step_s - low)
+        for history in self.histories:
+            if low + 2 < history.first or low - 1 > history.last:
+                continue
+            states = [(weight, history.step(low - 1 + i)) for i, weight in enumerate(weights)]
+            steps = [(weight, step) for weight, step in states if step is not None and weight > 0.0]
+            if steps:
+                yield history, steps
+
+
+def _spline(share: float) -> tuple[float, float, float, float]:
+    """Return the weights of four steps for a time between the second and the third: the cubic B-spline."""
+    s, rest = share, 1.0 - share
+    cube, other = s * s * s / 6.0, rest * rest * rest / 6.0
+    second = 2.0 / 3.0 - s * s * (1.0 - 0.5 * s)
+    return other, second, 1.0 - other - second - cube, cube
+
+
+def _contact(history: History, steps: Weighted) -> BodyContact:
+    """Return the weighted mean of some steps, on the smallest window that holds those of all steps."""
+    firsts = np.array([step.first for _, step in steps])
+    low = firsts.min(axis=0)
+    size = (firsts - low).max(axis=0) + np.array(steps[0][1].traction_pa.shape[1:])
+    traction, force = np.zeros((3, int(size[0]), int(size[1]))), np.zeros(3)
+    area = depth = 0.0
+    for weight, step in steps:
+        x, y = (np.array(step.first) - low).tolist()
+        width, height = step.traction_pa.shape[1:]
+        traction[:, x : x + width, y : y + height] += weight * step.traction_pa
+        force += weight * step.force_n
+        area += weight * step.area_m2
+        depth += weight * step.depth_m
+    origin = history.cell_m((int(low[0]), int(low[1])))
+    pressure = -traction[2]
+    x_m = origin[0] + history.size_m * np.arange(size[0])
+    y_m = origin[1] + history.size_m * np.arange(size[1])
+    total = max(float(pressure.sum()), 1e-300)
+    centre = np.array([float(x_m @ pressure.sum(axis=1)) / total, float(y_m @ pressure.sum(axis=0)) / total])
+    return BodyContact(history.touch.body, centre, area, depth, force, origin, history.size_m, traction)

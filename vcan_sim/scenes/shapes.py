@@ -1,0 +1,130 @@
+"""Shapes of rigid bodies: height of the surface above the body's lowest point.
+
+A shape is a function of places (…, 2) in the frame of the body, metres, to heights (…,), metres. The lowest
+point has height 0; where there is no body above the skin, the height is inf.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Float = NDArray[np.float64]
+Height = Callable[[Float], Float]
+
+
+@dataclass(frozen=True, slots=True)
+class Shape:
+    """A rigid body as a height over the skin.
+
+    Attributes:
+        height: Function of places (…, 2), metres, in the frame of the body, to heights (…,), metres.
+        round: Whether the height depends only on the distance from the lowest point.
+        key: Values that determine the height; shapes with equal keys are equal.
+    """
+
+    height: Height
+    round: bool
+    key: tuple[object, ...]
+
+    def over(self, places_m: Float, yaw_rad: float) -> Float:
+        """Return the height over places relative to the body's lowest point, in the frame of the patch.
+
+        Args:
+            places_m: (…, 2) places relative to the lowest point, metres.
+            yaw_rad: Rotation of the body about z, rad.
+
+        Returns:
+            (…,) heights above the lowest point, metres; inf where there is no body.
+        """
+        if self.round or yaw_rad == 0.0:
+            return self.height(places_m)
+        cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)
+        x, y = places_m[..., 0], places_m[..., 1]
+        return self.height(np.stack([cos * x + sin * y, cos * y - sin * x], axis=-1))
+
+
+def ellipsoid(radii_m: tuple[float, float, float], name: str = "ellipsoid") -> Shape:
+    """Return an ellipsoid with semi-axes (x, y, z), metres; its lowest point is a pole of the z axis.
+
+    Args:
+        radii_m: Semi-axes along x, y and z, metres, each positive.
+        name: Name of the shape, part of its key.
+    """
+    rx, ry, rz = radii_m
+
+    def height(places_m: Float) -> Float:
+        inside = 1.0 - (places_m[..., 0] / rx) ** 2 - (places_m[..., 1] / ry) ** 2
+        return np.where(inside > 0.0, rz * (1.0 - np.sqrt(np.maximum(inside, 0.0))), math.inf)
+
+    return Shape(height, rx == ry, (name, *radii_m))
+
+
+def sphere(radius_m: float) -> Shape:
+    """Return a sphere.
+
+    Args:
+        radius_m: Radius, metres.
+    """
+    return ellipsoid((radius_m, radius_m, radius_m), "sphere")
+
+
+def punch(radius_m: float, edge_radius_m: float) -> Shape:
+    """Return a flat circular punch with a rounded rim.
+
+    Args:
+        radius_m: Radius of the punch, rim included, metres.
+        edge_radius_m: Radius of the rounding of the rim, metres; at most ``radius_m``, 0 for a sharp rim.
+    """
+    flat = radius_m - edge_radius_m
+
+    def height(places_m: Float) -> Float:
+        r = np.hypot(places_m[..., 0], places_m[..., 1])
+        return np.where(r <= radius_m, _rounded(np.maximum(r - flat, 0.0), edge_radius_m), math.inf)
+
+    return Shape(height, True, ("punch", radius_m, edge_radius_m))
+
+
+def box_edge(length_m: float, slope_rad: float, edge_radius_m: float) -> Shape:
+    """Return the edge of a box, along x, which points down: two flanks that rise to both sides.
+
+    Args:
+        length_m: Length of the edge along x, metres.
+        slope_rad: Angle of both flanks to the skin, rad.
+        edge_radius_m: Radius of the rounding of the edge, metres.
+    """
+    tangent_m = edge_radius_m * math.sin(slope_rad)  # where the rounding meets the flank
+    tangent_height_m = edge_radius_m * (1.0 - math.cos(slope_rad))
+
+    def height(places_m: Float) -> Float:
+        across = np.abs(places_m[..., 1])
+        flank = tangent_height_m + (across - tangent_m) * math.tan(slope_rad)
+        risen = np.where(across <= tangent_m, _rounded(np.minimum(across, tangent_m), edge_radius_m), flank)
+        return np.where(np.abs(places_m[..., 0]) <= 0.5 * length_m, risen, math.inf)
+
+    return Shape(height, False, ("box_edge", length_m, slope_rad, edge_radius_m))
+
+
+def ridge(radius_m: float, length_m: float) -> Shape:
+    """Return a cylinder that lies along x and ends in half-spheres.
+
+    Args:
+        radius_m: Radius of the cylinder, metres.
+        length_m: Length of the cylinder without its ends, metres.
+    """
+
+    def height(places_m: Float) -> Float:
+        beyond = np.maximum(np.abs(places_m[..., 0]) - 0.5 * length_m, 0.0)
+        r = np.hypot(beyond, places_m[..., 1])
+        return np.where(r < radius_m, _rounded(np.minimum(r, radius_m), radius_m), math.inf)
+
+    return Shape(height, False, ("ridge", radius_m, length_m))
+
+
+def _rounded(distance_m: Float, radius_m: float) -> Float:
+    """Return the height of a circle of ``radius_m`` at a distance from its lowest point."""
+    return np.asarray(radius_m - np.sqrt(np.maximum(radius_m**2 - distance_m**2, 0.0)))

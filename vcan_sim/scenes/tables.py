@@ -1,0 +1,343 @@
+"""Keys of a scene file: ``[skin]``, ``[[bodies]]``, ``[[touches]]`` and ``[[touches.motions]]``."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any, Final, Literal
+
+from pydantic import Field, PrivateAttr, ValidationError, model_validator
+
+from skinnode.config.explain import first_error, key_path
+from skinnode.config.table import Allowed, Length, Name, Table, one_of
+from skinnode.config.toml_text import Document, read_toml
+from skinnode.errors import NOTHING, ConfigError
+from vcan_sim.scenes import shapes
+
+BodyShape = Literal["sphere", "punch", "box_edge", "ridge", "fingertip"]
+MotionKind = Literal["slide", "shear", "roll", "turn", "walk", "press"]
+
+_KEYS_OF_SHAPE: Final[dict[str, tuple[str, ...]]] = {
+    "sphere": ("radius_m",),
+    "punch": ("radius_m", "edge_radius_m"),
+    "box_edge": ("length_m", "edge_radius_m", "slope_rad"),
+    "ridge": ("radius_m", "length_m"),
+    "fingertip": ("radii_m",),
+}
+_REQUIRED_OF_SHAPE: Final[dict[str, tuple[str, ...]]] = {
+    "sphere": ("radius_m",),
+    "punch": ("radius_m",),
+    "box_edge": ("length_m",),
+    "ridge": ("radius_m", "length_m"),
+    "fingertip": ("radii_m",),
+}
+_KEYS_OF_MOTION: Final[dict[str, tuple[str, ...]]] = {
+    "slide": ("by_m",),
+    "shear": ("by_m",),
+    "roll": ("by_m",),
+    "turn": ("by_rad",),
+    "walk": ("seed", "reach_m", "every_s"),
+    "press": ("depth_m", "force_n"),
+}
+_REQUIRED_OF_MOTION: Final[dict[str, tuple[str, ...]]] = {
+    "slide": ("by_m",),
+    "shear": ("by_m",),
+    "roll": ("by_m",),
+    "turn": ("by_rad",),
+    "walk": ("reach_m",),
+    "press": (),
+}
+
+_Coordinate = Annotated[float, Field(ge=-1, le=1, allow_inf_nan=False), Allowed("a number from -1 to 1")]
+_Place = Annotated[
+    tuple[_Coordinate, _Coordinate], Field(strict=False), Allowed("two numbers [x, y], metres, from -1 to 1")
+]
+_Radii = Annotated[
+    tuple[Length, Length, Length], Field(strict=False), Allowed("three numbers of metres from 1e-6 to 1")
+]
+_Angle = Annotated[
+    float, Field(ge=-6.2832, le=6.2832, allow_inf_nan=False), Allowed("a number from -6.2832 to 6.2832")
+]
+_Slope = Annotated[float, Field(ge=0.01, le=1.5, allow_inf_nan=False), Allowed("a number from 0.01 to 1.5")]
+_Friction = Annotated[float, Field(ge=0, le=2, allow_inf_nan=False), Allowed("a number from 0 to 2")]
+_Time = Annotated[
+    float, Field(ge=0, le=86400, allow_inf_nan=False), Allowed("a number of seconds from 0 to 86400")
+]
+_Duration = Annotated[
+    float, Field(ge=1e-3, le=86400, allow_inf_nan=False), Allowed("a number of seconds from 1e-3 to 86400")
+]
+_Step = Annotated[
+    float, Field(ge=1e-3, le=0.1, allow_inf_nan=False), Allowed("a number of seconds from 1e-3 to 0.1")
+]
+_Force = Annotated[
+    float, Field(ge=1e-4, le=1e4, allow_inf_nan=False), Allowed("a number of N from 1e-4 to 1e4")
+]
+_Modulus = Annotated[
+    float, Field(ge=1e3, le=1e10, allow_inf_nan=False), Allowed("a number of Pa from 1e3 to 1e10")
+]
+_Poisson = Annotated[float, Field(ge=0, le=0.5, allow_inf_nan=False), Allowed("a number from 0 to 0.5")]
+
+
+class SkinConfig(Table):
+    """Elastic layer of every patch of the scene, bonded to a rigid base."""
+
+    thickness_m: Length | None = None
+    """Thickness of the layer, metres; None: the height of the patch's upper electrodes above the lower."""
+    young_pa: _Modulus | None = None
+    """Young's modulus, Pa; None: ``calibration.young_pa`` of the patch in the hand file."""
+    poisson: _Poisson | None = None
+    """Poisson's ratio; None: ``calibration.poisson`` of the patch in the hand file."""
+
+
+class BodyConfig(Table):
+    """Rigid body that touches the skin."""
+
+    name: Name
+    """Name of the body in the touches and in the ground truth."""
+    shape: Annotated[BodyShape, one_of(BodyShape)]
+    """Shape of the part of the body that faces the skin."""
+    radius_m: Length | None = None
+    """Radius of the sphere, the punch or the ridge, metres."""
+    edge_radius_m: Length | None = None
+    """Radius of the rounded rim of the punch (default: a tenth of its radius) or of the edge of the box
+    (default: 1 mm), metres."""
+    length_m: Length | None = None
+    """Length of the edge of the box, or of the ridge without its round ends, metres; along x at yaw 0."""
+    slope_rad: _Slope | None = None
+    """Angle between the skin and the faces of the box next to its edge, rad; default: π/4."""
+    radii_m: _Radii | None = None
+    """Semi-axes of the fingertip, an ellipsoid, metres: along x and y at yaw 0, and along z."""
+    friction: _Friction = 0.3
+    """Coefficient of friction between the body and the skin."""
+
+    @model_validator(mode="after")
+    def _keys_of_shape(self) -> BodyConfig:
+        _require_keys(self, "shape", self.shape, _KEYS_OF_SHAPE, _REQUIRED_OF_SHAPE)
+        if self.shape == "punch" and (self.edge_radius_m or 0.0) > (self.radius_m or 0.0):
+            raise ConfigError("edge_radius_m", self.edge_radius_m, f"at most radius_m, {self.radius_m}")
+        return self
+
+    def build(self) -> shapes.Shape:
+        """Return the shape of the body."""
+        radius, length, edge = self.radius_m or 0.0, self.length_m or 0.0, self.edge_radius_m
+        if self.shape == "sphere":
+            return shapes.sphere(radius)
+        if self.shape == "punch":
+            return shapes.punch(radius, 0.1 * radius if edge is None else edge)
+        if self.shape == "box_edge":
+            slope = 0.25 * math.pi if self.slope_rad is None else self.slope_rad
+            return shapes.box_edge(length, slope, 1e-3 if edge is None else edge)
+        if self.shape == "ridge":
+            return shapes.ridge(radius, length)
+        assert self.radii_m is not None
+        return shapes.ellipsoid(self.radii_m)
+
+
+class MotionConfig(Table):
+    """Motion of a body while it touches the skin. Motions add up; several may run at once."""
+
+    kind: Annotated[MotionKind, one_of(MotionKind)]
+    """``slide``: move along the skin. ``shear``: move along the skin and back. ``roll``: move without slip.
+    ``turn``: turn about z. ``walk``: slide at random. ``press``: change the depth or the force."""
+    from_s: _Time
+    """Scene time at which the motion starts, s."""
+    to_s: _Time
+    """Scene time at which the motion ends, s."""
+    by_m: _Place | None = None
+    """Way of ``slide`` and ``roll``, and of the outward half of ``shear``, metres: [x, y]."""
+    by_rad: _Angle | None = None
+    """Angle of ``turn``, rad, counterclockwise as seen from above the skin."""
+    depth_m: Length | None = None
+    """Depth after ``press``, metres, if the touch is by depth."""
+    force_n: _Force | None = None
+    """Force after ``press``, N, if the touch is by force."""
+    reach_m: Length | None = None
+    """Largest distance of ``walk`` from its start, metres."""
+    every_s: _Duration | None = None
+    """Time between two targets of ``walk``, s; default: 0.5."""
+    seed: Annotated[int, Field(ge=0), Allowed("an integer of at least 0")] | None = None
+    """Random seed of ``walk``; default: 1."""
+
+    @model_validator(mode="after")
+    def _keys_of_kind(self) -> MotionConfig:
+        _require_keys(self, "kind", self.kind, _KEYS_OF_MOTION, _REQUIRED_OF_MOTION)
+        if self.to_s <= self.from_s:
+            raise ConfigError("to_s", self.to_s, f"later than from_s, {self.from_s} s")
+        return self
+
+
+class TouchConfig(Table):
+    """One touch: a body comes down, moves, and lifts off."""
+
+    body: Name
+    """Name of the body."""
+    patch: Name
+    """Name of the patch in the hand file."""
+    at_m: _Place
+    """Place where the body comes down, metres: [x, y] in the frame of the patch."""
+    from_s: _Time
+    """Scene time of the first contact, s."""
+    to_s: _Time
+    """Scene time at which the body has left the skin, s."""
+    ramp_s: _Duration = 0.3
+    """Duration of the press at the start and of the lift at the end, s (minimum jerk)."""
+    depth_m: Length | None = None
+    """Depth of the body's lowest point below the undeformed surface, metres. Give this or ``force_n``."""
+    force_n: _Force | None = None
+    """Normal force, N. Give this or ``depth_m``."""
+    yaw_rad: _Angle = 0.0
+    """Rotation of the body about z, rad."""
+    motions: Annotated[tuple[MotionConfig, ...], Field(strict=False)] = ()
+    """Motions between the press and the lift."""
+
+    @property
+    def by_force(self) -> bool:
+        """Whether the touch is controlled by force."""
+        return self.force_n is not None
+
+    @model_validator(mode="after")
+    def _times_and_level(self) -> TouchConfig:
+        if (self.depth_m is None) == (self.force_n is None):
+            got = None if self.depth_m is None else self.force_n
+            raise ConfigError("force_n", got, "a force_n or a depth_m, one of the two")
+        if self.to_s <= self.from_s:
+            raise ConfigError("to_s", self.to_s, f"later than from_s, {self.from_s} s")
+        if self.to_s - self.from_s < 2.0 * self.ramp_s * (1.0 - 1e-9):
+            most = 0.5 * (self.to_s - self.from_s)
+            raise ConfigError("ramp_s", self.ramp_s, f"at most half the touch, {most:g} s")
+        pressed_s = 0.0
+        for i, motion in enumerate(self.motions):
+            key = f"motions[{i}]"
+            if motion.from_s < self.from_s:
+                raise ConfigError(f"{key}.from_s", motion.from_s, f"at least {self.from_s} s, in the touch")
+            if motion.to_s > self.to_s:
+                raise ConfigError(f"{key}.to_s", motion.to_s, f"at most {self.to_s} s, in the touch")
+            if motion.kind != "press":
+                continue
+            own, other = ("force_n", "depth_m") if self.by_force else ("depth_m", "force_n")
+            if getattr(motion, other) is not None:
+                raise ConfigError(f"{key}.{other}", getattr(motion, other), f"{own}, as in the touch")
+            if getattr(motion, own) is None:
+                raise ConfigError(f"{key}.{own}", None, f"a {own}, as in the touch")
+            if motion.from_s < pressed_s:
+                raise ConfigError(
+                    f"{key}.from_s", motion.from_s, f"at least {pressed_s} s, the end of the press before"
+                )
+            pressed_s = motion.to_s
+        return self
+
+
+class SceneConfig(Table):
+    """Scene: bodies that touch the patches of a hand."""
+
+    name: Name = "scene"
+    """Name of the scene."""
+    step_s: _Step = 0.025
+    """Step of the contact mechanics, s. The state between steps is interpolated smoothly, so that motions
+    shorter than four steps are blurred."""
+    repeat_s: _Duration | None = None
+    """Period after which the scene repeats, s; None: the scene plays once."""
+    skin: SkinConfig = SkinConfig()
+    bodies: Annotated[
+        tuple[BodyConfig, ...], Field(min_length=1, strict=False), Allowed("at least one [[bodies]]")
+    ]
+    """Rigid bodies."""
+    touches: Annotated[
+        tuple[TouchConfig, ...], Field(min_length=1, strict=False), Allowed("at least one [[touches]]")
+    ]
+    """Touches, in any order."""
+    _read_of: Document = PrivateAttr(Document("", {}, {}))
+
+    def body(self, name: str) -> BodyConfig:
+        """Return the body called ``name``.
+
+        Raises:
+            KeyError: The scene has no such body.
+        """
+        return {body.name: body for body in self.bodies}[name]
+
+    def where(self, key: str) -> str:
+        """Return ``file:line:column`` of a dotted key, for error messages; empty if there is no file."""
+        return self._read_of.where(key_path(key))
+
+    @model_validator(mode="after")
+    def _cross_checks(self) -> SceneConfig:
+        names: list[str] = []
+        for i, body in enumerate(self.bodies):
+            if body.name in names:
+                allowed = f"a value that bodies[{names.index(body.name)}] does not use"
+                raise ConfigError(f"bodies[{i}].name", body.name, allowed)
+            names.append(body.name)
+        for i, touch in enumerate(self.touches):
+            if touch.body not in names:
+                allowed = f"a body of this file: {', '.join(names)}"
+                raise ConfigError(f"touches[{i}].body", touch.body, allowed)
+            if self.repeat_s is not None and touch.to_s > self.repeat_s:
+                raise ConfigError(f"touches[{i}].to_s", touch.to_s, f"at most repeat_s, {self.repeat_s} s")
+            self._check_motions(i, touch)
+            for j, other in enumerate(self.touches[:i]):
+                if other.body == touch.body and touch.from_s < other.to_s and other.from_s < touch.to_s:
+                    allowed = f"a time at which touches[{j}] does not use the body {touch.body!r}"
+                    raise ConfigError(f"touches[{i}].from_s", touch.from_s, allowed)
+        return self
+
+    def _check_motions(self, number: int, touch: TouchConfig) -> None:
+        """Check that only bodies that can roll do."""
+        body = self.body(touch.body)
+        for j, motion in enumerate(touch.motions):
+            if motion.kind == "roll" and body.shape not in ("sphere", "ridge"):
+                key, allowed = f"touches[{number}].motions[{j}].kind", "roll only for a sphere or a ridge"
+                raise ConfigError(key, motion.kind, f"{allowed}; {body.name!r} is a {body.shape}")
+
+
+def read_scene(path: Path | str) -> SceneConfig:
+    """Read a scene file without a hand. :func:`vcan_sim.scenes.load_scene` also checks it with the hand.
+
+    Args:
+        path: The file.
+
+    Raises:
+        ConfigError: The file cannot be read or is not a scene. The message is one line with line and column.
+    """
+    path = Path(path)
+    return _parse(read_toml(path, "scene file"))
+
+
+def parse_scene(table: Mapping[str, Any], *, where: str = "") -> SceneConfig:
+    """Validate a table with the keys of a scene file.
+
+    Args:
+        table: The table, as returned by tomllib.
+        where: File name for error messages.
+
+    Raises:
+        ConfigError: The table is not a scene.
+    """
+    return _parse(Document(where, dict(table), {}))
+
+
+def _parse(document: Document) -> SceneConfig:
+    try:
+        scene = SceneConfig.model_validate(document.table)
+    except ValidationError as error:
+        raise first_error(error, SceneConfig, document.where) from None
+    scene._read_of = document
+    return scene
+
+
+def _require_keys(
+    table: Table,
+    key: str,
+    value: str,
+    allowed: Mapping[str, tuple[str, ...]],
+    required: Mapping[str, tuple[str, ...]],
+) -> None:
+    """Raise ConfigError if a key does not belong to the shape or kind, or if one is missing."""
+    for name in sorted({each for keys in allowed.values() for each in keys}):
+        given = getattr(table, name)
+        if given is not None and name not in allowed[value]:
+            owners = " or ".join(f'"{each}"' for each, keys in allowed.items() if name in keys)
+            raise ConfigError(name, given, f"only with {key} = {owners}")
+        if given is None and name in required[value]:
+            raise ConfigError(name, NOTHING, f"a value, because {key} is {value!r}")

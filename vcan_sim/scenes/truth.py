@@ -1,0 +1,69 @@
+"""Ground truth of a patch at one time."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from vcan_sim.scenes.shapes import Float
+
+
+@dataclass(frozen=True, eq=False)
+class BodyContact:
+    """Contact of one body with the skin.
+
+    Attributes:
+        body: Name of the body.
+        centre_m: (2,) centre of pressure in the frame of the patch, metres.
+        area_m2: Area of contact, m².
+        depth_m: Depth of the body's lowest point below the undeformed surface, metres.
+        force_n: (3,) force on the skin in the frame of the patch, N; z is negative, into the skin.
+        origin_m: (2,) centre of the first cell, metres.
+        cell_m: Side of a cell, metres.
+        traction_pa: (3, X, Y) tractions on the skin, Pa: force per area in the frame of the patch. The first
+            index of a cell counts along x.
+    """
+
+    body: str
+    centre_m: Float
+    area_m2: float
+    depth_m: float
+    force_n: Float
+    origin_m: Float
+    cell_m: float
+    traction_pa: Float
+
+    @property
+    def radius_m(self) -> float:
+        """Radius of a circle with the area of the contact, metres."""
+        return math.sqrt(self.area_m2 / math.pi)
+
+    @property
+    def pressure_pa(self) -> Float:
+        """Pressure (X, Y) on the skin, Pa; positive under the body."""
+        return -self.traction_pa[2]
+
+    @property
+    def cells_m(self) -> Float:
+        """Centres (X, Y, 2) of the cells in the frame of the patch, metres."""
+        x, y = (np.arange(n) * self.cell_m for n in self.traction_pa.shape[1:])
+        return np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1) + self.origin_m
+
+
+@dataclass(frozen=True, eq=False)
+class PatchTruth:
+    """What touches a patch at one time, and how the skin has moved.
+
+    Attributes:
+        t_s: Scene time, s.
+        displacement_m: (U, N, 3) displacement of the upper electrodes, metres.
+        contacts: Contacts, in the order of the touches in the scene.
+        wrench: (6,) force, N, and moment, N m, on the patch about the origin of its frame.
+    """
+
+    t_s: float
+    displacement_m: Float
+    contacts: tuple[BodyContact, ...]
+    wrench: Float

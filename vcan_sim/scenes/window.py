@@ -1,0 +1,221 @@
+"""Window of cells that moves with a body, sized for the deepest contact of a touch."""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from vcan_sim.contact.grid import Grid
+from vcan_sim.contact.layer import Layer
+from vcan_sim.contact.solve import press
+from vcan_sim.scenes.shapes import Float, Shape
+
+ACROSS: Final = 20
+"""Cells across the narrow side of a window; a round contact has about 16 of them in its diameter."""
+MOST_CELLS: Final = 560
+"""Cells of a window at which its cells get larger instead of more; roundings may exceed the number."""
+MARGIN: Final = 0.1
+"""Margin around the deepest contact, relative to its half width; at least ``MARGIN_CELLS``."""
+MARGIN_CELLS: Final = 2
+CLOSE: Final = 3e-4
+"""Tolerance of the contact mechanics (:func:`vcan_sim.contact.solve.press`), relative to the depth."""
+FORCE_CLOSE: Final = 2e-3
+"""Tolerance of a touch by force, relative to the force."""
+_TURNS: Final = 12
+"""Maximum number of sizes that are tried for a window."""
+_SEARCHES: Final = 40
+"""Maximum number of depths that are tried for a force."""
+_NOWHERE_M: Final = -1.0
+"""Overlap where there is no body, metres; any large negative length."""
+
+
+class TooMuch(ValueError):
+    """No depth within the layer reaches the force; ``most_n`` is the force at the largest depth, N."""
+
+    def __init__(self, most_n: float) -> None:
+        self.most_n = most_n
+        super().__init__(f"at most {most_n:.3g} N")
+
+
+@dataclass(frozen=True, eq=False)
+class Window:
+    """Cells under a body.
+
+    Attributes:
+        grid: Response of the cells.
+        half_m: Half of the deepest contact's bounding box along x and y, metres.
+        deepest_m: Depth of the deepest contact without friction, metres.
+        force_n: Normal force of the deepest contact without friction, N.
+    """
+
+    grid: Grid
+    half_m: tuple[float, float]
+    deepest_m: float
+    force_n: float
+
+
+def overlap_m(grid: Grid, shape: Shape, offset_m: Float, yaw_rad: float, depth_m: float) -> Float:
+    """Return the overlap of the undeformed body and the undeformed layer.
+
+    Args:
+        grid: The cells.
+        shape: The body.
+        offset_m: (2,) centre of the first cell relative to the lowest point of the body, metres.
+        yaw_rad: Rotation of the body, rad.
+        depth_m: Depth of the body's lowest point below the surface, metres.
+
+    Returns:
+        (X, Y) overlap, metres; negative where the body is above the surface.
+    """
+    return np.maximum(depth_m - shape.over(grid.centres_m(offset_m), yaw_rad), _NOWHERE_M)
+
+
+def centred_m(grid: Grid) -> Float:
+    """Return the centre (2,) of the first cell of a grid relative to the middle of the grid, metres."""
+    return -0.5 * grid.size_m * (np.array(grid.shape, float) - 1.0)
+
+
+@functools.lru_cache(maxsize=512)
+def window_of(  # noqa: PLR0913 - what a contact depends on
+    layer: Layer, body: BodyKey, yaws_rad: tuple[float, ...], level: float, by_force: bool, most_m: float
+) -> Window:
+    """Return the window for a touch.
+
+    Args:
+        layer: The layer.
+        body: The body.
+        yaws_rad: Rotations of the body in the touch, rad.
+        level: Largest depth, metres, or largest normal force, N, of the touch.
+        by_force: Whether ``level`` is a force.
+        most_m: Largest depth allowed, metres.
+
+    Raises:
+        TooMuch: The force needs a larger depth than ``most_m``.
+    """
+    if not by_force:
+        return _fit(layer, body.shape, yaws_rad, level)
+    found: dict[float, Window] = {}
+
+    def force_n(depth_m: float) -> float:
+        found[depth_m] = _fit(layer, body.shape, yaws_rad, depth_m)
+        return found[depth_m].force_n
+
+    if force_n(most_m) < level:
+        raise TooMuch(found[most_m].force_n)
+    depth = solve_depth(force_n, level, (most_m, found[most_m].force_n), 0.01)
+    return found[depth]
+
+
+@dataclass(frozen=True, eq=False)
+class BodyKey:
+    """A shape that is equal to another if its key is."""
+
+    shape: Shape
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, BodyKey) and self.shape.key == other.shape.key
+
+    def __hash__(self) -> int:
+        return hash(self.shape.key)
+
+
+def solve_depth(
+    force_n: Callable[[float], float],
+    target_n: float,
+    known: tuple[float, float],
+    close: float = FORCE_CLOSE,
+) -> float:
+    """Return the depth at which a force that rises with depth reaches a target.
+
+    Bracketed secant steps on the logarithms, because a force is nearly a power of the depth.
+
+    Args:
+        force_n: Function from depth, metres, to force, N; its last call is at the result.
+        target_n: Force to reach, N, positive.
+        known: A depth, metres, and its force, N, from which the first trial follows by F ∝ δ^1.5.
+        close: Tolerance relative to the target.
+
+    Raises:
+        ArithmeticError: If the search does not converge.
+    """
+    low, high = 0.0, math.inf
+    last = known
+    depth = known[0] * (target_n / known[1]) ** (2.0 / 3.0)
+    for _ in range(_SEARCHES):
+        force = force_n(depth)
+        if abs(force - target_n) <= close * target_n:
+            return depth
+        if force < target_n:
+            low = max(low, depth)
+        else:
+            high = min(high, depth)
+        power = 1.5
+        if force > 0.0 and last[1] > 0.0 and last[0] != depth and last[1] != force:
+            power = min(max(math.log(force / last[1]) / math.log(depth / last[0]), 0.7), 6.0)
+        last = (depth, force)
+        following = depth * (target_n / force) ** (1.0 / power) if force > 0.0 else 1.5 * depth
+        if not low < following < high:
+            following = 0.5 * (low + high) if math.isfinite(high) else 1.5 * low
+        depth = following
+    raise ArithmeticError(f"no depth for {target_n:g} N within {_SEARCHES} trials, last {depth:g} m")
+
+
+def _fit(layer: Layer, shape: Shape, yaws_rad: tuple[float, ...], depth_m: float) -> Window:
+    """Return a window that holds the contact at a depth, whichever the rotation."""
+    half = 1.5 * np.max([_extent_m(shape, yaw, depth_m) for yaw in yaws_rad], axis=0)
+    for _ in range(_TURNS):
+        grid = _grid(layer, half)
+        reached, force = np.zeros(2), 0.0
+        for yaw in yaws_rad:
+            pressure = press(grid, overlap_m(grid, shape, centred_m(grid), yaw, depth_m), close=CLOSE)
+            places = np.abs(grid.centres_m(centred_m(grid))[pressure > 0.0]) + 0.5 * grid.size_m
+            reached = np.maximum(reached, places.max(axis=0, initial=0.5 * grid.size_m))
+            force = max(force, float(pressure.sum()) * grid.size_m**2)
+        wanted = reached + np.maximum(MARGIN * reached, MARGIN_CELLS * grid.size_m)
+        has = 0.5 * grid.size_m * np.array(grid.shape)
+        if (has >= reached + (MARGIN_CELLS - 0.5) * grid.size_m).all():
+            if (has <= 1.15 * wanted + grid.size_m).all():
+                return Window(grid, (float(reached[0]), float(reached[1])), depth_m, force)
+            half = wanted
+        else:
+            half = np.where(has < wanted, np.maximum(1.3 * has, wanted), has)
+    return Window(grid, (float(reached[0]), float(reached[1])), depth_m, force)
+
+
+@functools.lru_cache(maxsize=256)
+def _grid_of(layer: Layer, shape: tuple[int, int], size_m: float) -> Grid:
+    return Grid.of(layer, shape, size_m)
+
+
+def _grid(layer: Layer, half_m: Float) -> Grid:
+    """Return a grid that is at least twice ``half_m`` (2,) large, metres."""
+    wide = 2.0 * half_m
+    size = max(float(wide.min()) / ACROSS, math.sqrt(float(wide.prod()) / MOST_CELLS))
+    size = float(f"{size:.2g}")  # equal sizes share the response
+    cells = np.maximum(np.ceil(wide / size - 1e-9), 4).astype(int)
+    return _grid_of(layer, (int(cells[0]), int(cells[1])), size)
+
+
+def _extent_m(shape: Shape, yaw_rad: float, depth_m: float) -> Float:
+    """Return half of the bounding box (2,) of the body's section at a depth, metres, roughly from above."""
+    reach = 1e-5
+    for _ in range(20):
+        line = np.linspace(-reach, reach, 65)
+        places = np.stack(np.meshgrid(line, line, indexing="ij"), axis=-1)
+        inside = shape.over(places, yaw_rad) <= depth_m
+        extent = np.abs(places[inside]).max(axis=0, initial=0.0)
+        if extent.max() < reach * (1.0 - 1e-9):
+            break
+        reach *= 2.0
+    for axis in (0, 1):  # a narrow body lies between the samples
+        line = np.linspace(0.0, extent[axis] + 2.0 * reach / 64, 257)
+        places = np.stack([line, 0.0 * line] if axis == 0 else [0.0 * line, line], axis=-1)
+        inside = shape.over(places, yaw_rad) <= depth_m
+        along = float(line[inside].max(initial=0.0)) + float(line[1])
+        extent[axis] = max(extent[axis], along)
+    return np.asarray(extent)

@@ -15,6 +15,7 @@ from skinnode.cli._options import OtherChannel, OtherInterface, Seconds
 from skinnode.text.words import counted
 
 if TYPE_CHECKING:
+    from skinnode.config import HandConfig
     from skinnode.node import NmtState
     from vcan_sim.fleet import Fleet, NodeReport
 
@@ -41,19 +42,31 @@ def simulate(
             metavar="[PATCH:]FAULTS",
         ),
     ] = None,
+    scene: Annotated[
+        Path | None, typer.Option(help="Scene to play on the patches.", metavar="SCENE.toml")
+    ] = None,
+    plot: Annotated[
+        Path | None,
+        typer.Option(help="Plot the forces and pressures of the scene to FILE, and exit.", metavar="FILE"),
+    ] = None,
 ) -> None:
     """Simulate a hand's patches as CANopen nodes on a bus; a sphere presses each patch and slides over it.
 
-    Bring the nodes up by running `skinnode host` with the same file in another terminal.
+    With a scene, its bodies touch the patches instead. Bring the nodes up by running `skinnode host` with the
+    same file in another terminal.
     """
     from skinnode.config import load_hand
     from skinnode.process.garbage_collection import without_long_collections
     from skinnode.process.signals import stop_on_signal
     from vcan_sim.faults import faults_of
     from vcan_sim.fleet import Fleet
+    from vcan_sim.scenes import load_scene
 
     plan = load_hand(hand).on(interface, channel)
-    simulated = Fleet(plan)
+    if plot is not None:
+        _preview(plan, scene, plot)
+        return
+    simulated = Fleet(plan, scene=None if scene is None else load_scene(scene, plan))
     for patch, faults in faults_of(fault or [], [each.name for each in plan.patches]).items():
         simulated.inject(faults, patch)
     with stop_on_signal() as stop, simulated as fleet, without_long_collections():
@@ -71,6 +84,24 @@ def simulate(
         )
     for line in injected:
         _say(line)
+
+
+def _preview(hand: HandConfig, scene: Path | None, plot: Path) -> None:
+    """Plot a scene to a file.
+
+    Raises:
+        ConfigError: There is no scene, matplotlib is missing, or the file cannot be written.
+    """
+    from skinnode.errors import ConfigError
+    from skinnode.files.plot_file import require_matplotlib
+    from vcan_sim.scenes import load_scene
+    from vcan_sim.scenes.plot import write_plot
+
+    if scene is None:
+        raise ConfigError("--plot", str(plot), "only with --scene")
+    require_matplotlib(plot)
+    write_plot(load_scene(scene, hand), hand, plot)
+    _say(f"wrote {plot}")
 
 
 def _watch(fleet: Fleet, wait: Callable[[float], bool], seconds: float | None) -> None:

@@ -6,6 +6,7 @@ from collections import Counter
 from collections.abc import Callable, Collection, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
+from threading import Lock
 from types import TracebackType
 from typing import Self
 
@@ -20,7 +21,8 @@ from skinnode.transport import CanPort, Frame
 from vcan_sim.faults import NO_FAULTS, OF_WIRES, Faults, Injected
 from vcan_sim.faulty_node import Emit, FaultyNode
 from vcan_sim.scene import Scene
-from vcan_sim.sensor import SimulatedPatch
+from vcan_sim.scenes import PatchTruth, SceneConfig, bind_scene
+from vcan_sim.sensor import SimulatedPatch, SkinMotion
 from vcan_sim.skin.imperfections import EXACT, Imperfections
 from vcan_sim.tally import Kind, Tally, kind_of
 
@@ -60,10 +62,13 @@ class Fleet:
         unchecked: Names of patches with protocol revision 1.0, whose summaries carry no check.
         imperfections: Departures of all patches from their layouts, or of each named patch. The draws differ
             from patch to patch. Default: exact patches.
+        scene: Scene in place of the strokes of ``[simulation]``. Its time begins on all patches at once, when
+            the first node has sent its first scan.
 
     Raises:
         ConfigError: A channel is given for a hand with several buses, imperfections name a patch that the
-            hand does not have, or the draws of a patch leave too small a gap between electrodes.
+            hand does not have, the draws of a patch leave too small a gap between electrodes, or a touch of
+            the scene is impossible on its patch.
     """
 
     def __init__(  # noqa: PLR0913 - keyword arguments, most of them rarely given
@@ -76,9 +81,12 @@ class Fleet:
         wire_up: Callable[[SimulatedPatch], ResistanceSource] = lambda patch: patch,
         unchecked: Collection[str] = (),
         imperfections: Imperfections | Mapping[str, Imperfections] = EXACT,
+        scene: SceneConfig | None = None,
     ) -> None:
         self.hand = hand.on(interface, channel)
         sizes = _by_patch(imperfections, [patch.name for patch in hand.patches])
+        self._scenes = {} if scene is None else bind_scene(scene, self.hand)
+        self._beginning = Lock()
         self._stations = {
             patch.name: _Station(
                 patch,
@@ -86,17 +94,31 @@ class Fleet:
                     PatchProfile.from_config(patch, hand.bus(patch.bus)), checked=patch.name not in unchecked
                 ),
                 SimulatedPatch(
-                    Scene(patch.layout.build(), hand.simulation, number),
-                    imperfections=sizes.get(patch.name, EXACT),
+                    self._skin(patch, number), imperfections=sizes.get(patch.name, EXACT)
                 ),
                 wire_up,
                 faults,
+                self._begin,
             )
             for number, patch in enumerate(hand.patches)
         }
         self._runners: list[NodeRunner] = []
         self._ports: dict[str, FaultyPort] = {}
         self._running = ExitStack()
+
+    def _skin(self, patch: PatchConfig, number: int) -> SkinMotion:
+        """Return the motion of a patch's skin."""
+        if self._scenes:
+            return self._scenes[patch.name]
+        return Scene(patch.layout.build(), self.hand.simulation, number)
+
+    def _begin(self, source: SimulatedPatch) -> None:
+        """Start the motion of a patch's skin, or a scene on all patches, at the patch's newest reading."""
+        t_ns = source.last_read_ns
+        with self._beginning:
+            for each in self.patches.values() if self._scenes else (source,):
+                if not each.started:
+                    each.start(t_ns)
 
     def start(self) -> None:
         """Open the buses and power the nodes on.
@@ -207,6 +229,26 @@ class Fleet:
         except LookupError as error:
             raise LookupError(f"{patch}: {error}") from None
 
+    def truth(self, patch: str, device_time_us: int) -> PatchTruth:
+        """Return the ground truth of a scan: displacement, contacts, pressure and wrench.
+
+        Args:
+            patch: Name of the patch.
+            device_time_us: Device time in the scan's summary, µs.
+
+        Raises:
+            LookupError: The fleet has no scene, the patch is not in the hand, or the scan was never sent or
+                is too old.
+        """
+        if not self._scenes:
+            raise LookupError("this fleet has no scene; the strokes of [simulation] have truth_m only")
+        source = self._stations[patch].source
+        try:
+            t_s = source.scene_s(source.read_ns(device_time_us))
+        except LookupError as error:
+            raise LookupError(f"{patch}: {error}") from None
+        return self._scenes[patch].truth(-1.0 if t_s is None else t_s)
+
     def __enter__(self) -> Self:
         self.start()
         return self
@@ -276,15 +318,16 @@ def _count(frames: list[Frame], counter: Counter[Kind]) -> None:
 class _Station:
     """A node, its analogue front end and the counts of its frames."""
 
-    def __init__(
+    def __init__(  # noqa: PLR0913 - the parts of a node
         self,
         config: PatchConfig,
         profile: PatchProfile,
         source: SimulatedPatch,
         wire_up: Callable[[SimulatedPatch], ResistanceSource],
         faults: Faults,
+        begin: Callable[[SimulatedPatch], None],
     ) -> None:
-        self.source = source
+        self.source, self._begin = source, begin
         self._converter = wire_up(source)
         self._profile, self._config = profile, config
         self._pdo_ids = {chunk_cob_id(config.node_id), summary_cob_id(config.node_id)}
@@ -328,7 +371,7 @@ class _Station:
         self._pdos += can_id in self._pdo_ids
         source, node = self.source, self._node
         if not source.started and node is not None and node.scans_sent:
-            source.start(source.last_read_ns)
+            self._begin(source)
 
     def report(self) -> NodeReport:
         node, config = self._node, self._config

@@ -5,10 +5,11 @@ from __future__ import annotations
 import time
 from collections import OrderedDict
 from collections.abc import Callable
-from typing import Final
+from typing import Final, Protocol
 
 import numpy as np
 
+from skinnode.config import SimulationConfig
 from skinnode.model.layout import Float, PatchLayout
 from skinnode.protocol.device_time import TIME_STEP_US
 from vcan_sim.scene import Scene
@@ -23,6 +24,25 @@ Fault = Callable[[Float, int], Float]
 converter sees instead; inf means an open pair of wires, 0 a shorted pair."""
 
 
+class SkinMotion(Protocol):
+    """Motion of a patch's skin: :class:`vcan_sim.scene.Scene` or :class:`vcan_sim.scenes.PatchScene`."""
+
+    @property
+    def layout(self) -> PatchLayout:
+        """The patch at rest."""
+
+    @property
+    def simulation(self) -> SimulationConfig:
+        """Seed and noise of the converter."""
+
+    @property
+    def number(self) -> int:
+        """Number of the patch in the hand; each patch has its own noise."""
+
+    def upper_m(self, t_s: float) -> Float:
+        """Return the electrodes (U, N, 3), metres, at scene time ``t_s``; ``layout.upper_m`` while at rest."""
+
+
 class SimulatedPatch:
     """Resistances of a patch in a scene, as read by a noisy converter.
 
@@ -32,7 +52,7 @@ class SimulatedPatch:
     the time of a scan.
 
     Args:
-        scene: Motion of the indenter and the skin.
+        scene: Motion of the skin.
         converter_noise: Standard deviation of a reading, relative to the resistance. Default: the scene's.
         fault: Function applied to each reading, after the noise.
         imperfections: Departures of the patch from its layout; drawn for the scene's number.
@@ -43,7 +63,7 @@ class SimulatedPatch:
 
     def __init__(
         self,
-        scene: Scene,
+        scene: SkinMotion,
         *,
         converter_noise: float | None = None,
         fault: Fault | None = None,
@@ -84,7 +104,7 @@ class SimulatedPatch:
         self.reads += 1
         self.last_read_ns = t_ns
         self._remember(t_ns)
-        t_s = self._scene_s(t_ns)
+        t_s = self.scene_s(t_ns)
         resistance = self.skin.rest_ohm if t_s is None else self.skin.analogue_ohm(t_s, self.scene.upper_m)
         noisy = resistance * (1.0 + self._noise * self._random.standard_normal(resistance.shape))
         read = self.skin.converted_ohm(noisy, self.reads)
@@ -115,7 +135,7 @@ class SimulatedPatch:
             own sample. With imperfections they differ from ``layout.upper_m`` at rest too; see
             :meth:`displacement_m`.
         """
-        t_s = self._scene_s(t_ns)
+        t_s = self.scene_s(t_ns)
         return self.skin.rest_m if t_s is None else self.skin.upper_m(t_s, self.scene.upper_m)
 
     def displacement_m(self, t_ns: int) -> Float:
@@ -127,8 +147,8 @@ class SimulatedPatch:
         """
         return np.asarray(self.truth_m(t_ns) - self.skin.rest_m)
 
-    def _scene_s(self, t_ns: int) -> float | None:
-        """Return the scene time in s, or None before the start."""
+    def scene_s(self, t_ns: int) -> float | None:
+        """Return the scene time at ``t_ns``, s, or None if the scene has not begun."""
         return None if self._origin_ns is None else (t_ns - self._origin_ns) * 1e-9
 
     def _remember(self, t_ns: int) -> None:

@@ -29,7 +29,7 @@ app = typer.Typer(
 
 
 @app.command()
-def simulate(
+def simulate(  # noqa: PLR0913 - Typer makes a command's options of its arguments
     hand: Annotated[Path, typer.Argument(help="The hand to simulate.", metavar="HAND.toml")],
     interface: OtherInterface = None,
     channel: OtherChannel = None,

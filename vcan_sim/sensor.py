@@ -40,7 +40,7 @@ class SkinMotion(Protocol):
         """Number of the patch in the hand; each patch has its own noise."""
 
     def upper_m(self, t_s: float) -> Float:
-        """Return the electrodes (U, N, 3), metres, at scene time ``t_s``; ``layout.upper_m`` while at rest."""
+        """Return the electrodes (U, N, 3), metres, at scene time ``t_s``; at rest, ``layout.upper_m``."""
 
 
 class SimulatedPatch:

@@ -19,7 +19,8 @@ from vcan_sim.contact.grid import Grid
 from vcan_sim.contact.layer import Float
 
 CLOSE: Final = 1e-6
-"""Default tolerance: largest overlap or gap of a cell in contact, relative to the largest overlap of the undeformed shapes."""
+"""Default tolerance: largest overlap or gap of a cell in contact, relative to the largest overlap of the
+undeformed shapes."""
 STEPS: Final = 400
 """Maximum number of iterations."""
 TURNS: Final = 12
@@ -55,9 +56,7 @@ def untouched(grid: Grid) -> Contact:
     return Contact(zero, zero, np.zeros(grid.shape, bool))
 
 
-def press(
-    grid: Grid, overlap_m: Float, start_pa: Float | None = None, *, close: float = CLOSE
-) -> Float:
+def press(grid: Grid, overlap_m: Float, start_pa: Float | None = None, *, close: float = CLOSE) -> Float:
     """Return the pressure (X, Y), Pa, of a body without friction.
 
     Args:
@@ -100,9 +99,7 @@ def press(
     raise NoSolution(f"no pressure within {STEPS} iterations: gap {np.abs(gap[active]).max():.2g} m")
 
 
-def rub(  # noqa: PLR0913 - the last is a tolerance
-    grid: Grid, limit_pa: Float, target_m: Float, start_pa: Float, *, close: float = CLOSE
-) -> Float:
+def rub(grid: Grid, limit_pa: Float, target_m: Float, start_pa: Float, *, close: float = CLOSE) -> Float:
     """Return the shear (2, X, Y), Pa, of at most ``limit_pa`` that comes closest to a displacement.
 
     Args:
@@ -118,7 +115,7 @@ def rub(  # noqa: PLR0913 - the last is a tolerance
     inside = limit_pa > 0.0
     if not inside.any():
         return np.zeros_like(start_pa)
-    stiffness = _largest(grid, inside)
+    compliance = grid.largest_compliance
 
     def within(shear: Float) -> Float:
         size = np.hypot(*shear)
@@ -128,7 +125,7 @@ def rub(  # noqa: PLR0913 - the last is a tolerance
     weight, scale = 1.0, float(limit_pa.max())
     for _ in range(STEPS):
         slip = np.where(inside, grid.shear_m(ahead) - target_m, 0.0)
-        after = within(ahead - slip / stiffness)
+        after = within(ahead - slip / compliance)
         change = after - shear
         if float(np.abs(after - ahead).max()) < 0.1 * close * scale:
             return after
@@ -138,19 +135,6 @@ def rub(  # noqa: PLR0913 - the last is a tolerance
         ahead = after + (weight - 1.0) / new * change
         shear, weight = after, new
     raise NoSolution(f"no shear within {STEPS} iterations")
-
-
-def _largest(grid: Grid, inside: np.ndarray) -> float:
-    """Return the largest eigenvalue of the response to shear on some cells, and a tenth more, m/Pa."""
-    vector = np.stack([inside, inside]).astype(float)
-    largest = 0.0
-    for _ in range(8):
-        vector = np.where(inside, vector, 0.0)
-        vector /= np.linalg.norm(vector)
-        moved = grid.shear_m(vector)
-        largest = float(np.linalg.norm(np.where(inside, moved, 0.0)))
-        vector = moved
-    return 1.1 * largest
 
 
 def advance(  # noqa: PLR0913 - the last two steer the search

@@ -56,7 +56,9 @@ def bind_scene(scene: SceneConfig, hand: HandConfig) -> dict[str, PatchScene]:
     names = [patch.name for patch in hand.patches]
     for i, touch in enumerate(scene.touches):
         if touch.patch not in names:
-            raise _error(scene, f"touches[{i}].patch", touch.patch, f"a patch of the hand: {', '.join(names)}")
+            raise _error(
+                scene, f"touches[{i}].patch", touch.patch, f"a patch of the hand: {', '.join(names)}"
+            )
     return {patch.name: _patch_scene(scene, hand, patch, i) for i, patch in enumerate(hand.patches)}
 
 
@@ -94,14 +96,14 @@ def _patch_scene(scene: SceneConfig, hand: HandConfig, patch: PatchConfig, numbe
     histories = []
     for i, touch in touches:
         body = scene.body(touch.body)
-        made = History(touch, body.build(), body.friction, windows[i], scene.step_s, electrodes)
-        histories.append(made)
+        histories += [
+            History(each, body.build(), body.friction, windows[i], scene.step_s, electrodes)
+            for each in touch.each
+        ]
     return PatchScene(layout, hand.simulation, number, scene.step_s, scene.repeat_s, tuple(histories))
 
 
-def _window(
-    scene: SceneConfig, number: int, touch: TouchConfig, layer: Layer, layout: PatchLayout
-) -> Window:
+def _window(scene: SceneConfig, number: int, touch: TouchConfig, layer: Layer, layout: PatchLayout) -> Window:
     """Return the window of a touch. Raises ConfigError if the touch is deeper than the layer."""
     most = DEEPEST * min(layer.thickness_m, layout.height_m)
     level, key = highest_level(touch), "force_n" if touch.by_force else "depth_m"
@@ -121,9 +123,12 @@ def _window(
 
 
 def _path(touch: TouchConfig, step_s: float) -> dict[int, Pose]:
-    """Return the pose at each time step of a touch."""
-    numbers = range(int(touch.from_s / step_s), int(touch.to_s / step_s) + 2)
-    return {number: pose_at(touch, number * step_s) for number in numbers}
+    """Return the pose at each time step of a touch, each time that it is made."""
+    return {
+        number: pose_at(each, number * step_s)
+        for each in touch.each
+        for number in range(int(each.from_s / step_s), int(each.to_s / step_s) + 2)
+    }
 
 
 def _check_on_patch(  # noqa: PLR0913 - what a touch is checked with
@@ -158,7 +163,9 @@ def _check_on_patch(  # noqa: PLR0913 - what a touch is checked with
                 name = "reach_m" if motion.kind == "walk" else "by_m"
                 key, got = f"touches[{number}].motions[{j}].{name}", getattr(motion, name)
         shown = list(got) if isinstance(got, tuple) else got
-        where = "" if key.endswith("at_m") else f"; at {t:.3g} s the body is at [{place[0]:.4g}, {place[1]:.4g}]"
+        where = (
+            "" if key.endswith("at_m") else f"; at {t:.3g} s the body is at [{place[0]:.4g}, {place[1]:.4g}]"
+        )
         raise _error(scene, key, shown, room + where)
 
 
@@ -168,7 +175,7 @@ def _check_apart(
     early: tuple[int, TouchConfig, Window, dict[int, Pose]],
     layer: Layer,
 ) -> None:
-    """Raise ConfigError if two touches come so close at some time that one would move the skin of the other."""
+    """Raise ConfigError if two touches come so close at some time that one would move the other's skin."""
     (i, touch, window, path), (j, _, other_window, other_path) = late, early
     both = np.array(window.half_m) + np.array(other_window.half_m)
     gap = APART * min(layer.thickness_m, max(*window.half_m, *other_window.half_m))

@@ -112,6 +112,7 @@ class History:
             self._contact, self._pose = untouched(self.window.grid), pose
             self._depth_and_force = None
             return None
+        start = self._contact  # what slides takes its tractions along
         self._follow(pose)
         offset = self.cell_m(self._first_cell) - np.asarray(pose.place_m)
         slide = np.zeros(2) if last is None else np.subtract(pose.slid_m, last.slid_m)
@@ -119,14 +120,13 @@ class History:
             arm = self.window.grid.centres_m(offset)
             turn = pose.yaw_rad - last.yaw_rad
             slide = slide[:, None, None] + turn * np.stack([-arm[..., 1], arm[..., 0]])
-        depth, contact = self._solve(pose, offset, slide)
+        depth, contact = self._solve(pose, offset, slide, start)
         self._contact, self._pose = contact, pose
         return self._summary(depth)
 
-    def _solve(self, pose: Pose, offset_m: Float, slide_m: Float) -> tuple[float, Contact]:
-        """Return the depth, metres, and the contact after the move to a pose."""
+    def _solve(self, pose: Pose, offset_m: Float, slide_m: Float, start: Contact) -> tuple[float, Contact]:
+        """Return the depth, metres, and the contact after the move to a pose, searched from ``start``."""
         grid = self.window.grid
-        start = self._contact
 
         def at(depth_m: float) -> Contact:
             nonlocal start

@@ -81,10 +81,8 @@ def _way_m(motion: MotionConfig, share: float, t_s: float) -> tuple[float, float
     if motion.kind == "walk":
         return _walked_m(motion, t_s)
     way_x, way_y = motion.by_m or (0.0, 0.0)
-    if motion.kind == "shear":
-        gone = ease(2.0 * share) - ease(2.0 * share - 1.0)
-    else:
-        gone = glide(share)
+    out_and_back = motion.kind == "shear"
+    gone = ease(2.0 * share) - ease(2.0 * share - 1.0) if out_and_back else glide(share)
     return way_x * gone, way_y * gone
 
 
@@ -101,9 +99,12 @@ def _walked_m(motion: MotionConfig, t_s: float) -> tuple[float, float]:
 
 @functools.lru_cache(maxsize=256)
 def _targets_m(motion: MotionConfig) -> tuple[tuple[float, float], ...]:
-    """Return the targets of a walk, metres, uniform in a disc of radius ``reach_m``; the first is its centre."""
+    """Return the targets of a walk, metres, uniform in a disc of radius ``reach_m`` about the first."""
     count = max(1, round((motion.to_s - motion.from_s) / (motion.every_s or _EVERY_S)))
     random = np.random.default_rng(1 if motion.seed is None else motion.seed)
     r = (motion.reach_m or 0.0) * np.sqrt(random.uniform(0.0, 1.0, count))
     angle = random.uniform(0.0, 2.0 * math.pi, count)
-    return ((0.0, 0.0), *((float(x), float(y)) for x, y in zip(r * np.cos(angle), r * np.sin(angle), strict=True)))
+    return (
+        (0.0, 0.0),
+        *((float(x), float(y)) for x, y in zip(r * np.cos(angle), r * np.sin(angle), strict=True)),
+    )

@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import functools
+import math
 from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 
 from vcan_sim.contact.grid import Grid
-from vcan_sim.contact.layer import Layer, cell_response
+from vcan_sim.contact.layer import Layer, PointResponse
 from vcan_sim.contact.solve import Contact
 from vcan_sim.scenes.shapes import Float
 
+FAR: Final = 1e-5
+"""Response to a point force, relative to that next to the force, below which it counts as zero. In a layer it
+falls exponentially with the distance."""
 POINTS: Final = 4096
 """Points of the table of the response over the distance."""
 
@@ -31,6 +35,8 @@ class Electrodes:
     _table: Float
     """(POINTS, 4) r Z, r A, r B and r K over the distance r, m²/N."""
     _step_m: float
+    _far_m: float
+    """Distance from which the response is negligible, metres."""
 
     @classmethod
     def of(cls, layer: Layer, places_m: Float, surface_m: float) -> Electrodes:
@@ -44,7 +50,8 @@ class Electrodes:
         reach = 2.0 * float(np.linalg.norm(np.ptp(places_m, axis=0))) + 4.0 * min(layer.thickness_m, 0.01)
         reach = float(f"{reach:.1g}") * 1.5  # equal reaches share the table
         table, step = _radial(layer, reach)
-        return cls(places_m, surface_m, table, step)
+        noticed = np.flatnonzero((np.abs(table) > FAR * np.abs(table).max()).any(axis=1))
+        return cls(places_m, surface_m, table, step, step * float(noticed[-1] + 1))
 
     def displacement_m(self, grid: Grid, origin_m: Float, contact: Contact) -> Float:
         """Return the displacement of the electrodes.
@@ -66,7 +73,10 @@ class Electrodes:
         moved[inside] = _cubic(contact.displacement_m, index[inside])
         loaded = contact.traction_pa.any(axis=0)
         force = contact.traction_pa[:, loaded] * grid.size_m**2
-        moved[~inside] = self._under_forces(self.places_m[~inside], grid.centres_m(origin_m)[loaded], force)
+        last_m = origin_m + grid.size_m * (np.array(grid.shape) - 1.0)
+        away = np.maximum(np.maximum(origin_m - self.places_m, self.places_m - last_m), 0.0)
+        near = ~inside & (np.hypot(away[:, 0], away[:, 1]) < self._far_m)
+        moved[near] = self._under_forces(self.places_m[near], grid.centres_m(origin_m)[loaded], force)
         return moved
 
     def _under_forces(self, places_m: Float, at_m: Float, force_n: Float) -> Float:
@@ -90,20 +100,19 @@ class Electrodes:
 
 @functools.lru_cache(maxsize=64)
 def _radial(layer: Layer, reach_m: float) -> tuple[Float, float]:
-    """Return the table of the response to a point force, and the distance between its points, metres."""
+    """Return the table of the response to a point force, and the distance between its points, metres.
+
+    On a half-space it is the solution of Boussinesq and Cerruti (Johnson, Contact Mechanics, 1985, sections
+    3.2 and 3.6); :class:`vcan_sim.contact.layer.PointResponse` is the difference of a layer.
+    """
     r = np.linspace(0.0, reach_m, POINTS)
-    step = float(r[1])
-    size = 0.1 * step  # so small that the cell is a point at the first distance already
-    offset = np.stack([r, np.zeros(POINTS)], axis=-1)
-    response = cell_response(layer, offset, size, reach_m + size) / size**2
-    along, across = response[:, 0, 0], response[:, 1, 1]
-    table = np.stack(
-        [response[:, 2, 2], 0.5 * (along + across), 0.5 * (along - across), response[:, 0, 2]], axis=-1
-    )
-    table *= r[:, None]
-    table[0] = 2.0 * table[1] - table[2]
+    nu = layer.poisson
+    half_space = np.array([1.0 - nu, 1.0 - 0.5 * nu, 0.5 * nu, 0.5 - nu])
+    table = np.tile(half_space / (2.0 * math.pi * layer.shear_modulus_pa), (POINTS, 1))
+    if math.isfinite(layer.thickness_m):
+        table += r[:, None] * np.stack(PointResponse(layer, reach_m)(r), axis=-1)
     table.setflags(write=False)
-    return table, step
+    return table, float(r[1])
 
 
 def _cubic(field: Float, index: Float) -> Float:

@@ -188,6 +188,10 @@ class TouchConfig(Table):
     """Normal force, N. Give this or ``depth_m``."""
     yaw_rad: _Angle = 0.0
     """Rotation of the body about z, rad."""
+    times: Annotated[int, Field(ge=1, le=1000), Allowed("an integer from 1 to 1000")] = 1
+    """Number of times that the touch is made, as for taps."""
+    every_s: _Duration | None = None
+    """Time from the start of one touch to the start of the next, s, if ``times`` is more than 1."""
     motions: Annotated[tuple[MotionConfig, ...], Field(strict=False)] = ()
     """Motions between the press and the lift."""
 
@@ -195,6 +199,23 @@ class TouchConfig(Table):
     def by_force(self) -> bool:
         """Whether the touch is controlled by force."""
         return self.force_n is not None
+
+    @property
+    def each(self) -> tuple[TouchConfig, ...]:
+        """One touch for each of the ``times``."""
+        if self.times == 1:
+            return (self,)
+        return tuple(self._after(number * (self.every_s or 0.0)) for number in range(self.times))
+
+    def _after(self, delay_s: float) -> TouchConfig:
+        """Return the touch made once, ``delay_s`` later."""
+
+        def later(table: Any, **changes: Any) -> Any:
+            times = {"from_s": table.from_s + delay_s, "to_s": table.to_s + delay_s}
+            return table.model_copy(update=times | changes)
+
+        motions = tuple(later(motion) for motion in self.motions)
+        return later(self, times=1, every_s=None, motions=motions)  # type: ignore[no-any-return]
 
     @model_validator(mode="after")
     def _times_and_level(self) -> TouchConfig:
@@ -206,6 +227,16 @@ class TouchConfig(Table):
         if self.to_s - self.from_s < 2.0 * self.ramp_s * (1.0 - 1e-9):
             most = 0.5 * (self.to_s - self.from_s)
             raise ConfigError("ramp_s", self.ramp_s, f"at most half the touch, {most:g} s")
+        if self.times > 1 and self.every_s is None:
+            raise ConfigError("every_s", NOTHING, "a number of seconds, because times is more than 1")
+        if self.times > 1 and (self.every_s or 0.0) < self.to_s - self.from_s:
+            least = self.to_s - self.from_s
+            raise ConfigError("every_s", self.every_s, f"at least the duration of the touch, {least:g} s")
+        self._check_motions()
+        return self
+
+    def _check_motions(self) -> None:
+        """Check that motions lie in the touch and that presses follow each other."""
         pressed_s = 0.0
         for i, motion in enumerate(self.motions):
             key = f"motions[{i}]"
@@ -225,7 +256,6 @@ class TouchConfig(Table):
                     f"{key}.from_s", motion.from_s, f"at least {pressed_s} s, the end of the press before"
                 )
             pressed_s = motion.to_s
-        return self
 
 
 class SceneConfig(Table):
@@ -233,7 +263,7 @@ class SceneConfig(Table):
 
     name: Name = "scene"
     """Name of the scene."""
-    step_s: _Step = 0.025
+    step_s: _Step = 0.03
     """Step of the contact mechanics, s. The state between steps is interpolated smoothly, so that motions
     shorter than four steps are blurred."""
     repeat_s: _Duration | None = None
@@ -273,22 +303,36 @@ class SceneConfig(Table):
             if touch.body not in names:
                 allowed = f"a body of this file: {', '.join(names)}"
                 raise ConfigError(f"touches[{i}].body", touch.body, allowed)
-            if self.repeat_s is not None and touch.to_s > self.repeat_s:
-                raise ConfigError(f"touches[{i}].to_s", touch.to_s, f"at most repeat_s, {self.repeat_s} s")
+            end_s = touch.each[-1].to_s
+            if self.repeat_s is not None and end_s > self.repeat_s:
+                raise ConfigError(f"touches[{i}].to_s", touch.to_s, f"an end by repeat_s, {self.repeat_s} s")
             self._check_motions(i, touch)
             for j, other in enumerate(self.touches[:i]):
-                if other.body == touch.body and touch.from_s < other.to_s and other.from_s < touch.to_s:
+                if other.body == touch.body and _meet(touch, other):
                     allowed = f"a time at which touches[{j}] does not use the body {touch.body!r}"
                     raise ConfigError(f"touches[{i}].from_s", touch.from_s, allowed)
         return self
 
     def _check_motions(self, number: int, touch: TouchConfig) -> None:
-        """Check that only bodies that can roll do."""
-        body = self.body(touch.body)
+        """Check that a body rolls only if its shape can: a sphere, or a ridge across its axis."""
+        body, key = self.body(touch.body), f"touches[{number}].motions"
+        turns = any(motion.kind == "turn" for motion in touch.motions)
         for j, motion in enumerate(touch.motions):
-            if motion.kind == "roll" and body.shape not in ("sphere", "ridge"):
-                key, allowed = f"touches[{number}].motions[{j}].kind", "roll only for a sphere or a ridge"
-                raise ConfigError(key, motion.kind, f"{allowed}; {body.name!r} is a {body.shape}")
+            if motion.kind != "roll":
+                continue
+            if body.shape not in ("sphere", "ridge"):
+                allowed = f"roll only for a sphere or a ridge; {body.name!r} is a {body.shape}"
+                raise ConfigError(f"{key}[{j}].kind", motion.kind, allowed)
+            x, y = motion.by_m or (0.0, 0.0)
+            along = x * math.cos(touch.yaw_rad) + y * math.sin(touch.yaw_rad)
+            if body.shape == "ridge" and (turns or abs(along) > 1e-3 * math.hypot(x, y)):
+                allowed = f"a way across the axis of the ridge, at yaw {touch.yaw_rad:g} rad without a turn"
+                raise ConfigError(f"{key}[{j}].by_m", [x, y], allowed)
+
+
+def _meet(one: TouchConfig, two: TouchConfig) -> bool:
+    """Return whether two touches are made at the same time."""
+    return any(a.from_s < b.to_s and b.from_s < a.to_s for a in one.each for b in two.each)
 
 
 def read_scene(path: Path | str) -> SceneConfig:

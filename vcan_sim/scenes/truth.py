@@ -43,7 +43,7 @@ class BodyContact:
     @property
     def pressure_pa(self) -> Float:
         """Pressure (X, Y) on the skin, Pa; positive under the body."""
-        return -self.traction_pa[2]
+        return np.asarray(-self.traction_pa[2])
 
     @property
     def cells_m(self) -> Float:

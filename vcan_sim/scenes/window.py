@@ -145,7 +145,7 @@ def solve_depth(
     """
     low, high = 0.0, math.inf
     last = known
-    depth = known[0] * (target_n / known[1]) ** (2.0 / 3.0)
+    depth = float(known[0] * (target_n / known[1]) ** (2.0 / 3.0))
     for _ in range(_SEARCHES):
         force = force_n(depth)
         if abs(force - target_n) <= close * target_n:
@@ -196,6 +196,7 @@ def _grid(layer: Layer, half_m: Float) -> Grid:
     """Return a grid that is at least twice ``half_m`` (2,) large, metres."""
     wide = 2.0 * half_m
     size = max(float(wide.min()) / ACROSS, math.sqrt(float(wide.prod()) / MOST_CELLS))
+    size = min(size, layer.thickness_m)  # a larger cell does not resolve the response of the layer
     size = float(f"{size:.2g}")  # equal sizes share the response
     cells = np.maximum(np.ceil(wide / size - 1e-9), 4).astype(int)
     return _grid_of(layer, (int(cells[0]), int(cells[1])), size)

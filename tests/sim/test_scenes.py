@@ -64,7 +64,7 @@ def slide() -> PatchScene:
 
 def test_hertz() -> None:
     """Force, depth, radius and pressure of a sphere on a half-space (Johnson, section 4.2)."""
-    scene = sphere({"depth_m": DEPTH_M}, skin=THICK)
+    scene = sphere({"depth_m": DEPTH_M}, skin=THICK, cells=48)
     truth = scene.truth(0.6)
     modulus, contact_m = 1e6 / 0.75, math.sqrt(RADIUS_M * DEPTH_M)
     (contact,) = truth.contacts
@@ -84,7 +84,10 @@ def test_hertz() -> None:
     sunk = (2 * contact_m**2 - outside**2) * np.arcsin(contact_m / outside)
     sunk = (sunk + outside * contact_m * np.sqrt(1 - (contact_m / outside) ** 2)) / (math.pi * RADIUS_M)
     far = at > contact_m
-    np.testing.assert_allclose(-truth.displacement_m[far, 2], sunk[far], rtol=0.01)
+    moved = -truth.displacement_m[
+        far, 2
+    ]  # less than on a half-space, by the same everywhere: it is 1 m thick
+    np.testing.assert_allclose(moved - moved[0], sunk[far] - sunk[far][0], atol=0.005 * sunk[far].max())
 
 
 def test_an_electrode_under_the_body_moves_as_the_body() -> None:
@@ -102,7 +105,7 @@ def test_a_thin_bonded_film() -> None:
     contact_m, film_m = 1e-3, 25e-6
     depth = contact_m**2 / (4 * RADIUS_M)
     skin = {"thickness_m": film_m, "young_pa": 1e6, "poisson": 0.5}
-    scene = sphere({"depth_m": depth, "to_s": 0.9}, skin=skin, step_s=0.1)
+    scene = sphere({"depth_m": depth, "to_s": 0.8, "ramp_s": 0.2}, skin=skin, step_s=0.1, cells=40)
     force = -scene.truth(0.5).contacts[0].force_n[2]
     expected = math.pi * (1e6 / 3) * contact_m**6 / (32 * RADIUS_M * film_m**3)
     assert force == pytest.approx(expected, rel=0.02)
@@ -110,7 +113,7 @@ def test_a_thin_bonded_film() -> None:
 
 def test_a_flat_punch() -> None:
     """The force is 2 a E* δ (Johnson, eq. 3.36); the rim is round only to some cells."""
-    punch = {"shape": "punch", "radius_m": 2e-3, "edge_radius_m": 0.0, "friction": 0.0}
+    punch = {"shape": "punch", "radius_m": 2e-3, "edge_radius_m": 1e-5, "friction": 0.0}
     (contact,) = one(punch, {"depth_m": 1e-5}, skin=THICK).truth(0.6).contacts
     assert contact.radius_m == pytest.approx(2e-3, rel=0.03)
     expected = 2 * contact.radius_m * 1e6 / 0.75 * 1e-5
@@ -120,7 +123,9 @@ def test_a_flat_punch() -> None:
 def test_a_long_ridge() -> None:
     """The middle of a cylinder has the pressure of a line contact, whose peak is √(E* P' / (π R))."""
     body = {"shape": "ridge", "radius_m": 5e-3, "length_m": 25e-3, "friction": 0.0}
-    (contact,) = one(body, {"depth_m": 5e-5, "yaw_rad": math.pi / 2}, skin=THICK).truth(0.6).contacts
+    (contact,) = (
+        one(body, {"depth_m": 5e-5, "yaw_rad": math.pi / 2}, skin=THICK, cells=40).truth(0.6).contacts
+    )
     middle = contact.pressure_pa[:, contact.pressure_pa.shape[1] // 2]
     line_load = middle.sum() * contact.cell_m
     assert middle.max() == pytest.approx(math.sqrt(1e6 / 0.75 * line_load / (math.pi * 5e-3)), rel=0.02)
@@ -329,9 +334,9 @@ def test_two_bodies_add_up() -> None:
 
 def test_bodies_as_near_as_allowed_hardly_move_each_others_skin() -> None:
     """The contacts do not see each other; the displacement that this neglects is small."""
-    scene = one({"shape": "sphere", "radius_m": 8e-3, "friction": 0.0}, {"depth_m": 3e-4})
+    scene = one({"shape": "sphere", "radius_m": 40e-3, "friction": 0.0}, {"depth_m": 3e-4})
     half = max(scene.histories[0].window.half_m)
-    gap = min(2e-3, half)
+    gap = 3 * 2e-3
     electrodes = scene.histories[0]._electrodes
     step = scene.histories[0].step(20)
     assert step is not None
@@ -339,13 +344,20 @@ def test_bodies_as_near_as_allowed_hardly_move_each_others_skin() -> None:
     loaded = step.traction_pa.any(axis=0)
     cells = grid.centres_m(scene.histories[0].cell_m(step.first))[loaded]
     force = step.traction_pa[:, loaded] * grid.size_m**2
-    at = np.array(CENTRE) + [[half + gap, 0.0]]
+    at = np.array([[CENTRE[0] + half + gap, CENTRE[1]]])
     moved = electrodes._under_forces(at, cells, force)
-    assert abs(moved[0, 2]) < 0.05 * 3e-4
+    assert abs(moved[0, 2]) < 0.03 * 3e-4
 
 
 BODY = '[[bodies]]\nname = "ball"\nshape = "sphere"\nradius_m = 0.01\n'
-TOUCH = '[[touches]]\nbody = "ball"\npatch = "p0"\nat_m = [0.018, 0.018]\nfrom_s = 1.0\nto_s = 2.0\ndepth_m = 2e-4\n'
+TOUCH = (
+    '[[touches]]\nbody = "ball"\npatch = "p0"\nat_m = [0.018, 0.018]\nfrom_s = 1.0\nto_s = 2.0\n'
+    "depth_m = 2e-4\n"
+)
+HAND = (
+    '[[buses]]\nname = "can0"\ninterface = "virtual"\nchannel = "c"\n\n'
+    '[[patches]]\nname = "p0"\nnode_id = 4\n'
+)
 SLIDE = '[[touches.motions]]\nkind = "slide"\nby_m = [0.001, 0.0]\nfrom_s = 1.3\nto_s = 1.7\n'
 
 
@@ -365,12 +377,12 @@ SLIDE = '[[touches.motions]]\nkind = "slide"\nby_m = [0.001, 0.0]\nfrom_s = 1.3\
         (BODY + TOUCH + "ramp_s = 0.8\n", "12:1", ["ramp_s", "0.8", "at most half"]),
         (BODY + TOUCH + "force_n = 1.0\n", "12:1", ["force_n", "one of the two"]),
         (BODY + TOUCH.replace("2e-4", "nan"), "11:1", ["depth_m", "nan", "metres"]),
-        (BODY + TOUCH.replace("0.018]", "inf]"), "8:17", ["at_m[1]", "inf"]),
+        (BODY + TOUCH.replace("0.018]", "inf]"), "8:16", ["at_m[1]", "inf"]),
         (BODY.replace('"sphere"', '"cube"') + TOUCH, "3:1", ["bodies[0].shape", "'cube'", "sphere"]),
         (BODY + "length_m = 0.01\n" + TOUCH, "5:1", ["bodies[0].length_m", "only with shape"]),
         (BODY.replace("radius_m = 0.01\n", "") + TOUCH, "1:1", ["bodies[0].radius_m", "nothing"]),
         (BODY + BODY + TOUCH, "6:1", ["bodies[1].name", "'ball'"]),
-        (BODY + TOUCH + TOUCH, "15:1", ["touches[1].from_s", "does not use the body"]),
+        (BODY + TOUCH + TOUCH, "16:1", ["touches[1].from_s", "does not use the body"]),
         (
             BODY
             + BODY.replace("ball", "two")
@@ -403,9 +415,7 @@ def test_a_bad_scene_is_one_line_with_its_place(
 
 
 def test_the_command_reports_a_bad_scene(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (tmp_path / "hand.toml").write_text(
-        '[[buses]]\nname = "can0"\ninterface = "virtual"\nchannel = "c"\n\n[[patches]]\nname = "p0"\nnode_id = 4\n'
-    )
+    (tmp_path / "hand.toml").write_text(HAND)
     scene = tmp_path / "scene.toml"
     scene.write_text(BODY + TOUCH.replace("2e-4", "2e-3"))
     for options in (["--seconds", "0"], ["--plot", str(tmp_path / "a.png")]):
@@ -422,9 +432,7 @@ def test_the_command_reports_a_bad_scene(tmp_path: Path, capsys: pytest.CaptureF
 
 
 def test_the_preview_is_a_png(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (tmp_path / "hand.toml").write_text(
-        '[[buses]]\nname = "can0"\ninterface = "virtual"\nchannel = "c"\n\n[[patches]]\nname = "p0"\nnode_id = 4\n'
-    )
+    (tmp_path / "hand.toml").write_text(HAND)
     (tmp_path / "scene.toml").write_text(BODY + TOUCH)
     with pytest.raises(SystemExit) as ended:
         main([str(tmp_path / name) for name in ("hand.toml",)] + ["--scene", str(tmp_path / "scene.toml"),
@@ -452,11 +460,13 @@ def test_a_scene_reaches_the_host() -> None:
     }
     with Fleet(plan, scene=parse_scene(table)) as fleet, sk.Host.from_config(plan) as host:
         for field in itertools.islice(host.fields(timeout_s=10), 2000):
-            truth = fleet.truth(field.patch, field.device_time_us)
-            moved = fleet.truth_m(field.patch, field.device_time_us)
-            layout = fleet.patches[field.patch].scene.layout
+            assert field.stamp is not None
+            name = field.stamp.patch
+            truth = fleet.truth(name, field.stamp.device_time_us)
+            moved = fleet.truth_m(name, field.stamp.device_time_us)
+            layout = fleet.patches[name].scene.layout
             np.testing.assert_allclose(truth.displacement_m, moved - layout.upper_m, atol=1e-15)
-            if field.patch == "p0":
+            if name == "p0":
                 assert truth.contacts == ()
             elif truth.contacts and truth.contacts[0].depth_m > 1.99e-4:
                 assert abs(field.displacement_m - truth.displacement_m).max() < 2e-5

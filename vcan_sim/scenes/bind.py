@@ -21,9 +21,10 @@ from vcan_sim.scenes.window import BodyKey, TooMuch, Window, window_of
 
 DEEPEST: Final = 0.9
 """Largest depth of a body, relative to the thickness of the layer and to the height of the electrodes."""
-APART: Final = 1.0
+APART: Final = 3.0
 """Least distance between the contacts of two bodies on a patch, in thicknesses of the layer or, if that is
-less, in half widths of the larger contact."""
+less, in half widths of the larger contact. A contact does not feel the displacement due to the other, which
+is at most 3 % of the depth there (an incompressible layer 2 mm thick under a sphere of 40 mm radius)."""
 
 
 def load_scene(path: Path | str, hand: HandConfig) -> SceneConfig:
@@ -116,7 +117,7 @@ def _window(scene: SceneConfig, number: int, touch: TouchConfig, layer: Layer, l
         raise _error(scene, path, level, allowed)
     shape = BodyKey(scene.body(touch.body).build())
     try:
-        return window_of(layer, shape, yaws_rad(touch), level, touch.by_force, most)
+        return window_of(layer, shape, yaws_rad(touch), level, touch.by_force, most, scene.cells)
     except TooMuch as error:
         allowed = f"at most {error.most_n:.3g} N, the force at a depth of {most:.3g} m"
         raise _error(scene, path, level, allowed) from None

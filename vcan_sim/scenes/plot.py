@@ -42,13 +42,18 @@ def write_plot(scene: SceneConfig, hand: HandConfig, file: Path) -> None:
         truths = [patch.truth(float(t)) for t in times]
         _forces(grid[0, column], times, truths, colours)
         grid[0, column].set_title(name)
-        deepest = min(truths, key=lambda truth: float(truth.displacement_m[..., 2].min()))
+        deepest = max(truths, key=_depth_m)
         image = _pressures(grid[1, column], patch, deepest, colours)
         figure.colorbar(image, ax=grid[1, column], label="pressure (kPa)")
         grid[0, column].axvline(deepest.t_s, color="0.6", lw=0.8)
-    grid[0, 0].set_ylabel("force (N)\nsolid: normal, dashed: along the skin")
+    grid[0, 0].set_ylabel("force (N), dashed: shear")
     grid[1, 0].set_ylabel("y (mm)")
     save_figure("--plot", file, figure, 110)
+
+
+def _depth_m(truth: PatchTruth) -> float:
+    """Return the largest depth of a body, metres; 0 if nothing touches."""
+    return max((contact.depth_m for contact in truth.contacts), default=0.0)
 
 
 def _forces(axes: Any, times_s: Any, truths: list[PatchTruth], colours: dict[str, str]) -> None:

@@ -14,9 +14,11 @@ from vcan_sim.contact.layer import Layer, PointResponse
 from vcan_sim.contact.solve import Contact
 from vcan_sim.scenes.shapes import Float
 
+BEYOND: Final = 20.0
+"""Distance from a point force, in thicknesses of the layer, beyond which the response is below ``FAR``."""
 FAR: Final = 1e-5
-"""Response to a point force, relative to that next to the force, below which it counts as zero. In a layer it
-falls exponentially with the distance."""
+"""Response to a point force, relative to that next to the force, below which it counts as zero. The response
+of a layer falls exponentially with the distance."""
 POINTS: Final = 4096
 """Points of the table of the response over the distance."""
 
@@ -47,8 +49,7 @@ class Electrodes:
             places_m: (E, 2) places in the frame of the patch, metres.
             surface_m: Height of the undeformed surface in the frame of the patch, metres.
         """
-        reach = 2.0 * float(np.linalg.norm(np.ptp(places_m, axis=0))) + 4.0 * min(layer.thickness_m, 0.01)
-        reach = float(f"{reach:.1g}") * 1.5  # equal reaches share the table
+        reach = min(3.0 * float(np.linalg.norm(np.ptp(places_m, axis=0))) + 0.01, BEYOND * layer.thickness_m)
         table, step = _radial(layer, reach)
         noticed = np.flatnonzero((np.abs(table) > FAR * np.abs(table).max()).any(axis=1))
         return cls(places_m, surface_m, table, step, step * float(noticed[-1] + 1))

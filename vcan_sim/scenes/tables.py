@@ -266,6 +266,9 @@ class SceneConfig(Table):
     step_s: _Step = 0.03
     """Step of the contact mechanics, s. The state between steps is interpolated smoothly, so that motions
     shorter than four steps are blurred."""
+    cells: Annotated[int, Field(ge=8, le=128), Allowed("an integer from 8 to 128")] = 20
+    """Number of cells across a contact's window. With 20, forces are within 1 % and areas within 3 %; the
+    duration of a computation grows with the square."""
     repeat_s: _Duration | None = None
     """Period after which the scene repeats, s; None: the scene plays once."""
     skin: SkinConfig = SkinConfig()

@@ -15,10 +15,9 @@ from vcan_sim.contact.layer import Layer
 from vcan_sim.contact.solve import press
 from vcan_sim.scenes.shapes import Float, Shape
 
-ACROSS: Final = 20
-"""Cells across the narrow side of a window; a round contact has about 16 of them in its diameter."""
-MOST_CELLS: Final = 560
-"""Cells of a window at which its cells get larger instead of more; roundings may exceed the number."""
+MOST_CELLS: Final = 1.4
+"""Cells of a window relative to the square of the number across, above which the cells get larger instead,
+up to twice as large."""
 MARGIN: Final = 0.1
 """Margin around the deepest contact, relative to its half width; at least ``MARGIN_CELLS``."""
 MARGIN_CELLS: Final = 2
@@ -82,7 +81,13 @@ def centred_m(grid: Grid) -> Float:
 
 @functools.lru_cache(maxsize=512)
 def window_of(  # noqa: PLR0913 - what a contact depends on
-    layer: Layer, body: BodyKey, yaws_rad: tuple[float, ...], level: float, by_force: bool, most_m: float
+    layer: Layer,
+    body: BodyKey,
+    yaws_rad: tuple[float, ...],
+    level: float,
+    by_force: bool,
+    most_m: float,
+    cells: int,
 ) -> Window:
     """Return the window for a touch.
 
@@ -93,16 +98,17 @@ def window_of(  # noqa: PLR0913 - what a contact depends on
         level: Largest depth, metres, or largest normal force, N, of the touch.
         by_force: Whether ``level`` is a force.
         most_m: Largest depth allowed, metres.
+        cells: Number of cells across the narrow side of the window.
 
     Raises:
         TooMuch: The force needs a larger depth than ``most_m``.
     """
     if not by_force:
-        return _fit(layer, body.shape, yaws_rad, level)
+        return _fit(layer, body.shape, yaws_rad, level, cells)
     found: dict[float, Window] = {}
 
     def force_n(depth_m: float) -> float:
-        found[depth_m] = _fit(layer, body.shape, yaws_rad, depth_m)
+        found[depth_m] = _fit(layer, body.shape, yaws_rad, depth_m, cells)
         return found[depth_m].force_n
 
     if force_n(most_m) < level:
@@ -165,11 +171,11 @@ def solve_depth(
     raise ArithmeticError(f"no depth for {target_n:g} N within {_SEARCHES} trials, last {depth:g} m")
 
 
-def _fit(layer: Layer, shape: Shape, yaws_rad: tuple[float, ...], depth_m: float) -> Window:
+def _fit(layer: Layer, shape: Shape, yaws_rad: tuple[float, ...], depth_m: float, cells: int) -> Window:
     """Return a window that holds the contact at a depth, whichever the rotation."""
     half = 1.5 * np.max([_extent_m(shape, yaw, depth_m) for yaw in yaws_rad], axis=0)
     for _ in range(_TURNS):
-        grid = _grid(layer, half)
+        grid = _grid(layer, half, cells)
         reached, force = np.zeros(2), 0.0
         for yaw in yaws_rad:
             pressure = press(grid, overlap_m(grid, shape, centred_m(grid), yaw, depth_m), close=CLOSE)
@@ -192,10 +198,12 @@ def _grid_of(layer: Layer, shape: tuple[int, int], size_m: float) -> Grid:
     return Grid.of(layer, shape, size_m)
 
 
-def _grid(layer: Layer, half_m: Float) -> Grid:
+def _grid(layer: Layer, half_m: Float, across: int) -> Grid:
     """Return a grid that is at least twice ``half_m`` (2,) large, metres."""
     wide = 2.0 * half_m
-    size = max(float(wide.min()) / ACROSS, math.sqrt(float(wide.prod()) / MOST_CELLS))
+    narrow = float(wide.min())
+    size = max(narrow / across, math.sqrt(float(wide.prod()) / MOST_CELLS) / across)
+    size = min(size, 2.0 * narrow / across)
     size = min(size, layer.thickness_m)  # a larger cell does not resolve the response of the layer
     size = float(f"{size:.2g}")  # equal sizes share the response
     cells = np.maximum(np.ceil(wide / size - 1e-9), 4).astype(int)

@@ -6,8 +6,9 @@
         -> faulty_node (the real node) -> faulty_scans (scan faults) -> fleet (all nodes on their buses)
         -> command (vcan-sim)
 
-``contact`` has contact mechanics on a bonded layer, apart from all models of the product; scenes do not use
-it yet. ``timed_bus`` is a CAN bus with exact times, arbitration, errors and error counters; the nodes do not
+The scene of a patch is a stroke of ``scene`` or, from a scene file, of ``scenes``. ``contact`` has contact
+mechanics on a bonded layer, apart from all models of the product; ``scenes`` uses it. ``smooth`` has smooth
+ramps. ``timed_bus`` is a CAN bus with exact times, arbitration, errors and error counters; the nodes do not
 use it yet. ``faults`` declares the faults, ``injector`` draws and counts faults, ``tally`` counts frames by
 kind.
 """

@@ -1,4 +1,5 @@
-"""Reference of hand.toml: purpose, type, unit, default and range of each key, read from its models."""
+"""Reference of hand.toml and of scene files: purpose, type, unit, default and range of each key, read from
+their models."""
 
 from __future__ import annotations
 
@@ -15,6 +16,7 @@ from pydantic.fields import FieldInfo
 
 from skinnode.config import HandConfig
 from skinnode.config.explain import allowed_in, tables_in
+from vcan_sim.scenes import SceneConfig
 
 _TYPES: Final = {str: "text", int: "integer", float: "number", bool: "boolean", Path: "path", dict: "table"}
 _UNITS: Final = {
@@ -24,6 +26,7 @@ _UNITS: Final = {
     "bps": "bit/s",
     "fields": "fields",
     "rad": "rad",
+    "n": "N",
     "ms": "ms",
     "us": "µs",
     "pa": "Pa",
@@ -35,6 +38,11 @@ _UNITS: Final = {
 def keys_of_a_hand() -> str:
     """Return one section per table of the file, in the order of the models."""
     return "\n\n".join(_sections("", HandConfig, listed=False))
+
+
+def keys_of_a_scene() -> str:
+    """Return one section per table of a scene file."""
+    return "\n\n".join(_sections("", SceneConfig, listed=False))
 
 
 def _sections(path: str, model: type[BaseModel], *, listed: bool) -> list[str]:
@@ -96,4 +104,4 @@ def _default(field: FieldInfo) -> str:
     return md.code(list(value) if isinstance(value, tuple) else value)
 
 
-TABLES: Final[dict[str, Callable[[], str]]] = {"hand-keys": keys_of_a_hand}
+TABLES: Final[dict[str, Callable[[], str]]] = {"hand-keys": keys_of_a_hand, "scene-keys": keys_of_a_scene}

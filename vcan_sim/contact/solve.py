@@ -23,8 +23,10 @@ CLOSE: Final = 1e-6
 undeformed shapes."""
 STEPS: Final = 400
 """Maximum number of iterations."""
-TURNS: Final = 12
+TURNS: Final = 24
 """Maximum number of turns of pressure and shear."""
+DAMPED: Final = 5
+"""Turns after which only half of a change is taken, because much friction on a thin layer oscillates."""
 
 
 class NoSolution(RuntimeError):
@@ -87,6 +89,9 @@ def press(grid: Grid, overlap_m: Float, start_pa: Float | None = None, *, close:
         active = pressure > 0.0
         if max(float(np.abs(gap[active]).max(initial=0.0)), -float(gap.min())) < close * largest:
             return pressure
+        if not active.any():  # a start far too large has been lifted off everywhere
+            pressure, conjugate = _steepest(grid, gap), 0.0
+            continue
         square = float((gap[active] ** 2).sum())
         direction = np.where(active, gap + conjugate * square / before * direction, 0.0)
         before = square
@@ -97,6 +102,12 @@ def press(grid: Grid, overlap_m: Float, start_pa: Float | None = None, *, close:
         pressure[entered] -= step * gap[entered]
         conjugate = 0.0 if entered.any() else 1.0
     raise NoSolution(f"no pressure within {STEPS} iterations: gap {np.abs(gap[active]).max():.2g} m")
+
+
+def _steepest(grid: Grid, gap_m: Float) -> Float:
+    """Return the pressure (X, Y), Pa, along the overlaps of a free surface that closes them best."""
+    direction = np.maximum(-gap_m, 0.0)
+    return np.asarray(direction * ((direction**2).sum() / (grid.normal_m(direction) * direction).sum()))
 
 
 def rub(grid: Grid, limit_pa: Float, target_m: Float, start_pa: Float, *, close: float = CLOSE) -> Float:
@@ -170,7 +181,7 @@ def advance(  # noqa: PLR0913 - the last two steer the search
     if not friction:
         shear = none[:2]
     by_shear = grid.displacement_m(np.concatenate([shear, none[2:]]))
-    for _ in range(TURNS):
+    for turn in range(TURNS):
         pressure = press(grid, overlap_m + by_shear[2], pressure, close=close)
         by_pressure = grid.displacement_m(np.concatenate([none[:2], -pressure[None]]))
         if not friction:
@@ -180,6 +191,8 @@ def advance(  # noqa: PLR0913 - the last two steer the search
         by_shear = grid.displacement_m(np.concatenate([shear, none[2:]]))
         if float(np.abs(by_shear[2] - before).max()) <= 10.0 * close * scale:
             break
+        if turn >= DAMPED:
+            by_shear[2] = 0.5 * (by_shear[2] + before)
     else:
         raise NoSolution(f"pressure and shear did not agree within {TURNS} turns")
     sticks = (pressure > 0.0) & (np.hypot(*shear) < (1.0 - 1e-6) * friction * pressure)

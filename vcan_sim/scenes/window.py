@@ -20,6 +20,8 @@ MOST_CELLS: Final = 1.4
 up to twice as large."""
 MARGIN: Final = 0.1
 """Margin around the deepest contact, relative to its half width; at least ``MARGIN_CELLS``."""
+FRICTION_MARGIN: Final = 0.15
+"""Additional margin per coefficient of friction: what slides piles up the skin in front of it."""
 MARGIN_CELLS: Final = 2
 CLOSE: Final = 3e-4
 """Tolerance of the contact mechanics (:func:`vcan_sim.contact.solve.press`), relative to the depth."""
@@ -88,6 +90,7 @@ def window_of(  # noqa: PLR0913 - what a contact depends on
     by_force: bool,
     most_m: float,
     cells: int,
+    margin: float = MARGIN,
 ) -> Window:
     """Return the window for a touch.
 
@@ -99,16 +102,17 @@ def window_of(  # noqa: PLR0913 - what a contact depends on
         by_force: Whether ``level`` is a force.
         most_m: Largest depth allowed, metres.
         cells: Number of cells across the narrow side of the window.
+        margin: Margin around the contact without friction, relative to its half width.
 
     Raises:
         TooMuch: The force needs a larger depth than ``most_m``.
     """
     if not by_force:
-        return _fit(layer, body.shape, yaws_rad, level, cells)
+        return _fit(layer, body.shape, yaws_rad, level, cells, margin)
     found: dict[float, Window] = {}
 
     def force_n(depth_m: float) -> float:
-        found[depth_m] = _fit(layer, body.shape, yaws_rad, depth_m, cells)
+        found[depth_m] = _fit(layer, body.shape, yaws_rad, depth_m, cells, margin)
         return found[depth_m].force_n
 
     if force_n(most_m) < level:
@@ -160,6 +164,8 @@ def solve_depth(
             low = max(low, depth)
         else:
             high = min(high, depth)
+        if high - low < 0.1 * close * high:  # the rest is the tolerance of the contact mechanics
+            return depth
         power = 1.5
         if force > 0.0 and last[1] > 0.0 and last[0] != depth and last[1] != force:
             power = min(max(math.log(force / last[1]) / math.log(depth / last[0]), 0.7), 6.0)
@@ -171,7 +177,14 @@ def solve_depth(
     raise ArithmeticError(f"no depth for {target_n:g} N within {_SEARCHES} trials, last {depth:g} m")
 
 
-def _fit(layer: Layer, shape: Shape, yaws_rad: tuple[float, ...], depth_m: float, cells: int) -> Window:
+def _fit(  # noqa: PLR0913 - what a contact depends on
+    layer: Layer,
+    shape: Shape,
+    yaws_rad: tuple[float, ...],
+    depth_m: float,
+    cells: int,
+    margin: float,
+) -> Window:
     """Return a window that holds the contact at a depth, whichever the rotation."""
     half = 1.5 * np.max([_extent_m(shape, yaw, depth_m) for yaw in yaws_rad], axis=0)
     for _ in range(_TURNS):
@@ -182,7 +195,7 @@ def _fit(layer: Layer, shape: Shape, yaws_rad: tuple[float, ...], depth_m: float
             places = np.abs(grid.centres_m(centred_m(grid))[pressure > 0.0]) + 0.5 * grid.size_m
             reached = np.maximum(reached, places.max(axis=0, initial=0.5 * grid.size_m))
             force = max(force, float(pressure.sum()) * grid.size_m**2)
-        wanted = reached + np.maximum(MARGIN * reached, MARGIN_CELLS * grid.size_m)
+        wanted = reached + np.maximum(margin * reached, MARGIN_CELLS * grid.size_m)
         has = 0.5 * grid.size_m * np.array(grid.shape)
         if (has >= reached + (MARGIN_CELLS - 0.5) * grid.size_m).all():
             if (has <= 1.15 * wanted + grid.size_m).all():

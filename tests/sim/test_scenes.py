@@ -17,6 +17,7 @@ import skinnode as sk
 from skinnode.config import HandConfig, parse_hand
 from skinnode.errors import ConfigError
 from vcan_sim.cli import main
+from vcan_sim.contact.layer import cell_response
 from vcan_sim.fleet import Fleet
 from vcan_sim.scenes import PatchScene, bind_scene, load_scene, parse_scene
 from vcan_sim.scenes.motions import pose_at
@@ -347,6 +348,27 @@ def test_bodies_as_near_as_allowed_hardly_move_each_others_skin() -> None:
     at = np.array([[CENTRE[0] + half + gap, CENTRE[1]]])
     moved = electrodes._under_forces(at, cells, force)
     assert abs(moved[0, 2]) < 0.03 * 3e-4
+
+
+@pytest.mark.parametrize("cells", [20, 40])
+def test_the_electrodes_move_as_the_response_of_each_cell_says(cells: int) -> None:
+    """Against the sum over all cells of the response of a cell, for every electrode, while the body slides."""
+    motion = {"kind": "slide", "by_m": [4e-3, 0.0], "from_s": 0.3, "to_s": 0.6}
+    touch = {"at_m": [16.03e-3, 18.02e-3], "depth_m": 2.5e-4, "to_s": 0.9, "ramp_s": 0.2, "motions": [motion]}
+    scene = one({"shape": "sphere", "radius_m": 10e-3, "friction": 0.5}, touch, cells=cells)
+    history = scene.histories[0]
+    step, grid = history.step(16), history.window.grid
+    assert step is not None
+    cells_m = grid.centres_m(history.cell_m(step.first))
+    places = scene.layout.upper_m[2:8, 2:8, :2].reshape(-1, 2)
+    response = cell_response(grid.layer, places[:, None, None] - cells_m, grid.size_m, 0.05)
+    moved = np.einsum("exyij,jxy->ei", response, step.traction_pa)
+    found = step.electrodes_m.reshape(10, 10, 3)[2:8, 2:8].reshape(-1, 3)
+    outside = (np.abs(places - cells_m.mean(axis=(0, 1))) > 0.5 * grid.size_m * cells).any(axis=1)
+    scale = np.abs(moved).max()
+    assert 20 < outside.sum() < 36
+    np.testing.assert_allclose(found[outside], moved[outside], atol=5e-4 * scale)
+    np.testing.assert_allclose(found, moved, atol=1e-3 * scale)
 
 
 BODY = '[[bodies]]\nname = "ball"\nshape = "sphere"\nradius_m = 0.01\n'

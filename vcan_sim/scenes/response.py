@@ -16,6 +16,8 @@ from vcan_sim.scenes.shapes import Float
 
 BEYOND: Final = 20.0
 """Distance from a point force, in thicknesses of the layer, beyond which the response is below ``FAR``."""
+CLUSTER_CELLS: Final = 6.0
+"""Distance from the window, in cells, beyond which 2 × 2 cells act as one force."""
 FAR: Final = 1e-5
 """Response to a point force, relative to that next to the force, below which it counts as zero. The response
 of a layer falls exponentially with the distance."""
@@ -58,7 +60,8 @@ class Electrodes:
         """Return the displacement of the electrodes.
 
         Electrodes inside the window take the displacement of its cells, interpolated by cubics. All others
-        are at least two cells from a loaded cell, whose traction then acts as a force at its centre.
+        are at least two cells from a loaded cell, whose traction then acts as a force at its centre. At a
+        distance of ``CLUSTER_CELLS`` from the window, the force of 2 × 2 cells acts at their centre.
 
         Args:
             grid: Cells of the window.
@@ -72,12 +75,18 @@ class Electrodes:
         index = (self.places_m - origin_m) / grid.size_m
         inside = ((index >= 1.0) & (index <= np.array(grid.shape) - 2.0)).all(axis=1)
         moved[inside] = _cubic(contact.displacement_m, index[inside])
-        loaded = contact.traction_pa.any(axis=0)
-        force = contact.traction_pa[:, loaded] * grid.size_m**2
+        force = contact.traction_pa * grid.size_m**2
         last_m = origin_m + grid.size_m * (np.array(grid.shape) - 1.0)
         away = np.maximum(np.maximum(origin_m - self.places_m, self.places_m - last_m), 0.0)
-        near = ~inside & (np.hypot(away[:, 0], away[:, 1]) < self._far_m)
-        moved[near] = self._under_forces(self.places_m[near], grid.centres_m(origin_m)[loaded], force)
+        distance = np.hypot(away[:, 0], away[:, 1])
+        near = ~inside & (distance < CLUSTER_CELLS * grid.size_m)
+        far = ~inside & ~near & (distance < self._far_m)
+        for places, (at, forces) in (
+            (near, _forces(force, origin_m, grid.size_m)),
+            (far, _forces(_clustered(force), origin_m + 0.5 * grid.size_m, 2.0 * grid.size_m)),
+        ):
+            if places.any():
+                moved[places] = self._under_forces(self.places_m[places], at, forces)
         return moved
 
     def _under_forces(self, places_m: Float, at_m: Float, force_n: Float) -> Float:
@@ -114,6 +123,19 @@ def _radial(layer: Layer, reach_m: float) -> tuple[Float, float]:
         table += r[:, None] * np.stack(PointResponse(layer, reach_m)(r), axis=-1)
     table.setflags(write=False)
     return table, float(r[1])
+
+
+def _forces(force_n: Float, origin_m: Float, size_m: float) -> tuple[Float, Float]:
+    """Return the places (F, 2), metres, and the forces (3, F), N, that are not zero of cells (3, X, Y)."""
+    loaded = np.argwhere(force_n.any(axis=0))
+    return origin_m + size_m * loaded, force_n[:, loaded[:, 0], loaded[:, 1]]
+
+
+def _clustered(force_n: Float) -> Float:
+    """Return the sums (3, X/2, Y/2) of 2 × 2 cells each of forces (3, X, Y), N."""
+    x, y = force_n.shape[1:]
+    even = np.pad(force_n, ((0, 0), (0, x % 2), (0, y % 2)))
+    return np.asarray(even.reshape(3, (x + 1) // 2, 2, (y + 1) // 2, 2).sum(axis=(2, 4)))
 
 
 def _cubic(field: Float, index: Float) -> Float:

@@ -8,7 +8,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from threading import Lock
 from types import TracebackType
-from typing import Self
+from typing import Final, Self
 
 from skinnode.canopen.indices import chunk_cob_id, summary_cob_id
 from skinnode.config import BusConfig, HandConfig, PatchConfig
@@ -25,6 +25,10 @@ from vcan_sim.scenes import PatchTruth, SceneConfig, bind_scene
 from vcan_sim.sensor import SimulatedPatch, SkinMotion
 from vcan_sim.skin.imperfections import EXACT, Imperfections
 from vcan_sim.tally import Kind, Tally, kind_of
+
+PREPARED_S: Final = 120.0
+"""Scene time that is computed before the nodes start, s, so that the threads of the nodes need not wait for
+contact mechanics. Later steps are computed when they are needed."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,11 +125,13 @@ class Fleet:
                     each.start(t_ns)
 
     def start(self) -> None:
-        """Open the buses and power the nodes on.
+        """Open the buses and power the nodes on, after the first two minutes of the scene are computed.
 
         Raises:
             BusError: A bus cannot be opened. No bus is left open.
         """
+        for scene in self._scenes.values():
+            scene.prepare(PREPARED_S)
         with ExitStack() as opened:
             runners, ports = [], {}
             for bus in self.hand.buses:

@@ -352,7 +352,7 @@ def test_bodies_as_near_as_allowed_hardly_move_each_others_skin() -> None:
 
 @pytest.mark.parametrize("cells", [20, 40])
 def test_the_electrodes_move_as_the_response_of_each_cell_says(cells: int) -> None:
-    """Against the sum over all cells of the response of a cell, for every electrode, while the body slides."""
+    """Against the sum over all cells of the response of a cell, for each electrode, while the body slides."""
     motion = {"kind": "slide", "by_m": [4e-3, 0.0], "from_s": 0.3, "to_s": 0.6}
     touch = {"at_m": [16.03e-3, 18.02e-3], "depth_m": 2.5e-4, "to_s": 0.9, "ramp_s": 0.2, "motions": [motion]}
     scene = one({"shape": "sphere", "radius_m": 10e-3, "friction": 0.5}, touch, cells=cells)

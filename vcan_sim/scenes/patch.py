@@ -79,10 +79,15 @@ class PatchScene:
                 wrench += weight * np.concatenate([step.force_n, step.moment_nm])
         return PatchTruth(t_s, moved.reshape(self.layout.upper_m.shape), tuple(contacts), wrench)
 
-    def prepare(self) -> None:
-        """Compute all steps of all touches now, instead of when they are needed."""
+    def prepare(self, until_s: float = math.inf) -> None:
+        """Compute the steps of all touches now, instead of when they are needed.
+
+        Args:
+            until_s: Scene time up to which the steps are computed, s.
+        """
         for history in self.histories:
-            history.step(history.last)
+            if history.touch.from_s < until_s:
+                history.step(min(history.last, math.ceil(min(until_s / self.step_s, history.last))))
 
     def _touching(self, t_s: float) -> Iterator[tuple[History, Weighted]]:
         """Yield each touch that contributes at a time, with its steps and their weights."""

@@ -97,9 +97,7 @@ class Fleet:
                 replace(
                     PatchProfile.from_config(patch, hand.bus(patch.bus)), checked=patch.name not in unchecked
                 ),
-                SimulatedPatch(
-                    self._skin(patch, number), imperfections=sizes.get(patch.name, EXACT)
-                ),
+                SimulatedPatch(self._skin(patch, number), imperfections=sizes.get(patch.name, EXACT)),
                 wire_up,
                 faults,
                 self._begin,

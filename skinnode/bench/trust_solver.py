@@ -66,7 +66,7 @@ def host_patch(taken: CodeStream, config: PatchConfig | None = None, **options: 
         heartbeat_s=0.5,
         checked=True,
     )
-    solver = ScanSolver(facts, SolverConfig(**options), clock=lambda: 0)
+    solver = ScanSolver(facts, SolverConfig(**options), now=lambda: 0)
     return HostPatch(solver, CodeWatch(SCALE, facts.config.relative_noise))
 
 

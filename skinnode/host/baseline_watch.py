@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
-import threading
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Executor, Future
 from typing import Final
 
 import numpy as np
@@ -13,6 +12,7 @@ import numpy as np
 from skinnode.errors import BusError, ConfigError
 from skinnode.host.sdo_client import Abandoned
 from skinnode.host.supervised import JOIN_DEADLINE_S, LEAST_NS, Joined, Supervised
+from skinnode.process import clock
 
 _log = logging.getLogger(__name__)
 
@@ -31,7 +31,7 @@ class BaselineWatch:
     Transfers run on ``pool``, one job per node at a time.
     """
 
-    def __init__(self, pool: ThreadPoolExecutor) -> None:
+    def __init__(self, pool: Executor) -> None:
         self._pool = pool
 
     def look(self, node: Supervised, now_ns: int) -> None:
@@ -55,7 +55,7 @@ class BaselineWatch:
                 remote.monitor.refusal = 'its baseline changed; guest_sends = "nothing" forbids reading it'
             return
         stream.doubtful = False
-        abandon = node.abandon = threading.Event()
+        abandon = node.abandon = clock.event()
 
         def read() -> Joined | None:
             withholdings = remote.withhold() if changed else stream.withholdings

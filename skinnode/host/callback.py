@@ -12,6 +12,7 @@ from skinnode.errors import SkinError
 from skinnode.host.containment import Defects, keep_on
 from skinnode.host.publish import Subscription
 from skinnode.model.frames import FieldFrame
+from skinnode.process import clock
 
 _log = logging.getLogger(__name__)
 
@@ -36,7 +37,7 @@ class FieldCallback:
         self._function, self._fields = function, fields
         self._defects = Defects("host") if defects is None else defects
         self._failed = 0
-        self._thread = threading.Thread(target=self._run, name="callback", daemon=True)
+        self._thread = clock.thread(target=self._run, name="callback")
         self._thread.start()
 
     @property

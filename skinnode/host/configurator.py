@@ -8,7 +8,6 @@ host must not send anything (``guest_sends = "nothing"``), all information about
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Final
@@ -25,6 +24,7 @@ from skinnode.host.hand_files import load_baseline
 from skinnode.host.node_facts import NodeFacts
 from skinnode.host.sdo_client import Abandoned, RemoteOd
 from skinnode.model.layout import Float, PatchLayout
+from skinnode.process import clock
 from skinnode.protocol.codes import CodeScale
 from skinnode.protocol.coordinates import unpack_coordinates
 from skinnode.protocol.profile import PatchProfile
@@ -108,11 +108,11 @@ class Configurator:
             raise Abandoned
 
     def _wait_for(self, patch: PatchConfig, remote: RemoteOd) -> None:
-        end_s = time.monotonic() + self.boot_deadline_s
+        end_s = clock.monotonic() + self.boot_deadline_s
         while not remote.answers():
             self._go_on()
             self.search(patch)
-            if time.monotonic() > end_s:
+            if clock.monotonic() > end_s:
                 raise NodeTimeout(
                     patch.node_id,
                     f"patch {patch.name!r} on {patch.bus}: no response within {self.boot_deadline_s:g} s",
@@ -252,7 +252,7 @@ class Configurator:
             SkinError: as raised by :meth:`configure`.
         """
         expected = None if patch.baseline is None else load_baseline(patch.baseline, profile)
-        end_s = time.monotonic() + self.boot_deadline_s
+        end_s = clock.monotonic() + self.boot_deadline_s
         while True:
             self._go_on()
             baseline = self._read_baseline(patch, profile, remote)
@@ -262,9 +262,9 @@ class Configurator:
                 if not np.array_equal(baseline, expected):
                     expected_from = f"those of {patch.baseline}"
                     raise _mismatch(patch, "baseline (0x2301)", "other values back", expected_from)
-            if baseline.any() or time.monotonic() > end_s:
+            if baseline.any() or clock.monotonic() > end_s:
                 break
-            time.sleep(_POLL_S)
+            clock.sleep(_POLL_S)
         bad = np.argwhere(~(np.isfinite(baseline) & (baseline > 0)))
         if len(bad):
             row, column = (int(i) for i in bad[0])

@@ -9,14 +9,13 @@ from __future__ import annotations
 
 import contextlib
 import logging
-import threading
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
 
 from skinnode.errors import SkinError
 from skinnode.host.retry_pause import Pause
+from skinnode.process import clock
 
 _log = logging.getLogger(__name__)
 
@@ -54,7 +53,7 @@ class Defects:
 
     def __init__(self, subject: str, on_new: Callable[[SkinError], object] = lambda error: None) -> None:
         self.subject, self._on_new = subject, on_new
-        self._lock = threading.Lock()
+        self._lock = clock.lock()
         self._count = 0
         self._newest: str | None = None
         self._logged: set[str] = set()
@@ -106,4 +105,4 @@ def keep_on(turn: Callable[[], bool], defects: Defects, doing: str) -> None:
                 return
         except Exception as error:
             defects.report(doing, error)
-            time.sleep(pause.next_s())
+            clock.sleep(pause.next_s())

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from typing import Generic, TypeVar
 
 from skinnode.errors import SkinError
+from skinnode.process import clock
 
 T = TypeVar("T")
 
@@ -29,7 +30,7 @@ class DropOldestQueue(Generic[T]):
     """
 
     def __init__(self, capacity: int) -> None:
-        self._items: queue.SimpleQueue[T | End] = queue.SimpleQueue()
+        self._items: queue.SimpleQueue[T | End] = clock.simple_queue()
         self._capacity = capacity
 
     def put(self, item: T | End) -> int:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import queue
-import threading
 import weakref
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -13,6 +12,7 @@ from typing import Final
 from skinnode.host.containment import Defects
 from skinnode.host.drop_oldest_queue import DropOldestQueue, End
 from skinnode.host.publish import check_capacity
+from skinnode.process import clock
 
 _log = logging.getLogger(__name__)
 
@@ -80,7 +80,7 @@ class Events:
     def __init__(self, defects: Defects | None = None) -> None:
         self._defects = Defects("host") if defects is None else defects
         self._subscriptions: weakref.WeakSet[EventSubscription] = weakref.WeakSet()
-        self._lock = threading.Lock()  # the set must not change while it is iterated over
+        self._lock = clock.lock()  # the set must not change while it is iterated over
         self._ended = False
 
     def subscribe(self, capacity: int) -> EventSubscription:

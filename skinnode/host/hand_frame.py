@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import functools
 import queue
-import time
 from collections.abc import AsyncIterator, Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType, TracebackType
@@ -20,6 +19,7 @@ from skinnode.model.distrust import why_not
 from skinnode.model.frames import FieldFrame
 from skinnode.model.hand_contact import HAND, HandContact, Wrench, wrench_of
 from skinnode.model.pose import Pose
+from skinnode.process import clock
 
 LATE: Final = "late"
 """Reason for a missing field: the patch is operational, but its field did not arrive in time."""
@@ -278,16 +278,16 @@ class HandSubscription:
         """Yield frames asynchronously; otherwise like :meth:`__iter__`."""
         while True:
             end_ns = _end_ns(self._timeout_s)
-            while (frame := self._gatherer.next(time.monotonic_ns())) is None:
+            while (frame := self._gatherer.next(clock.monotonic_ns())) is None:
                 try:
                     field = await self._fields.take_async(self._wait_s(end_ns))
                 except queue.Empty:
-                    if end_ns is not None and time.monotonic_ns() >= end_ns:
+                    if end_ns is not None and clock.monotonic_ns() >= end_ns:
                         raise self._too_long() from None
                     continue
                 if field is None:
                     return
-                self._gatherer.add(field, time.monotonic_ns())
+                self._gatherer.add(field, clock.monotonic_ns())
             yield frame
 
     def __enter__(self) -> Self:
@@ -302,26 +302,26 @@ class HandSubscription:
         """Return the next frame; raise queue.Empty after ``timeout_s``."""
         check_timeout(timeout_s)
         end_ns = _end_ns(timeout_s)
-        while (frame := self._gatherer.next(time.monotonic_ns())) is None:
+        while (frame := self._gatherer.next(clock.monotonic_ns())) is None:
             try:
                 field = self._fields.take(self._wait_s(end_ns))
             except queue.Empty:
-                if end_ns is not None and time.monotonic_ns() >= end_ns:
+                if end_ns is not None and clock.monotonic_ns() >= end_ns:
                     raise
                 continue
             if field is None:
                 return None
-            self._gatherer.add(field, time.monotonic_ns())
+            self._gatherer.add(field, clock.monotonic_ns())
         return frame
 
     def _wait_s(self, end_ns: int | None) -> float | None:
         """Return the time until the next deadline, s; None if there is no deadline."""
         times = [t_ns for t_ns in (end_ns, self._gatherer.next_deadline_ns()) if t_ns is not None]
-        return max(0, min(times) - time.monotonic_ns()) * 1e-9 if times else None
+        return max(0, min(times) - clock.monotonic_ns()) * 1e-9 if times else None
 
     def _too_long(self) -> TimeoutError:
         return TimeoutError(f"no hand frame within {self._timeout_s} s")
 
 
 def _end_ns(timeout_s: float | None) -> int | None:
-    return None if timeout_s is None else time.monotonic_ns() + int(timeout_s * 1e9)
+    return None if timeout_s is None else clock.monotonic_ns() + int(timeout_s * 1e9)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import threading
-import time
 from collections.abc import Callable, Mapping
 from types import TracebackType
 from typing import Final, Self
@@ -12,6 +10,7 @@ from skinnode.host.containment import Defects, DefectStats, keep_on
 from skinnode.host.events import Events, HealthEvent
 from skinnode.host.health import BusHealth, PatchHealth
 from skinnode.model.data_fault import DataFault, FaultKind, FaultyPart
+from skinnode.process import clock
 from skinnode.text.words import counted
 
 _CHECK_S: Final = 0.05
@@ -68,8 +67,8 @@ class HealthWatch:
         self._ended = False
         self._patch_before, self._bus_before = dict(patches()), dict(buses())
         self._reported: dict[tuple[str, str], tuple[int, int]] = {}  # when, and how many
-        self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="health", daemon=True)
+        self._stop = clock.event()
+        self._thread = clock.thread(target=self._run, name="health")
         self._thread.start()
 
     def close(self) -> None:
@@ -171,10 +170,10 @@ class HealthWatch:
     ) -> None:
         before, count = counts
         when_ns, reported = self._reported.get((name, counter), (0, before))
-        t_ns = time.monotonic_ns()
+        t_ns = clock.monotonic_ns()
         if count > reported and t_ns - when_ns > _QUIET_NS:
             self._reported[name, counter] = t_ns, count
             self._publish(name, counter, f"{counted(count - reported, *words)}{detail}")
 
     def _publish(self, subject: str, what: str, text: str) -> None:
-        self._events.publish(HealthEvent(time.monotonic_ns(), subject, what, text))
+        self._events.publish(HealthEvent(clock.monotonic_ns(), subject, what, text))

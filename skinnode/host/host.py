@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
@@ -30,6 +29,7 @@ from skinnode.host.sync import SyncStats
 from skinnode.host.tap import ContainedTap, HostTap, tap_bus
 from skinnode.host.tare import TARE_DEADLINE_S, TARE_DEADLINE_SYNCS, tare
 from skinnode.model.frames import FieldFrame
+from skinnode.process import clock
 from skinnode.transport import CanPort
 
 
@@ -82,7 +82,7 @@ class Host:
         self._callbacks, self._events = parts.callbacks, parts.events
         self._buses, self._nodes = parts.buses, parts.nodes
         self._sync, self._supervisor, self._publisher = parts.sync, parts.supervisor, parts.publisher
-        self._t_up_ns = time.monotonic_ns()
+        self._t_up_ns = clock.monotonic_ns()
 
     @classmethod
     @contextlib.contextmanager
@@ -247,7 +247,7 @@ class Host:
         """
         node = self._nodes[patch]
         health = node.monitor.health(
-            time.monotonic_ns(),
+            clock.monotonic_ns(),
             node.heartbeat_s,
             self.hand.sync.period_s,
             node.stream.stats().assembler.conflicts,

@@ -6,7 +6,6 @@ import contextlib
 import logging
 import math
 import os
-import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
@@ -34,6 +33,7 @@ from skinnode.host.supervisor import Supervisor
 from skinnode.host.sync import SyncProducer, Ticks
 from skinnode.host.tap import ContainedTap, HostTap, tap_link
 from skinnode.host.workers import Workers
+from skinnode.process import clock
 from skinnode.transport import CanPort
 
 _log = logging.getLogger(__name__)
@@ -200,11 +200,11 @@ def _logged_already(error: Exception) -> None:
 
 def _let_scans_end(streams: Sequence[tuple[PatchStream, Ticks]], period_s: float) -> None:
     """Wait for the scans started by the last SYNC, so that the shutdown does not interrupt them."""
-    end_s = time.monotonic() + min(1.5 * period_s, LAST_SCAN_S)
+    end_s = clock.monotonic() + min(1.5 * period_s, LAST_SCAN_S)
     while not all(stream.settled(ticks.newest) for stream, ticks in streams):
-        if time.monotonic() > end_s:
+        if clock.monotonic() > end_s:
             return
-        time.sleep(_POLL_S)
+        clock.sleep(_POLL_S)
 
 
 def _stand_by(node: RemoteNode) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import threading
-import time
 from collections import deque
 from collections.abc import Callable, Mapping
 from types import TracebackType
@@ -17,6 +16,7 @@ from skinnode.host.containment import Defects, keep_on, one_line
 from skinnode.host.dispatcher import BusStats, Dispatcher, Handler, PortCounters
 from skinnode.host.retry_pause import Pause
 from skinnode.host.sdo_client import RemoteOd, SkinNetwork
+from skinnode.process import clock
 from skinnode.transport import CanPort, Frame, Intake
 
 _log = logging.getLogger(__name__)
@@ -53,7 +53,7 @@ class BusLink(Dispatcher):
         on_defect: Callable[[SkinError], object],
         open_port: Callable[[BusConfig], CanPort] = CanPort,
     ) -> None:
-        super().__init__(config, handlers, time.monotonic_ns())
+        super().__init__(config, handlers, clock.monotonic_ns())
         self.defects = Defects(config.name, on_defect)
         """Collector of the exceptions raised while serving the bus itself rather than one of its patches."""
         self._sent_listeners: tuple[Callable[[Frame], None], ...] = ()
@@ -72,7 +72,7 @@ class BusLink(Dispatcher):
         self._resume: Callable[[], None] = lambda: None
         self._reopening: threading.Thread | None = None
         self._reopen_s = _REOPEN_S
-        self._stop = threading.Event()
+        self._stop = clock.event()
         self._port = open_port(config)
         self.intake = Intake(self._port)
         """Queue of received frames."""
@@ -84,7 +84,7 @@ class BusLink(Dispatcher):
         Raises:
             BusError: if the interface does not accept it.
         """
-        t_ns = time.monotonic_ns()
+        t_ns = clock.monotonic_ns()
         self._port.send(can_id, data)
         try:  # the frame has been sent; a listener's exception must not reach the caller
             if can_id != SYNC_COB_ID:
@@ -129,7 +129,7 @@ class BusLink(Dispatcher):
         Raises:
             BusError: if the interface does not accept it.
         """
-        t_ns = time.monotonic_ns()
+        t_ns = clock.monotonic_ns()
         self._port.send(can_id, b"", remote=True)
         self.intake.asked(t_ns)
         for listener in self._sent_listeners:
@@ -198,14 +198,14 @@ class BusLink(Dispatcher):
             return
         try:
             heard = self._dispatch_received()
-            if self.failure is not None and (heard or time.monotonic() > self._due_s):
+            if self.failure is not None and (heard or clock.monotonic() > self._due_s):
                 self.failure = None
                 _log.warning("%s: the bus is back", self.config.name)
         except Exception as error:
             if self.intake.failed:
                 self._go_away(error)
                 return
-            self._rests, self._rest_end_s = True, time.monotonic() + self._pause.next_s()
+            self._rests, self._rest_end_s = True, clock.monotonic() + self._pause.next_s()
             self.defects.report("dispatching frames", error)
 
     def measure_load(self) -> None:
@@ -248,7 +248,7 @@ class BusLink(Dispatcher):
     def _rest(self) -> None:
         """End a pause that is over, or try again to start the thread that reopens the interface."""
         if not self._opening:
-            self._rests = time.monotonic() < self._rest_end_s
+            self._rests = clock.monotonic() < self._rest_end_s
         elif (
             self._reopening is None or not self._reopening.is_alive()
         ) and self._opening:  # the thread did not start
@@ -271,7 +271,7 @@ class BusLink(Dispatcher):
         if self._stop.is_set():
             return
         name = f"reopen {self.config.name}"
-        thread = threading.Thread(target=self._reopen, name=name, daemon=True)
+        thread = clock.thread(target=self._reopen, name=name)
         thread.start()
         self._reopening = thread  # set after start(): a thread that did not start cannot be joined
 
@@ -286,7 +286,7 @@ class BusLink(Dispatcher):
         try:
             self._reopen_s = _REOPEN_S
             self._port.reopen()
-            self._due_s = time.monotonic() + _REOPEN_S
+            self._due_s = clock.monotonic() + _REOPEN_S
             self._resume()
         except BusError:
             return True

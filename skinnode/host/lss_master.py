@@ -10,8 +10,6 @@ from __future__ import annotations
 
 import contextlib
 import queue
-import threading
-import time
 from collections.abc import Callable
 from typing import Final
 
@@ -28,6 +26,7 @@ from skinnode.canopen.lss import (
     LssState,
 )
 from skinnode.errors import BusError
+from skinnode.process import clock
 
 ANSWER_S: Final = 0.1
 """Maximum wait for a response, s; LSS frames have the lowest priority of all CANopen frames."""
@@ -70,8 +69,8 @@ class LssMaster:
 
     def __init__(self, send: Callable[[int, bytes], None]) -> None:
         self._send = send
-        self._answers: queue.SimpleQueue[bytes] = queue.SimpleQueue()
-        self._dialogue = threading.Lock()
+        self._answers: queue.SimpleQueue[bytes] = clock.simple_queue()
+        self._dialogue = clock.lock()
 
     def on_response(self, data: bytes, t_ns: int) -> None:
         """Process a slave's response; as the standard requires, ignore it unless it is 8 bytes long."""
@@ -156,7 +155,7 @@ class LssMaster:
         data = value.to_bytes(4, "little") + bytes((bit, part, following))
         answer = self._ask(LssCommand.FASTSCAN, data, bytes((LssCommand.IDENTIFIED,)), answer_s)
         if answer is not None:  # other slaves may respond a little later; wait before the next request
-            time.sleep(answer_s * _SETTLE)
+            clock.sleep(answer_s * _SETTLE)
         return answer
 
     # --- one node
@@ -243,7 +242,7 @@ class LssMaster:
     def _must(self, command: int, data: bytes, what: str, answer_s: float = ANSWER_S) -> bytes:
         answer = self._ask(command, data, answer_s=answer_s)
         if answer is None:
-            time.sleep(_UNDER_WAY_S)
+            clock.sleep(_UNDER_WAY_S)
             raise LssFailed(f"{what}: no LSS response within {answer_s:g} s")
         return answer
 
@@ -259,8 +258,8 @@ class LssMaster:
         while not self._answers.empty():
             self._answers.get()
         self._request(command, data)
-        end_s = time.monotonic() + answer_s
-        while (left_s := end_s - time.monotonic()) > 0:
+        end_s = clock.monotonic() + answer_s
+        while (left_s := end_s - clock.monotonic()) > 0:
             with contextlib.suppress(queue.Empty):
                 answer = self._answers.get(timeout=left_s)
                 if answer.startswith(expected):

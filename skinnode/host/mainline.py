@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import functools
 import itertools
-import threading
 from collections.abc import Sequence
 from types import TracebackType
 from typing import Final, Self
 
 from skinnode.host.containment import Defects, keep_on
 from skinnode.host.link import BusLink
+from skinnode.process import clock
 from skinnode.transport import Receiver
 
 _WAIT_S: Final = 0.02
@@ -35,13 +35,13 @@ class Mainline:
         self._links = tuple(links)
         self._defects = links[0].defects if defects is None else defects
         self._measured = itertools.cycle(self._links)
-        self._stop = threading.Event()
+        self._stop = clock.event()
         self._receiver = Receiver(
             [link.intake for link in links], lambda error: self._defects.report("receiving", error)
         )
         for link in links:
             link.begin(functools.partial(self._receiver.resume, link.intake))
-        self._thread = threading.Thread(target=self._run, name="mainline", daemon=True)
+        self._thread = clock.thread(target=self._run, name="mainline")
         self._thread.start()
 
     def stop(self) -> None:

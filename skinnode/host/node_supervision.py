@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
-import threading
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Executor
 from typing import Final
 
 from skinnode.canopen.nmt import NmtState
@@ -15,6 +14,7 @@ from skinnode.host.baseline_watch import BaselineWatch, note_baseline
 from skinnode.host.health import HEARTBEATS_MISSED
 from skinnode.host.remote_node import RemoteNode
 from skinnode.host.supervised import JOIN_DEADLINE_S, LEAST_NS, Joined, Phase, Supervised
+from skinnode.process import clock
 from skinnode.text.words import known
 
 _log = logging.getLogger(__name__)
@@ -44,7 +44,7 @@ class NodeSupervision:
     Jobs that wait for a node run on ``pool``, one job per node at a time.
     """
 
-    def __init__(self, pool: ThreadPoolExecutor) -> None:
+    def __init__(self, pool: Executor) -> None:
         self._pool = pool
         self._baselines = BaselineWatch(pool)
 
@@ -97,7 +97,7 @@ class NodeSupervision:
         if node.job is not None and not node.job.done():
             node.abandon.set()
             return
-        remote, abandon = node.remote, threading.Event()
+        remote, abandon = node.remote, clock.event()
 
         def bring_up() -> Joined | None:
             withholdings = remote.withhold()

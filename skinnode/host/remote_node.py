@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import queue
-import time
 from collections.abc import Callable
 from typing import Final
 
@@ -18,6 +17,7 @@ from skinnode.host.node_facts import NodeFacts
 from skinnode.host.reception import PatchReception
 from skinnode.host.scan_solver import ScanSolver
 from skinnode.host.served_bus import ServedBus
+from skinnode.process import clock
 from skinnode.protocol.command import pack_command
 from skinnode.protocol.profile import PatchProfile
 
@@ -222,7 +222,7 @@ class RemoteNode:
         Raises:
             NodeTimeout: if the mainline is delayed, for example while the bus is unavailable.
         """
-        answer: queue.SimpleQueue[int] = queue.SimpleQueue()
+        answer: queue.SimpleQueue[int] = clock.simple_queue()
         self.link.call(lambda: answer.put(self.stream.withhold()), self.defects)
         try:
             return answer.get(timeout=_MAINLINE_S)
@@ -246,12 +246,12 @@ class RemoteNode:
         The result is the smaller of the counts for two requests, because a response to an earlier request may
         be late.
         """
-        time.sleep(_ANSWER_S)
+        clock.sleep(_ANSWER_S)
         counts = []
         for _ in range(2):
             before = self._answers
             self.probe()
-            time.sleep(_ANSWER_S)
+            clock.sleep(_ANSWER_S)
             counts.append(self._answers - before)
             if counts[-1] < 2:
                 break

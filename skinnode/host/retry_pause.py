@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-import time
 from typing import Final
+
+from skinnode.process import clock
 
 FIRST_PAUSE_S: Final = 0.1
 LONGEST_PAUSE_S: Final = 1.0
@@ -25,7 +26,7 @@ class Pause:
 
     def next_s(self) -> float:
         """Return the length of the pause that starts now, before the next attempt."""
-        now_s = time.monotonic()
+        now_s = clock.monotonic()
         again = now_s <= self._end_s + self._longest_s
         self._pause_s = min(2 * self._pause_s, self._longest_s) if again else self._first_s
         self._end_s = now_s + self._pause_s

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 
 import numpy as np
@@ -13,6 +12,7 @@ from skinnode.host.node_facts import NodeFacts
 from skinnode.model.forward import resistance_ohm
 from skinnode.model.frames import FieldFrame, ResistanceFrame, ScanStamp, sealed
 from skinnode.model.layout import Float
+from skinnode.process import clock
 from skinnode.protocol.codes import Decoder, as_baseline
 from skinnode.protocol.scan import Scan
 from skinnode.solve.inputs import CodeMap
@@ -26,14 +26,14 @@ class ScanSolver:
     Args:
         facts: Layout, code scale and baseline of the patch.
         config: Settings for the solver.
-        clock: Returns the monotonic time at which a field is ready, ns.
+        now: Returns the monotonic time at which a field is ready, ns.
     """
 
     def __init__(
-        self, facts: NodeFacts, config: SolverConfig, clock: Callable[[], int] = time.monotonic_ns
+        self, facts: NodeFacts, config: SolverConfig, now: Callable[[], int] = clock.monotonic_ns
     ) -> None:
         self.facts = facts
-        self._clock = clock
+        self._now = now
         calibration = facts.config.calibration
         gain = None if calibration.upper_gain is None else np.array(calibration.upper_gain)[:, None]
         scale = facts.scale
@@ -69,7 +69,7 @@ class ScanSolver:
         self._tracker.scan = stamp.scan
         field, invalid = self._tracker.update_codes(scan.codes)
         contacts = tuple(sealed(contact) for contact in field.contacts)
-        return sealed(field, contacts=contacts, stamp=stamp.solved_at(self._clock())), invalid
+        return sealed(field, contacts=contacts, stamp=stamp.solved_at(self._now())), invalid
 
 
 def tracker_options(

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import logging
 import struct
-import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any, Final
@@ -27,6 +26,7 @@ from skinnode.canopen.sdo import SEGMENT_BYTES
 from skinnode.errors import NodeError, NodeTimeout, SdoAbort, SkinError
 from skinnode.host.containment import one_line
 from skinnode.host.sdo_streams import BlockDownload, BlockUpload, Client, Download
+from skinnode.process import clock
 from skinnode.text.words import counted
 
 ATTEMPTS: Final = 3
@@ -264,7 +264,7 @@ class RemoteOd:
         if stream.size is not None and stream.size > most:
             raise _UploadTooLong(f"a value of {counted(stream.size, 'byte')}, expected at most {most}")
         limit_s = _TRANSFER_S + _SEGMENT_S * most / SEGMENT_BYTES
-        end_s = time.monotonic() + limit_s
+        end_s = clock.monotonic() + limit_s
         data = bytearray()
         while segment := stream.read(SEGMENT_BYTES):
             data += segment
@@ -274,7 +274,7 @@ class RemoteOd:
                 break
             if self.abandoned():
                 raise Abandoned
-            if time.monotonic() > end_s:
+            if clock.monotonic() > end_s:
                 raise _UploadTooLong(
                     f"{counted(len(data), 'byte')} without an end, expected the end within {limit_s:.1f} s"
                 )

@@ -22,7 +22,6 @@ import contextlib
 import io
 import queue
 import struct
-import time
 from typing import Any, Final
 
 import canopen
@@ -33,6 +32,7 @@ from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError
 from skinnode.canopen.abort import AbortCode
 from skinnode.canopen.indices import sdo_request_cob_id, sdo_response_cob_id
 from skinnode.canopen.sdo import ABORT
+from skinnode.process import clock
 
 _QUIET_S: Final = 0.02
 """Duration in s of the silence after an abort that rules out further responses to the old transfer."""
@@ -74,13 +74,13 @@ class Client(SdoClient):
             (6, 0),
         )
         objects = (bytes(sdo_request[1:4]), bytes(3))
-        self.responses = queue.Queue()
+        self.responses = clock.queue()
         self.send_request(sdo_request)  # type: ignore[no-untyped-call]
-        end_s = time.monotonic() + self.RESPONSE_TIMEOUT
+        end_s = clock.monotonic() + self.RESPONSE_TIMEOUT
         late: bytes | None = None
         while True:
             try:
-                response: bytes = self.responses.get(timeout=max(0.0, end_s - time.monotonic()))
+                response: bytes = self.responses.get(timeout=max(0.0, end_s - clock.monotonic()))
             except queue.Empty:
                 if late is None:
                     raise SdoCommunicationError("No SDO response received") from None
@@ -100,9 +100,9 @@ class Client(SdoClient):
         """
         code, self._abort_code = self._abort_code, AbortCode.TIMED_OUT
         self.send_request(struct.pack("<BHBI", ABORT, index, subindex, code))  # type: ignore[no-untyped-call]
-        end_s = time.monotonic() + _SETTLE_S
+        end_s = clock.monotonic() + _SETTLE_S
         with contextlib.suppress(queue.Empty):
-            while time.monotonic() < end_s:
+            while clock.monotonic() < end_s:
                 self.responses.get(timeout=_QUIET_S)
 
 

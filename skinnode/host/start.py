@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import threading
-import time
 from collections.abc import Callable, Sequence
-from concurrent.futures import FIRST_EXCEPTION, Future, ThreadPoolExecutor, wait
+from concurrent.futures import Future
+from queue import SimpleQueue
 from typing import Final
 
 from skinnode.canopen.nmt import NmtState
@@ -16,6 +15,7 @@ from skinnode.host.node_supervision import START_DEADLINE_S
 from skinnode.host.remote_node import RemoteNode
 from skinnode.host.scan_solver import ScanSolver
 from skinnode.host.sdo_client import Abandoned
+from skinnode.process import clock
 from skinnode.text.words import known
 
 BRING_UP_THREADS: Final = 16
@@ -79,13 +79,13 @@ class _Start:
     ) -> None:
         self._nodes, self._waits, self._deadline_s = nodes, missing == "wait", deadline_s
         self._cancelled = cancelled
-        self._over = threading.Event()
+        self._over = clock.event()
         self._answered: list[PatchConfig] = []
 
     def run(self) -> dict[RemoteNode, ScanSolver]:
         """Configure the nodes and return those that are present, with their solvers."""
         threads = min(len(self._nodes), BRING_UP_THREADS)
-        with ThreadPoolExecutor(threads, thread_name_prefix="bring-up") as pool:
+        with clock.pool(threads, "bring-up") as pool:
             try:
                 jobs = {node: pool.submit(self._configure, node) for node in self._nodes}
                 self._wait_for(jobs)
@@ -128,11 +128,13 @@ class _Start:
 
     def _wait_for(self, jobs: dict[RemoteNode, Future[ScanSolver]]) -> None:
         """Wait until all jobs have ended, or one fails in a way that prevents the start."""
-        pending = set(jobs.values())
-        while pending:
-            done, pending = wait(pending, return_when=FIRST_EXCEPTION)
-            failures = {node: job.exception() for node, job in jobs.items() if job in done}
-            if any(failure and not self._may_join_later(node, failure) for node, failure in failures.items()):
+        ended: SimpleQueue[RemoteNode] = clock.simple_queue()
+        for node, job in jobs.items():
+            job.add_done_callback(lambda job, node=node: ended.put(node))  # type: ignore[misc]
+        for _ in jobs:
+            node = ended.get()
+            failure = jobs[node].exception()
+            if failure is not None and not self._may_join_later(node, failure):
                 break
 
     def _result(self, node: RemoteNode, job: Future[ScanSolver]) -> ScanSolver | None:
@@ -158,7 +160,7 @@ def start_all(ready: dict[RemoteNode, ScanSolver]) -> None:
     Raises:
         NodeTimeout: if a node does not become operational in time.
     """
-    t_start_ns = time.monotonic_ns()
+    t_start_ns = clock.monotonic_ns()
     for node, solver in ready.items():
         node.start(solver, node.stream.withholdings)
     naps = round(START_DEADLINE_S / _POLL_S)
@@ -175,22 +177,22 @@ def start_all(ready: dict[RemoteNode, ScanSolver]) -> None:
             naps -= 1
             if naps % _START_AGAIN_NAPS == 0:
                 nmt_master.start(node.link.send, patch.node_id)
-            time.sleep(_POLL_S)
+            clock.sleep(_POLL_S)
 
 
 def _listen(node: RemoteNode, deadline_s: float, abandoned: Callable[[], bool]) -> None:
     """Wait for a frame from a node to which nothing may be sent; raise NodeTimeout after the deadline."""
-    end_s = time.monotonic() + deadline_s
+    end_s = clock.monotonic() + deadline_s
     while not node.heard:
         if abandoned():
             raise Abandoned
-        if time.monotonic() > end_s:
+        if clock.monotonic() > end_s:
             patch = node.patch
             raise NodeTimeout(
                 patch.node_id,
                 f"patch {patch.name!r} on {patch.bus}: received nothing within {deadline_s:g} s",
             )
-        time.sleep(_POLL_S)
+        clock.sleep(_POLL_S)
 
 
 def _silence(

@@ -12,6 +12,7 @@ from skinnode.host.remote_node import RemoteNode
 from skinnode.host.retry_pause import Pause
 from skinnode.host.scan_solver import ScanSolver
 from skinnode.model.layout import Float
+from skinnode.process import clock
 
 JOIN_DEADLINE_S: Final = 1.0
 """Maximum time in s for a node that has sent any frame to send its first SDO response or to tare itself."""
@@ -64,7 +65,7 @@ class Supervised:
     job: Future[Joined | None] | None = None
     """Job that communicates with the node; its result is None if the job only reads the error register."""
     searching: Future[bool] | None = None
-    abandon: threading.Event = field(default_factory=threading.Event)
+    abandon: threading.Event = field(default_factory=clock.event)
     """Set to stop the job."""
     pause: Pause = field(default_factory=Pause)
     not_before_ns: int = 0

@@ -24,10 +24,7 @@ silence or a refusal, so does any frame from the node.
 from __future__ import annotations
 
 import logging
-import threading
-import time
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from types import TracebackType
 from typing import Final, Self
 
@@ -38,6 +35,7 @@ from skinnode.host.containment import Defects, keep_on
 from skinnode.host.node_supervision import NodeSupervision
 from skinnode.host.remote_node import RemoteNode
 from skinnode.host.supervised import LEAST_NS, NodeStats, Phase, Supervised
+from skinnode.process import clock
 
 _log = logging.getLogger(__name__)
 
@@ -68,7 +66,7 @@ class Supervisor:
         heartbeat_s: float,
         defects: Defects,
     ) -> None:
-        now_ns = time.monotonic_ns()
+        now_ns = clock.monotonic_ns()
         self._nodes = [
             Supervised(
                 remote,
@@ -87,10 +85,10 @@ class Supervisor:
         }
         self._heartbeat_ns, self._beat_ns = int(heartbeat_s * 1e9), now_ns
         self._defects = defects
-        self._stop = threading.Event()
-        self._pool = ThreadPoolExecutor(min(THREADS, len(self._nodes)), thread_name_prefix="rejoin")
+        self._stop = clock.event()
+        self._pool = clock.pool(min(THREADS, len(self._nodes)), "rejoin")
         self._supervision = NodeSupervision(self._pool)
-        self._thread = threading.Thread(target=self._run, name="supervisor", daemon=True)
+        self._thread = clock.thread(target=self._run, name="supervisor")
         self._thread.start()
 
     def stats(self) -> dict[str, NodeStats]:
@@ -128,11 +126,11 @@ class Supervisor:
             return False
         for node in self._nodes:
             try:
-                self._supervision.look(node, time.monotonic_ns())
+                self._supervision.look(node, clock.monotonic_ns())
             except Exception as error:  # the next iteration marks the patch as faulty
                 node.upset = True
                 node.remote.defects.report("supervision", error)
-        self._beat(time.monotonic_ns())
+        self._beat(clock.monotonic_ns())
         return True
 
     def _beat(self, now_ns: int) -> None:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import threading
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from types import TracebackType
@@ -12,6 +10,7 @@ from typing import NamedTuple, Self
 from skinnode.canopen.indices import SYNC_COB_ID
 from skinnode.errors import BusError
 from skinnode.host.containment import Defects, keep_on
+from skinnode.process import clock
 
 
 class Tick(NamedTuple):
@@ -119,11 +118,11 @@ class SyncProducer:
     ) -> None:
         self._buses = tuple(buses)
         self._defects = tuple(defects) or tuple(Defects("SYNC") for _ in buses)
-        self._due_ns, self._number = time.monotonic_ns(), 0
+        self._due_ns, self._number = clock.monotonic_ns(), 0
         self._period_ns, self._stagger_ns = round(period_s * 1e9), round(stagger_s * 1e9)
         self._sent = self._missed = self._failed = self._latest_ns = 0
-        self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="sync", daemon=True)
+        self._stop = clock.event()
+        self._thread = clock.thread(target=self._run, name="sync")
         self._thread.start()
 
     def stats(self) -> SyncStats:
@@ -144,7 +143,7 @@ class SyncProducer:
         self.close()
 
     def _run(self) -> None:
-        self._due_ns = time.monotonic_ns()
+        self._due_ns = clock.monotonic_ns()
         keep_on(self._turn, self._defects[0], "sending SYNC")
 
     def _turn(self) -> bool:
@@ -153,7 +152,7 @@ class SyncProducer:
             return False
         self._number += 1
         due_ns, self._due_ns = self._due_ns, self._due_ns + self._period_ns
-        now_ns = time.monotonic_ns()  # one instant for all buses
+        now_ns = clock.monotonic_ns()  # one instant for all buses
         for i in range(len(self._buses)):
             try:
                 self._send(i, due_ns + i * self._stagger_ns, now_ns)
@@ -163,7 +162,7 @@ class SyncProducer:
                 self._failed += 1
                 self._defects[i].report("sending SYNC", error)
         self._sent += 1
-        skipped = max(0, (time.monotonic_ns() - self._due_ns) // self._period_ns)
+        skipped = max(0, (clock.monotonic_ns() - self._due_ns) // self._period_ns)
         self._missed += skipped
         self._due_ns += skipped * self._period_ns
         return True
@@ -172,11 +171,11 @@ class SyncProducer:
         send, ticks = self._buses[i]
         if i and self._stagger_ns:
             self._wait(due_ns)
-            now_ns = time.monotonic_ns()
+            now_ns = clock.monotonic_ns()
         self._latest_ns = max(self._latest_ns, now_ns - due_ns)
         payload = bytes([ticks.note(self._number, now_ns)])  # before sending, so that scans find this SYNC
         send(SYNC_COB_ID, payload)
 
     def _wait(self, until_ns: int) -> bool:
         """Wait until ``until_ns``, or until :meth:`close`. Returns whether to end."""
-        return self._stop.wait(max(0.0, (until_ns - time.monotonic_ns()) * 1e-9))
+        return self._stop.wait(max(0.0, (until_ns - clock.monotonic_ns()) * 1e-9))

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from typing import Final
 
 from skinnode.errors import NodeTimeout
 from skinnode.host.health import PatchHealth
 from skinnode.host.remote_node import RemoteNode
+from skinnode.process import clock
 
 TARE_DEADLINE_S: Final = 5.0
 """Default deadline for a tare in s, excluding the SYNC periods below: 16 readings take milliseconds, reading
@@ -38,11 +38,11 @@ def tare(
     """
     before, emergencies = baselines(), health().emergencies
     node.tare()
-    end_s = time.monotonic() + deadline_s
+    end_s = clock.monotonic() + deadline_s
     while baselines() == before or node.stream.withholding:
-        if time.monotonic() > end_s:
+        if clock.monotonic() > end_s:
             raise NodeTimeout(node.patch.node_id, _why(node, health(), emergencies, deadline_s))
-        time.sleep(_POLL_S)
+        clock.sleep(_POLL_S)
 
 
 def _why(node: RemoteNode, now: PatchHealth, emergencies: int, deadline_s: float) -> str:

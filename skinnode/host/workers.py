@@ -8,12 +8,12 @@ with the job, and the thread continues with the next job.
 from __future__ import annotations
 
 import queue
-import threading
 from collections.abc import Callable
 from types import TracebackType
 from typing import Self
 
 from skinnode.host.containment import Defects, keep_on
+from skinnode.process import clock
 
 Job = Callable[[], None]
 OnError = Callable[[Exception], object]
@@ -27,11 +27,9 @@ class Workers:
     """
 
     def __init__(self, count: int, name: str, defects: Defects | None = None) -> None:
-        self._jobs: queue.SimpleQueue[tuple[Job, OnError] | None] = queue.SimpleQueue()  # None: end
+        self._jobs: queue.SimpleQueue[tuple[Job, OnError] | None] = clock.simple_queue()  # None: end
         self._defects = Defects(name) if defects is None else defects
-        self._threads = [
-            threading.Thread(target=self._run, name=f"{name} {i}", daemon=True) for i in range(count)
-        ]
+        self._threads = [clock.thread(target=self._run, name=f"{name} {i}") for i in range(count)]
         for thread in self._threads:
             thread.start()
 

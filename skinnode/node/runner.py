@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import threading
-import time
 from collections.abc import Iterable
 from types import TracebackType
 from typing import Final, Self
@@ -13,6 +11,7 @@ from skinnode.canopen.lss import NOT_CONFIGURED
 from skinnode.errors import BusError
 from skinnode.node.clock import NO_DEADLINE_NS
 from skinnode.node.patch.patch_node import PatchNode
+from skinnode.process import clock
 from skinnode.transport.bus_state import BusState, bus_state
 from skinnode.transport.frame import Frame
 from skinnode.transport.port import CanPort
@@ -68,9 +67,9 @@ class NodeRunner:
         self._heard = 0
         self._bus_state = BusState.ACTIVE
         self._sent_before = 0  # frames sent before bus-off; one more shows that the bus has recovered
-        self._powered, self._stopping = threading.Event(), threading.Event()
+        self._powered, self._stopping = clock.event(), clock.event()
         self._error: BaseException | None = None
-        self._thread = threading.Thread(target=self._run, name=f"nodes {port.config.name}", daemon=True)
+        self._thread = clock.thread(target=self._run, name=f"nodes {port.config.name}")
 
     @property
     def failed(self) -> bool:
@@ -114,7 +113,7 @@ class NodeRunner:
 
     def _run(self) -> None:
         try:
-            now_ns = time.monotonic_ns()
+            now_ns = clock.monotonic_ns()
             for node in self.nodes:
                 node.power_on(now_ns)
             self._powered.set()
@@ -128,7 +127,7 @@ class NodeRunner:
 
     def _drive(self) -> None:
         failing_since_s: float | None = None
-        opened_s = time.monotonic()
+        opened_s = clock.monotonic()
         while not self._stopping.is_set():
             moved = self._port.sent + self._heard
             try:
@@ -136,7 +135,7 @@ class NodeRunner:
             except BusError as error:
                 # A frame that could not be sent is lost, as on any bus, and the nodes continue.
                 self.bus_errors += 1
-                now_s = time.monotonic()
+                now_s = clock.monotonic()
                 if failing_since_s is None:
                     failing_since_s = opened_s = now_s
                     self.bus_error = str(error)
@@ -156,7 +155,7 @@ class NodeRunner:
 
     def _set_bus_state(self, state: BusState) -> None:
         self._bus_state = state
-        now_ns = time.monotonic_ns()
+        now_ns = clock.monotonic_ns()
         for node in self.nodes:
             with contextlib.suppress(BusError):  # the emergency stays queued in the node
                 node.on_bus(state, now_ns)
@@ -170,9 +169,9 @@ class NodeRunner:
 
     def _turn(self) -> None:
         """Serve all timers and at most one frame; return when a timer is due, or after a limited wait."""
-        nodes, clock = self.nodes, time.monotonic_ns
+        nodes, now = self.nodes, clock.monotonic_ns
         # All nodes receive the same time, so that nodes started together share one wake-up of the thread.
-        now_ns, first_ns = clock(), NO_DEADLINE_NS
+        now_ns, first_ns = now(), NO_DEADLINE_NS
         silent = any(now_ns >= node.silent_from_ns for node in nodes)
         failure = self._catch_up(now_ns) if silent else None
         for node in nodes:
@@ -185,7 +184,7 @@ class NodeRunner:
                 deadline_ns = node.next_deadline_ns()
             if deadline_ns is not None and deadline_ns < first_ns:
                 first_ns = deadline_ns
-        wait_s = min((first_ns + self._slack_ns - clock()) * 1e-9, _IDLE_S)
+        wait_s = min((first_ns + self._slack_ns - now()) * 1e-9, _IDLE_S)
         frame = self._port.recv(wait_s if wait_s > 0.0 else 0.0)
         if frame is not None:
             failure = self._serve(frame) or failure

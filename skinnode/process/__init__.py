@@ -1,1 +1,1 @@
-"""Signal handling, child processes and garbage collection in a running program."""
+"""The clock, signal handling, child processes and garbage collection of a running program."""

@@ -10,8 +10,6 @@ import datetime
 import json
 import logging
 import queue
-import threading
-import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -23,6 +21,7 @@ from skinnode.config import HandConfig
 from skinnode.errors import ConfigError
 from skinnode.host.containment import Defects, keep_on
 from skinnode.host.scan_solver import ScanSolver
+from skinnode.process import clock
 from skinnode.record.journal import SUFFIX, Header, facts_table
 from skinnode.transport.frame import Frame
 from skinnode.transport.frame_log import SUFFIXES, FrameLog, LogFormat, LoggedFrame, create
@@ -122,7 +121,7 @@ class Recorder:
         elif path.suffix not in SUFFIXES:
             raise ConfigError("recording", asked, _ALLOWED)
         self._channels = channels(hand)
-        offset_ns = time.time_ns() - time.monotonic_ns()
+        offset_ns = clock.time_ns() - clock.monotonic_ns()
         self._log = FrameLog(path, tuple(self._channels.values()))
         try:
             self._journal = create(path.with_suffix(SUFFIX))
@@ -137,12 +136,12 @@ class Recorder:
         self._solvers: dict[str, ScanSolver] = {}
         self._lost = self._lost_reported = 0
         self._defects = Defects(str(path))
-        self._flush_s = self._sync_s = time.monotonic()
+        self._flush_s = self._sync_s = clock.monotonic()
         self._ended = False
         self._failure: str | None = None
-        self._queue: queue.SimpleQueue[_Entry | None] = queue.SimpleQueue()
+        self._queue: queue.SimpleQueue[_Entry | None] = clock.simple_queue()
         self._try(lambda: self._begin(Header(hand, now.isoformat(timespec="seconds"), offset_ns)))
-        self._thread = threading.Thread(target=self._run, name="record", daemon=True)
+        self._thread = clock.thread(target=self._run, name="record")
         self._thread.start()
 
     def stats(self) -> RecorderStats:
@@ -205,14 +204,14 @@ class Recorder:
             self._queue.put(entry)
 
     def _event(self, patch: str, event: str, *, t_ns: int | None = None, **more: Any) -> None:
-        bus, t_ns = self._bus_of[patch], time.monotonic_ns() if t_ns is None else t_ns
+        bus, t_ns = self._bus_of[patch], clock.monotonic_ns() if t_ns is None else t_ns
         self._put(lambda: self._write_event(bus, t_ns, event, patch=patch, **more), 0)
 
     # --- called on the recorder's thread
 
     def _run(self) -> None:
         keep_on(self._turn, self._defects, "recording")
-        self._try(lambda: self._write_event("", time.monotonic_ns(), "ended", frames=self._log.frames))
+        self._try(lambda: self._write_event("", clock.monotonic_ns(), "ended", frames=self._log.frames))
         with suppress(OSError):
             self._journal.close()
         self._log.close()
@@ -226,7 +225,7 @@ class Recorder:
             self._ended = entry is None
             if entry is not None:
                 self._try(entry)
-        now_s = time.monotonic()
+        now_s = clock.monotonic()
         if now_s >= self._flush_s + FLUSH_S or self._ended:
             to_disk = now_s >= self._sync_s + SYNC_S
             self._try(lambda: self._flush(to_disk=to_disk))
@@ -249,7 +248,7 @@ class Recorder:
         """Flush the journal before the log, so that the journal never lags behind the log."""
         if self._lost != self._lost_reported:
             lost, self._lost_reported = self._lost - self._lost_reported, self._lost
-            self._write_event("", time.monotonic_ns(), "dropped", frames=lost)
+            self._write_event("", clock.monotonic_ns(), "dropped", frames=lost)
         self._journal.flush()
         self._log.flush(to_disk=to_disk)
 

@@ -12,7 +12,6 @@ when incomplete scans end.
 
 from __future__ import annotations
 
-import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -33,6 +32,7 @@ from skinnode.host.scan_solver import ScanSolver
 from skinnode.host.sync import SyncFollower, Ticks
 from skinnode.host.workers import Inline
 from skinnode.model.frames import FieldFrame
+from skinnode.process import clock
 from skinnode.record.journal import SUFFIX, facts_of, read_journal
 from skinnode.record.recorder import channels
 from skinnode.text.words import counted
@@ -194,9 +194,9 @@ class Replay:
         return self._buses[self.hand.patch(patch).bus].patches[patch].stream.stats()
 
     def _wait(self, seconds: float) -> None:
-        end_s = time.monotonic() + seconds
-        while not self.stopped and (left_s := end_s - time.monotonic()) > 0:
-            time.sleep(min(left_s, _SLICE_S))
+        end_s = clock.monotonic() + seconds
+        while not self.stopped and (left_s := end_s - clock.monotonic()) > 0:
+            clock.sleep(min(left_s, _SLICE_S))
 
     def complain(self, event: dict[str, Any], what: str) -> None:
         """Report a malformed event in the journal."""
@@ -218,7 +218,7 @@ class _Pace:
     def __init__(self, speed: float | None, wait: Callable[[float], None]) -> None:
         self._speed, self._wait = speed, wait
         self._last_ns: int | None = None
-        self._due_s = time.monotonic()
+        self._due_s = clock.monotonic()
 
     def wait_for(self, t_ns: int) -> None:
         if self._speed is None:
@@ -226,7 +226,7 @@ class _Pace:
         gap_s = 0.0 if self._last_ns is None else (t_ns - self._last_ns) * 1e-9
         self._last_ns = t_ns
         self._due_s += max(-1.0, min(gap_s, LONGEST_SILENCE_S)) / self._speed
-        ahead_s = self._due_s - time.monotonic()
+        ahead_s = self._due_s - clock.monotonic()
         if ahead_s > 0:
             self._wait(ahead_s)
 

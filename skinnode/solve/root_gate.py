@@ -10,7 +10,6 @@ of a doubtful wire, replaces it, or leaves the wire without a root. The threshol
 from __future__ import annotations
 
 import dataclasses
-from time import perf_counter
 from typing import Final
 
 import numpy as np
@@ -19,6 +18,7 @@ from numpy.typing import NDArray
 from skinnode.model.frames import FieldFrame
 from skinnode.model.layout import Float
 from skinnode.model.status import Status
+from skinnode.process.clock import perf_counter
 from skinnode.solve import roots
 from skinnode.solve.exact.tracker import ExactTracker
 from skinnode.solve.options import TrackerOptions
@@ -113,7 +113,7 @@ class RootGate:
 
         Args:
             field: Field of the exact tracker.
-            start: Value of :func:`time.perf_counter` when the update began, s.
+            start: Value of :func:`skinnode.process.clock.perf_counter` when the update began, s.
             again: Whether the same frame was checked before, with other readings.
         """
         doubtful: Mask | None = None

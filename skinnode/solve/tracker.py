@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from time import perf_counter
 from typing import Final, Unpack
 
 import numpy as np
@@ -21,6 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from skinnode.model.frames import FieldFrame, amended
 from skinnode.model.layout import Float, PatchLayout
+from skinnode.process.clock import perf_counter
 from skinnode.solve.checks.data_check import DataCheck, Solved
 from skinnode.solve.cramer_rao import patch_std
 from skinnode.solve.exact.contacts import ExactContacts

@@ -13,8 +13,6 @@ import errno
 import logging
 import os
 import socket
-import threading
-import time
 import uuid
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Final, Self
@@ -23,6 +21,7 @@ import can
 
 from skinnode.canopen.data_length import fd_length
 from skinnode.errors import BusError
+from skinnode.process import clock
 from skinnode.text.words import counted
 from skinnode.transport.frame import Frame
 from skinnode.transport.socketcan import BATCH_FRAMES, SocketReader, set_link_bitrate
@@ -122,7 +121,7 @@ class CanPort:
         self._longest = 64 if config.fd else 8
         self._closed = False
         self._link_gone: Exception | None = None
-        self._counting = threading.Lock()  # several threads count sent frames; see send()
+        self._counting = clock.lock()  # several threads count sent frames; see send()
         self._sent = self._received = self._errors = self._undelivered = self._malformed = 0
         self._dropped_before = 0  # by earlier readers
         self._away = False
@@ -277,7 +276,7 @@ class CanPort:
         return frames
 
     def _recv_message(self, timeout_s: float) -> list[Frame]:
-        end_ns = time.monotonic_ns() + int(timeout_s * 1e9)
+        end_ns = clock.monotonic_ns() + int(timeout_s * 1e9)
         while True:
             try:
                 message = self._bus.recv(timeout_s)
@@ -292,7 +291,7 @@ class CanPort:
                     raise BusError(f"{self._where}: cannot receive ({_why(error)})") from error
                 self._malformed += 1
             # The endpoint's own frame, or a malformed packet: wait for the remaining time.
-            timeout_s = max(0.0, (end_ns - time.monotonic_ns()) * 1e-9)
+            timeout_s = max(0.0, (end_ns - clock.monotonic_ns()) * 1e-9)
 
     def reopen(self) -> None:
         """Close and reopen the interface after a failure; the counters are not reset.
@@ -375,7 +374,7 @@ def _discard_other_groups(sock: socket.socket) -> None:
     If there were any, the kernel may still be delivering another that it accepted before the change.
     """
     if _discard_waiting(sock):
-        time.sleep(_DELIVERY_S)
+        clock.sleep(_DELIVERY_S)
         _discard_waiting(sock)
 
 
@@ -390,8 +389,8 @@ def _discard_waiting(sock: socket.socket) -> int:
 
 
 def _frame(message: can.Message) -> Frame:
-    now_ns = time.monotonic_ns()
-    age_s = time.time() - message.timestamp
+    now_ns = clock.monotonic_ns()
+    age_s = clock.time() - message.timestamp
     if 0.0 < age_s < _OLDEST_STAMP_S:
         now_ns -= int(age_s * 1e9)
     return Frame(

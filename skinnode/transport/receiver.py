@@ -9,13 +9,13 @@ import contextlib
 import queue
 import select
 import threading
-import time
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from types import TracebackType
 from typing import Final, Self
 
+from skinnode.process import clock
 from skinnode.transport.frame import Frame
 from skinnode.transport.port import CanPort
 
@@ -172,7 +172,7 @@ class Intake:
         Returns:
             Whether there is something new to take: frames or an error.
         """
-        now_ns = time.monotonic_ns()
+        now_ns = clock.monotonic_ns()
         try:
             frames = self.port.recv_batch(timeout_s)
         except Exception as error:  # every exception must reach the reader
@@ -218,13 +218,13 @@ class Receiver:
         self, intakes: Sequence[Intake], on_defect: Callable[[Exception], object] = lambda error: None
     ) -> None:
         self._on_defect = on_defect
-        self._news: queue.SimpleQueue[None] = queue.SimpleQueue()
+        self._news: queue.SimpleQueue[None] = clock.simple_queue()
         self._joining: deque[Intake] = deque()  # waiting for the shared thread to add them
-        self._stop = threading.Event()
+        self._stop = clock.event()
         self._shared: threading.Thread | None = None
         self._alone: dict[Intake, threading.Thread] = {}
         if any(intake.port.reads_batches for intake in intakes):
-            self._shared = threading.Thread(target=self._receive_batches, name="receive", daemon=True)
+            self._shared = clock.thread(target=self._receive_batches, name="receive")
             self._shared.start()
         for intake in intakes:
             self.resume(intake)
@@ -245,7 +245,7 @@ class Receiver:
             self._alone[intake].join()
         intake.resume()
         name = f"receive {intake.port.config.name}"
-        thread = threading.Thread(target=self._receive_alone, args=(intake,), name=name, daemon=True)
+        thread = clock.thread(target=self._receive_alone, args=(intake,), name=name)
         thread.start()
         self._alone[intake] = thread  # set after start(): a thread that did not start cannot be joined
 
@@ -274,7 +274,7 @@ class Receiver:
                 self._receive_batch(shared)
             except Exception as error:
                 self._on_defect(error)
-                time.sleep(_POLL_S)
+                clock.sleep(_POLL_S)
 
     def _receive_batch(self, shared: _Shared) -> None:
         """Run one iteration of the shared thread."""
@@ -284,7 +284,7 @@ class Receiver:
                 intakes[self._joining[0]] = None
                 self._joining.popleft()
             shared.poll = _poll_of(intakes)
-        now_ns = time.monotonic_ns()
+        now_ns = clock.monotonic_ns()
         fetched = [intake for intake in intakes if intake.due_ns <= now_ns + _SHORT_NS]
         if not _fetch(fetched):
             fetched = list(intakes)
@@ -299,11 +299,11 @@ class Receiver:
                 del intakes[intake]
             shared.poll = _poll_of(intakes)
         self._notify()
-        now_ns = time.monotonic_ns()
+        now_ns = clock.monotonic_ns()
         for intake in fetched:
             intake.gather(now_ns)
         due_ns = min([intake.due_ns for intake in intakes], default=now_ns + GATHER_NS)
-        time.sleep(max(0, due_ns - now_ns) * 1e-9)
+        clock.sleep(max(0, due_ns - now_ns) * 1e-9)
 
     def _receive_alone(self, intake: Intake) -> None:
         while True:
@@ -315,7 +315,7 @@ class Receiver:
                     self._notify()
             except Exception as error:
                 self._on_defect(error)
-                time.sleep(_POLL_S)
+                clock.sleep(_POLL_S)
 
     def _notify(self) -> None:
         if self._news.empty():  # one notification is enough
@@ -354,8 +354,8 @@ def _poll_of(intakes: Iterable[Intake]) -> select.poll:
 def drain(port: CanPort, within_s: float) -> list[Frame]:
     """Return every frame that arrives within ``within_s``. For tools and tests without a receiving thread."""
     frames: list[Frame] = []
-    end_ns = time.monotonic_ns() + int(within_s * 1e9)
-    while (left_ns := end_ns - time.monotonic_ns()) > 0:
+    end_ns = clock.monotonic_ns() + int(within_s * 1e9)
+    while (left_ns := end_ns - clock.monotonic_ns()) > 0:
         frame = port.recv(left_ns * 1e-9)
         if frame is not None:
             frames.append(frame)

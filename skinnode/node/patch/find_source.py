@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import importlib
 import importlib.metadata
-import time
 from typing import Any, Final
 
 from skinnode.errors import ConfigError
 from skinnode.model.layout import PatchLayout
 from skinnode.node.patch.source import ResistanceSource, SourceFailed, read_source
+from skinnode.process import clock
 
 GROUP: Final = "skinnode.sources"
 """Entry-point group in which installed packages register named sources."""
@@ -69,7 +69,7 @@ def make_source(name: str, layout: PatchLayout, option: str = "source") -> Resis
     if not callable(getattr(source, "read", None)):
         raise ConfigError(option, name, f"a source with a method read(t_ns), not {source!r:.80}")
     try:
-        read_source(source, layout.shape, time.monotonic_ns())
+        read_source(source, layout.shape, clock.monotonic_ns())
     except SourceFailed as failure:
         raise ConfigError(option, name, f"a source that returns readings ({failure})") from failure
     return source

@@ -11,7 +11,6 @@ import dataclasses
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from time import perf_counter
 from typing import Final
 
 import numpy as np
@@ -22,6 +21,7 @@ from skinnode.model.frames import FieldFrame, amended
 from skinnode.model.kernels import potential
 from skinnode.model.layout import Float
 from skinnode.model.status import Status
+from skinnode.process.clock import perf_counter
 from skinnode.solve.checks.crossed_wires import likeliest
 from skinnode.solve.checks.explanations import DOUBT, Explainer, Group
 from skinnode.solve.checks.fault_list import FaultList, agree
@@ -156,9 +156,10 @@ class DataCheck:
         Args:
             solved: The frame, solved without the readings of :attr:`left_out`.
             solve_without: Solves the frame without these readings (U, K) and those of :attr:`left_out`.
-            until: Value of :func:`time.perf_counter` by which this should return; −inf if some wires are
-                unsolved for lack of time, which proves nothing. A suspicious frame that cannot be examined by
-                then is not trusted; every :data:`PATIENCE` frames in succession one takes longer.
+            until: Value of :func:`skinnode.process.clock.perf_counter` by which this should return; −inf if
+                some wires are unsolved for lack of time, which proves nothing. A suspicious frame that cannot
+                be examined by then is not trusted; every :data:`PATIENCE` frames in succession one takes
+                longer.
         """
         self._frame += 1
         last = self._last

@@ -20,7 +20,6 @@ import dataclasses
 import functools
 import math
 from dataclasses import dataclass
-from time import perf_counter
 from typing import Final
 
 import numpy as np
@@ -31,6 +30,7 @@ from skinnode.model.elastic import Rubber
 from skinnode.model.forward import jacobian
 from skinnode.model.frames import Contact, FieldFrame
 from skinnode.model.layout import Float, PatchLayout
+from skinnode.process.clock import perf_counter
 from skinnode.solve.linalg.cholesky import multiply, multiply_vector, solve_positive, subtract_product
 from skinnode.solve.linalg.vectors import Index, orthonormalise
 from skinnode.solve.options import TrackerOptions

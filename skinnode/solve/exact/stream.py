@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from time import perf_counter
 from typing import Final
 
 import numpy as np
@@ -17,6 +16,7 @@ from numpy.typing import NDArray
 
 from skinnode.model.kernels import relative_residual
 from skinnode.model.layout import Float
+from skinnode.process.clock import perf_counter
 from skinnode.solve.linalg.vectors import Index
 from skinnode.solve.operators import codes as op
 from skinnode.solve.roots import on_rest_branch

@@ -13,7 +13,6 @@ The rules for acceptable roots are in :mod:`skinnode.solve.roots`.
 from __future__ import annotations
 
 import math
-from time import perf_counter
 from typing import Final
 
 import numpy as np
@@ -22,6 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 from skinnode.model.frames import FieldFrame, SolveStats
 from skinnode.model.layout import Float, PatchLayout, require_array
 from skinnode.model.status import as_statuses
+from skinnode.process.clock import perf_counter
 from skinnode.solve.exact.leave_out import LeftOut
 from skinnode.solve.exact.recover import recover_lost
 from skinnode.solve.exact.stream import FRAME_STEPS, Frame, StreamState

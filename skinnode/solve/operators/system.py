@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import math
 import numbers
-import time
 from collections.abc import Callable
 from typing import Final
 
@@ -21,6 +20,7 @@ from numpy.typing import ArrayLike
 from skinnode.model.frames import SolveStats
 from skinnode.model.layout import Float, require_array
 from skinnode.model.status import Status
+from skinnode.process.clock import perf_counter
 from skinnode.solve.operators import codes as op
 from skinnode.solve.operators.attempt import Attempt, System
 from skinnode.solve.operators.minimum import Point
@@ -85,7 +85,7 @@ def solve_system(  # noqa: PLR0913 - keyword arguments of the public interface
     """
     code = operator_code(operator)
     require_tolerances(tol_f, tol_x, max_steps)
-    begin = time.perf_counter()
+    begin = perf_counter()
     x = require_array("x0", x0, ("n",))
     system = System(residual, jacobian, x)
     wide = system.m < system.n
@@ -101,7 +101,7 @@ def solve_system(  # noqa: PLR0913 - keyword arguments of the public interface
             residual_norm=math.sqrt(at.r.dot(at.r)),
             optimality=math.nan if invalid else float(np.abs(at.j.T @ at.r).max()),
             error_estimate=best.error if best.went == op.CONVERGED else math.inf,
-            stats=SolveStats(system.evaluations, system.jacobians, system.steps, time.perf_counter() - begin),
+            stats=SolveStats(system.evaluations, system.jacobians, system.steps, perf_counter() - begin),
         )
 
 

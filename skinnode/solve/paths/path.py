@@ -8,7 +8,6 @@ samples.
 
 from __future__ import annotations
 
-import time
 from dataclasses import dataclass
 from typing import Final
 
@@ -18,6 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from skinnode.model.frames import SolveStats
 from skinnode.model.layout import Float, PatchLayout, require_array
 from skinnode.model.status import Status
+from skinnode.process.clock import perf_counter
 from skinnode.solve import roots
 from skinnode.solve.cramer_rao import wire_std
 from skinnode.solve.operators.system import operator_code
@@ -120,7 +120,7 @@ def solve_path(
     if schedule is not None and (isinstance(schedule, type) or not hasattr(schedule, "follow")):
         raise ValueError(f"schedule: got {schedule!r}, must be Uniform(), Periodic(), Adaptive() or similar")
     problem = PatchProblem.of(layout, baseline_ohm)
-    start = time.perf_counter()
+    start = perf_counter()
     with np.errstate(divide="ignore", over="ignore", invalid="ignore"):  # the status reports divergence
         tracker = PathTracker(problem, samples * problem.gain, code)
         (Uniform() if schedule is None else schedule).follow(tracker)
@@ -145,7 +145,7 @@ def solve_path(
         steps=log.steps,
         evaluations=log.evaluations,
         optimality=log.optimality,
-        stats=SolveStats(total, total, int(log.steps.sum()), time.perf_counter() - start),
+        stats=SolveStats(total, total, int(log.steps.sum()), perf_counter() - start),
     )
 
 

@@ -12,7 +12,6 @@ reject    mark a wire as INCONSISTENT if no deformation explains its residual, l
 from __future__ import annotations
 
 import math
-from time import perf_counter
 from typing import Final, Unpack
 
 import numpy as np
@@ -23,6 +22,7 @@ from skinnode.model.frames import Contact, FieldFrame, SolveStats
 from skinnode.model.layout import Float, PatchLayout, require_array
 from skinnode.model.status import Status, as_statuses
 from skinnode.model.tolerances import EXACT
+from skinnode.process.clock import perf_counter
 from skinnode.solve import roots
 from skinnode.solve.inputs import NOISE_MAX, broadcast_noise, checked_mask, checked_noise
 from skinnode.solve.linalg.vectors import Index
@@ -201,7 +201,11 @@ class FrameEstimator:
         return self._field(observation, status, held, start)
 
     def stop_at(self, until: float) -> None:
-        """Set the deadline for subsequent updates, as a :func:`time.perf_counter` value; inf for no limit."""
+        """Set the deadline for subsequent updates; inf for no limit.
+
+        Args:
+            until: Value of :func:`skinnode.process.clock.perf_counter`, s.
+        """
         self._until = until
 
     def covariance_m2(self) -> Float:

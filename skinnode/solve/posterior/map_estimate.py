@@ -13,13 +13,13 @@ anneal    starts at the rest position with an assumed noise of 3 %, which is div
 from __future__ import annotations
 
 import math
-from time import perf_counter
 from typing import Final
 
 import numpy as np
 
 from skinnode.model.layout import Float
 from skinnode.model.tolerances import EXACT, Tolerances
+from skinnode.process.clock import perf_counter
 from skinnode.solve import roots
 from skinnode.solve.linalg.cholesky import cholesky, inverse_diagonal, multiply, solve_lower
 from skinnode.solve.linalg.vectors import Index
@@ -94,7 +94,7 @@ class MapEstimator:
         factors: Serial number of the current factors.
         evaluations: Number of evaluations of F and J since the owner set it to 0.
         factorisations: Number of factorisations since the owner set it to 0.
-        until: Value of :func:`time.perf_counter` after which a solve raises TimeoutError.
+        until: Value of :func:`skinnode.process.clock.perf_counter` after which a solve raises TimeoutError.
     """
 
     def __init__(

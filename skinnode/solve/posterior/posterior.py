@@ -7,7 +7,6 @@ A frame is solved (``frame_estimator``) and its readings are tested against the 
 from __future__ import annotations
 
 import math
-from time import perf_counter
 from typing import Final, Unpack
 
 import numpy as np
@@ -16,6 +15,7 @@ from numpy.typing import ArrayLike
 from skinnode.model.frames import FieldFrame
 from skinnode.model.layout import Float, PatchLayout
 from skinnode.model.tolerances import EXACT
+from skinnode.process.clock import perf_counter
 from skinnode.solve.checks.data_check import DataCheck, Solved
 from skinnode.solve.options import PosteriorArguments, PosteriorOptions, merged
 from skinnode.solve.posterior.frame_estimator import FrameEstimator, Mask

@@ -1,0 +1,163 @@
+"""Time, waiting and threads: the system's, or those of a virtual clock that a simulation sets.
+
+Code that reads the time, waits or starts threads calls these functions. A thread runs by the clock of the
+thread that made it; :func:`use` sets the clock of the current thread. Without a virtual clock, the functions
+are those of the standard library.
+"""
+
+from __future__ import annotations
+
+import queue as queues
+import threading
+import time as system_time
+from collections.abc import Callable, Iterator
+from concurrent.futures import Executor, ThreadPoolExecutor
+from contextlib import AbstractContextManager, contextmanager
+from typing import Any, Protocol
+
+
+class Clock(Protocol):
+    """Source of time and of the objects on which threads wait."""
+
+    def monotonic_ns(self) -> int:
+        """Return the monotonic time, ns."""
+
+    def time_ns(self) -> int:
+        """Return the time since 1970, ns."""
+
+    def sleep(self, seconds: float, /) -> None:
+        """Suspend the current thread."""
+
+    def event(self) -> threading.Event:
+        """Return an event that is not set."""
+
+    def queue(self) -> queues.Queue[Any]:
+        """Return an empty queue without a limit."""
+
+    def simple_queue(self) -> queues.SimpleQueue[Any]:
+        """Return an empty queue without a limit."""
+
+    def lock(self) -> AbstractContextManager[Any]:
+        """Return a lock."""
+
+    def thread(self, target: Callable[..., object], name: str, args: tuple[Any, ...]) -> threading.Thread:
+        """Return a daemon thread that has not been started."""
+
+    def pool(self, threads: int, name: str) -> Executor:
+        """Return a pool of threads."""
+
+
+class SystemClock:
+    """The clocks and threads of the operating system."""
+
+    monotonic_ns = staticmethod(system_time.monotonic_ns)
+    time_ns = staticmethod(system_time.time_ns)
+    sleep = staticmethod(system_time.sleep)
+    event = staticmethod(threading.Event)
+    lock = staticmethod(threading.Lock)
+
+    def queue(self) -> queues.Queue[Any]:
+        """Return an empty queue without a limit."""
+        return queues.Queue()
+
+    def simple_queue(self) -> queues.SimpleQueue[Any]:
+        """Return an empty queue without a limit."""
+        return queues.SimpleQueue()
+
+    def thread(self, target: Callable[..., object], name: str, args: tuple[Any, ...]) -> threading.Thread:
+        """Return a daemon thread that has not been started."""
+        return threading.Thread(target=target, name=name, args=args, daemon=True)
+
+    def pool(self, threads: int, name: str) -> Executor:
+        """Return a pool of threads."""
+        return ThreadPoolExecutor(threads, thread_name_prefix=name)
+
+
+class _Here(threading.local):
+    clock: Clock = SystemClock()
+
+
+_here = _Here()
+
+
+@contextmanager
+def use(clock: Clock) -> Iterator[None]:
+    """Let the current thread, and the threads that it starts in this ``with`` block, run by ``clock``."""
+    before, _here.clock = _here.clock, clock
+    try:
+        yield
+    finally:
+        _here.clock = before
+
+
+def current() -> Clock:
+    """Return the clock of the current thread."""
+    return _here.clock
+
+
+def monotonic_ns() -> int:
+    """Return the monotonic time, ns."""
+    return _here.clock.monotonic_ns()
+
+
+def monotonic() -> float:
+    """Return the monotonic time, s."""
+    return _here.clock.monotonic_ns() * 1e-9
+
+
+def perf_counter() -> float:
+    """Return the time for measuring durations, s. In virtual time, computing takes none."""
+    clock = _here.clock
+    return system_time.perf_counter() if clock is _SYSTEM else clock.monotonic_ns() * 1e-9
+
+
+def time_ns() -> int:
+    """Return the time since 1970, ns."""
+    return _here.clock.time_ns()
+
+
+def time() -> float:
+    """Return the time since 1970, s."""
+    return _here.clock.time_ns() * 1e-9
+
+
+def sleep(seconds: float) -> None:
+    """Suspend the current thread."""
+    _here.clock.sleep(seconds)
+
+
+def event() -> threading.Event:
+    """Return a :class:`threading.Event` that is not set."""
+    return _here.clock.event()
+
+
+def queue() -> queues.Queue[Any]:
+    """Return an empty :class:`queues.Queue` without a limit."""
+    return _here.clock.queue()
+
+
+def simple_queue() -> queues.SimpleQueue[Any]:
+    """Return an empty :class:`queues.SimpleQueue`."""
+    return _here.clock.simple_queue()
+
+
+def lock() -> AbstractContextManager[Any]:
+    """Return a :class:`threading.Lock`."""
+    return _here.clock.lock()
+
+
+def thread(target: Callable[..., object], name: str, args: tuple[Any, ...] = ()) -> threading.Thread:
+    """Return a daemon :class:`threading.Thread` that has not been started."""
+    return _here.clock.thread(target, name, args)
+
+
+def pool(threads: int, name: str) -> Executor:
+    """Return a :class:`concurrent.futures.ThreadPoolExecutor`.
+
+    Wait for its jobs with :meth:`concurrent.futures.Future.add_done_callback`; the other methods that wait
+    know no virtual time.
+    """
+    return _here.clock.pool(threads, name)
+
+
+_SYSTEM = _here.clock

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import sys
-import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -12,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from skinnode.cli._options import OtherChannel, OtherInterface, Seconds
+from skinnode.process import clock
 from skinnode.text.words import counted
 
 if TYPE_CHECKING:
@@ -106,12 +106,12 @@ def _preview(hand: HandConfig, scene: Path | None, plot: Path) -> None:
 
 def _watch(fleet: Fleet, wait: Callable[[float], bool], seconds: float | None) -> None:
     """Print a line every second until ``wait`` returns True, time is up, or a node thread has failed."""
-    start = time.monotonic()
+    start = clock.monotonic()
     before = fleet.report()
     silent_until_s = 0.0
     for second in range(1, sys.maxsize):
         due = float(second) if seconds is None else min(second, seconds)
-        if wait(max(0.0, start + due - time.monotonic())) or fleet.failed:
+        if wait(max(0.0, start + due - clock.monotonic())) or fleet.failed:
             return
         now = fleet.report()
         _say(_progress(due, before, now))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections import OrderedDict
 from collections.abc import Callable
 from typing import Final, Protocol
@@ -11,6 +10,7 @@ import numpy as np
 
 from skinnode.config import SimulationConfig
 from skinnode.model.layout import Float, PatchLayout
+from skinnode.process import clock
 from skinnode.protocol.device_time import TIME_STEP_US
 from vcan_sim.scene import Scene
 from vcan_sim.skin.imperfections import EXACT, Imperfections
@@ -164,5 +164,5 @@ def simulated(layout: PatchLayout) -> SimulatedPatch:
     untouched patch.
     """
     source = SimulatedPatch(Scene(layout))
-    source.start(time.monotonic_ns())
+    source.start(clock.monotonic_ns())
     return source

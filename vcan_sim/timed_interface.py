@@ -1,0 +1,201 @@
+"""python-can interface ``timed``: a CAN bus with exact times, in virtual time.
+
+Endpoints that open the same channel under the same virtual clock are stations of one
+:class:`~vcan_sim.timed_bus.TimedBus`. Any program that uses python-can can be one of them.
+"""
+
+from __future__ import annotations
+
+import queue
+from collections.abc import Callable
+from typing import Any, Final, cast
+
+import can
+
+from skinnode.process import clock as process_clock
+from vcan_sim.timed_bus import BitRates, CanFrame, Delivered, Event, StationOptions, TimedBus
+from vcan_sim.virtual_time import VirtualClock
+
+MOST_STATIONS: Final = 64
+"""Maximum number of endpoints that are ever opened on a bus."""
+
+
+class Segment:
+    """One bus and its endpoints.
+
+    Args:
+        channel: Name of the bus.
+        clock: The clock by which it runs.
+        rates: Its bit rates.
+
+    Attributes:
+        listeners: Called with each event on the bus.
+    """
+
+    def __init__(self, channel: str, clock: VirtualClock, rates: BitRates) -> None:
+        self.channel, self.clock, self.rates = channel, clock, rates
+        self.bus = TimedBus([StationOptions()] * MOST_STATIONS, rates)
+        now_ns = clock.now_ns
+        for station in range(MOST_STATIONS):
+            self.bus.disconnect(now_ns, station)
+        self.listeners: list[Callable[[Event], None]] = []
+        self._queues: list[queue.SimpleQueue[can.Message]] = []
+        self._leaving: set[int] = set()
+        self._connected: set[int] = set()
+        self._due_ns: int | None = None
+
+    def join(self) -> int:
+        """Connect a new station and return its number."""
+        station = len(self._queues)
+        if station == MOST_STATIONS:
+            raise can.CanInitializationError(f"{self.channel}: got {station} endpoints, cannot open another")
+        self._queues.append(self.clock.simple_queue())
+        self._connected.add(station)
+        self.bus.connect(self.clock.now_ns, station)
+        return station
+
+    def leave(self, station: int) -> None:
+        """Disconnect a station for good, once its frames have been sent, as a closed socket's are."""
+        self._leaving.add(station)
+        self._disconnect()
+        self._plan()
+
+    def send(self, station: int, frame: CanFrame) -> None:
+        """Hand in a frame."""
+        self.bus.send(self.clock.now_ns, station, frame)
+        self._plan()
+
+    def received(self, station: int) -> queue.SimpleQueue[can.Message]:
+        """Return the queue of frames that a station has received."""
+        return self._queues[station]
+
+    def _plan(self) -> None:
+        due_ns = self.bus.next_event_ns
+        if due_ns is not None and (self._due_ns is None or due_ns < self._due_ns):
+            self._due_ns = due_ns
+            self.clock.call_at(due_ns, self._advance)
+
+    def _advance(self) -> None:
+        self._due_ns = None
+        wall_to_monotonic_ns = self.clock.time_ns() - self.clock.now_ns
+        for event in self.bus.advance(self.clock.now_ns):
+            if isinstance(event, Delivered):
+                frame = event.frame
+                for station in event.receivers:
+                    self._queues[station].put(
+                        can.Message(
+                            timestamp=(event.time_ns + wall_to_monotonic_ns) * 1e-9,
+                            arbitration_id=frame.can_id,
+                            is_extended_id=frame.extended,
+                            is_remote_frame=frame.remote,
+                            is_fd=frame.fd,
+                            bitrate_switch=frame.brs,
+                            dlc=frame.dlc if frame.remote else None,
+                            data=frame.data,
+                            channel=self.channel,
+                        )
+                    )
+            for listener in self.listeners:
+                listener(event)
+        self._disconnect()
+        self._plan()
+
+    def _disconnect(self) -> None:
+        """Disconnect the stations that leave and have nothing to send, or nobody to send it to."""
+        for station in sorted(self._leaving):
+            if not self.bus.waiting(station) or self._connected <= self._leaving:
+                self.bus.clear(self.clock.now_ns, station)
+                self.bus.disconnect(self.clock.now_ns, station)
+                self._leaving.remove(station)
+                self._connected.remove(station)
+
+
+def segment(channel: str, clock: VirtualClock, rates: BitRates) -> Segment:
+    """Return the bus with this name under a clock; the first call makes it.
+
+    Raises:
+        can.CanInitializationError: If the bus has other bit rates.
+    """
+    found = cast(Segment, clock.shared.setdefault(f"bus {channel}", Segment(channel, clock, rates)))
+    if found.rates != rates:
+        raise can.CanInitializationError(f"{channel}: got {rates}, the bus has {found.rates}")
+    return found
+
+
+class TimedInterface(can.BusABC):
+    """Endpoint of a bus in virtual time.
+
+    Args:
+        channel: Name of the bus.
+        can_filters: Filters of received frames, as in python-can.
+        bitrate: Nominal bit rate, bit/s.
+        fd: Whether the bus carries CAN FD frames.
+        data_bitrate: Bit rate of the data phase, bit/s; default: the nominal one.
+        **options: Ignored.
+
+    Raises:
+        can.CanInitializationError: If the thread does not run in virtual time, or the bus has other bit
+            rates.
+    """
+
+    def __init__(
+        self,
+        channel: Any,
+        can_filters: Any = None,
+        bitrate: int = 1_000_000,
+        fd: bool = False,
+        data_bitrate: int | None = None,
+        **options: object,
+    ) -> None:
+        clock = process_clock.current()
+        if not isinstance(clock, VirtualClock):
+            raise can.CanInitializationError(
+                "interface timed: the thread runs in real time, must run in a vcan_sim.VirtualClock"
+            )
+        self.channel_info = f"timed {channel}"
+        rates = BitRates(bitrate, (data_bitrate or bitrate) if fd else None)
+        self._clock, self._segment = clock, segment(str(channel), clock, rates)
+        self._station = self._segment.join()
+        self._received = self._segment.received(self._station)
+        super().__init__(channel, can_filters)
+
+    def send(self, msg: can.Message, timeout: float | None = None) -> None:
+        """Hand in a frame; it is sent when it wins arbitration."""
+        if self._is_shutdown:
+            raise can.CanOperationError(f"{self.channel_info} is closed")
+        if msg.is_error_frame:
+            raise can.CanOperationError(
+                f"{self.channel_info}: got an error frame, must be a data or remote frame"
+            )
+        self._segment.send(
+            self._station,
+            CanFrame(
+                msg.arbitration_id,
+                b"" if msg.is_remote_frame else bytes(msg.data),
+                msg.is_extended_id,
+                msg.is_remote_frame,
+                msg.dlc if msg.is_remote_frame else 0,
+                msg.is_fd,
+                msg.bitrate_switch,
+            ),
+        )
+
+    def recv(self, timeout: float | None = None) -> can.Message | None:
+        """Return the next frame, or None if none arrives within ``timeout`` seconds."""
+        end_ns = None if timeout is None else self._clock.monotonic_ns() + round(timeout * 1e9)
+        while True:
+            if self._is_shutdown:
+                raise can.CanOperationError(f"{self.channel_info} is closed")
+            left_s = None if end_ns is None else max(0.0, (end_ns - self._clock.monotonic_ns()) * 1e-9)
+            try:
+                message = self._received.get(timeout=left_s)
+            except queue.Empty:
+                return None
+            if self._matches_filters(message):
+                return message
+
+    def shutdown(self) -> None:
+        """Leave the bus."""
+        if not self._is_shutdown:
+            self._segment.leave(self._station)
+        super().shutdown()

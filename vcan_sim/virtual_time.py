@@ -1,0 +1,409 @@
+"""Virtual time: a program whose threads run one at a time, by a clock that jumps from event to event.
+
+Each thread of the program is a real thread, but only one runs at any time: it runs until it waits (for an
+event, a queue, a lock, another thread or a time), and then passes the right to run to the thread that was
+made ready first. If no thread is ready, the clock jumps to the next time that a thread waits for. Computing
+takes no virtual time. The same program therefore runs in the same order at the same times, however fast the
+machine is, and a minute of waiting takes no time at all::
+
+    with VirtualClock():
+        with Fleet(hand), skinnode.Host(hand) as host:  # host and nodes on a bus with interface "timed"
+            field = host.next_field(timeout_s=5.0)
+
+What waits outside :mod:`skinnode.process.clock` (a socket, a subprocess, an event of ``threading``) stops the
+whole program until it is over.
+"""
+
+from __future__ import annotations
+
+import functools
+import heapq
+import itertools
+import queue as queues
+import threading
+from collections import deque
+from collections.abc import Callable
+from concurrent.futures import Executor, Future
+from types import TracebackType
+from typing import Any, Final, Self, cast
+
+from skinnode.process import clock
+
+START_NS: Final = 1_000_000_000_000
+"""Monotonic time at which a virtual clock starts, ns."""
+START_WALL_NS: Final = 1_600_000_000_000_000_000
+"""Time since 1970 at which a virtual clock starts, ns: 2020-09-13 12:26:40 UTC."""
+READINGS: Final = 10_000
+"""Maximum number of readings of the time between two waits of a thread."""
+POLL_S: Final = 1e-4
+"""Wait of a thread that polls the time, s."""
+
+
+class Deadlock(RuntimeError):
+    """Every thread waits for another one, and none for a time."""
+
+
+class VirtualClock:
+    """Clock of a program in virtual time, for the ``with`` block of one thread and the threads it starts.
+
+    The program begins with the thread that enters the block. When the block ends, every thread that it
+    started must have ended.
+
+    Attributes:
+        shared: What belongs to the clock, by name: the buses of its programs.
+
+    Raises:
+        Deadlock: From the first thread, where it waits, if every thread waits for another one.
+        RuntimeError: On leaving the block, if threads are left.
+    """
+
+    def __init__(self) -> None:
+        self.shared: dict[str, object] = {}
+        self._now_ns = START_NS
+        self._readings = 0  # of the time, since the running thread was last suspended
+        self._ready: deque[_Turn] = deque()
+        self._timers: list[tuple[int, int, int, _Turn | Callable[[], None]]] = []
+        self._number = itertools.count()
+        self._first = self._running = _Turn("the first thread")
+        self._alive: dict[_Turn, None] = {}
+        self._used: Any = None
+
+    def __enter__(self) -> Self:
+        self._used = clock.use(self)
+        self._used.__enter__()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._used.__exit__(kind, error, trace)
+        if self._alive and error is None:
+            names = ", ".join(repr(turn.name) for turn in self._alive)
+            raise RuntimeError(f"virtual time: threads {names} have not ended")
+
+    # --- time
+
+    @property
+    def now_ns(self) -> int:
+        """Monotonic time, ns, for what does not run in a thread of the program."""
+        return self._now_ns
+
+    def monotonic_ns(self) -> int:
+        """Return the monotonic time, ns.
+
+        A thread that reads the time again and again without waiting waits for it to pass; it is suspended for
+        :data:`POLL_S` at each reading from the :data:`READINGS`-th on.
+        """
+        self._readings += 1
+        if self._readings > READINGS:
+            self.wait(deque(), POLL_S)
+            self._readings = READINGS
+        return self._now_ns
+
+    def time_ns(self) -> int:
+        """Return the time since 1970, ns."""
+        return START_WALL_NS - START_NS + self._now_ns
+
+    def sleep(self, seconds: float, /) -> None:
+        """Suspend the current thread."""
+        if seconds < 0:
+            raise ValueError("sleep length must be non-negative")
+        self.wait(deque(), seconds)
+
+    def call_at(self, t_ns: int, function: Callable[[], None]) -> None:
+        """Call a function at a time, between the turns of the threads. It must not wait.
+
+        Args:
+            t_ns: Monotonic time, ns; a time that is over means now.
+            function: The function.
+        """
+        heapq.heappush(self._timers, (t_ns, next(self._number), 0, function))
+
+    # --- what threads wait for
+
+    def event(self) -> threading.Event:
+        """Return an event that is not set."""
+        return _Event(self)
+
+    def queue(self) -> queues.Queue[Any]:
+        """Return an empty queue without a limit."""
+        return cast("queues.Queue[Any]", _Queue(self))
+
+    def simple_queue(self) -> queues.SimpleQueue[Any]:
+        """Return an empty queue without a limit."""
+        return cast("queues.SimpleQueue[Any]", _Queue(self))
+
+    def lock(self) -> _Lock:
+        """Return a lock."""
+        return _Lock(self)
+
+    def thread(self, target: Callable[..., object], name: str, args: tuple[Any, ...]) -> threading.Thread:
+        """Return a daemon thread that has not been started."""
+        return _Thread(self, target, name, args)
+
+    def pool(self, threads: int, name: str) -> Executor:
+        """Return a pool of threads."""
+        return _Pool(self, threads, name)
+
+    # --- turns
+
+    def wait(self, waiting: deque[_Turn], seconds: float | None) -> bool:
+        """Suspend the current thread until :meth:`wake` is called with the same list, or the time is over.
+
+        Args:
+            waiting: Turns of the threads that wait for the same thing.
+            seconds: Maximum wait, s; None: no limit.
+
+        Returns:
+            Whether the thread was woken.
+        """
+        turn = self._running
+        turn.woken, turn.waiting = False, waiting
+        waiting.append(turn)
+        if seconds is not None:
+            due_ns = self._now_ns + max(0, round(seconds * 1e9))
+            heapq.heappush(self._timers, (due_ns, next(self._number), turn.waits, turn))
+        self._pass_on(turn)
+        return turn.woken
+
+    def wake(self, waiting: deque[_Turn]) -> None:
+        """Make the thread ready that has waited longest."""
+        if waiting:
+            turn = waiting.popleft()
+            turn.woken = True
+            turn.waits += 1
+            self._ready.append(turn)
+
+    def begin(self, turn: _Turn) -> None:
+        """Make a new thread ready."""
+        self._alive[turn] = None
+        self._ready.append(turn)
+
+    def end(self, turn: _Turn) -> None:
+        """Pass the right to run on for good."""
+        del self._alive[turn]
+        self._run(self._next())
+
+    def _pass_on(self, turn: _Turn) -> None:
+        following = self._next()
+        if following is not turn:
+            self._run(following)
+            turn.gate.acquire()
+        if turn is self._first and turn.error is not None:
+            error, turn.error = turn.error, None
+            raise error
+
+    def _run(self, turn: _Turn) -> None:
+        self._running, self._readings = turn, 0
+        turn.gate.release()
+
+    def _next(self) -> _Turn:
+        """Return the turn of the next thread to run; advance the clock if none is ready."""
+        while not self._ready:
+            if not self._timers:
+                names = ", ".join(repr(turn.name) for turn in self._alive)
+                self._first.error = Deadlock(f"virtual time: nothing will happen any more; waiting: {names}")
+                self._first.waits += 1
+                self._first.waiting.remove(self._first)
+                return self._first
+            due_ns, _, waits, what = heapq.heappop(self._timers)
+            if isinstance(what, _Turn):
+                if what.waits != waits:
+                    continue  # woken before
+                what.waits += 1
+                what.waiting.remove(what)
+                self._ready.append(what)
+            self._now_ns = max(self._now_ns, due_ns)
+            if not isinstance(what, _Turn):
+                what()
+        return self._ready.popleft()
+
+
+class _Turn:
+    """The right of one thread to run."""
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+        self.gate = threading.Lock()
+        self.gate.acquire()
+        self.woken = False
+        """Whether the last wait ended because the thread was woken."""
+        self.waiting: deque[_Turn] = deque()
+        """Turns of the threads that wait for the same thing."""
+        self.waits = 0
+        """Number of waits that are over; a timer of an earlier wait is void."""
+        self.error: Exception | None = None
+
+
+class _Event(threading.Event):
+    def __init__(self, of: VirtualClock) -> None:
+        super().__init__()
+        self._of, self._set = of, False
+        self._waiting: deque[_Turn] = deque()
+
+    def is_set(self) -> bool:
+        return self._set
+
+    def set(self) -> None:
+        self._set = True
+        while self._waiting:
+            self._of.wake(self._waiting)
+
+    def clear(self) -> None:
+        self._set = False
+
+    def wait(self, timeout: float | None = None) -> bool:
+        if not self._set:
+            self._of.wait(self._waiting, timeout)
+        return self._set
+
+
+class _Queue:
+    """Queue with the methods of ``queue.Queue`` and ``queue.SimpleQueue``."""
+
+    def __init__(self, of: VirtualClock) -> None:
+        self._of = of
+        self.queue: deque[Any] = deque()
+        self._waiting: deque[_Turn] = deque()
+
+    def put(self, item: Any, block: bool = True, timeout: float | None = None) -> None:
+        self.queue.append(item)
+        self._of.wake(self._waiting)
+
+    def get(self, block: bool = True, timeout: float | None = None) -> Any:
+        if not block:
+            timeout = 0.0
+        elif timeout is not None and timeout < 0:
+            raise ValueError("'timeout' must be a non-negative number")
+        until_ns = None if timeout is None else self._of.monotonic_ns() + round(timeout * 1e9)
+        while not self.queue:
+            if until_ns is None:
+                self._of.wait(self._waiting, None)
+            else:
+                left_ns = until_ns - self._of.monotonic_ns()
+                if left_ns <= 0 or not (self._of.wait(self._waiting, left_ns * 1e-9) or self.queue):
+                    raise queues.Empty
+        return self.queue.popleft()
+
+    def put_nowait(self, item: Any) -> None:
+        self.put(item)
+
+    def get_nowait(self) -> Any:
+        return self.get(block=False)
+
+    def qsize(self) -> int:
+        return len(self.queue)
+
+    def empty(self) -> bool:
+        return not self.queue
+
+
+class _Lock:
+    def __init__(self, of: VirtualClock) -> None:
+        self._of, self._held = of, False
+        self._waiting: deque[_Turn] = deque()
+
+    def acquire(self, blocking: bool = True, timeout: float = -1) -> bool:
+        while self._held:
+            if not blocking or not (self._of.wait(self._waiting, None if timeout < 0 else timeout)):
+                return False
+        self._held = True
+        return True
+
+    def release(self) -> None:
+        if not self._held:
+            raise RuntimeError("release unlocked lock")
+        self._held = False
+        self._of.wake(self._waiting)
+
+    def locked(self) -> bool:
+        return self._held
+
+    def __enter__(self) -> bool:
+        return self.acquire()
+
+    def __exit__(self, *_: object) -> None:
+        self.release()
+
+
+class _Pool(Executor):
+    """Pool with all threads from the start."""
+
+    def __init__(self, of: VirtualClock, threads: int, name: str) -> None:
+        self._jobs: queues.SimpleQueue[tuple[Future[Any], Callable[[], Any]] | None] = of.simple_queue()
+        self._closed = False
+        self._threads = [of.thread(self._run, f"{name} {i}", ()) for i in range(threads)]
+        for thread in self._threads:
+            thread.start()
+
+    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+        if self._closed:
+            raise RuntimeError("cannot schedule new futures after shutdown")
+        future: Future[Any] = Future()
+        self._jobs.put((future, functools.partial(fn, *args, **kwargs)))
+        return future
+
+    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
+        if not self._closed:
+            self._closed = True
+            waiting = []
+            while not self._jobs.empty():
+                waiting.append(self._jobs.get())
+            for job in waiting:
+                if cancel_futures and job is not None:
+                    job[0].cancel()
+                else:
+                    self._jobs.put(job)
+            for _ in self._threads:
+                self._jobs.put(None)
+        if wait:
+            for thread in self._threads:
+                thread.join()
+
+    def _run(self) -> None:
+        while (job := self._jobs.get()) is not None:
+            future, call = job
+            if future.set_running_or_notify_cancel():
+                try:
+                    result = call()
+                except BaseException as error:
+                    future.set_exception(error)
+                else:
+                    future.set_result(result)
+
+
+class _Thread(threading.Thread):
+    def __init__(
+        self, of: VirtualClock, target: Callable[..., object], name: str, args: tuple[Any, ...]
+    ) -> None:
+        super().__init__(target=target, name=name, args=args, daemon=True)
+        self._of, self._turn = of, _Turn(name)
+        self._over = False
+        self._joining: deque[_Turn] = deque()
+
+    def start(self) -> None:
+        super().start()
+        self._of.begin(self._turn)
+        self._of.sleep(0.0)  # a new thread usually runs until it waits before the next statement here
+
+    def run(self) -> None:
+        self._turn.gate.acquire()
+        try:
+            with clock.use(self._of):
+                super().run()
+        finally:
+            self._over = True
+            while self._joining:
+                self._of.wake(self._joining)
+            self._of.end(self._turn)
+
+    def is_alive(self) -> bool:
+        return super().is_alive() and not self._over
+
+    def join(self, timeout: float | None = None) -> None:
+        if self.ident is None:
+            raise RuntimeError("cannot join thread before it is started")
+        if not self._over:
+            self._of.wait(self._joining, timeout)
+        if self._over:
+            super().join()

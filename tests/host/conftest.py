@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import threading
-import time
 import uuid
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing
@@ -16,9 +15,11 @@ from skinnode.config import BusConfig, HandConfig, parse_hand
 from skinnode.model.forward import resistance_ohm
 from skinnode.model.layout import Float
 from skinnode.node import NodeRunner, PatchNode
+from skinnode.process import clock
 from skinnode.protocol.profile import PatchProfile
 from skinnode.transport import CanPort, Frame
 from vcan_sim.fleet import Fleet
+from vcan_sim.virtual_time import VirtualClock
 
 from .processor import ProcessorWait
 
@@ -35,12 +36,24 @@ def nothing_left_running() -> Iterator[None]:
     assert len(os.listdir("/proc/self/fd")) == len(descriptors)
 
 
+@pytest.fixture(autouse=True)
+def virtual_time(request: pytest.FixtureRequest, nothing_left_running: None) -> Iterator[bool]:
+    """Run the test in virtual time, unless other processes or event loops take part in it."""
+    marked = any(request.node.get_closest_marker(name) for name in ("system_time", "vcan"))
+    if marked or "crossing_bus" in request.fixturenames:
+        yield False
+        return
+    with VirtualClock():
+        yield True
+
+
 @pytest.fixture
-def make_hand() -> Callable[..., HandConfig]:
-    """A hand of small patches called p0, p1 … with node-IDs from 5 on, on a virtual bus of its own."""
+def make_hand(virtual_time: bool) -> Callable[..., HandConfig]:
+    """A hand of small patches called p0, p1 … with node-IDs from 5 on, on a bus of its own."""
 
     def make(patches: int = 2, **tables: object) -> HandConfig:
-        bus = {"name": "can0", "interface": "virtual", "channel": uuid.uuid4().hex[:8]}
+        interface = "timed" if virtual_time else "virtual"
+        bus = {"name": "can0", "interface": interface, "channel": uuid.uuid4().hex[:8]}
         listed = [
             {"name": f"p{i}", "node_id": 5 + i, "layout": SMALL, "tolerances": "exact"}
             for i in range(patches)
@@ -90,11 +103,11 @@ def heard(port: CanPort) -> list[Frame]:
 
 def eventually(condition: Callable[[], bool], within_s: float = 10.0) -> bool:
     """Whether ``condition`` comes true in time; waiting for a processor does not count."""
-    end_s, waited = time.monotonic() + within_s, ProcessorWait()
+    end_s, waited = clock.monotonic() + within_s, ProcessorWait()
     while not condition():
-        if time.monotonic() > end_s + waited.seconds():
+        if clock.monotonic() > end_s + waited.seconds():
             return False
-        time.sleep(0.01)
+        clock.sleep(0.01)
     return True
 
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 import random
 import subprocess
 import threading
-import time
 import uuid
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
@@ -20,6 +19,7 @@ import pytest
 from skinnode.config import HandConfig, parse_hand
 from skinnode.errors import NodeTimeout
 from skinnode.host import Condition, Host
+from skinnode.process import clock
 from skinnode.transport import CanPort
 from vcan_sim.faults import NO_FAULTS, Faults
 from vcan_sim.fleet import Fleet
@@ -27,7 +27,7 @@ from vcan_sim.fleet import Fleet
 from .conftest import SMALL
 from .processor import ProcessorWait
 
-pytestmark = pytest.mark.real_time
+pytestmark = [pytest.mark.real_time, pytest.mark.system_time]
 
 SEED = 4
 BACK_S = 1.0
@@ -128,7 +128,7 @@ class Running:
     def suffer(self, wave: tuple[Attack, ...]) -> dict[str, str]:
         """Go through all steps of each attack; the reasons at the end of the longest."""
         longest_s = max(sum(seconds for _, seconds in each.steps) for each in wave)
-        begin_s = time.monotonic()
+        begin_s = clock.monotonic()
         due = []
         for name, each in zip(self.names, wave, strict=False):
             at_s = longest_s - sum(seconds for _, seconds in each.steps)  # all end together
@@ -136,9 +136,9 @@ class Running:
                 due.append((at_s, name, faults))
                 at_s += seconds
         for at_s, name, faults in sorted(due, key=lambda step: step[0]):
-            time.sleep(max(0.0, begin_s + at_s - time.monotonic()))
+            clock.sleep(max(0.0, begin_s + at_s - clock.monotonic()))
             self.fleet.inject(faults, name)
-        time.sleep(max(0.0, begin_s + longest_s - time.monotonic()))
+        clock.sleep(max(0.0, begin_s + longest_s - clock.monotonic()))
         return {name: self.host.health(name).reason for name in self.names}
 
     def assert_back(self, within_s: float = BACK_S) -> float:
@@ -147,12 +147,12 @@ class Running:
         A machine too busy for its nodes, which then skip scans and say so, is a fault of its own: its
         end counts too, for ten seconds at most. Waiting for a processor does not count."""
         processor = ProcessorWait()
-        begin_ns = cause_ns = time.monotonic_ns()
+        begin_ns = cause_ns = clock.monotonic_ns()
         steady_ns: int | None = None
         overruns = self._overruns()
-        while steady_ns is None or time.monotonic_ns() < steady_ns + STEADY_S * 1e9:
+        while steady_ns is None or clock.monotonic_ns() < steady_ns + STEADY_S * 1e9:
             waited = {name: why for name in self.names if (why := self._waited_for(name, begin_ns))}
-            now_ns = time.monotonic_ns()
+            now_ns = clock.monotonic_ns()
             if self._overruns() != overruns and now_ns < begin_ns + 10e9:
                 overruns, cause_ns = self._overruns(), now_ns
             if waited:
@@ -160,7 +160,7 @@ class Running:
                 assert now_ns < cause_ns + (within_s + processor.seconds()) * 1e9, waited
             elif steady_ns is None:
                 steady_ns = now_ns
-            time.sleep(0.01)
+            clock.sleep(0.01)
         return (steady_ns - begin_ns) * 1e-9
 
     def _overruns(self) -> int:
@@ -209,7 +209,7 @@ def running(nothing_left_running: None) -> Iterator[Running]:
             it = Running(fleet, host)
             it.assert_back(5.0)
             yield it
-        time.sleep(0.1)  # what the host sent last is heard
+        clock.sleep(0.1)  # what the host sent last is heard
     for patch in hand.patches:
         assert fleet.tally(patch.name).discrepancies() == []
 
@@ -227,7 +227,7 @@ def test_patches_are_back_within_a_second(running: Running, wave: tuple[Attack, 
 @pytest.mark.parametrize("off_s", [0.05, 0.2, 1.5])
 def test_bus_off(running: Running, off_s: float) -> None:
     running.fleet.bus_off("can0", off=True)
-    time.sleep(off_s)
+    clock.sleep(off_s)
     running.fleet.bus_off("can0", off=False)
     running.assert_back()
 
@@ -236,7 +236,7 @@ def test_bus_off(running: Running, off_s: float) -> None:
 def test_a_stranger_stops_or_resets_a_node(running: Running, command: int) -> None:
     with CanPort(running.host.hand.buses[0]) as stranger:
         stranger.send(0, bytes([command, 5]))
-        time.sleep(0.02)
+        clock.sleep(0.02)
         running.assert_back()
 
 
@@ -244,7 +244,7 @@ def test_a_second_node_with_the_same_id_comes_and_goes(running: Running) -> None
     table = running.host.hand.model_dump(mode="json")
     twin = parse_hand({**table, "patches": table["patches"][:1], "buses": table["buses"][:1]})
     with Fleet(twin):
-        time.sleep(1.0)
+        clock.sleep(1.0)
         assert running.host.health("p0").reason
     running.assert_back()
 
@@ -282,8 +282,8 @@ def test_a_node_that_lost_its_configuration_is_configured_again(make_hand: Calla
         running.assert_back(5.0)
         for request in ("23 06 10 00 00 00 00 00", "2F 19 10 00 00 00 00 00"):  # 0x1006 = 0, 0x1019 = 0
             other.send(0x605, bytes.fromhex(request))
-            time.sleep(0.05)
-        time.sleep(0.2)
+            clock.sleep(0.05)
+        clock.sleep(0.2)
         running.assert_back(1.5)  # from the last scan on; it is missed after 0.4 s
         assert host.stats().nodes["p0"].rejoins == 1
         assert host.stats().nodes["p1"].rejoins == 0
@@ -302,14 +302,14 @@ def test_an_interface_goes_down_and_up_in_the_kernel() -> None:
         brought_up_s = 0.0
         for _ in range(2):
             stranger.send(0, bytes([0x82, 0]))
-            time.sleep(0.1)
+            clock.sleep(0.1)
             brought_up_s = max(brought_up_s, running.assert_back(10.0))
         stranger.close()
         for down_s in (0.2, 0.5, 1.2, 3.0, 0.2, 0.8):
-            time.sleep(chance.uniform(0.0, 0.3))
+            clock.sleep(chance.uniform(0.0, 0.3))
             try:
                 subprocess.run(["ip", "link", "set", "vcan0", "down"], check=True)
-                time.sleep(down_s)
+                clock.sleep(down_s)
             finally:
                 subprocess.run(["ip", "link", "set", "vcan0", "up"], check=True)
             running.assert_back(brought_up_s + BACK_S)

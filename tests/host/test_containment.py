@@ -4,8 +4,6 @@ long as it lasts: the others do not notice, and it comes back by itself."""
 from __future__ import annotations
 
 import logging
-import threading
-import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -25,6 +23,7 @@ from skinnode.host.remote_node import RemoteNode
 from skinnode.host.retry_pause import Pause
 from skinnode.host.scan_solver import ScanSolver
 from skinnode.host.supervisor import Supervisor
+from skinnode.process import clock
 from skinnode.protocol.assembler import ScanAssembler
 from skinnode.record import Recorder
 from skinnode.transport import CanPort, Frame
@@ -53,7 +52,7 @@ class Broken:
 
 def streams(host: Host, patch: str) -> bool:
     """Whether a field of a scan that begins from now on comes."""
-    since_ns = time.monotonic_ns()
+    since_ns = clock.monotonic_ns()
 
     def came() -> bool:
         field = host.latest(patch)
@@ -96,7 +95,7 @@ def test_a_lost_summary_and_then_the_end_of_the_block_read_that_follows(
     hand: HandConfig, rack_of: Callable[[HandConfig], Rack]
 ) -> None:
     rack, lost = rack_of(hand), list[bytes]()
-    armed = threading.Event()
+    armed = clock.event()
 
     def lets_through(can_id: int, data: bytes) -> bool:
         if not armed.is_set():
@@ -289,7 +288,10 @@ def test_a_bus_whose_receiving_is_defective_is_opened_again(
             return super().recv_batch(timeout_s, most)
 
     table = make_hand().model_dump(mode="json")
-    table["buses"] = [{"name": f"can{i}", "channel": f"{table['buses'][0]['channel']}-{i}"} for i in range(2)]
+    table["buses"] = [
+        {"name": f"can{i}", "interface": "timed", "channel": f"{table['buses'][0]['channel']}-{i}"}
+        for i in range(2)
+    ]
     made = {"layout": SMALL, "tolerances": "exact"}
     table["patches"] = [{"name": f"p{i}", "node_id": 5, "bus": f"can{i}", **made} for i in range(2)]
     hand = parse_hand(table)
@@ -367,7 +369,7 @@ def test_pauses_grow_to_a_second_and_begin_anew_after_a_second_of_success(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     now_s = [100.0]
-    monkeypatch.setattr(retry_pause.time, "monotonic", lambda: now_s[0])
+    monkeypatch.setattr(retry_pause.clock, "monotonic", lambda: now_s[0])
     pause, pauses = Pause(), []
     for _ in range(6):
         pauses.append(pause.next_s())

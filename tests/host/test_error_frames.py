@@ -39,6 +39,7 @@ def test_states_of_a_controller_as_linux_tells_them(
     assert losses_of_bus(stats)["error_frames"].startswith(f"{len(told)} error frame")
 
 
+@pytest.mark.system_time
 def test_an_error_frame_is_a_fault_of_the_bus(hand: HandConfig, fleet: Fleet) -> None:
     bus = hand.buses[0]
     with Host.from_config(hand) as host, can.Bus(interface="virtual", channel=bus.channel) as driver:

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import logging
-import threading
 from collections.abc import Mapping
 from dataclasses import replace
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -18,6 +16,7 @@ from skinnode.host.events import Events, EventSubscription, HealthEvent
 from skinnode.host.health import BusHealth, Condition, PatchHealth
 from skinnode.host.health_watch import HealthWatch
 from skinnode.host.wire_faults import WireFault, WireState
+from skinnode.process import clock
 from skinnode.transport.bus_state import BusState
 
 PATCH = PatchHealth(
@@ -146,8 +145,8 @@ def test_a_counter_that_keeps_growing_is_reported_once_a_second(
     hand: HandHealth, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """By all that it grew meanwhile."""
-    now_ns, looked = [10**12], threading.Event()
-    monkeypatch.setattr(watch_module, "time", SimpleNamespace(monotonic_ns=lambda: now_ns[0]))
+    now_ns, looked = [10**12], clock.event()
+    monkeypatch.setattr(watch_module.clock, "monotonic_ns", lambda: now_ns[0])
     monkeypatch.setattr(watch_module, "_CHECK_S", 0.001)
 
     def look() -> None:

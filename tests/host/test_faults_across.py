@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import socket
 import struct
-import time
 from collections.abc import Callable, Iterator
 
 import pytest
@@ -12,6 +11,7 @@ import pytest
 from skinnode.config import BusConfig, HandConfig
 from skinnode.host import Condition, Host
 from skinnode.host.accounting import discrepancies
+from skinnode.process import clock
 from skinnode.protocol.scan import AssemblerStats
 from vcan_sim.faults import NO_FAULTS, Faults, Injected
 from vcan_sim.fleet import Fleet
@@ -59,7 +59,7 @@ class Suffers:
 
     def is_back(self) -> None:
         """Within a second."""
-        since_ns = time.monotonic_ns()
+        since_ns = clock.monotonic_ns()
 
         def streams() -> bool:
             field = self.host.latest("p0")

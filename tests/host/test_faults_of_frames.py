@@ -25,8 +25,6 @@ from vcan_sim.fleet import Fleet
 from .conftest import eventually
 from .tagged import Tags
 
-pytestmark = pytest.mark.real_time
-
 SCANS = 40
 """How many scans suffer; the pace is one in 25 ms."""
 

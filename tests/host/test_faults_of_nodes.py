@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import threading
-import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 
@@ -13,14 +11,13 @@ from skinnode.config import HandConfig
 from skinnode.host import Condition, Host, nmt_master
 from skinnode.host.accounting import discrepancies
 from skinnode.host.events import EventSubscription, HealthEvent
+from skinnode.process import clock
 from skinnode.transport import CanPort
 from vcan_sim.faults import NO_FAULTS, Faults
 from vcan_sim.fleet import Fleet
 
 from .conftest import eventually, heard
 from .tagged import Tags
-
-pytestmark = pytest.mark.real_time
 
 BACK_S = 1.0
 """How soon the stream must be back after the cause has gone."""
@@ -52,7 +49,7 @@ class Hand:
 
     def well_again(self) -> bool:
         """Whether a scan solved comes within a second from now."""
-        since_ns = time.monotonic_ns()
+        since_ns = clock.monotonic_ns()
 
         def streams() -> bool:
             field = self.host.latest("p0")
@@ -256,6 +253,7 @@ def test_second_producer_of_sync(running: Hand) -> None:
     assert running.well_again()
 
 
+@pytest.mark.system_time
 def test_stuck_receiver_costs_nobody_else(running: Hand, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("skinnode.transport.port.VIRTUAL_QUEUE_FRAMES", 16)
     with CanPort(running.host.hand.buses[0]):  # nobody reads it
@@ -311,7 +309,7 @@ def test_loop_over_events_ends_with_the_host(make_hand: Callable[..., HandConfig
     with Fleet(hand), Host.from_config(hand) as host:
         seen: list[HealthEvent] = []
         events = host.events()
-        reader = threading.Thread(target=lambda: seen.extend(events))
+        reader = clock.thread(lambda: seen.extend(events), "reader")
         reader.start()
     reader.join(10)
     assert not reader.is_alive()

@@ -21,8 +21,6 @@ from vcan_sim.fleet import Fleet
 
 from .conftest import SMALL, eventually
 
-pytestmark = pytest.mark.real_time
-
 PRESSED_M = 5e-5
 """Depth from which a press is under way: a twelfth of its final depth."""
 IN_FLIGHT = 3
@@ -86,7 +84,7 @@ def road() -> Callable[..., AbstractContextManager[Road]]:
     def pressed(noise: float, faults: Faults = NO_FAULTS) -> Iterator[Road]:
         hand = parse_hand(
             {
-                "buses": [{"name": "can0", "interface": "virtual", "channel": uuid.uuid4().hex[:8]}],
+                "buses": [{"name": "can0", "interface": "timed", "channel": uuid.uuid4().hex[:8]}],
                 "patches": [{"name": "p0", "node_id": 5, "layout": SMALL, "relative_noise": noise}],
                 "sync": {"period_ms": 50},
                 "simulation": {"cycle_s": 16.0, "depth": 0.3, "converter_noise": noise},

@@ -248,7 +248,6 @@ def take(frames: HandSubscription, count: int) -> list[HandFrame]:
     return list(itertools.islice(frames, count))
 
 
-@pytest.mark.real_time
 def test_of_a_running_hand(hand: HandConfig, fleet: Fleet) -> None:
     with Host.from_config(hand) as host:
         frames = take(host.hands(timeout_s=10), 10)
@@ -259,6 +258,7 @@ def test_of_a_running_hand(hand: HandConfig, fleet: Fleet) -> None:
         assert {one.stamp.t_sync_ns for one in frame.fields.values() if one.stamp} == {frame.t_sync_ns}
 
 
+@pytest.mark.system_time
 @pytest.mark.real_time
 def test_one_after_the_other_as_async_for(hand: HandConfig, fleet: Fleet) -> None:
     async def gather(host: Host) -> list[HandFrame]:
@@ -308,7 +308,9 @@ def test_a_hand_of_two_masters_has_none(
     """The host on one bus, the robot on the other: their SYNCs have nothing to do with each other."""
     table = make_hand().model_dump(mode="json")
     channel = table["buses"][0]["channel"]
-    table["buses"] = [{"name": f"can{i}", "channel": f"{channel}-{i}"} for i in range(2)]
+    table["buses"] = [
+        {"name": f"can{i}", "interface": "timed", "channel": f"{channel}-{i}"} for i in range(2)
+    ]
     table["buses"][1] |= {"role": "guest", "guest_sends": "sdo"}
     table["patches"][1]["bus"] = "can1"
     hand = parse_hand(table)

@@ -8,7 +8,6 @@ import signal
 import subprocess
 import sys
 import threading
-import time
 import tomllib
 import uuid
 from collections.abc import Callable, Iterator
@@ -22,6 +21,7 @@ from skinnode.cli._host_report import faults_and_notes, final_state_text, operat
 from skinnode.cli.main import main
 from skinnode.config import BusConfig, HandConfig, load_hand, parse_hand
 from skinnode.host import Host
+from skinnode.process import clock
 from skinnode.transport import CanPort
 from skinnode.transport.receiver import drain
 from vcan_sim.command import _too_slow
@@ -30,6 +30,8 @@ from vcan_sim.fleet import Fleet
 from vcan_sim.sensor import SimulatedPatch
 
 from .conftest import SMALL, eventually
+
+pytestmark = pytest.mark.system_time
 
 TWO_ROLES: Any = {
     "buses": [
@@ -337,7 +339,7 @@ class Busy:
 
     def read(self, t_ns: int) -> Any:
         busy_s, self.busy_s = self.busy_s, 0.0
-        time.sleep(busy_s)
+        clock.sleep(busy_s)
         return self._patch.read(t_ns)
 
 

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import random
 import threading
-import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
@@ -24,11 +23,14 @@ from skinnode.errors import BusError, SkinError
 from skinnode.host import Host, supervisor
 from skinnode.host.containment import Defects
 from skinnode.host.sdo_streams import Client
+from skinnode.process import clock
 from skinnode.record import Recorder
 from skinnode.transport import CanPort, Frame
 
 from .conftest import SMALL, Rack
 from .injector import Edge, Injector, kind_of
+
+pytestmark = pytest.mark.system_time
 
 SAMPLE: Final = 12
 LONGEST_S: Final = 20.0
@@ -96,21 +98,21 @@ class Bench:
 
     def all_stream(self, within_s: float = BACK_S) -> bool:
         """Whether each patch gives a field of a scan that begins from now on, and runs."""
-        since_ns, end_s = time.monotonic_ns(), time.monotonic() + within_s
-        while time.monotonic() < end_s:
+        since_ns, end_s = clock.monotonic_ns(), clock.monotonic() + within_s
+        while clock.monotonic() < end_s:
             fields = [self.host.latest(patch.name) for patch in self.host.hand.patches]
             stamps = [field.stamp for field in fields if field is not None and field.stamp is not None]
             running = all(node.phase == "running" for node in self.host.stats().nodes.values())
             if running and len(stamps) == 4 and all(stamp.t_sync_ns > since_ns for stamp in stamps):
                 return True
-            time.sleep(0.02)
+            clock.sleep(0.02)
         return False
 
     def wait_for(self, stimulus: str) -> None:
         """Until its consequences are over."""
-        end_s = time.monotonic() + 0.4
-        while time.monotonic() < end_s:
-            time.sleep(0.02)
+        end_s = clock.monotonic() + 0.4
+        while clock.monotonic() < end_s:
+            clock.sleep(0.02)
         assert self.all_stream()
 
 
@@ -125,9 +127,9 @@ def bench(hand: HandConfig, rack: Rack, injector: Injector, folder: Path) -> Ite
             running = Bench(host, recorder, outsider, injector)
             assert running.all_stream()
             yield running
-            begin_s = time.monotonic()
+            begin_s = clock.monotonic()
             stack.close()
-        assert time.monotonic() - begin_s < BACK_S
+        assert clock.monotonic() - begin_s < BACK_S
     assert not [thread.name for thread in threading.enumerate() if kind_of(thread.name)]
 
 
@@ -239,9 +241,9 @@ def inject(running: Bench, edge: Edge, stimulus: str, skip: int, times: int) -> 
         running.stimuli[stimulus]()
     except SkinError as error:
         return f"{stimulus}: {error}"
-    end_s = time.monotonic() + REACHED_S
-    while running.injector.armed is not None and time.monotonic() < end_s:
-        time.sleep(0.005)
+    end_s = clock.monotonic() + REACHED_S
+    while running.injector.armed is not None and clock.monotonic() < end_s:
+        clock.sleep(0.005)
     running.injector.disarm()
     fired = running.injector.fired
     if not running.all_stream():
@@ -288,10 +290,10 @@ def test_an_exception_at_any_call_costs_what_it_was_made_for(
     todo = [(edge, times) for edge in candidates for times in ((1, 3) if every else (lot.choice((1, 3)),))]
     del todo[len(todo) if every else SAMPLE :]
     wrong: list[str] = []
-    end_s = time.monotonic() + (float("inf") if every else LONGEST_S)
-    while todo and time.monotonic() < end_s:  # a bench goes on until something is wrong
+    end_s = clock.monotonic() + (float("inf") if every else LONGEST_S)
+    while todo and clock.monotonic() < end_s:  # a bench goes on until something is wrong
         with closing_noted(wrong), bench(four, rack, injector, tmp_path / str(len(todo))) as running:
-            while todo and time.monotonic() < end_s:
+            while todo and clock.monotonic() < end_s:
                 edge, times = todo.pop()
                 stimulus, count = edges[edge]
                 problem = inject(running, edge, stimulus, lot.randrange(min(3, count)), times)

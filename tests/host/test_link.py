@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import itertools
 import queue
-import threading
-import time
 from collections.abc import Callable, Sequence
 
 import pytest
@@ -18,6 +16,7 @@ from skinnode.host.containment import Defects
 from skinnode.host.dispatcher import Dispatcher
 from skinnode.host.link import BusLink
 from skinnode.host.mainline import Mainline
+from skinnode.process import clock
 from skinnode.transport import CanPort, Frame
 from skinnode.transport.receiver import GATHER_NS
 
@@ -29,7 +28,7 @@ def fail(error: SkinError) -> None:
 
 
 def test_frames_go_to_their_handlers_in_order(hand: HandConfig, listener: CanPort) -> None:
-    got: queue.SimpleQueue[tuple[str, bytes]] = queue.SimpleQueue()
+    got: queue.SimpleQueue[tuple[str, bytes]] = clock.simple_queue()
     handlers = {
         0x185: lambda data, t_ns: got.put(("a", data)),
         0x186: lambda data, t_ns: got.put(("b", data)),
@@ -61,8 +60,8 @@ def test_defect_of_a_handler_costs_its_frame_and_is_reported_once(
     hand: HandConfig, listener: CanPort
 ) -> None:
     """Whatever else is in the same batch goes to its handlers."""
-    failures: queue.SimpleQueue[SkinError] = queue.SimpleQueue()
-    got: queue.SimpleQueue[bytes] = queue.SimpleQueue()
+    failures: queue.SimpleQueue[SkinError] = clock.simple_queue()
+    got: queue.SimpleQueue[bytes] = clock.simple_queue()
 
     def broken(data: bytes, t_ns: int) -> None:
         raise ZeroDivisionError("by zero")
@@ -124,8 +123,8 @@ def test_a_batch_and_the_pollers_go_on_after_a_defect() -> None:
 
 
 def test_a_listener_that_raises_costs_no_frame(hand: HandConfig, listener: CanPort) -> None:
-    got: queue.SimpleQueue[bytes] = queue.SimpleQueue()
-    batches: queue.SimpleQueue[int] = queue.SimpleQueue()
+    got: queue.SimpleQueue[bytes] = clock.simple_queue()
+    batches: queue.SimpleQueue[int] = clock.simple_queue()
 
     def broken(frames: Sequence[Frame]) -> None:
         raise ZeroDivisionError("of ours")
@@ -156,7 +155,7 @@ def test_a_load_that_cannot_be_measured_is_tried_again_ever_more_seldom(
 ) -> None:
     """The mainline would spend its time on it, for it turns with each batch of frames."""
     now_s, due_s = [100.0], list[float]()
-    monkeypatch.setattr(containment.time, "monotonic", lambda: now_s[0])
+    monkeypatch.setattr(containment.clock, "monotonic", lambda: now_s[0])
     with BusLink(hand.buses[0], {}, lambda error: None) as link:
 
         def broken(now_ns: int) -> None:
@@ -174,8 +173,8 @@ def test_a_load_that_cannot_be_measured_is_tried_again_ever_more_seldom(
 
 
 def test_a_defect_on_one_bus_is_told_once_and_the_other_goes_on(hand: HandConfig) -> None:
-    failures: queue.SimpleQueue[SkinError] = queue.SimpleQueue()
-    got: queue.SimpleQueue[bytes] = queue.SimpleQueue()
+    failures: queue.SimpleQueue[SkinError] = clock.simple_queue()
+    got: queue.SimpleQueue[bytes] = clock.simple_queue()
 
     def broken(data: bytes, t_ns: int) -> None:
         raise ZeroDivisionError("by zero")
@@ -196,7 +195,7 @@ def test_a_defect_on_one_bus_is_told_once_and_the_other_goes_on(hand: HandConfig
 
 
 def test_an_interface_that_takes_long_to_open_again_holds_up_no_other_bus(hand: HandConfig) -> None:
-    opening, go = threading.Event(), threading.Event()
+    opening, go = clock.event(), clock.event()
 
     class Slow(CanPort):
         def recv_batch(self, timeout_s: float, most: int = 1) -> list[Frame]:
@@ -209,7 +208,7 @@ def test_an_interface_that_takes_long_to_open_again_holds_up_no_other_bus(hand: 
             go.wait(10)
             super().reopen()
 
-    got: dict[str, queue.SimpleQueue[bytes]] = {"a": queue.SimpleQueue(), "b": queue.SimpleQueue()}
+    got: dict[str, queue.SimpleQueue[bytes]] = {"a": clock.simple_queue(), "b": clock.simple_queue()}
     one, other = two_buses(hand)
     with (
         CanPort(one) as to_one,
@@ -248,20 +247,21 @@ def test_the_mainline_ends_while_an_interface_is_away(hand: HandConfig) -> None:
         assert link.stats().outages == 1
 
 
+@pytest.mark.system_time  # one bus is to be busy, not overloaded
 def test_time_goes_on_for_a_silent_bus_while_another_is_busy(hand: HandConfig) -> None:
     """What a scan on it lacks is not waited for until the other falls silent."""
     one, other = two_buses(hand)
-    told: queue.SimpleQueue[int] = queue.SimpleQueue()
+    told: queue.SimpleQueue[int] = clock.simple_queue()
     with CanPort(one) as to_one, BusLink(one, {}, fail) as busy, BusLink(other, {}, fail) as silent:
         silent.poll_with(told.put)
         with Mainline([busy, silent]):
-            begin_ns = time.monotonic_ns()
-            end_s, newest_ns = time.monotonic() + 10, 0
-            while newest_ns < begin_ns and time.monotonic() < end_s:
+            begin_ns = clock.monotonic_ns()
+            end_s, newest_ns = clock.monotonic() + 10, 0
+            while newest_ns < begin_ns and clock.monotonic() < end_s:
                 to_one.send(0x185, b"")
                 while not told.empty():
                     newest_ns = told.get()
-    assert begin_ns < newest_ns <= time.monotonic_ns()
+    assert begin_ns < newest_ns <= clock.monotonic_ns()
 
 
 def test_the_time_up_to_which_frames_were_dealt_out_never_goes_back(hand: HandConfig) -> None:
@@ -277,14 +277,14 @@ def test_the_time_up_to_which_frames_were_dealt_out_never_goes_back(hand: HandCo
 def test_whoever_asks_is_answered_as_soon_as_if_no_scan_were_expected(hand: HandConfig) -> None:
     """A SYNC asks for no answer, for it is known when scans come."""
     with BusLink(hand.buses[0], {}, fail) as link:
-        far_ns = time.monotonic_ns() + 1_000_000_000
+        far_ns = clock.monotonic_ns() + 1_000_000_000
         link.expect("thumb", (far_ns,))
         link.send(0x80, b"\x01")
-        now_ns = time.monotonic_ns()
+        now_ns = clock.monotonic_ns()
         link.intake.gather(now_ns)
         assert link.intake.due_ns > now_ns + 1.5 * GATHER_NS
         link.send(0x605, bytes(8))
-        now_ns = time.monotonic_ns()
+        now_ns = clock.monotonic_ns()
         link.intake.gather(now_ns)
         assert link.intake.due_ns <= now_ns + 1.5 * GATHER_NS
 
@@ -301,7 +301,7 @@ def test_the_load_of_each_bus_is_measured_though_in_turn(hand: HandConfig) -> No
         for _ in range(20):
             to_one.send(0x185, bytes(8))
             to_other.send(0x186, b"")
-            time.sleep(0.01)
+            clock.sleep(0.01)
         assert eventually(lambda: a.stats().bits == 20 * exact_bits(0x185, bytes(8)))
         assert eventually(lambda: b.stats().bits == 20 * exact_bits(0x186, b""))
 
@@ -367,7 +367,7 @@ def test_short_sdo_answer_is_rejected_and_the_next_one_counts(hand: HandConfig, 
 
 
 def test_listener_gets_frames_of_all_kinds(hand: HandConfig, listener: CanPort) -> None:
-    got: queue.SimpleQueue[tuple[int, bytes, bool]] = queue.SimpleQueue()
+    got: queue.SimpleQueue[tuple[int, bytes, bool]] = clock.simple_queue()
 
     def note(frames: Sequence[Frame]) -> None:
         for frame in frames:

@@ -11,6 +11,7 @@ from skinnode.canopen import indices as od
 from skinnode.canopen.lss import NOT_CONFIGURED, LssAddress, LssCommand
 from skinnode.host.lss_master import ANSWER_S, LssFailed, LssMaster
 from skinnode.node.lss import LssSlave
+from skinnode.process import clock
 
 LATE_S = 1.5 * ANSWER_S
 
@@ -30,7 +31,7 @@ class Line:
         """Commands whose next answer comes late."""
         self.late_s = LATE_S
         self.resets: list[bytes] = []
-        self._timers: list[threading.Timer] = []
+        self._timers: list[threading.Thread] = []
 
     def _send(self, can_id: int, data: bytes) -> None:
         if can_id == od.NMT_COB_ID:
@@ -44,11 +45,15 @@ class Line:
                 continue
             if data[0] in self.late:
                 self.late.discard(data[0])
-                timer = threading.Timer(self.late_s, self.master.on_response, (answer, 0))
+                timer = clock.thread(self._answer_late, "late answer", (answer,))
                 timer.start()
                 self._timers.append(timer)
             else:
                 self.master.on_response(answer, 0)
+
+    def _answer_late(self, answer: bytes) -> None:
+        clock.sleep(self.late_s)
+        self.master.on_response(answer, 0)
 
     def close(self) -> None:
         for timer in self._timers:

@@ -12,8 +12,6 @@ from vcan_sim.fleet import Fleet
 
 from .conftest import eventually
 
-pytestmark = pytest.mark.real_time
-
 SCANS = 200
 OF_THE_MACHINE = {"emergencies", "faulty", "stale", "operational"}
 """A simulator that is held up by other work is stale, and says that it skipped a scan (EMCY 0x8110)."""

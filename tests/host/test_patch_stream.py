@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from types import SimpleNamespace
@@ -24,6 +23,7 @@ from skinnode.model.forward import resistance_ohm
 from skinnode.model.frames import FieldFrame, ScanStamp, SolveStats
 from skinnode.model.layout import PatchLayout
 from skinnode.model.status import Status
+from skinnode.process import clock
 from skinnode.protocol.assembler import ScanAssembler
 from skinnode.protocol.chunk import pack_scan
 from skinnode.protocol.codes import CodeScale, encode
@@ -45,7 +45,7 @@ class Stub:
     """Stands for the solver: waits until it is let go, or fails."""
 
     def __init__(self) -> None:
-        self.entered, self.go = threading.Event(), threading.Event()
+        self.entered, self.go = clock.event(), clock.event()
         self.error: Exception | None = None
         self.facts = SimpleNamespace(checked=False)
 

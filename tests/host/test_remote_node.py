@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import threading
-import time
 from collections.abc import Callable
 
 import pytest
@@ -12,19 +10,19 @@ from skinnode.canopen.indices import LSS_REQUEST_COB_ID
 from skinnode.config import HandConfig, parse_hand
 from skinnode.errors import BusError, NodeError
 from skinnode.host import Condition, Host
+from skinnode.process import clock
 from skinnode.transport import CanPort
 
 from .conftest import Rack, eventually, heard
 
 
-@pytest.mark.real_time
 def test_a_node_that_sends_scans_is_asked_nothing(hand: HandConfig, rack: Rack, listener: CanPort) -> None:
     """Its configuration is read back only if its scans stop: see 0.4 s in the remote node."""
     with Host.from_config(hand) as host:
         assert eventually(lambda: all(patch.solved > 2 for patch in host.stats().patches.values()))
         for _ in range(10):
             heard(listener)
-            time.sleep(0.7)
+            clock.sleep(0.7)
             traffic = {frame.can_id for frame in heard(listener)}
             if not {0x085, 0x086} & traffic:  # a node that was too slow for its scans is asked for its errors
                 break
@@ -33,12 +31,11 @@ def test_a_node_that_sends_scans_is_asked_nothing(hand: HandConfig, rack: Rack, 
         assert {name: defects.count for name, defects in host.stats().defects.items() if defects.count} == {}
 
 
-@pytest.mark.real_time
 def test_the_configuration_of_a_node_that_sends_no_scan_is_read_back_once_a_second(
     hand: HandConfig, rack_of: Callable[[HandConfig], Rack], listener: CanPort
 ) -> None:
     """It is as it was set, so nothing is to be done about it."""
-    rack, mute = rack_of(hand), threading.Event()
+    rack, mute = rack_of(hand), clock.event()
     rack.plug("p0", lets_through=lambda can_id, data: not (mute.is_set() and can_id in (0x185, 0x285)))
     rack.plug("p1")
     with Host.from_config(hand) as host:
@@ -53,7 +50,7 @@ def test_the_configuration_of_a_node_that_sends_no_scan_is_read_back_once_a_seco
 
         overflow = bytes.fromhex("40 19 10 00 00 00 00 00")
         assert eventually(lambda: overflow in reads())
-        time.sleep(0.7)
+        clock.sleep(0.7)
         assert reads().count(overflow) == 1
         assert {data[0] for data in read} == {0x40}  # nothing is written
         assert host.stats().nodes["p0"].rejoins == 0
@@ -103,6 +100,6 @@ def test_a_node_that_left_operational_is_not_tared(hand: HandConfig, rack: Rack)
     """It would not hear the command."""
     with Host.from_config(hand) as host:
         assert host.fields(timeout_s=10, patch="p0").get(10) is not None
-        host._nodes["p0"].monitor.on_heartbeat(b"\x7f", time.monotonic_ns())
+        host._nodes["p0"].monitor.on_heartbeat(b"\x7f", clock.monotonic_ns())
         with pytest.raises(NodeError, match=r"patch 'p0' on can0: not tared: it is not operational$"):
             host.tare("p0", deadline_s=0.0)

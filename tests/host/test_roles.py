@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import functools
 import logging
-import threading
-import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -23,6 +21,7 @@ from skinnode.host.accounting import discrepancies
 from skinnode.host.sync import SyncProducer, Ticks
 from skinnode.model.layout import PatchLayout
 from skinnode.node import NmtState
+from skinnode.process import clock
 from skinnode.protocol.profile import PatchProfile
 from skinnode.transport import CanPort
 
@@ -91,7 +90,7 @@ def test_a_guest_that_sends_nothing_learns_by_the_flag_who_sends_checks(
     hand: HandConfig, rack_of: Callable[[HandConfig], Rack], tmp_path: Path, listener: CanPort
 ) -> None:
     """p1 is of revision 1.0. Summaries of both are lost from some time on."""
-    lost = threading.Event()
+    lost = clock.event()
 
     def lets_through(can_id: int, data: bytes) -> bool:
         return not (lost.is_set() and can_id & 0x780 == 0x280)
@@ -138,7 +137,7 @@ def test_a_guest_that_joins_while_patches_run_tears_no_scan(
         assert eventually(lambda: {n.nmt_state for n in rack.nodes.values()} == {NmtState.OPERATIONAL})
         while tries < 8 or (joined == 0 and tries < 40):  # whether it comes during a scan depends on chance
             tries += 1
-            time.sleep(tries * 0.0618 % 0.1)  # at another phase of SYNC: each try ends with a scan
+            clock.sleep(tries * 0.0618 % 0.1)  # at another phase of SYNC: each try ends with a scan
             with Host.from_config(hand) as host:
                 take(host.fields(timeout_s=10), 4)
                 assert eventually(functools.partial(all_operational, host))

@@ -43,7 +43,7 @@ def test_a_node_is_not_late_while_the_machine_of_the_host_stands_still(
         node.naps -= 1
 
     clock = SimpleNamespace(sleep=nap, monotonic=lambda: now_s[0], monotonic_ns=lambda: round(now_s[0] * 1e9))
-    monkeypatch.setattr(start, "time", clock)
+    monkeypatch.setattr(start, "clock", clock)
     start.start_all({node: None})  # type: ignore[dict-item]
     node.naps = 10_000
     with pytest.raises(NodeTimeout, match="got NMT state 127 after the start command"):

@@ -17,6 +17,7 @@ from skinnode.errors import BusError, NodeTimeout
 from skinnode.host import Host
 from skinnode.host.publish import Publisher
 from skinnode.model.frames import FieldFrame, SolveStats
+from skinnode.process import clock
 from vcan_sim.fleet import Fleet
 
 from .conftest import eventually
@@ -111,6 +112,7 @@ def test_an_event_loop_that_was_left_costs_the_publisher_nothing(publisher: Publ
     assert numbers(take(fields, 1)) == [1]
 
 
+@pytest.mark.system_time
 def test_async_for_of_a_running_host(hand: HandConfig, fleet: Fleet) -> None:
     with Host.from_config(hand) as host:
         fields = asyncio.run(collected(host.fields(timeout_s=10), 20))
@@ -136,11 +138,10 @@ def test_callbacks_are_called_until_they_are_closed(hand: HandConfig, fleet: Fle
     assert {one.stamp.patch for one in of_one if one.stamp} == {"p1"}
 
 
-@pytest.mark.real_time
 def test_a_callback_that_raises_or_blocks_loses_its_own_data_only(
     hand: HandConfig, fleet: Fleet, caplog: pytest.LogCaptureFixture
 ) -> None:
-    go = threading.Event()
+    go = clock.event()
 
     def broken(one: FieldFrame) -> None:
         raise ZeroDivisionError("of the user")
@@ -169,7 +170,7 @@ def test_a_callback_may_close_itself(hand: HandConfig, fleet: Fleet) -> None:
             seen.append(one)
             callback.close()
 
-        started = threading.Event()
+        started = clock.event()
         callback = host.on_field(lambda one: once(one) if started.wait(10) else None, capacity=1)
         started.set()
         assert eventually(lambda: callback.ended)
@@ -180,7 +181,7 @@ def test_a_callback_that_never_returns_does_not_keep_the_host(
     hand: HandConfig, fleet: Fleet, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("skinnode.host.callback.LAST_CALL_S", 0.05)
-    go, entered = threading.Event(), threading.Event()
+    go, entered = clock.event(), clock.event()
 
     def stuck(one: FieldFrame) -> None:
         entered.set()

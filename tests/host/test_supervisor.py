@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import subprocess
-import time
 from collections.abc import Callable
 from typing import Any
 
@@ -16,6 +15,7 @@ from skinnode.model.forward import resistance_ohm
 from skinnode.model.frames import FieldFrame
 from skinnode.model.layout import PatchLayout
 from skinnode.node import NmtState
+from skinnode.process import clock
 from skinnode.transport import CanPort
 
 from .conftest import SMALL, Rack, eventually, heard
@@ -68,7 +68,7 @@ def test_a_node_that_is_replugged_runs_again_and_the_other_does_not_notice(
         assert eventually(lambda: host.health("p1").condition is Condition.LOST)
         fields = host.fields(timeout_s=10, patch="p1")
         rack.plug("p1")
-        t_plugged_ns, processor = time.monotonic_ns(), ProcessorWait()
+        t_plugged_ns, processor = clock.monotonic_ns(), ProcessorWait()
         (first,) = take(fields, 1)
         assert first.stamp is not None
         assert first.stamp.t_receive_ns - t_plugged_ns < (BACK_S + processor.seconds()) * 1e9
@@ -123,7 +123,7 @@ def test_a_node_that_restarts_in_a_loop_is_taken_up_when_it_has_calmed_down(
         for _ in range(8):
             rack.pull("p1")
             rack.plug("p1")
-            time.sleep(0.05)  # long enough to be asked who it is, too short to be configured
+            clock.sleep(0.05)  # long enough to be asked who it is, too short to be configured
         assert host.health("p1").condition is Condition.RESTARTING
         assert eventually(lambda: runs(host, "p1"))
         take(host.fields(timeout_s=10, patch="p1"), 4)

@@ -3,20 +3,17 @@
 from __future__ import annotations
 
 import queue
-import threading
-from types import SimpleNamespace
 
 import pytest
 
 from skinnode.errors import BusError
-from skinnode.host import sync
 from skinnode.host.sync import SyncProducer, Ticks
-
-from .conftest import eventually
+from skinnode.process import clock
+from vcan_sim.virtual_time import VirtualClock
 
 
 def test_counter_runs_from_one_and_wraps() -> None:
-    sent: queue.SimpleQueue[tuple[int, bytes]] = queue.SimpleQueue()
+    sent: queue.SimpleQueue[tuple[int, bytes]] = clock.simple_queue()
     ticks = Ticks(3)
     with SyncProducer([(lambda cob_id, data: sent.put((cob_id, data)), ticks)], 0.002):
         frames = [sent.get(timeout=10) for _ in range(8)]
@@ -37,13 +34,13 @@ def test_ticks_name_the_newest_sync_of_a_counter() -> None:
 def test_the_tick_is_known_before_the_frame_is_out() -> None:
     """A node may answer before send() returns."""
     ticks = Ticks(240)
-    known: queue.SimpleQueue[bool] = queue.SimpleQueue()
+    known: queue.SimpleQueue[bool] = clock.simple_queue()
     with SyncProducer([(lambda _, data: known.put(ticks.find(data[0]) is not None), ticks)], 0.002):
         assert [known.get(timeout=10) for _ in range(5)] == [True] * 5
 
 
 def test_a_bus_that_refuses_does_not_silence_the_others() -> None:
-    sent: queue.SimpleQueue[int] = queue.SimpleQueue()
+    sent: queue.SimpleQueue[int] = clock.simple_queue()
 
     def broken(cob_id: int, data: bytes) -> None:
         raise BusError("can0: 0x080 not sent (no buffer space)")
@@ -58,8 +55,8 @@ def test_a_bus_that_refuses_does_not_silence_the_others() -> None:
 
 def test_missed_periods_are_skipped_and_counted_not_sent_in_a_burst() -> None:
     period_s = 0.02
-    sent: queue.SimpleQueue[int] = queue.SimpleQueue()
-    hold = threading.Event()
+    sent: queue.SimpleQueue[int] = clock.simple_queue()
+    hold = clock.event()
 
     def send(cob_id: int, data: bytes) -> None:
         sent.put(data[0])
@@ -79,41 +76,32 @@ def test_missed_periods_are_skipped_and_counted_not_sent_in_a_burst() -> None:
 
 
 @pytest.mark.parametrize("period_ms", [1, 25, 80, 1000, 60_000])
-def test_no_drift_builds_up(monkeypatch: pytest.MonkeyPatch, period_ms: int) -> None:
+def test_no_drift_builds_up(period_ms: int) -> None:
     """SYNC number n is due n periods after the first, to the nanosecond, however many there were."""
-    now_ns, sent_ns = [10**9], list[int]()
-
-    class Event(threading.Event):
-        """Waits by the clock of this test."""
-
-        def wait(self, timeout: float | None = None) -> bool:
-            assert timeout is not None
-            now_ns[0] += round(timeout * 1e9)
-            return len(sent_ns) == 1000
-
-    clock = SimpleNamespace(monotonic_ns=lambda: now_ns[0])
-    monkeypatch.setattr(sync, "time", clock)
-    monkeypatch.setattr(sync, "threading", SimpleNamespace(Event=Event, Thread=threading.Thread))
-    with SyncProducer([(lambda _, data: sent_ns.append(now_ns[0]), Ticks(240))], period_ms * 1e-3) as running:
-        assert eventually(lambda: len(sent_ns) == 1000)
-    assert sent_ns == [10**9 + n * period_ms * 1_000_000 for n in range(1000)]
+    sent_ns: list[int] = []
+    with VirtualClock() as clock:
+        begin_ns = clock.monotonic_ns()
+        send = (lambda _, data: sent_ns.append(clock.monotonic_ns()), Ticks(240))
+        with SyncProducer([send], period_ms * 1e-3) as running:
+            clock.sleep(999.5 * period_ms * 1e-3)
+    assert sent_ns == [begin_ns + n * period_ms * 1_000_000 for n in range(1000)]
     assert running.stats().missed == 0
 
 
 def test_nothing_is_sent_after_close() -> None:
-    sent: queue.SimpleQueue[int] = queue.SimpleQueue()
+    sent: queue.SimpleQueue[int] = clock.simple_queue()
     with SyncProducer([(lambda _, data: sent.put(data[0]), Ticks(240))], 0.001):
         sent.get(timeout=10)
     while not sent.empty():
         sent.get()
-    threading.Event().wait(0.02)
+    clock.sleep(0.02)
     assert sent.empty()
 
 
 def test_buses_are_staggered_and_each_has_its_own_time() -> None:
     """The SYNC of a bus is as much later as was asked; a SYNC that has begun reaches all buses, even at the
     end."""
-    sent: queue.SimpleQueue[tuple[str, int]] = queue.SimpleQueue()
+    sent: queue.SimpleQueue[tuple[str, int]] = clock.simple_queue()
     ticks = [Ticks(240) for _ in range(3)]
     senders = [lambda _, data, name=name: sent.put((name, data[0])) for name in "abc"]
     with SyncProducer(list(zip(senders, ticks, strict=True)), 0.8, 0.3):

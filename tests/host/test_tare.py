@@ -37,7 +37,7 @@ def test_a_pressed_patch_reads_zero_after_a_tare(hand: HandConfig, rack: Rack) -
 
 
 def test_a_guest_does_not_tare(make_hand: Callable[..., HandConfig], rack_of: Callable[..., Rack]) -> None:
-    bus = {"channel": uuid.uuid4().hex[:8], "role": "guest", "guest_sends": "sdo"}
+    bus = {"interface": "timed", "channel": uuid.uuid4().hex[:8], "role": "guest", "guest_sends": "sdo"}
     hand = make_hand(1, sync={"period_ms": 25, "counter_overflow": 0}, buses=[bus])
     rack_of(hand).plug("p0")
     with Host.from_config(hand) as host:

@@ -12,7 +12,6 @@ import pytest
 from skinnode.config import BusConfig
 from skinnode.errors import BusError
 from skinnode.transport import CanPort, Frame
-from skinnode.transport import port as port_module
 from skinnode.transport.socketcan import HardwareDelay
 
 VCAN = BusConfig(name="can7", interface="socketcan", channel="vcan0")
@@ -59,7 +58,7 @@ def test_a_step_of_the_wall_clock_dates_no_frame_into_the_future(monkeypatch) ->
     real_ns = time.time_ns
     with CanPort(VCAN) as ours, CanPort(VCAN) as theirs:
         for step_s in (-3600, 3600):
-            monkeypatch.setattr(port_module.time, "time_ns", lambda step_s=step_s: real_ns() + step_s * 10**9)
+            monkeypatch.setattr(time, "time_ns", lambda step_s=step_s: real_ns() + step_s * 10**9)
             ours.send(1, b"")
             before_ns = time.monotonic_ns()
             frame = theirs.recv(1.0)

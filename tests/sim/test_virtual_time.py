@@ -1,0 +1,215 @@
+"""Virtual time: threads that run one at a time, by a clock that jumps."""
+
+from __future__ import annotations
+
+import queue
+import threading
+import time
+from concurrent.futures import Future
+
+import can
+import pytest
+
+from skinnode.process import clock
+from vcan_sim.virtual_time import START_NS, Deadlock, VirtualClock
+
+
+def test_waiting_takes_virtual_time_and_computing_none() -> None:
+    with VirtualClock():
+        begin_s = clock.monotonic()
+        sum(range(100_000))
+        assert clock.monotonic() == begin_s
+        clock.sleep(3600.0)
+        assert clock.monotonic() == begin_s + 3600.0
+        assert not clock.event().wait(0.25)
+        with pytest.raises(queue.Empty):
+            clock.simple_queue().get(timeout=0.5)
+        assert clock.monotonic() == begin_s + 3600.75
+        assert clock.perf_counter() == clock.monotonic()
+
+
+def test_time_passes_for_a_thread_that_polls_it() -> None:
+    with VirtualClock():
+        end_s = clock.monotonic() + 1.0
+        while clock.monotonic() < end_s:
+            pass
+        assert clock.monotonic() == pytest.approx(end_s, abs=1e-3)
+
+
+def test_outside_and_in_other_threads_time_is_the_systems() -> None:
+    seen: list[int] = []
+    with VirtualClock():
+        other = threading.Thread(target=lambda: seen.append(clock.monotonic_ns()))
+        other.start()
+        other.join()
+        assert clock.monotonic_ns() == START_NS
+    before, seen_ns, after = time.monotonic_ns(), clock.monotonic_ns(), time.monotonic_ns()
+    assert before <= seen_ns <= after
+    assert abs(seen[0] - seen_ns) < 60e9
+
+
+def test_threads_run_in_the_order_of_their_times_and_then_of_their_waits() -> None:
+    order: list[tuple[str, float]] = []
+
+    def nap(name: str, seconds: float) -> None:
+        for _ in range(3):
+            clock.sleep(seconds)
+            order.append((name, clock.monotonic() - START_NS * 1e-9))
+
+    with VirtualClock():
+        naps = [clock.thread(nap, name, (name, s)) for name, s in (("a", 0.5), ("b", 0.25), ("c", 0.5))]
+        for thread in naps:
+            thread.start()
+        for thread in naps:
+            thread.join()
+    assert order == [
+        ("b", 0.25), ("a", 0.5), ("c", 0.5), ("b", 0.5), ("b", 0.75), ("a", 1.0), ("c", 1.0), ("a", 1.5),
+        ("c", 1.5),
+    ]  # fmt: skip
+
+
+def test_an_event_wakes_all_that_wait_and_a_queue_the_first() -> None:
+    woken: list[str] = []
+    with VirtualClock():
+        event, items = clock.event(), clock.simple_queue()
+
+        def wait_for_event(name: str) -> None:
+            assert event.wait(10.0)
+            woken.append(name)
+
+        def take(name: str) -> None:
+            woken.append(f"{name} {items.get()}")
+
+        threads = [clock.thread(wait_for_event, n, (n,)) for n in "ab"]
+        threads += [clock.thread(take, n, (n,)) for n in "cd"]
+        for thread in threads:
+            thread.start()
+        clock.sleep(1.0)
+        items.put(1)
+        event.set()
+        items.put(2)
+        for thread in threads:
+            thread.join()
+        assert clock.monotonic_ns() == START_NS + 10**9
+    assert woken == ["c 1", "a", "b", "d 2"]
+
+
+def test_a_time_out_and_a_wake_at_the_same_instant_wake_once() -> None:
+    got: list[object] = []
+    with VirtualClock() as virtual:
+        items = clock.simple_queue()
+
+        def take() -> None:
+            try:
+                got.append(items.get(timeout=1.0))
+            except queue.Empty:
+                got.append("empty")
+            clock.sleep(1.0)
+            got.append("after")
+
+        taker = clock.thread(take, "taker")
+        taker.start()
+        clock.sleep(0.0)
+        virtual.call_at(START_NS + 10**9, lambda: items.put("item"))
+        taker.join(5.0)
+        assert not taker.is_alive()
+        assert clock.monotonic_ns() == START_NS + 2 * 10**9
+    assert got[-1] == "after"
+    assert got[0] in ("item", "empty")
+
+
+def test_a_lock_is_handed_over() -> None:
+    log: list[str] = []
+    with VirtualClock():
+        lock = clock.lock()
+
+        def work(name: str) -> None:
+            with lock:
+                log.append(f"{name} in")
+                clock.sleep(1.0)
+                log.append(f"{name} out")
+
+        threads = [clock.thread(work, name, (name,)) for name in "abc"]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+    assert log == ["a in", "a out", "b in", "b out", "c in", "c out"]
+
+
+def test_pool_runs_its_jobs_and_cancels_what_waits() -> None:
+    with VirtualClock():
+        ended = clock.simple_queue()
+
+        def job(number: int) -> int:
+            clock.sleep(1.0)
+            if number == 1:
+                raise ValueError("one")
+            return number
+
+        with clock.pool(2, "pool") as pool:
+            jobs: list[Future[int]] = [pool.submit(job, number) for number in range(5)]
+            for each in jobs:
+                each.add_done_callback(ended.put)
+            assert [ended.get() is each for each in jobs[:2]] == [True, True]
+            assert clock.monotonic_ns() == START_NS + 10**9
+            pool.shutdown(cancel_futures=True)
+        assert jobs[0].result() == 0
+        assert isinstance(jobs[1].exception(), ValueError)
+        assert [each.cancelled() for each in jobs] == [False, False, False, False, True]
+
+
+def test_a_deadlock_is_reported_with_the_threads_that_wait() -> None:
+    def wait_for_each_other() -> None:
+        with VirtualClock():
+            event = clock.event()
+            clock.thread(event.wait, "never").start()
+            event.wait()
+
+    with pytest.raises(Deadlock, match="waiting: 'never'"):
+        wait_for_each_other()
+
+
+def test_threads_left_behind_are_named() -> None:
+    def leave_one() -> None:
+        with VirtualClock():
+            clock.thread(clock.event().wait, "left").start()
+
+    with pytest.raises(RuntimeError, match="threads 'left' have not ended"):
+        leave_one()
+
+
+def test_the_interface_needs_virtual_time() -> None:
+    with pytest.raises(can.CanInitializationError, match="runs in real time"):
+        can.Bus(interface="timed", channel="a", ignore_config=True)
+
+
+def test_frames_take_the_time_of_their_bits() -> None:
+    """A base frame with 8 bytes 0x55 at 500 kbit/s has 111 bits and the intermission, and few stuff bits."""
+    with VirtualClock():
+        options = {"interface": "timed", "channel": "a", "bitrate": 500_000, "ignore_config": True}
+        with can.Bus(**options) as one, can.Bus(**options) as other, can.Bus(**options) as third:
+            clock.sleep(0.001)
+            begin_s = clock.monotonic()
+            one.send(can.Message(arbitration_id=0x555, is_extended_id=False, data=b"\x55" * 8))
+            other.send(can.Message(arbitration_id=0x123, is_extended_id=False, data=b""))
+            first, second = third.recv(1.0), third.recv(1.0)
+            assert first is not None
+            assert second is not None
+            assert (first.arbitration_id, second.arbitration_id) == (0x123, 0x555)
+            assert 47 - 3 + 108 <= (clock.monotonic() - begin_s) * 500_000 <= 55 + 135
+            assert third.recv(0.1) is None
+
+
+def test_what_an_endpoint_has_sent_arrives_although_it_is_closed() -> None:
+    with VirtualClock():
+        options = {"interface": "timed", "channel": "a", "ignore_config": True}
+        with can.Bus(**options) as stays:
+            with can.Bus(**options) as leaves:
+                for number in range(3):
+                    leaves.send(can.Message(arbitration_id=number, is_extended_id=False))
+            heard = [stays.recv(0.01) for _ in range(4)]
+        assert [message.arbitration_id if message else None for message in heard] == [0, 1, 2, None]
+        with can.Bus(**options) as alone:
+            alone.send(can.Message(arbitration_id=1, is_extended_id=False))
+        clock.sleep(1.0)

@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, Final
 
 import pytest
@@ -157,7 +158,8 @@ def injector(monkeypatch: pytest.MonkeyPatch) -> Injector:
 
     monkeypatch.setattr(Defects, "report", reported)
     monkeypatch.setattr(Client, "give_up", given_up)
-    monkeypatch.setattr(supervisor, "ThreadPoolExecutor", Pool)
+    pool = {"pool": lambda threads, name: Pool(threads, thread_name_prefix=name)}
+    monkeypatch.setattr(supervisor, "clock", SimpleNamespace(**{**vars(clock), **pool}))
     return injector
 
 

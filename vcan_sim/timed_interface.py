@@ -14,10 +14,46 @@ import can
 
 from skinnode.process import clock as process_clock
 from vcan_sim.timed_bus import BitRates, CanFrame, Delivered, Event, StationOptions, TimedBus
-from vcan_sim.virtual_time import VirtualClock
+from vcan_sim.virtual_time import Mailbox, VirtualClock
 
+COALESCED_NS: Final = 1_000_000
+"""Least time between two wake-ups of a thread that reads frames, ns."""
 MOST_STATIONS: Final = 64
 """Maximum number of endpoints that are ever opened on a bus."""
+
+
+class Inbox:
+    """Frames that a station has received and not read.
+
+    The first frame after a pause wakes the reader at once; the frames of the following
+    :data:`COALESCED_NS` wake it together, as interrupts of a busy controller are. A frame keeps its own time.
+
+    Args:
+        clock: The clock by which the reader runs.
+    """
+
+    def __init__(self, clock: VirtualClock) -> None:
+        self._clock, self._queue = clock, Mailbox(clock)
+        self._quiet_until_ns, self._due = 0, False
+
+    def put(self, message: can.Message) -> None:
+        """Append a frame. Called between the turns of the threads."""
+        self._queue.store(message)
+        if self._due:
+            return
+        if self._clock.now_ns >= self._quiet_until_ns:
+            self._wake()
+        else:
+            self._due = True
+            self._clock.call_at(self._quiet_until_ns, self._wake)
+
+    def get(self, timeout_s: float | None) -> can.Message:
+        """Return the next frame; raises :class:`queue.Empty` if none arrives in time."""
+        return cast(can.Message, self._queue.get(timeout=timeout_s))
+
+    def _wake(self) -> None:
+        self._due, self._quiet_until_ns = False, self._clock.now_ns + COALESCED_NS
+        self._queue.wake()
 
 
 class Segment:
@@ -39,17 +75,17 @@ class Segment:
         for station in range(MOST_STATIONS):
             self.bus.disconnect(now_ns, station)
         self.listeners: list[Callable[[Event], None]] = []
-        self._queues: list[queue.SimpleQueue[can.Message]] = []
+        self._inboxes: list[Inbox] = []
         self._leaving: set[int] = set()
         self._connected: set[int] = set()
         self._due_ns: int | None = None
 
     def join(self) -> int:
         """Connect a new station and return its number."""
-        station = len(self._queues)
+        station = len(self._inboxes)
         if station == MOST_STATIONS:
             raise can.CanInitializationError(f"{self.channel}: got {station} endpoints, cannot open another")
-        self._queues.append(self.clock.simple_queue())
+        self._inboxes.append(Inbox(self.clock))
         self._connected.add(station)
         self.bus.connect(self.clock.now_ns, station)
         return station
@@ -65,9 +101,9 @@ class Segment:
         self.bus.send(self.clock.now_ns, station, frame)
         self._plan()
 
-    def received(self, station: int) -> queue.SimpleQueue[can.Message]:
-        """Return the queue of frames that a station has received."""
-        return self._queues[station]
+    def inbox(self, station: int) -> Inbox:
+        """Return the frames that a station has received."""
+        return self._inboxes[station]
 
     def _plan(self) -> None:
         due_ns = self.bus.next_event_ns
@@ -82,7 +118,7 @@ class Segment:
             if isinstance(event, Delivered):
                 frame = event.frame
                 for station in event.receivers:
-                    self._queues[station].put(
+                    self._inboxes[station].put(
                         can.Message(
                             timestamp=(event.time_ns + wall_to_monotonic_ns) * 1e-9,
                             arbitration_id=frame.can_id,
@@ -156,7 +192,7 @@ class TimedInterface(can.BusABC):
         rates = BitRates(bitrate, (data_bitrate or bitrate) if fd else None)
         self._clock, self._segment = clock, segment(str(channel), clock, rates)
         self._station = self._segment.join()
-        self._received = self._segment.received(self._station)
+        self._inbox = self._segment.inbox(self._station)
         super().__init__(channel, can_filters)
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
@@ -188,7 +224,7 @@ class TimedInterface(can.BusABC):
                 raise can.CanOperationError(f"{self.channel_info} is closed")
             left_s = None if end_ns is None else max(0.0, (end_ns - self._clock.monotonic_ns()) * 1e-9)
             try:
-                message = self._received.get(timeout=left_s)
+                message = self._inbox.get(left_s)
             except queue.Empty:
                 return None
             if self._matches_filters(message):

@@ -275,14 +275,15 @@ class _Queue:
             timeout = 0.0
         elif timeout is not None and timeout < 0:
             raise ValueError("'timeout' must be a non-negative number")
-        until_ns = None if timeout is None else self._of.monotonic_ns() + round(timeout * 1e9)
-        while not self.queue:
-            if until_ns is None:
-                self._of.wait(self._waiting, None)
-            else:
-                left_ns = until_ns - self._of.monotonic_ns()
-                if left_ns <= 0 or not (self._of.wait(self._waiting, left_ns * 1e-9) or self.queue):
-                    raise queues.Empty
+        if not self.queue:
+            until_ns = None if timeout is None else self._of.monotonic_ns() + round(timeout * 1e9)
+            while not self.queue:
+                if until_ns is None:
+                    self._of.wait(self._waiting, None)
+                else:
+                    left_ns = until_ns - self._of.now_ns
+                    if left_ns <= 0 or not (self._of.wait(self._waiting, left_ns * 1e-9) or self.queue):
+                        raise queues.Empty
         return self.queue.popleft()
 
     def put_nowait(self, item: Any) -> None:
@@ -296,6 +297,19 @@ class _Queue:
 
     def empty(self) -> bool:
         return not self.queue
+
+
+class Mailbox(_Queue):
+    """Queue that can be filled without waking the thread that reads it."""
+
+    def store(self, item: Any) -> None:
+        """Append an item without waking a thread; :meth:`wake` does that later."""
+        self.queue.append(item)
+
+    def wake(self) -> None:
+        """Make the thread ready that has waited longest for an item, if there is one."""
+        if self.queue:
+            self._of.wake(self._waiting)
 
 
 class _Lock:

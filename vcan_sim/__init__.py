@@ -10,6 +10,6 @@ The scene of a patch is a stroke of ``scene`` or, from a scene file, of ``scenes
 mechanics on a bonded layer, apart from all models of the product; ``scenes`` uses it. ``smooth`` has smooth
 ramps. ``virtual_time`` is a clock that jumps from event to event. ``timed_bus`` is a CAN bus with exact
 times, arbitration, errors and error counters; ``timed_interface`` is its interface for python-can in virtual
-time, and ``trace`` records it. ``faults`` declares the faults, ``injector`` draws and counts faults,
-``tally`` counts frames by kind.
+time, and ``trace`` records it. ``pytest_plugin`` and ``testing`` serve tests of other programs. ``faults``
+declares the faults, ``injector`` draws and counts faults, ``tally`` counts frames by kind.
 """

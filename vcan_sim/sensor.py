@@ -127,6 +127,10 @@ class SimulatedPatch:
                 f"no reading at device time {device_time_us} µs among the last {len(self._read_ns)}"
             ) from None
 
+    def read_times_ns(self) -> list[int]:
+        """Return the times of the newest readings, ns, at most :data:`REMEMBERED_READINGS`, oldest first."""
+        return list(self._read_ns.values())
+
     def truth_m(self, t_ns: int) -> Float:
         """Return the true electrode positions in a reading at ``t_ns``.
 

@@ -1,13 +1,23 @@
-"""Trace of the frames on a timed bus, in the format of ``candump -L``."""
+"""Traces of the frames on a bus, in the format of ``candump -L``."""
 
 from __future__ import annotations
 
+from types import TracebackType
+from typing import Final, Self
+
+from skinnode.config import BusConfig
+from skinnode.errors import BusError
+from skinnode.process import clock
+from skinnode.transport import CanPort, Frame
 from vcan_sim.timed_bus import CanFrame, Delivered, Event
 from vcan_sim.timed_interface import Segment
 
+_POLL_S: Final = 0.05
+"""Maximum wait for a frame, s; also the longest wait of :meth:`Listener.__exit__`."""
+
 
 class Trace:
-    """Record of every frame on a bus from now on, at the end of the frame.
+    """Record of every frame on a timed bus from now on, with the time of the frame's end.
 
     Args:
         of: The bus.
@@ -29,15 +39,63 @@ class Trace:
 
     def _on_event(self, event: Event) -> None:
         if isinstance(event, Delivered):
-            micros = (event.time_ns + self._wall_ns) // 1000
-            stamp = f"{micros // 10**6}.{micros % 10**6:06d}"
-            self._lines.append(f"({stamp}) {self._channel} {_shown(event.frame)}\n")
+            self._lines.append(_line(event.time_ns + self._wall_ns, self._channel, event.frame))
 
 
-def _shown(frame: CanFrame) -> str:
+class Listener:
+    """Record of every frame that an endpoint of its own receives on a bus, in a ``with`` block.
+
+    Args:
+        bus: The bus.
+
+    Raises:
+        BusError: The bus cannot be opened.
+    """
+
+    def __init__(self, bus: BusConfig) -> None:
+        self._port, self._channel = CanPort(bus), bus.channel
+        self._wall_ns = clock.time_ns() - clock.monotonic_ns()
+        self._lines: list[str] = []
+        self._stop = clock.event()
+        self._thread = clock.thread(self._run, f"trace {bus.name}")
+
+    def text(self) -> str:
+        """Return one line per frame, such as ``(1600000000.000310) vcan0 080#01``."""
+        return "".join(self._lines)
+
+    def __enter__(self) -> Self:
+        self._thread.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._stop.set()
+        self._thread.join()
+        self._port.close()
+
+    def _run(self) -> None:
+        while not self._stop.is_set():
+            try:
+                frame = self._port.recv(_POLL_S)
+            except BusError:
+                self._stop.wait(_POLL_S)
+                continue
+            if frame is not None and not frame.error:
+                self._lines.append(_line(frame.t_ns + self._wall_ns, self._channel, _can_frame(frame)))
+
+
+def _can_frame(frame: Frame) -> CanFrame:
+    return CanFrame(frame.can_id, frame.data, frame.extended, frame.remote, fd=frame.fd, brs=frame.fd)
+
+
+def _line(wall_ns: int, channel: str, frame: CanFrame) -> str:
+    micros = wall_ns // 1000
     can_id = f"{frame.can_id:08X}" if frame.extended else f"{frame.can_id:03X}"
     if frame.remote:
-        return f"{can_id}#R{frame.dlc or ''}"
-    if frame.fd:
-        return f"{can_id}##{int(frame.brs)}{frame.data.hex().upper()}"
-    return f"{can_id}#{frame.data.hex().upper()}"
+        shown = f"{can_id}#R{frame.dlc or ''}"
+    elif frame.fd:
+        shown = f"{can_id}##{int(frame.brs)}{frame.data.hex().upper()}"
+    else:
+        shown = f"{can_id}#{frame.data.hex().upper()}"
+    return f"({micros // 10**6}.{micros % 10**6:06d}) {channel} {shown}\n"

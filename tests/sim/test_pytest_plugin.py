@@ -1,0 +1,128 @@
+"""pytest plugin: fixtures of a simulated hand on the bus that an option chooses, and what a failure keeps."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+
+HAND = """
+[[buses]]
+name = "can0"
+
+[sync]
+period_ms = 50
+
+[[patches]]
+name = "palm"
+node_id = 4
+tolerances = "exact"
+layout = { upper_wires = 4, upper_electrodes = 4, lower_wires = 12, lower_electrodes = 4 }
+"""
+SCENE = """
+[[bodies]]
+name = "ball"
+shape = "sphere"
+radius_m = 0.01
+
+[[touches]]
+body = "ball"
+patch = "palm"
+at_m = [0.004, 0.004]
+force_n = 0.5
+from_s = 0.5
+to_s = 4.0
+"""
+SUITE = """
+import pytest
+from vcan_sim.testing import eventually, within
+
+
+@pytest.fixture
+def host(skin_hand, skin_host):
+    skin_hand("hand.toml", scene="press.toml")
+    return skin_host()
+
+
+def test_a_press_is_felt(host, skin_truth):
+    fields = host.fields(timeout_s=5)
+    eventually(lambda: any(contact.force_n[2] < -0.4 for contact in skin_truth(fields.get()).contacts))
+    field = fields.get()
+    moved = skin_truth(field).displacement_m
+    assert moved[..., 2].min() < -1e-5
+    assert field.trusted
+    assert (abs(field.displacement_m - moved) < 5 * field.displacement_std_m).all()
+
+
+def test_a_patch_that_is_unplugged_comes_back(host, skin_faults):
+    skin_faults.inject("palm", unplugged=True)
+    eventually(lambda: host.health("palm").condition == "lost")
+    skin_faults.clear()
+    with within(5.0):
+        eventually(lambda: host.health("palm").condition == "operational")
+
+
+@pytest.mark.skin_bus("timed")
+def test_a_minute_passes(host, skin_clock):
+    begin_s = skin_clock.monotonic()
+    skin_clock.sleep(20.0)
+    assert skin_clock.monotonic() == begin_s + 20.0
+    assert host.stats().patches["palm"].solved > 390
+
+
+def test_that_fails(host):
+    host.fields(timeout_s=5).get()
+    assert host.health("palm").condition == "lost"
+"""
+
+
+def run(folder: Path, *options: str) -> subprocess.CompletedProcess[str]:
+    (folder / "hand.toml").write_text(HAND)
+    (folder / "press.toml").write_text(SCENE)
+    (folder / "test_grip.py").write_text(SUITE)
+    command = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", "-p", "no:xdist", "-rA", *options]
+    return subprocess.run(
+        command, cwd=folder, env={**os.environ, "PYTEST_ADDOPTS": ""}, capture_output=True, text=True,
+        timeout=100, check=False,
+    )  # fmt: skip
+
+
+def test_the_same_suite_in_virtual_and_in_real_time(tmp_path: Path) -> None:
+    for options, passed, skipped in (((), 3, 0), (("--skin-bus=virtual",), 2, 1)):
+        done = run(tmp_path, *options)
+        assert re.search(rf"1 failed, {passed} passed(, {skipped} skipped)? in", done.stdout), done.stdout
+        assert bool(skipped) == ("--skin-bus is virtual" in done.stdout)
+
+
+def test_what_a_failure_keeps(tmp_path: Path) -> None:
+    done = run(tmp_path, "-k", "fails")
+    folder = tmp_path / "skin-kept" / "test_grip.py_test_that_fails"
+    kept = "trace.log, truth.npz, scene.json, scene.png"
+    assert f"kept in {folder.relative_to(tmp_path)}: {kept}" in done.stdout
+    frames = (folder / "trace.log").read_text().splitlines()
+    assert all(re.fullmatch(r"\(\d+\.\d{6}\) \S+ [0-9A-F]{3}#[0-9A-F]*", line) for line in frames)
+    assert any(" 080#" in line for line in frames)  # SYNC
+    truth = np.load(folder / "truth.npz")
+    assert truth["palm displacement_m"].shape == (len(truth["palm time_ns"]), 4, 4, 3)
+    assert json.loads((folder / "scene.json").read_text())["bodies"][0]["name"] == "ball"
+    assert (folder / "scene.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_bad_use_is_one_line(tmp_path: Path) -> None:
+    done = run(tmp_path, "--skin-bus=wireless")
+    assert done.returncode == 4
+    assert "--skin-bus" in done.stderr
+    (tmp_path / "test_more.py").write_text("def test_no_hand(skin_host):\n    skin_host()\n")
+    assert "skin_host: there is no hand yet, call skin_hand first" in run(tmp_path, "test_more.py").stdout
+
+
+def test_pytest_starts_without_numpy_and_numba(tmp_path: Path) -> None:
+    (tmp_path / "test_light.py").write_text(
+        "import sys\n\n\ndef test_light():\n    assert not {'numpy', 'numba', 'can'} & set(sys.modules)\n"
+    )
+    assert "1 passed" in run(tmp_path, "test_light.py").stdout

@@ -1,0 +1,296 @@
+"""pytest plugin: a simulated hand, its host, its truth, its faults and its clock as fixtures.
+
+::
+
+    def test_a_press_is_felt(skin_hand, skin_host, skin_truth):
+        skin_hand("hand.toml", scene="press.toml")
+        host = skin_host()
+        field = host.fields(timeout_s=5).get()
+        assert skin_truth(field).wrench[2] < 0
+
+The option ``--skin-bus`` chooses the bus of all tests: virtual time on a bus with exact times by default. A
+test that fails keeps its trace, its scene, its truth and a plot in a folder that the report names.
+"""
+
+from __future__ import annotations
+
+import random
+import re
+import uuid
+from collections.abc import Callable, Generator, Iterator
+from contextlib import ExitStack
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import pytest
+
+if TYPE_CHECKING:  # numba and NumPy are not imported before a test needs them
+    from skinnode.config import HandConfig
+    from skinnode.host import Host
+    from skinnode.model.frames import FieldFrame
+    from vcan_sim.faults import Injected
+    from vcan_sim.fleet import Fleet
+    from vcan_sim.scenes import PatchTruth, SceneConfig
+
+BUSES: Final = {
+    "timed": ("timed", ""),
+    "virtual": ("virtual", ""),
+    "udp_multicast": ("udp_multicast", ""),
+    "vcan0": ("socketcan", "vcan{}"),
+}
+"""Interface and channel of each choice of ``--skin-bus``: the number of the bus goes into the braces; an
+empty channel is one that nobody else uses."""
+TRUTH_READINGS: Final = 200
+"""Number of the newest readings of each patch whose truth is kept of a test that fails."""
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """Add the options of the plugin."""
+    group = parser.getgroup("skinnode", "simulated robot skin")
+    group.addoption(
+        "--skin-bus",
+        choices=tuple(BUSES),
+        default="timed",
+        help="bus of simulated hands: timed (virtual time, the default), virtual, udp_multicast or vcan0",
+    )
+    group.addoption(
+        "--skin-kept",
+        metavar="DIR",
+        default="skin-kept",
+        help="folder for the trace, scene, truth and plot of tests that fail (default: skin-kept)",
+    )
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Declare the marker of the plugin."""
+    config.addinivalue_line(
+        "markers", f"skin_bus(*buses): run this test only on these buses: {', '.join(BUSES)}"
+    )
+
+
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    """Skip a test that is not for the chosen bus."""
+    chosen = item.config.getoption("--skin-bus")
+    for marker in item.iter_markers("skin_bus"):
+        for bus in marker.args:
+            if bus not in BUSES:
+                raise pytest.UsageError(f"skin_bus: got {bus!r}, must be one of {', '.join(BUSES)}")
+        if chosen not in marker.args:
+            pytest.skip(f"only on {', '.join(marker.args)}; --skin-bus is {chosen}")
+
+
+class SkinTest:
+    """The simulated hand of one test.
+
+    Args:
+        bus: Choice of ``--skin-bus``.
+        open_until_end: Closed at the end of the test.
+    """
+
+    def __init__(self, bus: str, open_until_end: ExitStack) -> None:
+        self.bus = bus
+        self.fleet: Fleet | None = None
+        self.scene: SceneConfig | None = None
+        self._open = open_until_end
+        self._traces: list[Callable[[], str]] = []
+
+    def start(
+        self, hand: HandConfig | Path | str, scene: SceneConfig | Path | str | None, options: dict[str, Any]
+    ) -> Fleet:
+        """Power the nodes of a hand on."""
+        from skinnode.config import HandConfig, load_hand
+        from vcan_sim.fleet import Fleet
+        from vcan_sim.scenes import SceneConfig, load_scene
+
+        if self.fleet is not None:
+            raise RuntimeError("skin_hand: called twice, a test has one hand")
+        plan = self._on_bus(hand if isinstance(hand, HandConfig) else load_hand(Path(hand)))
+        self.scene = scene if isinstance(scene, SceneConfig | None) else load_scene(scene, plan)
+        for bus in plan.buses:
+            self._traces.append(self._trace(bus))
+        self.fleet = self._open.enter_context(Fleet(plan, scene=self.scene, **options))
+        return self.fleet
+
+    def started(self, needs: str) -> Fleet:
+        """Return the running hand; ``needs`` is the fixture that needs it."""
+        if self.fleet is None:
+            raise RuntimeError(f"{needs}: there is no hand yet, call skin_hand first")
+        return self.fleet
+
+    def bring_up(self, options: dict[str, Any]) -> Host:
+        """Bring the hand up; it is shut down at the end of the test."""
+        from skinnode.host import Host
+
+        return self._open.enter_context(Host.from_config(self.started("skin_host").hand, **options))
+
+    def keep(self, folder: Path) -> list[str]:
+        """Write what is known of the test to files. Returns their names."""
+        folder.mkdir(parents=True, exist_ok=True)
+        kept = ["trace.log"]
+        (folder / "trace.log").write_text("".join(trace() for trace in self._traces), encoding="utf-8")
+        if self.fleet is not None:
+            kept += self._keep_truth(self.fleet, folder)
+        return kept
+
+    def _keep_truth(self, fleet: Fleet, folder: Path) -> list[str]:
+        import numpy as np
+
+        truth: dict[str, Any] = {}
+        for name, patch in fleet.patches.items():
+            times_ns = patch.read_times_ns()[-TRUTH_READINGS:]
+            truth[f"{name} time_ns"] = np.array(times_ns, np.int64)
+            truth[f"{name} displacement_m"] = np.array([patch.displacement_m(t_ns) for t_ns in times_ns])
+        np.savez_compressed(folder / "truth.npz", **truth)
+        kept = ["truth.npz"]
+        if self.scene is not None:
+            (folder / "scene.json").write_text(self.scene.model_dump_json(indent=1), encoding="utf-8")
+            kept.append("scene.json")
+            try:
+                from vcan_sim.scenes.plot import write_plot
+
+                write_plot(self.scene, fleet.hand, folder / "scene.png")
+                kept.append("scene.png")
+            except ImportError:  # matplotlib is an extra
+                pass
+        return kept
+
+    def _on_bus(self, hand: HandConfig) -> HandConfig:
+        interface, channel = BUSES[self.bus]
+        buses = [
+            bus.model_copy(
+                update={"interface": interface, "channel": channel.format(number) or self._own(bus.name)}
+            )
+            for number, bus in enumerate(hand.buses)
+        ]
+        return hand.model_copy(update={"buses": tuple(buses)})
+
+    def _own(self, name: str) -> str:
+        """Return a channel of which no other test knows."""
+        if self.bus == "udp_multicast":
+            return f"239.75.{random.randrange(256)}.{random.randrange(1, 255)}"
+        return f"{name}-{uuid.uuid4().hex[:8]}"
+
+    def _trace(self, bus: Any) -> Callable[[], str]:
+        """Record the frames of a bus; the function that is returned gives them as text."""
+        from skinnode.process import clock
+        from vcan_sim.trace import Listener, Trace
+
+        if self.bus != "timed":
+            return self._open.enter_context(Listener(bus)).text
+        from vcan_sim.timed_bus import BitRates
+        from vcan_sim.timed_interface import segment
+        from vcan_sim.virtual_time import VirtualClock
+
+        virtual = clock.current()
+        assert isinstance(virtual, VirtualClock)
+        rates = BitRates(bus.bitrate_bps, bus.data_bitrate_bps if bus.fd else None)
+        return Trace(segment(bus.channel, virtual, rates)).text
+
+
+class SkinFaults:
+    """Faults of the nodes of a test's hand."""
+
+    def __init__(self, test: SkinTest) -> None:
+        self._test = test
+
+    def inject(self, patch: str | None = None, **faults: Any) -> None:
+        """Replace the faults of one patch, or of all patches.
+
+        Args:
+            patch: Name of the patch.
+            **faults: Fields of :class:`vcan_sim.faults.Faults`, such as ``lost=0.01`` or ``unplugged=True``.
+        """
+        from vcan_sim import faults as declared
+
+        self._test.started("skin_faults").inject(declared.Faults(**faults), patch)
+
+    def clear(self, patch: str | None = None) -> None:
+        """End the faults of one patch, or of all patches."""
+        self.inject(patch)
+
+    def injected(self, patch: str) -> Injected:
+        """Return how often each fault has been injected into a patch's node."""
+        return self._test.started("skin_faults").injected(patch)
+
+
+_TEST: Final = pytest.StashKey[SkinTest]()
+
+
+@pytest.fixture
+def skin_clock(request: pytest.FixtureRequest) -> Iterator[Any]:
+    """The clock of the test: the module ``skinnode.process.clock``, in virtual time on the bus ``timed``."""
+    from skinnode.process import clock
+    from vcan_sim.virtual_time import VirtualClock
+
+    if request.config.getoption("--skin-bus") != "timed":
+        yield clock
+        return
+    with VirtualClock():
+        yield clock
+
+
+@pytest.fixture
+def _skin_test(request: pytest.FixtureRequest, skin_clock: Any) -> Iterator[SkinTest]:
+    with ExitStack() as opened:
+        test = SkinTest(request.config.getoption("--skin-bus"), opened)
+        request.node.stash[_TEST] = test
+        yield test
+
+
+@pytest.fixture
+def skin_hand(_skin_test: SkinTest) -> Callable[..., Fleet]:
+    """Function that powers a simulated hand on: ``skin_hand(hand, scene=None, **options) -> Fleet``.
+
+    ``hand`` and ``scene`` are files or configurations; the options are those of
+    :class:`vcan_sim.fleet.Fleet`. The hand's buses are replaced by the bus of ``--skin-bus``.
+    """
+
+    def start(
+        hand: HandConfig | Path | str, scene: SceneConfig | Path | str | None = None, **options: Any
+    ) -> Fleet:
+        return _skin_test.start(hand, scene, options)
+
+    return start
+
+
+@pytest.fixture
+def skin_host(_skin_test: SkinTest) -> Callable[..., Host]:
+    """Function that brings the hand up: ``skin_host(**options) -> Host``, options of ``Host.from_config``."""
+    return lambda **options: _skin_test.bring_up(options)
+
+
+@pytest.fixture
+def skin_truth(_skin_test: SkinTest) -> Callable[[FieldFrame], PatchTruth]:
+    """Function that returns the ground truth of a field's scan; the hand needs a scene."""
+
+    def truth(field: FieldFrame) -> PatchTruth:
+        if field.stamp is None:
+            raise ValueError("field: got one without a stamp, must be a field of a host")
+        fleet = _skin_test.started("skin_truth")
+        return fleet.truth(field.stamp.patch, field.stamp.device_time_us)
+
+    return truth
+
+
+@pytest.fixture
+def skin_faults(_skin_test: SkinTest) -> SkinFaults:
+    """Faults to inject: ``inject(patch, lost=0.1)``, ``clear(patch)``, ``injected(patch)``."""
+    return SkinFaults(_skin_test)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport(
+    item: pytest.Item, call: pytest.CallInfo[None]
+) -> Generator[None, pytest.TestReport, pytest.TestReport]:
+    """Keep what is known of a simulated hand whose test fails, and name the files in the report."""
+    report = yield
+    test = item.stash.get(_TEST, None)
+    if test is not None and report.when == "call" and report.failed:
+        name = re.sub(r"[^\w.-]+", "_", item.nodeid)[-150:]
+        folder = Path(item.config.getoption("--skin-kept")) / name
+        try:
+            kept = ", ".join(test.keep(folder))
+            report.sections.append(("simulated hand", f"kept in {folder}: {kept}"))
+        except Exception as error:
+            report.sections.append(("simulated hand", f"nothing kept in {folder}: {error}"))
+    return report

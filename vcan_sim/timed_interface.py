@@ -152,7 +152,10 @@ def segment(channel: str, clock: VirtualClock, rates: BitRates) -> Segment:
     Raises:
         can.CanInitializationError: If the bus has other bit rates.
     """
-    found = cast(Segment, clock.shared.setdefault(f"bus {channel}", Segment(channel, clock, rates)))
+    name = f"bus {channel}"
+    if name not in clock.shared:
+        clock.shared[name] = Segment(channel, clock, rates)
+    found = cast(Segment, clock.shared[name])
     if found.rates != rates:
         raise can.CanInitializationError(f"{channel}: got {rates}, the bus has {found.rates}")
     return found

@@ -129,8 +129,12 @@ class _Start:
     def _wait_for(self, jobs: dict[RemoteNode, Future[ScanSolver]]) -> None:
         """Wait until all jobs have ended, or one fails in a way that prevents the start."""
         ended: SimpleQueue[RemoteNode] = clock.simple_queue()
+
+        def put_when_done(node: RemoteNode) -> Callable[[Future[ScanSolver]], None]:
+            return lambda _: ended.put(node)
+
         for node, job in jobs.items():
-            job.add_done_callback(lambda job, node=node: ended.put(node))  # type: ignore[misc]
+            job.add_done_callback(put_when_done(node))
         for _ in jobs:
             node = ended.get()
             failure = jobs[node].exception()

@@ -251,16 +251,16 @@ def test_the_mainline_ends_while_an_interface_is_away(hand: HandConfig) -> None:
 def test_time_goes_on_for_a_silent_bus_while_another_is_busy(hand: HandConfig) -> None:
     """What a scan on it lacks is not waited for until the other falls silent."""
     one, other = two_buses(hand)
-    told: queue.SimpleQueue[int] = clock.simple_queue()
+    polled_ns: queue.SimpleQueue[int] = clock.simple_queue()
     with CanPort(one) as to_one, BusLink(one, {}, fail) as busy, BusLink(other, {}, fail) as silent:
-        silent.poll_with(told.put)
+        silent.poll_with(polled_ns.put)
         with Mainline([busy, silent]):
             begin_ns = clock.monotonic_ns()
             end_s, newest_ns = clock.monotonic() + 10, 0
             while newest_ns < begin_ns and clock.monotonic() < end_s:
                 to_one.send(0x185, b"")
-                while not told.empty():
-                    newest_ns = told.get()
+                while not polled_ns.empty():
+                    newest_ns = polled_ns.get()
     assert begin_ns < newest_ns <= clock.monotonic_ns()
 
 

@@ -171,8 +171,11 @@ class Fleet:
             patch: Name of the patch; None for all patches.
 
         Raises:
-            ConfigError: A patch does not have the wire that a fault names.
+            ConfigError: The hand does not have this patch, or a patch does not have the wire that a fault
+                names.
         """
+        if patch is not None and patch not in self._stations:
+            raise ConfigError("patch", patch, f"a patch of the hand: {', '.join(self._stations)}")
         for name, station in self._stations.items():
             if patch in (None, name):
                 station.inject(faults)

@@ -199,9 +199,19 @@ class SkinFaults:
         Args:
             patch: Name of the patch.
             **faults: Fields of :class:`vcan_sim.faults.Faults`, such as ``lost=0.01`` or ``unplugged=True``.
+
+        Raises:
+            ConfigError: There is no such patch, or a fault is unknown or out of range.
         """
+        from dataclasses import fields
+
+        from skinnode.errors import ConfigError, Shown
         from vcan_sim import faults as declared
 
+        known = [field.name for field in fields(declared.Faults)]
+        for name in faults:
+            if name not in known:
+                raise ConfigError(name, Shown("an unknown fault"), f"one of {', '.join(known)}")
         self._test.started("skin_faults").inject(declared.Faults(**faults), patch)
 
     def clear(self, patch: str | None = None) -> None:

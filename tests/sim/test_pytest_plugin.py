@@ -121,6 +121,15 @@ def test_bad_use_is_one_line(tmp_path: Path) -> None:
     assert "skin_host: there is no hand yet, call skin_hand first" in run(tmp_path, "test_more.py").stdout
 
 
+def test_a_fault_that_is_unknown_or_of_no_patch_is_one_line(tmp_path: Path) -> None:
+    test = "def test_{0}(skin_hand, skin_faults):\n    skin_hand('hand.toml')\n    skin_faults.inject({1})\n"
+    both = test.format("patch", "'pinky', lost=0.1"), test.format("name", "'palm', loss=0.1")
+    (tmp_path / "test_faults.py").write_text("\n\n".join(both))
+    printed = run(tmp_path, "test_faults.py").stdout
+    assert "ConfigError: patch: got 'pinky', allowed: a patch of the hand: palm" in printed
+    assert "ConfigError: loss: got an unknown fault, allowed: one of seed, lost, " in printed
+
+
 def test_pytest_starts_without_numpy_and_numba(tmp_path: Path) -> None:
     (tmp_path / "test_light.py").write_text(
         "import sys\n\n\ndef test_light():\n    assert not {'numpy', 'numba', 'can'} & set(sys.modules)\n"

@@ -20,14 +20,14 @@ from skinnode.config import HandConfig, parse_hand
 from skinnode.errors import NodeTimeout
 from skinnode.host import Condition, Host
 from skinnode.process import clock
+from skinnode.process.clock import SystemClock
 from skinnode.transport import CanPort
 from vcan_sim.faults import NO_FAULTS, Faults
 from vcan_sim.fleet import Fleet
+from vcan_sim.virtual_time import VirtualClock
 
 from .conftest import SMALL
 from .processor import ProcessorWait
-
-pytestmark = [pytest.mark.real_time, pytest.mark.system_time]
 
 SEED = 4
 BACK_S = 1.0
@@ -200,9 +200,32 @@ def nothing_left_running() -> Iterator[None]:
     assert left <= {"stall watch"}  # of the test that runs
 
 
+@pytest.fixture(autouse=True, scope="module")
+def module_clock() -> Iterator[None]:
+    """Virtual time of the host that all tests share."""
+    with VirtualClock():
+        yield
+
+
+@pytest.fixture(autouse=True)
+def virtual_time(request: pytest.FixtureRequest, module_clock: None) -> Iterator[bool]:
+    """Run in the virtual time of the module, but for a test in the kernel."""
+    kernel = request.node.get_closest_marker("vcan") is not None
+    with clock.use(SystemClock() if kernel else clock.current()):
+        yield not kernel
+
+
 @pytest.fixture(scope="module")
-def running(nothing_left_running: None) -> Iterator[Running]:
-    buses = [{"name": f"can{i}", "channel": uuid.uuid4().hex[:8], "heartbeat_node_id": 1} for i in range(2)]
+def running(nothing_left_running: None, module_clock: None) -> Iterator[Running]:
+    buses = [
+        {
+            "name": f"can{i}",
+            "interface": "timed",
+            "channel": uuid.uuid4().hex[:8],
+            "heartbeat_node_id": 1,
+        }
+        for i in range(2)
+    ]
     hand = hand_on(*buses, patches=PATCHES, period_ms=50)
     with Fleet(hand, faults=replace(NO_FAULTS, seed=SEED)) as fleet:
         with Host.from_config(hand) as host:

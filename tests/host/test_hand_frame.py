@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import dataclasses
 import itertools
 from collections.abc import Callable
@@ -21,6 +20,7 @@ from skinnode.model.pose import Pose
 from skinnode.model.status import Status
 from skinnode.node import NmtState
 from skinnode.transport import CanPort
+from vcan_sim.event_loop import run
 from vcan_sim.fleet import Fleet
 
 from .conftest import Rack, eventually
@@ -258,8 +258,6 @@ def test_of_a_running_hand(hand: HandConfig, fleet: Fleet) -> None:
         assert {one.stamp.t_sync_ns for one in frame.fields.values() if one.stamp} == {frame.t_sync_ns}
 
 
-@pytest.mark.system_time
-@pytest.mark.real_time
 def test_one_after_the_other_as_async_for(hand: HandConfig, fleet: Fleet) -> None:
     async def gather(host: Host) -> list[HandFrame]:
         frames = []
@@ -270,7 +268,7 @@ def test_one_after_the_other_as_async_for(hand: HandConfig, fleet: Fleet) -> Non
         return frames
 
     with Host.from_config(hand) as host:
-        frames = asyncio.run(gather(host))
+        frames = run(gather(host))
     assert [frame.scan - frames[0].scan for frame in frames] == [0, 1, 2, 3, 4]
 
 

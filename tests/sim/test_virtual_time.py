@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import queue
 import threading
 import time
@@ -11,6 +12,7 @@ import can
 import pytest
 
 from skinnode.process import clock
+from vcan_sim.event_loop import run
 from vcan_sim.virtual_time import START_NS, Deadlock, VirtualClock
 
 
@@ -213,3 +215,40 @@ def test_what_an_endpoint_has_sent_arrives_although_it_is_closed() -> None:
         with can.Bus(**options) as alone:
             alone.send(can.Message(arbitration_id=1, is_extended_id=False))
         clock.sleep(1.0)
+
+
+def test_an_event_loop_waits_in_virtual_time() -> None:
+    """It sleeps, its time-outs expire, and another thread of the program wakes it at the time it says."""
+
+    async def main() -> list[float]:
+        loop, arrived, at_s = asyncio.get_running_loop(), asyncio.Event(), []
+
+        def work() -> None:
+            clock.sleep(30.0)
+            loop.call_soon_threadsafe(arrived.set)
+
+        worker = clock.thread(work, "worker")
+        worker.start()
+        begin_s = loop.time()
+        await asyncio.sleep(10.0)
+        at_s.append(loop.time() - begin_s)
+        with pytest.raises(TimeoutError):
+            async with asyncio.timeout(5.0):
+                await arrived.wait()
+        at_s.append(loop.time() - begin_s)
+        await arrived.wait()
+        at_s.append(loop.time() - begin_s)
+        worker.join()
+        return at_s
+
+    begin_s = time.monotonic()
+    with VirtualClock():
+        assert run(main()) == pytest.approx([10.0, 15.0, 30.0], abs=1e-6)
+    assert time.monotonic() - begin_s < 5.0
+
+
+def test_without_a_virtual_clock_an_event_loop_is_that_of_asyncio() -> None:
+    async def main() -> type:
+        return type(asyncio.get_running_loop())
+
+    assert run(main()) is asyncio.run(main())

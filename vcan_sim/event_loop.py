@@ -1,0 +1,65 @@
+"""Event loop of :mod:`asyncio` that runs by the clock of its thread: virtual time, or the system's."""
+
+from __future__ import annotations
+
+import asyncio
+import selectors
+from collections.abc import Callable, Coroutine
+from contextvars import Context
+from typing import Any, TypeVar, TypeVarTuple
+
+from skinnode.process import clock
+
+T = TypeVar("T")
+Ts = TypeVarTuple("Ts")
+
+
+def run(main: Coroutine[Any, Any, T]) -> T:
+    """Run a coroutine like :func:`asyncio.run`, by the clock of the current thread.
+
+    In virtual time the loop waits for callbacks from other threads of the program and for times. It looks for
+    data at its sockets and pipes each time it runs, but does not wait for them.
+
+    Args:
+        main: The coroutine.
+
+    Returns:
+        What the coroutine returns.
+    """
+    virtual = not isinstance(clock.current(), clock.SystemClock)
+    with asyncio.Runner(loop_factory=VirtualEventLoop if virtual else None) as runner:
+        return runner.run(main)
+
+
+class VirtualEventLoop(asyncio.SelectorEventLoop):
+    """Event loop of a thread that runs in virtual time."""
+
+    def __init__(self) -> None:
+        self._woken = clock.event()
+        super().__init__(_Selector(self._woken.wait, self._woken.clear))
+
+    def time(self) -> float:
+        """Return the monotonic time, s."""
+        return clock.monotonic()
+
+    def call_soon_threadsafe(
+        self, callback: Callable[[*Ts], object], *args: *Ts, context: Context | None = None
+    ) -> asyncio.Handle:
+        """Call a function soon, at the request of any thread of the program."""
+        handle = super().call_soon_threadsafe(callback, *args, context=context)
+        self._woken.set()
+        return handle
+
+
+class _Selector(selectors.DefaultSelector):
+    """Selector that waits for an event instead of its files."""
+
+    def __init__(self, wait: Callable[[float | None], bool], clear: Callable[[], None]) -> None:
+        super().__init__()
+        self._wait, self._clear = wait, clear
+
+    def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
+        if timeout is None or timeout > 0:
+            self._wait(timeout)
+        self._clear()
+        return super().select(0)

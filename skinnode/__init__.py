@@ -1,6 +1,6 @@
 """skinnode: robot skin on a CAN bus. Use ``import skinnode as sk`` and the names in ``__all__``.
 
-Names are loaded on first use, to keep ``import skinnode`` and every ``--help`` fast.
+Public names are imported on first use, which keeps ``import skinnode`` and every ``--help`` fast.
 """
 
 from __future__ import annotations

@@ -5,15 +5,16 @@
     SkinError
      ├ ConfigError(ValueError)     names the key, the value found and the values allowed
      │  ├ ProfileError             an EDS contradicts itself or the profile
-     │  └ BusLoadError             a plan needs more bus load than is available
+     │  └ BusLoadError             the planned bus load exceeds a limit
      ├ BusError                    a CAN interface fails to open, send or receive
-     │  └ NodeError                a node misbehaves
+     │  └ NodeError                a node violates the protocol
      │     ├ NodeTimeout(TimeoutError)
      │     └ SdoAbort              with the code and text from CiA 301
      └ CodecError(ValueError)      a payload does not match its COB-ID
 
-Lost chunks, stale patches and solves that do not converge are part of normal operation: statuses and counters
-report them, never exceptions. An argument of the wrong shape raises a plain ``ValueError``.
+Lost chunks, stale patches and solves that do not converge are part of normal operation: they are reported by
+statuses and counters, and never raise an exception. An array of the wrong shape raises a plain
+``ValueError``.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ class SkinError(Exception):
 
 
 class Shown(str):
-    """Text that an error message shows without quotes."""
+    """String whose ``repr`` has no quotes, for values that an error message shows unquoted."""
 
     __slots__ = ()
 
@@ -37,7 +38,7 @@ class Shown(str):
 
 
 NOTHING: Final = Shown("nothing")
-"""Value shown in a message when the key is missing."""
+"""Placeholder that an error message shows as the value of a missing key."""
 
 _MOST_SHOWN: Final = 240
 
@@ -56,7 +57,7 @@ class ConfigError(SkinError, ValueError):
         self.key, self.got, self.allowed, self.where = key, got, allowed, where
         prefix = f"{where}: " if where else ""
         shown = repr(NOTHING if got is None else got)
-        if len(shown) > _MOST_SHOWN:  # an overlong path, or an array
+        if len(shown) > _MOST_SHOWN:  # the value may be a very long path, or an array
             shown = f"{shown[: _MOST_SHOWN - 40]}…{shown[-40:]}"
         super().__init__(f"{prefix}{key}: got {shown}, allowed: {allowed}")
 
@@ -66,7 +67,7 @@ class ProfileError(ConfigError):
 
 
 class BusLoadError(ConfigError):
-    """Plan that exceeds a bus load limit; ``needed`` and ``available`` are fractions of bus capacity."""
+    """Planned bus load above a limit; ``needed`` and ``available`` are fractions of the bus capacity."""
 
     def __init__(  # noqa: PLR0913 - one argument per part of the message
         self, key: str, got: object, allowed: str, *, needed: float, available: float, where: str = ""
@@ -80,7 +81,7 @@ class BusError(SkinError):
 
 
 class NodeError(BusError):
-    """Violation of the specification by a node."""
+    """Protocol violation by a CANopen node, or failure to communicate with the node."""
 
     def __init__(self, node_id: int, message: str) -> None:
         self.node_id = node_id
@@ -100,7 +101,7 @@ class SdoAbort(NodeError):
 
 
 class CodecError(SkinError, ValueError):
-    """Payload that cannot be decoded; ``cob_id`` and ``data`` are taken from the frame."""
+    """Payload that cannot be decoded; ``cob_id`` and ``data`` are those of the frame."""
 
     def __init__(self, cob_id: int, data: bytes, allowed: str) -> None:
         self.cob_id, self.data, self.allowed = cob_id, bytes(data), allowed

@@ -1,4 +1,4 @@
-"""Old import paths of public names, which keep working for one version and issue a warning."""
+"""Keep the old import paths of moved names working for one version, with a deprecation warning."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 """Fault confinement states of a CAN controller (ISO 11898-1), as reported by SocketCAN error frames.
 
-The error frames are coded as in <linux/can/error.h>.
+The encoding of the error frames is that of <linux/can/error.h>.
 """
 
 from __future__ import annotations
@@ -20,15 +20,15 @@ class BusState(StrEnum):
 
     ACTIVE = "error active"
     WARNING = "error warning"
-    """Some errors occurred; the controller is still error active."""
+    """Warning limit of an error counter reached; the controller is still error active."""
     PASSIVE = "error passive"
-    """Many errors occurred; the controller still sends and receives."""
+    """Error passive limit of an error counter reached; the controller still sends and receives."""
     OFF = "bus-off"
     """The controller neither sends nor receives."""
 
 
 def bus_state(frame: Frame) -> BusState | None:
-    """Return the state that a SocketCAN error frame reports, or None if it reports something else."""
+    """Return the controller state that a SocketCAN error frame reports, or None if it reports no state."""
     if frame.can_id & _BUS_OFF:
         return BusState.OFF
     if frame.can_id & _RESTARTED:

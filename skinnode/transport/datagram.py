@@ -1,8 +1,8 @@
 """UDP bus for load tests: each packet holds one frame in SocketCAN's memory layout.
 
-The reader is SocketCAN's, with the same system calls, kernel timestamps, bounded buffer and drop counter.
-Only the CAN driver and the protocol below the socket differ: UDP over the loopback device replaces them and
-costs the receiver about as much.
+Packets are received by the same reader as SocketCAN frames, with the same system calls, kernel timestamps,
+bounded buffer and drop counter. UDP over the loopback device only replaces the CAN driver and the CAN
+protocol layer of the kernel, at about the same cost to the receiver.
 """
 
 from __future__ import annotations
@@ -17,32 +17,29 @@ from skinnode.transport.port import RECEIVE_BUFFER_BYTES, SO_RCVBUFFORCE, CanPor
 from skinnode.transport.socketcan import HEADER, SocketReader
 
 LOOPBACK: Final = "127.0.0.1"
-_MTU: Final = {False: 8, True: 64}  # bytes of data in <linux/can.h>'s struct can_frame and struct canfd_frame
+_MTU: Final = {False: 8, True: 64}  # data bytes in struct can_frame and struct canfd_frame from <linux/can.h>
 
 
 def datagram(can_id: int, data: bytes, *, fd: bool = False) -> bytes:
-    """Return the packet for a frame with an 11-bit identifier.
+    """Return the UDP packet for a CAN frame with an 11-bit identifier.
 
     Args:
-        can_id: 0 to 0x7FF.
-        data: Up to 8 bytes, or up to 64 bytes if ``fd``.
-        fd: Whether to return a CAN FD frame.
+        can_id: Identifier, 0 to 0x7FF.
+        data: Payload of up to 8 bytes, or up to 64 bytes if ``fd``.
+        fd: Whether the frame is a CAN FD frame.
     """
     return HEADER.pack(can_id, len(data), 0) + data.ljust(_MTU[fd], b"\0")
 
 
 def free_channel() -> str:
-    """Return a UDP port that no program on this machine is using."""
+    """Return the number of a UDP port that no program on this machine is using."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
         sock.bind((LOOPBACK, 0))
         return str(sock.getsockname()[1])
 
 
 class DatagramPort(CanPort):
-    """Port that only receives packets.
-
-    The ``channel`` of its configuration is a UDP port number.
-    """
+    """Receive-only port for a UDP bus. The ``channel`` in its configuration is a UDP port number."""
 
     def _open(self) -> can.BusABC:
         try:

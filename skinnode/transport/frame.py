@@ -1,4 +1,4 @@
-"""Received frame, in the same form for every interface."""
+"""Received CAN frame, with the same fields for every type of interface."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 
 class Frame(NamedTuple):
-    """A received frame. ``t_ns`` is monotonic; ``data`` is empty for a remote frame."""
+    """A received CAN frame. ``t_ns`` is a monotonic time; ``data`` is empty in a remote frame."""
 
     can_id: int
     data: bytes

@@ -1,9 +1,9 @@
-"""Write frames to a file with python-can's writers: candump text (``.log``) or Vector BLF.
+"""Write CAN frames to a candump text file (``.log``) or a Vector BLF file, with python-can's writers.
 
-Both formats keep all frames written before the last :meth:`FrameLog.flush`, even if the process is killed
-later. A ``.log`` file is only appended to. python-can's BLF writer buffers up to 128 kB of frames and
-corrects the file header only when it stops. Each flush therefore stops the writer, which leaves a complete
-BLF file, and opens another writer that appends.
+In both formats, all frames written before the last :meth:`FrameLog.flush` survive even if the process is
+killed later. In a ``.log`` file, each frame is simply appended. python-can's BLF writer buffers up to 128 kB
+of frames and completes the file header only when the writer stops. Each flush therefore stops the BLF writer,
+which leaves a complete file, and opens another writer that appends.
 """
 
 from __future__ import annotations
@@ -22,30 +22,30 @@ LogFormat = Literal["log", "blf"]
 SUFFIXES: Final = (".log", ".blf")
 
 _CONTAINER_BYTES: Final = 1 << 20
-"""Maximum size of a BLF container before compression: more than is written between two flushes, so that no
-frame is split between two containers."""
+"""Maximum size of a BLF container before compression, bytes. The limit exceeds the data written between two
+flushes, so that no frame is split between two containers."""
 
 
 class LoggedFrame(NamedTuple):
-    """A frame in a log; its ``t_ns`` is wall-clock time with a resolution of 1 µs."""
+    """A CAN frame in a log file; the frame's ``t_ns`` is wall-clock time with a resolution of 1 µs."""
 
     frame: Frame
     channel: str
-    """Name of the channel; in BLF, which numbers channels, the channel number, counted from 0."""
+    """Channel name; in a BLF file, which stores no names, the channel number, counted from 0."""
     sent: bool
     """Whether the recording program sent the frame."""
 
 
 class FrameLog:
-    """Log file being written. Owned by one thread.
+    """Open log file to which CAN frames are written. Owned by one thread.
 
     Args:
-        path: A new file ending in ``.log`` or ``.blf``.
+        path: Path of the file to create, ending in ``.log`` or ``.blf``.
         channels: Names of the channels; BLF numbers them in this order.
 
     Raises:
         ConfigError: if the file exists already, or cannot be created.
-        OSError: from the other methods, if writing to the disk fails.
+        OSError: if writing to the disk fails; raised by the other methods.
     """
 
     def __init__(self, path: Path, channels: tuple[str, ...]) -> None:
@@ -61,7 +61,7 @@ class FrameLog:
         """Number of frames written."""
 
     def write(self, logged: LoggedFrame) -> None:
-        """Write a frame, which is safe only after the next :meth:`flush`."""
+        """Write a frame, which survives a crash only after the next :meth:`flush`."""
         frame = logged.frame
         if self._writer is None:
             self._writer = self._open()
@@ -82,10 +82,10 @@ class FrameLog:
         self.frames += 1
 
     def flush(self, *, to_disk: bool) -> None:
-        """Pass everything written so far to the kernel, which keeps it even if this process is killed.
+        """Pass all data written so far to the kernel, so that the data survive if this process is killed.
 
         Args:
-            to_disk: Whether to wait until the data is on the disk, so that it survives a loss of power.
+            to_disk: Whether to wait until the data are on the disk, so that they survive a loss of power.
         """
         if self._is_blf:
             self._end_blf()
@@ -95,7 +95,7 @@ class FrameLog:
             os.fsync(self._file.fileno())
 
     def close(self) -> None:
-        """Close the file. Never raises: earlier calls have already reported write errors."""
+        """Close the file. Raises nothing, because earlier calls have already reported any write error."""
         with contextlib.suppress(OSError):
             self.flush(to_disk=True)
         with contextlib.suppress(OSError):

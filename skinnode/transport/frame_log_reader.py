@@ -1,8 +1,9 @@
 """Read frames from a candump log or a BLF file, even if the file is damaged.
 
-A truncated or partly overwritten file yields every complete frame; the damage is counted and located by line
-or offset (:class:`Damage`). No file content causes an exception. A corrupted byte that leaves a frame valid
-is detected in BLF, whose containers have checksums, but not in a candump log, which has no checksums.
+All complete frames of a truncated or partly overwritten file are read. Damaged places are counted and located
+by line or offset (:class:`Damage`). Invalid file content never causes an exception. If a corrupted byte
+leaves a frame well-formed, the error is detected in a BLF file, whose containers have checksums, but not in a
+candump log, which has no checksums.
 """
 
 from __future__ import annotations
@@ -26,15 +27,15 @@ from skinnode.transport.frame import Frame
 from skinnode.transport.frame_log import SUFFIXES, LoggedFrame
 
 DAMAGES_KEPT: Final = 100
-"""Maximum number of damaged places described; further places are only counted."""
+"""Maximum number of damaged places described; additional damaged places are only counted."""
 
 
 @dataclass(frozen=True, slots=True)
 class Damage:
-    """Part of a file that could not be read."""
+    """Damaged part of a log file, which could not be read."""
 
     line: int | None
-    """Line number, counted from 1; None in BLF, which has no lines."""
+    """Line number, counted from 1; None in a BLF file, which has no lines."""
     offset: int
     """Offset from the beginning of the file, bytes."""
     what: str
@@ -48,14 +49,14 @@ class _Container(NamedTuple):
     """Container in a BLF file."""
 
     end: int
-    """Offset from which to look for the next container, bytes."""
+    """File offset from which to search for the next container, bytes."""
     objects: bytes | None
-    """Content, as far as it is readable; None if nothing is readable."""
+    """Readable part of the container's content; None if no part is readable."""
     intact: bool = False
 
 
 class FrameLogReader:
-    """Log file, read once from the beginning by iterating over it. Owned by one thread.
+    """Log file that can be read once, by iterating over the reader. Owned by one thread.
 
     Raises:
         ConfigError: if the file cannot be opened, or its name does not end in ``.log`` or ``.blf``.
@@ -70,16 +71,16 @@ class FrameLogReader:
             raise ConfigError("recording", str(path), f"a file that can be read ({error.strerror})") from None
         self.path = path
         self.damages: list[Damage] = []
-        """The first :data:`DAMAGES_KEPT` damaged places."""
+        """Descriptions of the first :data:`DAMAGES_KEPT` damaged places."""
         self.damaged = 0
-        """Number of damaged places up to the current position."""
+        """Number of damaged places found so far."""
 
     def __iter__(self) -> Iterator[LoggedFrame]:
         with self._file:
             yield from self._blf() if self.path.suffix == ".blf" else self._candump()
 
     def close(self) -> None:
-        """Stop reading."""
+        """Stop reading and close the file."""
         self._file.close()
 
     def _complain(self, line: int | None, offset: int, what: str) -> None:
@@ -122,7 +123,7 @@ class FrameLogReader:
                 if objects is not None:
                     whole, tail = self._whole_objects(tail + objects, at)
                     yield from self._frames(header, whole, at)
-                if not intact:  # the length of a partial frame may be wrong, and would swallow later frames
+                if not intact:  # a partial frame's length may be wrong and extend over later frames
                     tail = b""
                 following = _find_container(data, end)
                 if following > end + _PADDING_BYTES and intact:
@@ -133,9 +134,9 @@ class FrameLogReader:
                 self._complain(None, size, f"truncated: a frame that ends after {counted(len(tail), 'byte')}")
 
     def _container(self, data: mmap.mmap, at: int) -> _Container:
-        """Return the end and the content of the container at ``at``.
+        """Return the end and the content of the container at file offset ``at``.
 
-        A damaged container is assumed to end after its header, because its length may be wrong too.
+        A damaged container is assumed to end directly after its header, because its length may be wrong.
         """
         _, _, _, size, _ = _OBJECT.unpack_from(data, at)
         begin, end = at + _CONTAINER_HEAD_BYTES, at + size
@@ -167,7 +168,7 @@ class FrameLogReader:
     def _whole_objects(self, data: bytes, container: int) -> tuple[bytes, bytes]:
         """Return the complete objects in ``data``, and the beginning of an incomplete object at its end."""
         pieces: list[bytes] = []
-        begin = at = 0  # begin: offset of the objects since the last gap; at: offset of the next object
+        begin = at = 0  # begin: offset of the first object after the last gap; at: offset of the next object
         while True:
             start = data.find(b"LOBJ", at, at + _PADDING_BYTES + 4)
             if start < 0 and len(data) - at <= _PADDING_BYTES:
@@ -191,7 +192,7 @@ class FrameLogReader:
                 at = start + length
 
     def _frames(self, header: bytes, objects: bytes, container: int) -> Iterator[LoggedFrame]:
-        """Yield the frames among ``objects``, read by python-can from a small file that holds them."""
+        """Yield the CAN frames in ``objects``, which python-can reads from an in-memory BLF file."""
         head = _OBJECT.pack(b"LOBJ", _OBJECT.size, 1, _CONTAINER_HEAD_BYTES + len(objects), _LOG_CONTAINER)
         file = io.BytesIO(header + head + struct.pack("<H6xL4x", _STORED, len(objects)) + objects)
         try:
@@ -213,7 +214,7 @@ _ERROR_BIT: Final = 0x2000_0000
 
 
 def _candump_frame(line: bytes) -> LoggedFrame | None:
-    """Return the frame on a line as written by ``candump -L`` or python-can; None for any other line."""
+    """Return the frame on a line written by ``candump -L`` or python-can; None for any other line."""
     match = _LINE.fullmatch(line)
     if match is None:
         return None
@@ -243,9 +244,9 @@ def _shown(data: bytes) -> str:
     return repr(shown + ("…" if len(data) > 40 else ""))
 
 
-# --- BLF: sizes as in python-can's can/io/blf.py
+# --- BLF: sizes are those of python-can's can/io/blf.py
 
-_OBJECT: Final = struct.Struct("<4sHHLL")  # "LOBJ", header bytes, version, bytes, type
+_OBJECT: Final = struct.Struct("<4sHHLL")  # "LOBJ", header size, version, object size, object type
 _CONTAINER_HEAD_BYTES: Final = _OBJECT.size + 16
 _FILE_HEADER_BYTES: Final = 144
 _BLANK_HEADER: Final = b"LOGG" + struct.pack("<L", _FILE_HEADER_BYTES) + bytes(_FILE_HEADER_BYTES - 8)
@@ -258,7 +259,7 @@ _MOST_OBJECT: Final = 1 << 16
 
 
 def _find_container(data: mmap.mmap, at: int) -> int:
-    """Return the offset of the next container, or the length of the file if there is none."""
+    """Return the file offset of the next container, or the file's length if there is no further container."""
     while (at := data.find(b"LOBJ", at)) >= 0:
         if at + _OBJECT.size <= len(data):
             _, _, _, size, kind = _OBJECT.unpack_from(data, at)

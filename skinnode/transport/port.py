@@ -1,8 +1,9 @@
-"""Endpoint on a CAN bus, with the same behaviour on every interface.
+"""Endpoint on a CAN bus, with the same behaviour on every type of interface.
 
-Each python-can error is raised as a one-line :class:`~skinnode.errors.BusError`. Times are on the host's
-monotonic clock. If the interface stamps frames with the wall clock (virtual, udp_multicast, socketcan), the
-age of the stamp is subtracted, so that waiting in a queue does not change a frame's time.
+Each python-can error is raised as a one-line :class:`~skinnode.errors.BusError`. Frame times are times of the
+host's monotonic clock. If the interface timestamps frames with the wall clock (virtual, udp_multicast,
+socketcan), the timestamp's age is subtracted from the time of reading, so that the time that a frame spends
+in a queue does not change its arrival time.
 """
 
 from __future__ import annotations
@@ -30,12 +31,12 @@ if TYPE_CHECKING:
     from skinnode.config import BusConfig
 
 VIRTUAL_QUEUE_FRAMES: Final = 32768
-"""Queue capacity of an endpoint on python-can's virtual bus: about 4 s of traffic on a fully loaded bus at 1
-Mbit/s. Without a limit, an endpoint that is never read would fill the memory."""
+"""Queue capacity of an endpoint on python-can's virtual bus, frames: about 4 s of traffic on a fully loaded
+bus at 1 Mbit/s. Without a limit, the queue of an endpoint that is never read would fill the memory."""
 
 RECEIVE_BUFFER_BYTES: Final = 1 << 22
-"""Size of the receive buffer requested from the kernel, if the interface is a socket; a waiting frame takes
-about 800 bytes."""
+"""Size of the receive buffer requested from the kernel for interfaces that are sockets, bytes; a waiting
+frame occupies about 800 bytes."""
 
 # Python has no names for these constants from <asm-generic/socket.h>, <linux/in.h> and <linux/in6.h>.
 SO_RCVBUFFORCE: Final = 33
@@ -43,42 +44,42 @@ _IP_MULTICAST_ALL: Final = 49
 _IPV6_MULTICAST_ALL: Final = 29
 
 _OLDEST_STAMP_S: Final = 10.0
-"""Maximum age of a timestamp. An older or future timestamp does not come from this machine's wall clock, so
-the time of reading is used."""
+"""Maximum age of a frame's timestamp, s. An older or future timestamp does not come from this machine's wall
+clock, so the time of reading is used instead."""
 
 _LINK_GONE: Final = (errno.ENETDOWN, errno.ENODEV, errno.ENXIO)
-"""Errors by which the kernel reports, once per socket, that the interface went down; the error may be raised
-by a send call rather than a receive call."""
+"""Error codes with which the kernel reports that the interface went down. The kernel reports this error only
+once per socket, and possibly from a send call rather than a receive call."""
 
 _SOCKETCAN: Final = "socketcan"
 _MULTICAST: Final = "udp_multicast"
 _VIRTUAL: Final = "virtual"
 
 _DELIVERY_S: Final = 0.05
-"""Time allowed for the kernel to finish delivering a frame, s; an assumption, above the 28 ms for which a
-virtual machine stood still when a frame from another group was received."""
+"""Time allowed for the kernel to finish delivering a frame, s. The value is an assumption: a frame from
+another multicast group once arrived after a virtual machine had been suspended for 28 ms."""
 
-# In a program without logging, python-can's loggers would print warnings on stderr, even about errors that
-# BusError reports.
+# In a program that does not configure logging, python-can's loggers would print warnings to stderr, even for
+# errors that are already reported by a BusError.
 logging.getLogger("can").addHandler(logging.NullHandler())
 
 
 def is_interface(config: BusConfig) -> bool:
-    """Return whether python-can, or one of its plugins, provides the interface of this bus."""
+    """Return whether python-can or one of its plugins provides the bus's type of interface."""
     return config.interface in can.VALID_INTERFACES
 
 
 def allowed_interfaces(config: BusConfig) -> str:
-    """Return a phrase that lists python-can's interfaces and suggests the closest match."""
+    """Return a phrase that lists python-can's interface types and suggests the closest match."""
     known = ", ".join(sorted(can.VALID_INTERFACES))
     near = difflib.get_close_matches(config.interface.lower(), can.VALID_INTERFACES, 1)
     return f"one of {known}; did you mean {near[0]!r}?" if near else f"one of {known}"
 
 
 class _Message(can.Message):
-    """CAN message class; copying an instance is five times as fast as with python-can's ``Message``.
+    """CAN message that can be copied five times as fast as python-can's ``Message``.
 
-    python-can's virtual bus copies each message once per receiver.
+    Copying speed matters because python-can's virtual bus copies each message once per receiver.
     """
 
     __slots__ = ()
@@ -101,15 +102,15 @@ class _Message(can.Message):
 
 
 class CanPort:
-    """Open endpoint on a bus, from construction to :meth:`close` or the end of a ``with`` block.
+    """Endpoint on a bus, open from construction until :meth:`close` or the end of a ``with`` block.
 
-    An endpoint does not receive its own frames. python-can's configuration files and environment
+    An endpoint does not receive the frames that it sends. python-can's configuration files and environment
     variables are ignored.
 
-    Threads: any thread may send; one thread receives.
+    Threads: any thread may send; only one thread may receive.
 
     Args:
-        config: The bus: interface, channel, bit rates and options.
+        config: Interface, channel, bit rates and options of the bus.
 
     Raises:
         BusError: if the interface cannot be opened.
@@ -121,14 +122,15 @@ class CanPort:
         self._longest = 64 if config.fd else 8
         self._closed = False
         self._link_gone: Exception | None = None
-        self._counting = clock.lock()  # several threads count sent frames; see send()
+        self._counting = clock.lock()  # protects the counters that several threads change in send()
         self._sent = self._received = self._errors = self._undelivered = self._malformed = 0
-        self._dropped_before = 0  # by earlier readers
+        self._dropped_before = 0  # frames dropped by earlier readers
         self._away = False
         self._bus = self._open()
         self._reader = self._open_reader()
-        # Frames sent to a multicast group come back, and every member has the same address and port. The only
-        # field that can mark them is the channel, which python-can sends but does not use.
+        # A multicast group returns each frame to its sender, and all members have the same address and port.
+        # To recognise its own frames, the port marks them in the channel field, which python-can sends but
+        # does not use.
         self._tag = f"skinnode-{uuid.uuid4().hex}" if config.interface == _MULTICAST else None
         self._send_timeout_s = 0.0 if config.interface == _VIRTUAL else None
 
@@ -145,7 +147,7 @@ class CanPort:
             raise BusError(f"{self._where}: no such interface, allowed: {allowed_interfaces(config)}")
         try:
             bus = can.Bus(interface=config.interface, channel=config.channel, ignore_config=True, **options)
-        except Exception as error:  # backends pass on driver exceptions: OSError, ImportError, TypeError …
+        except Exception as error:  # drivers raise OSError, ImportError, TypeError and others
             raise BusError(
                 f"{self._where}: cannot be opened ({_why(error)}), allowed: {_channel_hint(config)}"
             ) from error
@@ -154,7 +156,7 @@ class CanPort:
         return bus
 
     def _open_reader(self) -> SocketReader | None:
-        """Return the reader that replaces python-can's, or None if python-can receives."""
+        """Return the reader that receives instead of python-can, or None if python-can receives."""
         bus: Any = self._bus  # python-can's SocketcanBus
         return SocketReader(bus.socket) if self.config.interface == _SOCKETCAN else None
 
@@ -164,53 +166,53 @@ class CanPort:
         return self._reader is not None
 
     def fileno(self) -> int:
-        """Return the file descriptor of a port that :attr:`reads_batches`; -1 while the port is closed."""
+        """Return the socket's file descriptor if the port :attr:`reads_batches`; -1 otherwise."""
         return -1 if self._reader is None else self._reader.fileno()
 
     @property
     def sent(self) -> int:
-        """Number of frames passed to the interface."""
+        """Number of frames sent to the interface."""
         return self._sent
 
     @property
     def received(self) -> int:
-        """Number of frames read, excluding the endpoint's own."""
+        """Number of frames read from the interface, excluding the endpoint's own frames."""
         return self._received
 
     @property
     def errors(self) -> int:
-        """Number of calls to send or receive that raised BusError."""
+        """Number of send and receive calls that raised BusError."""
         return self._errors
 
     @property
     def undelivered(self) -> int:
-        """Frames lost because another endpoint on a virtual bus had no room for them."""
+        """Number of sent frames lost because the queue of another endpoint on the virtual bus was full."""
         return self._undelivered
 
     @property
     def malformed(self) -> int:
-        """Packets sent to the multicast group that were not CAN frames."""
+        """Number of packets received from the multicast group that were not CAN frames."""
         return self._malformed
 
     @property
     def dropped(self) -> int:
-        """Frames for which the kernel had no room; 0 if the interface is not socketcan."""
+        """Number of frames dropped because the kernel's buffer was full; 0 unless socketcan is used."""
         return self._dropped_before + (0 if self._reader is None else self._reader.dropped)
 
     def send(self, can_id: int, data: bytes, *, remote: bool = False) -> None:
         """Send a frame with an 11-bit identifier.
 
-        On a bus with ``fd``, more than 8 bytes are sent as a CAN FD frame with bit-rate switching, padded
-        with zeros to a valid length. On a virtual bus, another endpoint whose queue is full loses the frame.
+        On a bus with ``fd``, data of more than 8 bytes are sent as a CAN FD frame with bit-rate switching,
+        padded with zeros to a valid length. On a virtual bus, endpoints whose queues are full lose the frame.
 
         Args:
-            can_id: 0 to 0x7FF.
-            data: Up to 8 bytes; up to 64 on a bus with ``fd``.
+            can_id: Identifier, 0 to 0x7FF.
+            data: Payload of up to 8 bytes, or up to 64 bytes on a bus with ``fd``.
             remote: Whether to send a remote frame.
 
         Raises:
             BusError: if the interface rejects the frame.
-            ValueError: if the identifier or the length is out of range for this bus.
+            ValueError: if the identifier or the payload length is out of range for this bus.
         """
         if not 0 <= can_id <= 0x7FF:
             raise ValueError(f"can_id: got {can_id}, must be 0 to 0x7FF")
@@ -244,7 +246,7 @@ class CanPort:
             self._undelivered += undelivered
 
     def recv(self, timeout_s: float) -> Frame | None:
-        """Return the next frame, or None if none arrives within ``timeout_s``.
+        """Return the next frame, or None if no frame arrives within ``timeout_s``.
 
         Raises:
             BusError: if the interface fails or is closed.
@@ -290,16 +292,17 @@ class CanPort:
                     self._errors += 1
                     raise BusError(f"{self._where}: cannot receive ({_why(error)})") from error
                 self._malformed += 1
-            # The endpoint's own frame, or a malformed packet: wait for the remaining time.
+            # After the endpoint's own frame or a malformed packet, wait for the remaining time.
             timeout_s = max(0.0, (end_ns - clock.monotonic_ns()) * 1e-9)
 
     def reopen(self) -> None:
         """Close and reopen the interface after a failure; the counters are not reset.
 
-        While the interface is closed, sending raises BusError. The receiving thread must have ended first.
+        While the interface is closed, sending raises BusError. The receiving thread must have ended before
+        the call.
 
         Raises:
-            BusError: if the interface cannot be opened; a later call may succeed.
+            BusError: if the interface cannot be opened; the call may then be repeated.
         """
         if not self._away:
             self._away = True
@@ -311,13 +314,13 @@ class CanPort:
         self._away = False
 
     def set_bitrate(self, bitrate_bps: int) -> None:
-        """Change the bit rate and reopen the interface.
+        """Change the bus's bit rate and reopen the interface.
 
-        On socketcan, ``ip link`` sets the bit rate, which requires the capability CAP_NET_ADMIN. The
-        receiving thread must have ended first.
+        On socketcan, the bit rate is set with ``ip link``, which requires the capability CAP_NET_ADMIN. The
+        receiving thread must have ended before the call.
 
         Raises:
-            BusError: if the bit rate is not accepted; the interface is then open at the previous rate.
+            BusError: if the interface rejects the bit rate; the interface is then open at the previous rate.
         """
         before = self.config
         self.config = before.model_copy(update={"bitrate_bps": bitrate_bps})
@@ -331,7 +334,7 @@ class CanPort:
             self.reopen()
 
     def close(self) -> None:
-        """Close the interface. Closing twice is allowed; the receiving thread must have ended first."""
+        """Close the interface, which may be closed already. The receiving thread must have ended."""
         if not self._closed:
             self._closed = True
             self._bus.shutdown()
@@ -349,15 +352,15 @@ class CanPort:
 
 
 def _tune_socket(fileno: int) -> None:
-    """Request a large receive buffer, and frames from this multicast group only."""
+    """Request a large receive buffer, and restrict reception to the socket's own multicast group."""
     duplicate = socket.socket(fileno=os.dup(fileno))
     try:
         try:
             duplicate.setsockopt(socket.SOL_SOCKET, SO_RCVBUFFORCE, RECEIVE_BUFFER_BYTES)
         except OSError:  # only root may exceed net.core.rmem_max
             duplicate.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER_BYTES)
-        # python-can binds to any address. Such a socket receives every group that any program has joined, so
-        # two buses on two groups would be merged.
+        # python-can binds the socket to any address. Such a socket receives the frames of every multicast
+        # group that any program on the machine has joined, which would merge the buses of different groups.
         if duplicate.family == socket.AF_INET:
             duplicate.setsockopt(socket.IPPROTO_IP, _IP_MULTICAST_ALL, 0)
             _discard_other_groups(duplicate)
@@ -369,9 +372,9 @@ def _tune_socket(fileno: int) -> None:
 
 
 def _discard_other_groups(sock: socket.socket) -> None:
-    """Discard frames received while the socket still accepted other groups.
+    """Discard the frames received while the socket still accepted other multicast groups.
 
-    If there were any, the kernel may still be delivering another that it accepted before the change.
+    If any such frame was received, the kernel may still be delivering another.
     """
     if _discard_waiting(sock):
         clock.sleep(_DELIVERY_S)
@@ -379,7 +382,7 @@ def _discard_other_groups(sock: socket.socket) -> None:
 
 
 def _discard_waiting(sock: socket.socket) -> int:
-    """Discard the waiting frames; return their number."""
+    """Discard the frames waiting in a socket. Returns the number of frames discarded."""
     count = 0
     with contextlib.suppress(BlockingIOError):
         while True:
@@ -405,16 +408,17 @@ def _frame(message: can.Message) -> Frame:
 
 
 def _is_garbage(error: Exception) -> bool:
-    """Return whether the multicast bus failed because of a packet's content, not because of the network.
+    """Return whether a multicast bus failed because of a packet's content rather than the network.
 
-    In that case msgpack or a check of the message raised the error, not the socket.
+    Errors caused by the content are raised by msgpack or by a check of the message, errors of the network by
+    the socket.
     """
     cause = error.__cause__
     return isinstance(error, can.CanOperationError) and cause is not None and not isinstance(cause, OSError)
 
 
 def _why(error: BaseException) -> str:
-    """Return the most informative error in a chain of exceptions, as one line."""
+    """Return the message of the most informative exception in a chain of exceptions, as one line."""
     while error.__cause__ is not None:
         error = error.__cause__
     if error.__context__ is not None and isinstance(error.__context__, OSError):

@@ -1,6 +1,6 @@
-"""Receiving threads, which only copy frames into bounded queues and count the frames that do not fit.
+"""Receiving threads, which only copy CAN frames into bounded queues and count the frames that do not fit.
 
-One reader takes whole batches from the other end of the queues.
+A single reader thread takes whole batches of frames from the queues.
 """
 
 from __future__ import annotations
@@ -20,48 +20,49 @@ from skinnode.transport.frame import Frame
 from skinnode.transport.port import CanPort
 
 CAPACITY_FRAMES: Final = 16384
-"""Capacity of an intake: 2 s of traffic on a fully loaded bus at 1 Mbit/s (8,000 frames/s); a host tolerates
-only shorter pauses."""
+"""Capacity of an intake, frames: 2 s of traffic on a fully loaded bus at 1 Mbit/s (8,000 frames/s). If the
+reader pauses for longer, frames are lost."""
 
 _POLL_S: Final = 0.02
-"""Maximum time that a thread waits for a frame before it checks whether to end, s."""
+"""Maximum time for which a receiving thread waits for a frame before it checks whether to end, s."""
 
 
 GATHER_NS: Final = 1_500_000
-"""Pause after a batch, like the interrupt moderation of a network card: waking 8,000 times a second, once per
-frame, would cost more than handling the frames. The first frame after a period of silence is not delayed, and
-each frame keeps its arrival time."""
+"""Pause after receiving a batch, ns, similar to the interrupt moderation of a network card. Waking 8,000
+times a second, once per frame, would cost more than handling the frames. The first frame after a period of
+silence is not delayed, and every frame keeps its original arrival time."""
 
 LONG_NS: Final = 5_000_000
-"""Pause after a batch while the arrival of every awaited frame is predicted. An unpredicted frame may wait
-one and a half times as long."""
+"""Pause after receiving a batch if the arrival time of every awaited frame is predicted, ns. An unpredicted
+frame may wait in the kernel for up to one and a half times this pause."""
 
 _BEFORE_NS: Final = 800_000
-"""Lead time before a predicted arrival at which waiting frames are fetched, so that little work is left when
+"""Time before a predicted arrival at which the waiting frames are fetched, ns. Little work then remains when
 the predicted frame arrives."""
 _SHORT_NS: Final = 300_000
-"""Minimum pause, used while a predicted frame is imminent or overdue."""
+"""Minimum pause between fetches, ns; used while a predicted frame is imminent or overdue."""
 _LATE_NS: Final = 600_000
-"""Time for which an overdue frame is awaited with minimum pauses."""
+"""Time after a predicted arrival during which an overdue frame is awaited with minimum pauses, ns."""
 _GIVEN_UP_NS: Final = 200_000_000
-"""Time after which an overdue frame is no longer awaited."""
+"""Time after a predicted arrival at which an overdue frame is no longer awaited, ns."""
 _ANSWER_NS: Final = 20_000_000
-"""Time after a request during which a response may arrive at any instant."""
+"""Time after sending a request during which the response may arrive at any instant, ns."""
 _LAG_NS: Final = 50_000
-"""Delay from a frame's arrival until it can be read."""
+"""Delay from a frame's arrival until the frame can be read from the socket, ns."""
 
 
 class Intake:
-    """Bounded queue for one port, between its receiving thread and the reader.
+    """Bounded queue between the receiving thread of a port and the reader.
 
-    A full queue drops the newest frame, as a kernel socket does: queued frames stay complete and in order,
-    and only the receiving thread ever touches the end of the queue. ``dropped`` counts the lost frames.
+    If the queue is full, the newest frame is dropped, as by a kernel socket. The queued frames thus stay in
+    order without gaps, and only the receiving thread accesses the end of the queue. ``dropped`` counts the
+    lost frames.
 
-    Threads: only the reader calls :meth:`take` and :meth:`expect`. Other methods belong to the receiving
-    thread unless they are documented for any thread.
+    Threads: only the reader may call :meth:`take` and :meth:`expect`. Only the receiving thread may call the
+    other methods, except those marked "Any thread".
 
     Args:
-        port: The port to receive on.
+        port: Port from which frames are received.
         capacity: Maximum number of waiting frames.
 
     Raises:
@@ -73,36 +74,38 @@ class Intake:
             raise ValueError(f"capacity: got {capacity}, must be at least 1")
         self.port = port
         self.seen_ns = 0
-        """Monotonic time before which every frame that arrived has been queued or dropped."""
+        """Monotonic time up to which all arrived frames have been queued or dropped, ns."""
         self.due_ns = 0
-        """Monotonic time of the next :meth:`fetch`. Used by the receiver."""
+        """Monotonic time of the next :meth:`fetch`, ns. Used only by the receiver."""
         self._capacity = capacity
         self._queue: deque[list[Frame]] = deque()
-        self._put = self._taken = self._dropped = 0  # the reader writes _taken, the receiver the other two
+        # _taken is written by the reader, _put and _dropped by the receiving thread
+        self._put = self._taken = self._dropped = 0
         self._error: Exception | None = None
         self._expected: dict[str, tuple[int, ...]] = {}
-        self._first_ns = 0  # earliest expected time; 0 if any group may arrive at any time
+        self._first_ns = 0  # earliest predicted arrival; 0 if a group has no prediction
         self._asked_ns = 0
 
     @property
     def dropped(self) -> int:
-        """Frames lost because the queue was full. The port counts frames that the kernel dropped."""
+        """Number of frames lost because the queue was full. The port counts those dropped by the kernel."""
         return self._dropped
 
     @property
     def queued(self) -> int:
-        """Number of frames waiting."""
-        taken = self._taken  # read before _put, so that the difference is never negative
+        """Number of frames waiting in the queue."""
+        taken = self._taken  # _taken is read before _put, so that the difference is never negative
         return self._put - taken
 
     def take(self) -> list[Frame]:
-        """Return all waiting frames in order of arrival; never waits.
+        """Return all queued frames in order of arrival, without waiting.
 
         Raises:
-            BusError: if the bus failed and all frames received before the failure have been taken.
-            Exception: any other exception that receiving raised.
+            BusError: if the bus failed and all frames received before the failure have already been taken.
+            Exception: any other exception raised by the receiving thread.
         """
-        error, batches = self._error, self._queue  # read the error first: queued frames precede it
+        # read the error first: all frames received before the error are then queued
+        error, batches = self._error, self._queue
         if not batches:
             if error is not None:
                 raise error
@@ -114,28 +117,26 @@ class Intake:
         return frames
 
     def expect(self, what: str, times_ns: tuple[int, ...]) -> None:
-        """Predict when the last frame of ``what`` will arrive, so that it is fetched without delay.
+        """Predict when the last frame of a group will arrive, so that this frame is fetched without delay.
 
         Args:
-            what: Name of the group of frames. A new prediction replaces the previous one with the same name.
-            times_ns: Possible monotonic times in ascending order; empty if the frame may arrive at any time.
+            what: Name of the group of frames. A new prediction replaces the group's previous prediction.
+            times_ns: Possible monotonic arrival times in ascending order, ns; empty if the frame may arrive
+                at any time.
         """
         self._expected[what] = times_ns
         self._first_ns = min([times[0] if times else 0 for times in self._expected.values()])
 
     def asked(self, t_ns: int) -> None:
-        """Record that a request was sent at monotonic time ``t_ns``.
-
-        A response may follow. Any thread.
-        """
+        """Record that a request was sent at monotonic time ``t_ns`` and expects a response. Any thread."""
         self._asked_ns = t_ns
 
     # --- called by the receiver
 
     def gather(self, now_ns: int) -> None:
-        """Set :attr:`due_ns` after a batch, so that frames accumulate until then."""
+        """Set :attr:`due_ns` after receiving a batch, so that frames accumulate until the next fetch."""
         known = now_ns > self._asked_ns + _ANSWER_NS
-        if now_ns < self._first_ns:  # fast path for the usual case: runs after every batch from every bus
+        if now_ns < self._first_ns:  # fast path, because this method runs after every batch from every bus
             awaited_ns = _before(self._first_ns, now_ns)
         else:
             awaited_ns, all_known = self._next_awaited(now_ns)
@@ -143,7 +144,7 @@ class Intake:
         self.due_ns = min(awaited_ns, _together(now_ns, LONG_NS if known else GATHER_NS))
 
     def _next_awaited(self, now_ns: int) -> tuple[int, bool]:
-        """Return when to fetch the next predicted frame, and whether all awaited frames are predicted."""
+        """Return when to fetch the next predicted frame, ns, and whether all awaited frames are predicted."""
         awaited_ns, all_known = now_ns + LONG_NS, bool(self._expected)
         for times in tuple(self._expected.values()):
             for t_ns in times:
@@ -156,26 +157,26 @@ class Intake:
 
     @property
     def failed(self) -> bool:
-        """Whether receiving has stopped until :meth:`Receiver.resume`."""
+        """Whether reception has failed and is stopped until :meth:`Receiver.resume` is called."""
         return self._error is not None
 
     def resume(self) -> None:
-        """Clear the error."""
+        """Clear the error of the failed port."""
         self._error = None
 
     def fetch(self, timeout_s: float) -> bool:
-        """Queue the frames that have arrived.
+        """Queue the frames that have arrived at the port.
 
         Args:
             timeout_s: Maximum wait for the first frame, s.
 
         Returns:
-            Whether there is something new to take: frames or an error.
+            Whether new frames or an error can be taken.
         """
         now_ns = clock.monotonic_ns()
         try:
             frames = self.port.recv_batch(timeout_s)
-        except Exception as error:  # every exception must reach the reader
+        except Exception as error:  # every exception must reach the reader thread
             self._error = error
             return True
         if not frames:
@@ -195,23 +196,24 @@ class Intake:
 
 @dataclass(slots=True)
 class _Shared:
-    """Intakes and poller of the shared thread."""
+    """Intakes and poll object of the shared receiving thread."""
 
     intakes: dict[Intake, None]
-    """Intakes in order, without duplicates."""
+    """Intakes in the order in which they were added, without duplicates."""
     poll: select.poll
 
 
 class Receiver:
-    """Receiver for the ports of ``intakes``, from construction until :meth:`close`.
+    """Receiver that fills ``intakes`` with frames from their ports, from construction until :meth:`close`.
 
-    Threads: ports that read batches share one thread, which wakes once for several buses where possible. Any
-    other port may block in python-can and has its own thread. A failing port stops only its own reception.
+    Threads: all ports that read batches share one thread, which wakes once for several buses where possible.
+    Each other port has its own thread, because receiving with python-can may block. If a port fails, only the
+    reception from that port stops.
 
     Args:
-        intakes: The queues to fill.
-        on_defect: Called with any exception raised outside the ports, on the thread that raised it; reception
-            continues.
+        intakes: Queues to fill.
+        on_defect: Called with any exception raised outside the ports, on the thread that raised the
+            exception; reception continues.
     """
 
     def __init__(
@@ -219,7 +221,7 @@ class Receiver:
     ) -> None:
         self._on_defect = on_defect
         self._news: queue.SimpleQueue[None] = clock.simple_queue()
-        self._joining: deque[Intake] = deque()  # waiting for the shared thread to add them
+        self._joining: deque[Intake] = deque()  # intakes that the shared thread has yet to add
         self._stop = clock.event()
         self._shared: threading.Thread | None = None
         self._alone: dict[Intake, threading.Thread] = {}
@@ -230,27 +232,27 @@ class Receiver:
             self.resume(intake)
 
     def wait(self, timeout_s: float) -> None:
-        """Wait up to ``timeout_s`` until there is something to take. Only one thread may wait."""
+        """Wait up to ``timeout_s`` for frames or an error in any intake. Only one thread may wait."""
         with contextlib.suppress(queue.Empty):
             self._news.get(timeout=timeout_s)
 
     def resume(self, intake: Intake) -> None:
-        """Receive again on a port that failed and was reopened. Any thread."""
+        """Resume reception on a port that has failed and been reopened. Any thread."""
         if intake.port.reads_batches:
             intake.resume()
             self._joining.append(intake)
             return
         if intake in self._alone:
-            # The thread ends after the failure; the error must stay set until then.
+            # The port's thread ends because the error is set, so clear the error only after the thread's end.
             self._alone[intake].join()
         intake.resume()
         name = f"receive {intake.port.config.name}"
         thread = clock.thread(target=self._receive_alone, args=(intake,), name=name)
         thread.start()
-        self._alone[intake] = thread  # set after start(): a thread that did not start cannot be joined
+        self._alone[intake] = thread  # set after start(): a thread that was not started cannot be joined
 
     def close(self) -> None:
-        """End and join the threads. The ports stay open; their owner closes them."""
+        """End and join the receiving threads. The ports stay open; closing them is up to their owner."""
         self._stop.set()
         for thread in self._alone.values():
             thread.join()
@@ -277,7 +279,7 @@ class Receiver:
                 clock.sleep(_POLL_S)
 
     def _receive_batch(self, shared: _Shared) -> None:
-        """Run one iteration of the shared thread."""
+        """Run one iteration of the shared receiving thread's loop."""
         intakes = shared.intakes
         if self._joining:
             while self._joining:
@@ -310,7 +312,7 @@ class Receiver:
             try:
                 if self._stop.is_set() or intake.failed:
                     return
-                # Polled twice: this thread may have been suspended since the first poll found nothing.
+                # Fetch twice: this thread may have been suspended after the first fetch found no frames.
                 if intake.fetch(_POLL_S) or intake.fetch(0.0):
                     self._notify()
             except Exception as error:
@@ -318,19 +320,19 @@ class Receiver:
                 clock.sleep(_POLL_S)
 
     def _notify(self) -> None:
-        if self._news.empty():  # one notification is enough
+        if self._news.empty():  # one notification is enough for all intakes
             self._news.put(None)
 
 
 def _fetch(intakes: Iterable[Intake]) -> bool:
-    """Fetch from every intake. Returns whether any intake has something new to take."""
-    return sum(intake.fetch(0.0) for intake in intakes) > 0  # any() would skip intakes
+    """Fetch frames from every port. Returns whether any intake has new frames or an error."""
+    return sum(intake.fetch(0.0) for intake in intakes) > 0  # any() would stop at the first success
 
 
 def _together(now_ns: int, pause_ns: int) -> int:
     """Return the end of a pause that lasts 0.5 to 1.5 times ``pause_ns``.
 
-    The end is the same instant for all buses, so that one wake-up serves them all.
+    The end of the pause is the same instant for all buses, so that one wake-up serves all of them.
     """
     return (now_ns + pause_ns // 2) // pause_ns * pause_ns + pause_ns
 
@@ -346,13 +348,13 @@ def _before(t_ns: int, now_ns: int) -> int:
 def _poll_of(intakes: Iterable[Intake]) -> select.poll:
     poll = select.poll()
     for intake in intakes:
-        with contextlib.suppress(ValueError):  # closed: the next fetch reports it
+        with contextlib.suppress(ValueError):  # the port is closed; the next fetch reports the error
             poll.register(intake.port.fileno(), select.POLLIN)
     return poll
 
 
 def drain(port: CanPort, within_s: float) -> list[Frame]:
-    """Return every frame that arrives within ``within_s``. For tools and tests without a receiving thread."""
+    """Return all frames that arrive within ``within_s``; for tools and tests without a receiving thread."""
     frames: list[Frame] = []
     end_ns = clock.monotonic_ns() + int(within_s * 1e9)
     while (left_ns := end_ns - clock.monotonic_ns()) > 0:

@@ -1,7 +1,8 @@
-"""Receive many messages from a socket in one system call: recvmmsg(2), which Python's socket module lacks.
+"""Receive many socket messages with one call of recvmmsg(2), which Python's socket module does not provide.
 
-The call holds Python's global interpreter lock. It does not wait and takes about 1 µs per message; releasing
-the lock 8,000 times a second, once per message, would cost the other threads more.
+The call does not release Python's global interpreter lock, but it does not wait either and takes only about
+1 µs per message. Releasing the lock 8,000 times a second, once per message, would delay the other threads
+more.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ class _Iovec(ctypes.Structure):
 
 
 class _Head(ctypes.Structure):
-    """struct msghdr of <sys/socket.h>."""
+    """The C structure ``msghdr`` from <sys/socket.h>."""
 
     _fields_ = (
         ("name", ctypes.c_void_p),
@@ -34,7 +35,7 @@ class _Head(ctypes.Structure):
 
 
 class _Message(ctypes.Structure):
-    """struct mmsghdr."""
+    """The C structure ``mmsghdr`` from <sys/socket.h>."""
 
     _fields_ = (("head", _Head), ("length", ctypes.c_uint))
 
@@ -68,16 +69,17 @@ class MessageBatch:
         self._got = 0
 
     def receive(self, sock: socket.socket, most: int) -> int:
-        """Replace the batch with up to ``most`` new messages, but no more than ``count``; never wait.
+        """Replace the batch with up to ``most`` new messages, at most ``count``, without waiting.
 
         Returns:
             Number of messages received.
 
         Raises:
-            OSError: if receiving fails; if messages arrived before the error, the next call raises it.
+            OSError: if receiving fails; if messages arrived before the error, only the next call raises it.
         """
         used = self._got * _USED.size
-        self._memory[:used] = self._fresh[:used]  # the kernel overwrote the buffer sizes with the sizes used
+        # restore the buffer sizes, which the kernel overwrote with the used sizes
+        self._memory[:used] = self._fresh[:used]
         self._got = 0
         got = _libc.recvmmsg(sock.fileno(), self._messages, min(most, self._count), socket.MSG_DONTWAIT, None)
         if got < 0:
@@ -89,13 +91,14 @@ class MessageBatch:
         return self._got
 
     def used(self) -> Iterator[tuple[int, int]]:
-        """Yield the lengths in bytes of the ancillary data and of the message, for each received message."""
+        """Yield the lengths of each received message's ancillary data and of the message, bytes."""
         return _USED.iter_unpack(self._memory[: self._got * _USED.size])
 
     def taken(self) -> memoryview:
-        """Return the memory that holds the received messages.
+        """Return the memory that contains the received messages.
 
-        Each message is followed by its ancillary data; both include unused space.
+        Each message occupies a record of fixed size: its data, then its ancillary data, each with unused
+        space.
         """
         return self._room[: self._got * self._record]
 

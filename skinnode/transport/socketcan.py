@@ -1,8 +1,8 @@
 """Read a raw SocketCAN socket in batches, with kernel timestamps and the kernel's drop counter.
 
-python-can opens and configures the socket and sends, but is not used to receive: it would need a ``select``,
-a ``recvmsg`` and a ``Message`` per frame, and ignores the drop counter. Structures and constants are from
-<linux/can.h>, <linux/can/raw.h>, <asm-generic/socket.h> and <linux/net_tstamp.h>.
+python-can opens and configures the socket and sends frames. Frames are not received with python-can, which
+needs a ``select``, a ``recvmsg`` and a ``Message`` for each frame and ignores the drop counter. Structures
+and constants are those of <linux/can.h>, <linux/can/raw.h>, <asm-generic/socket.h> and <linux/net_tstamp.h>.
 """
 
 from __future__ import annotations
@@ -26,36 +26,37 @@ _SO_TIMESTAMPNS: Final = 35
 _SO_TIMESTAMPING: Final = 37
 _RX_HARDWARE, _RX_SOFTWARE, _SOFTWARE, _RAW_HARDWARE = 1 << 2, 1 << 3, 1 << 4, 1 << 6
 
-HEADER: Final = struct.Struct("<IBB2x")  # identifier with flags, length, FD flags; 8 or 64 bytes follow
+HEADER: Final = struct.Struct("<IBB2x")  # identifier with flags, length, FD flags; then 8 or 64 data bytes
 FD_MTU: Final = 72
-"""Size of struct canfd_frame, bytes; a classic frame is shorter."""
-_STAMPS: Final = struct.Struct("@qqqqqq")  # seconds and nanoseconds: software, unused, hardware
+"""Size of struct canfd_frame, bytes; a classic CAN frame is shorter."""
+_STAMPS: Final = struct.Struct("@qqqqqq")  # s and ns of three timestamps: software, unused, hardware
 _DROPS: Final = struct.Struct("@I")
-_CONTROL: Final = struct.Struct("@Nii")  # struct cmsghdr: length including this header, level, type
+_CONTROL: Final = struct.Struct("@Nii")  # struct cmsghdr: length including the header, level, type
 _ALIGNED: Final = struct.calcsize("@N")
 _ANCILLARY_BYTES: Final = socket.CMSG_SPACE(_STAMPS.size) + socket.CMSG_SPACE(_DROPS.size)
-_STAMPED_BYTES: Final = socket.CMSG_SPACE(_STAMPS.size)  # ancillary data that holds only a time
+_STAMPED_BYTES: Final = socket.CMSG_SPACE(_STAMPS.size)  # ancillary data that contain only timestamps
 _RECORD: Final = struct.Struct(f"@IB3x8s56x{_CONTROL.size}xqq16xq8x{_ANCILLARY_BYTES - _STAMPED_BYTES}x")
-"""Usual memory layout of a frame and its times: identifier, length, 8 bytes, software and hardware time."""
+"""Usual memory layout of a received CAN frame: identifier, length, 8 data bytes, software and hardware
+times."""
 
 _EXTENDED, _REMOTE, _ERROR = 1 << 31, 1 << 30, 1 << 29
 
 _OLDEST_NS: Final = 10_000_000_000
-"""Maximum age of a frame. An older timestamp was taken before the wall clock was set, so the time of reading
-is used."""
+"""Maximum age of a received frame, ns. An older timestamp was taken before the wall clock was set, and is
+replaced by the time of reading."""
 
 _NEWEST_NS: Final = 100_000_000
-"""Maximum time from the start of reading a batch to the arrival of a frame in that batch."""
+"""Maximum time from the start of reading a batch to the arrival of the batch's last frame, ns."""
 
 _IP_S: Final = 5.0
 """Maximum duration of an ``ip link`` command, s."""
 
 BATCH_FRAMES: Final = 256
-"""Maximum number of frames per call: 30 ms of traffic on a fully loaded bus at 1 Mbit/s."""
+"""Maximum number of frames received per system call: 30 ms of traffic on a fully loaded bus at 1 Mbit/s."""
 
 
 class SocketReader:
-    """Reader that takes batches of frames from a bound socket. Owned by the receiving thread.
+    """Reader that receives batches of frames from a bound SocketCAN socket. Owned by the receiving thread.
 
     Hardware timestamps are used if the driver offers them: see :class:`HardwareDelay`.
     """
@@ -65,21 +66,21 @@ class SocketReader:
         self._poll = select.poll()
         self._poll.register(sock, select.POLLIN)
         self.dropped = 0
-        """Frames dropped because the socket's kernel buffer was full."""
+        """Number of frames dropped because the socket's kernel buffer was full."""
         self._batch = MessageBatch(BATCH_FRAMES, FD_MTU, _ANCILLARY_BYTES)
         self.hardware_stamps = False
         """Whether the newest frame had a hardware timestamp."""
         self._delay = HardwareDelay()
         sock.setsockopt(
             socket.SOL_SOCKET, _SO_TIMESTAMPNS, 0
-        )  # set by python-can; a socket has one kind of timestamp
+        )  # python-can enables this option, but a socket supports only one kind of timestamp
         sock.setsockopt(
             socket.SOL_SOCKET, _SO_TIMESTAMPING, _RX_SOFTWARE | _SOFTWARE | _RX_HARDWARE | _RAW_HARDWARE
         )
         sock.setsockopt(socket.SOL_SOCKET, _SO_RXQ_OVFL, 1)
 
     def fileno(self) -> int:
-        """Return the socket's file descriptor; -1 once it is closed."""
+        """Return the socket's file descriptor, or -1 if the socket is closed."""
         return self._sock.fileno()
 
     def read(self, timeout_s: float, most: int = BATCH_FRAMES) -> list[Frame]:
@@ -87,7 +88,7 @@ class SocketReader:
 
         Args:
             timeout_s: Maximum wait for the first frame, s.
-            most: Maximum number of frames; never more than :data:`BATCH_FRAMES`.
+            most: Maximum number of frames, capped at :data:`BATCH_FRAMES`.
 
         Raises:
             OSError: if the interface fails.
@@ -127,7 +128,7 @@ class SocketReader:
         return frames
 
     def _arrival(self, control: bytes, now_ns: int, wall_to_mono_ns: int) -> int:
-        """Return the monotonic time at which the frame with this ancillary data arrived."""
+        """Return a frame's monotonic arrival time, ns, from the frame's ancillary data."""
         t_ns, at = now_ns, 0
         while at < len(control):
             length, _, kind = _CONTROL.unpack_from(control, at)
@@ -148,10 +149,10 @@ class SocketReader:
 
 
 def set_link_bitrate(config: BusConfig) -> None:
-    """Take the interface down, set its bit rates and bring it up again, with ``ip link``.
+    """Take a CAN interface down, set its bit rates and bring it up again, using ``ip link``.
 
     Raises:
-        BusError: if a command fails, with the error message from ``ip``.
+        BusError: if an ``ip link`` command fails; the message contains the command's error output.
     """
     rates = ["bitrate", str(config.bitrate_bps)]
     if config.fd:
@@ -176,25 +177,26 @@ def _ip_link(config: BusConfig, *arguments: str) -> None:
 
 
 class HardwareDelay:
-    """Converter of times from a controller's own clock to the monotonic clock.
+    """Converter from hardware timestamps of a CAN controller to the monotonic clock.
 
-    A frame that the kernel timestamped late thus keeps its arrival time. The kernel's timestamp is never
-    early, so each frame gives an upper bound on the difference between the clocks. The lower envelope of
-    these bounds is tracked; it may rise as fast as two crystals drift apart. Owned by one thread.
+    The converted arrival time is correct even if the kernel timestamped the frame late. A kernel timestamp is
+    never early, so each frame provides an upper bound on the difference between the two clocks. The tracked
+    difference is the lower envelope of these bounds; its rate of increase is limited to the maximum drift
+    between two crystals. Owned by one thread.
     """
 
-    DRIFT: Final = 200e-6  # two oscillators of 100 ppm each
+    DRIFT: Final = 200e-6  # maximum relative drift of two oscillators with a tolerance of 100 ppm each
 
     def __init__(self) -> None:
         self._offset_ns: int | None = None
         self._last_ns = 0
 
     def arrival_ns(self, hardware_ns: int, kernel_ns: int) -> int:
-        """Return the monotonic arrival time of a frame.
+        """Return the monotonic arrival time of a frame, ns.
 
         Args:
-            hardware_ns: Timestamp from the controller.
-            kernel_ns: Timestamp from the kernel, converted to the monotonic clock.
+            hardware_ns: Timestamp from the controller, ns.
+            kernel_ns: Timestamp from the kernel, converted to the monotonic clock, ns.
         """
         offset_ns = kernel_ns - hardware_ns
         if self._offset_ns is not None and abs(offset_ns - self._offset_ns) < _OLDEST_NS:

@@ -1,1 +1,1 @@
-"""Old import paths of :mod:`skinnode.protocol`, kept for one version."""
+"""Deprecated import paths of :mod:`skinnode.protocol`, kept for one version."""

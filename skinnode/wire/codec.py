@@ -1,4 +1,4 @@
-"""Old import path of :mod:`skinnode.protocol.codec`, kept for one version."""
+"""Deprecated import path of :mod:`skinnode.protocol.codec`, kept for one version."""
 
 from skinnode.moved import moved
 

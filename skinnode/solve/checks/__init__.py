@@ -1,7 +1,8 @@
-"""Tests of the data behind a field: which readings contradict the others, and whether the field is trusted.
+"""Data checks: find readings that contradict the others, and decide whether a field is trusted.
 
-``reading_model`` describes, for one layout, how readings at rest vary together; ``explanations`` finds the
-likeliest explanation of a frame: loads, or readings that are wrong (with ``greedy_search``, ``wire_tests``
-and ``crossed_wires``); ``fault_list`` decides from frame to frame which readings are named and left out;
-``trust`` states what may be believed; ``data_check`` runs them on each field of a tracker.
+``reading_model`` models the joint distribution of a layout's readings, linearised at rest. ``explanations``
+finds the most likely explanation of a frame, either loads or wrong readings, with ``greedy_search``,
+``wire_tests`` and ``crossed_wires``. ``fault_list`` decides which readings are left out of the next frames.
+``trust`` decides whether a field and its wires are trusted. ``data_check`` runs these checks on each field of
+a tracker.
 """

@@ -1,12 +1,13 @@
-"""Crossed wires: two wires of a layer whose readings are exchanged.
+"""Crossed wires: two wires of the same layer whose readings are exchanged.
 
-If the wires were crossed before the readings at rest were measured, nothing shows it until the skin moves.
-Then the field of one wire lies where that of its neighbour belongs. The log evidence of a frame with the
-readings of two wires exchanged differs from that of the frame as it is by −αᵀδ − ½ δᵀPδ, with the precision
-P, α = P z and the change δ. No parameter is fitted, so a difference of a few nats means something.
+If two wires were already crossed when the readings at rest were measured, the error stays invisible until the
+skin moves. The displacements of each wire are then attributed to the other wire. Exchanging the readings of
+two wires changes the log evidence of a frame by −αᵀδ − ½ δᵀPδ, with the precision P, α = P z and the change δ
+of the readings z. The test fits no parameter, so a difference of a few nats is significant.
 
-In 108 healthy frames of presses of six kinds (staggered, h = 0.5, noise 1e-4), the largest difference was
-2.8 nats; with two upper or two lower wires crossed, its median was 125 and 43.
+In 108 healthy frames with six kinds of presses (staggered layout, h = 0.5, noise 1e-4), the largest change
+was 2.8 nats. The median change was 125 nats with two upper wires crossed, and 43 nats with two lower wires
+crossed.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ Mask = NDArray[np.bool_]
 
 @dataclass(frozen=True, slots=True)
 class WirePair:
-    """Two wires of a layer."""
+    """Two wires of the same layer."""
 
     part: FaultyPart
     one: int
@@ -34,7 +35,7 @@ class WirePair:
 
 
 def exchanged(z: Float, present: Mask, pair: WirePair) -> tuple[Float, Mask]:
-    """Return readings (U, K), and which of them there are, with those of two wires exchanged."""
+    """Return copies of the readings and of the mask of available readings, with two wires exchanged."""
     here, there = [pair.one, pair.other], [pair.other, pair.one]
     z, present = z.copy(), present.copy()
     for values in (z, present):
@@ -48,14 +49,15 @@ def exchanged(z: Float, present: Mask, pair: WirePair) -> tuple[Float, Mask]:
 def likeliest(
     p: Float, alpha: Float, z: Float, present: Mask, *, far: bool = False
 ) -> tuple[float, WirePair]:
-    """Return the two wires whose exchange raises the log evidence of a frame most, and by how much.
+    """Return the largest gain in log evidence from exchanging two wires, in nats, and these wires.
 
     Args:
         p: (m, m) precision of the readings.
         alpha: (m,) P z.
         z: (U, K) changes of the readings since rest, in units of their noise.
-        present: (U, K) readings that there are; others are not exchanged.
-        far: Whether the wires need not be neighbours, which takes ten times as long.
+        present: (U, K) bool, the available readings; other readings are not exchanged.
+        far: Whether to compare all pairs of wires; by default, only neighbours are compared. Comparing all
+            pairs takes ten times as long.
     """
     upper_wires, lower_wires = z.shape
     longest = max(upper_wires, lower_wires)
@@ -70,10 +72,10 @@ def likeliest(
 def best_exchange(  # noqa: PLR0913 - a kernel: arrays by name
     p: Float, alpha: Float, z: Float, present: Mask, upper: int, lower: int, reach: int, delta: Float
 ) -> tuple[float, bool, int, int]:
-    """Return the largest gain in log evidence, whether the wires are upper ones, and the two wires.
+    """Return the largest gain in log evidence, whether the two wires are upper wires, and their numbers.
 
-    Wires up to ``reach`` apart are compared; the choice among n pairs costs ln n. ``delta`` (max(U, K),) is
-    scratch.
+    Compares wires whose numbers differ by up to ``reach``. The choice among n pairs reduces the gain by ln n.
+    ``delta`` (max(U, K),) is a work array.
     """
     best, is_upper, one, other, pairs = -math.inf, True, 0, 0, 0
     for apart in range(1, reach + 1):
@@ -103,9 +105,11 @@ def _gain(  # noqa: PLR0913 - a kernel: arrays by name
     enough: float,
     delta: Float,
 ) -> float:
-    """Return the gain of exchanging readings start, start + step, … with those ``across`` further on.
+    """Return the gain in log evidence from exchanging the ``count`` readings of two wires.
 
-    The bound −αᵀδ comes first: if it is not above ``enough``, it is returned in place of the gain.
+    The first wire has the readings start, start + step, …; the indices of the second wire are larger by
+    ``across``. The upper bound −αᵀδ is computed first. If the bound does not exceed ``enough``, it is
+    returned instead of the gain.
     """
     linear, both = 0.0, 0
     for i in range(count):

@@ -1,8 +1,9 @@
-"""Check of a frame's data: finds readings that contradict the others, solves without them, assesses trust.
+"""Data check of a frame: finds readings that contradict the others, solves without them, and assesses trust.
 
-A frame is first solved with all readings but those already named. Its field then predicts, at rest geometry,
-what every reading should be (:mod:`skinnode.solve.checks.reading_model`). If one reading or wire contradicts
-the others, it is left out and the frame is solved again, up to :data:`ROUNDS` times.
+Each frame is first solved with all readings except those with confirmed faults. The field is converted to
+readings linearised at rest, which are tested by the model in :mod:`skinnode.solve.checks.reading_model`. If a
+reading or a wire contradicts the others, it is left out and the frame is solved again, until :data:`ROUNDS`
+groups of readings are left out.
 """
 
 from __future__ import annotations
@@ -33,69 +34,73 @@ from skinnode.solve.linalg.cholesky import multiply_vector, solve_positive
 from skinnode.solve.wires.problem import PatchProblem
 
 ROUNDS: Final = 3
-"""Maximum number of times that a frame is solved again without some of its readings."""
+"""Number of groups of readings left out of a frame at which the check stops solving the frame again."""
 WRONG: Final = 0.1
-"""Expected relative error of a wrong reading. Not tuned: an error of 0.01 changes the cost of a
-reading by 2 nats."""
+"""Expected relative error of a wrong reading. Not tuned: with a value of 0.01, the cost of a wrong reading
+would change by only 2 nats."""
 SUSPICIOUS: Final = 5.0
-"""Gain in log evidence at which a reading is suspected and explanations are sought, nats."""
+"""Gain in log evidence from a fault above which a frame is suspicious and explanations are sought, nats."""
 OFFSETS: Final = (0, 1, 3, 5)
-"""Steps below the κ that fits a frame at which single readings are tested."""
+"""Offsets of the κ indices at which single readings are tested, below the index that fits the frame best."""
 CLEAR: Final = -30.0
-"""Log evidence of faults over loads below which loads explain a frame so well that the next need no
-explanation, nats."""
+"""Log evidence of faults minus that of loads, nats, below which loads explain a frame clearly. Similar frames
+that follow are then not examined."""
 EXCUSED: Final = 10.0
-"""Rise of the gain after such a frame that makes a frame suspicious again, nats."""
+"""Increase of the gain after an examined frame that makes a similar frame suspicious again, nats."""
 EXCUSED_FRAMES: Final = 8
-"""Number of frames after such a frame that need no explanation; finding one takes 9 ms."""
+"""Number of frames after an examined frame in which similar frames need no new examination; an examination
+takes 9 ms."""
 PATIENCE: Final = 4
-"""Number of successive suspicious frames of which one is examined although its deadline does not permit it: a
-fault stays suspicious, a press seldom does."""
+"""Number of suspicious frames without time for an examination after which a frame is examined despite its
+deadline. Frames with a fault remain suspicious; frames of a press seldom do."""
 EXAMINATION_S: Final = 3e-3
-"""Expected time of the first examination, s."""
+"""Expected duration of the first examination, s. Later examinations use measured durations."""
 CROSSED_FRAMES: Final = 5
-"""Number of frames after one with two exchanged wires in which finding one of them means both."""
+"""Number of frames after two crossed wires were found in which a finding for one of these wires is reported
+for both."""
 NOISE_RATIOS: Final = (2.0, 4.0, 8.0, 16.0)
-"""Ratios of the actual to the stated noise that are considered in a suspicious frame."""
+"""Ratios of actual to stated noise that are tested as explanations of a suspicious frame."""
 COARSE: Final = 0.1
-"""Error of the linearised readings, relative to the largest change, if wires could not be solved."""
+"""Assumed error of the linearised readings if several upper wires have no solution, relative to the readings'
+largest change since rest."""
 COARSE_GROUPS: Final = 3
-"""Maximum number of groups that are left out at once if wires could not be solved; of more, only the
-likeliest is."""
+"""Maximum number of groups of readings that are left out at once if several upper wires have no solution. If
+more groups are found, only the first is left out."""
 UNSOLVED: Final = 1
-"""Number of upper wires without a solution that count as faults of these wires; if there are more, a lower
-wire may be the cause."""
+"""Maximum number of upper wires without a solution that are reported as faults of these wires. If more upper
+wires have no solution, a lower wire may be the cause."""
 SPARED: Final = 3
-"""Maximum number of upper wires that the posterior leaves out by itself."""
+"""Maximum number of upper wires left out by the solver that are reported as faults of these wires."""
 
 Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Solved:
-    """A field with the readings from which it was computed."""
+    """A field and the readings from which it was computed."""
 
     field: FieldFrame
     a: Float
-    """(U, K) R · gain in the units of the problem."""
+    """(U, K) resistances times gain, R · gain, in the units of the :class:`PatchProblem`."""
     noise: Float
-    """(U, K) relative standard deviation of R."""
+    """(U, K) relative standard deviation of the resistances R."""
     used: Mask
-    """(U, K) readings used."""
+    """(U, K) bool, the readings used."""
 
 
 class DataCheck:
-    """Check of the data of one patch, frame by frame. Do not share an instance between owners.
+    """Data check of one patch, frame by frame. Do not share an instance between owners.
 
     Args:
         problem: The patch.
-        sigma: Usual noise of a reading, for :meth:`prepare`.
+        sigma: Usual relative noise of a reading, used by :meth:`prepare`.
         model_std: Standard deviation of the forward model's error, relative to the largest change of a
-            reading: 0 for a patch that equals its layout.
-        drift: Gain errors that are expected and no fault: ``none``, ``patch`` or ``wire``.
+            reading; 0 if the patch matches its layout exactly.
+        drift: Gain errors that are expected and not reported as faults: ``none``, ``patch`` or ``wire``.
 
     Attributes:
-        scan: Number by which the user knows the next frame; by default, frames are counted.
+        scan: Scan number of the next frame, used in its faults; if None, the number of checked frames is
+            used.
     """
 
     def __init__(
@@ -123,18 +128,18 @@ class DataCheck:
         self._explainer.wrong_readings(self._z, every, self._evidence, 0, 1.0, 1.0)  # compiles the kernels
         self._largest_gains(every, self._evidences(every), 1.0, 1.0)
         every[0, 0] = False
-        self._evidences(every)  # compiles what a missing reading needs
+        self._evidences(every)  # compiles the kernels for missing readings
         self.reset()
 
     def prepare(self) -> None:
-        """Compute tables that the first suspicious frames of a stream would otherwise wait for."""
+        """Compute tables in advance, so that the first suspicious frames of a stream are not delayed."""
         self._model.prepare(self._sigma)
 
     def reset(self) -> None:
-        """Forget the stream."""
+        """Discard the state of the stream, including all faults."""
         self._list.reset()
         self._frame, self._doubtful, self._noisy = 0, False, False
-        self._lead = 0.0  # log evidence of more noise over the plain frame, if the last frame was noisy
+        self._lead = 0.0  # gain in log evidence from more noise if the last frame was noisy, else 0
         self._excused, self._excused_where, self._excused_until = -math.inf, -1, 0
         self._where = -1
         self._crossed: tuple[Group, ...] = ()
@@ -145,26 +150,27 @@ class DataCheck:
 
     @property
     def left_out(self) -> Mask | None:
-        """(U, K) readings to leave out of the next frame; None if there are none."""
+        """(U, K) bool, the readings to leave out of the next frame; None if all readings are used."""
         return self._list.mask
 
     def check(
         self, solved: Solved, solve_without: Callable[[Mask], Solved], until: float = math.inf
     ) -> FieldFrame:
-        """Return the field of a frame with its faults and the verdict on trust.
+        """Check the readings of a frame, and return its field with faults and trust added.
 
         Args:
-            solved: The frame, solved without the readings of :attr:`left_out`.
-            solve_without: Solves the frame without these readings (U, K) and those of :attr:`left_out`.
-            until: Value of :func:`skinnode.process.clock.perf_counter` by which this should return; −inf if
-                some wires are unsolved for lack of time, which proves nothing. A suspicious frame that cannot
-                be examined by then is not trusted; every :data:`PATIENCE` frames in succession one takes
-                longer.
+            solved: The frame, solved without the readings :attr:`left_out`.
+            solve_without: Function that solves the frame without the given readings (U, K) and without those
+                in :attr:`left_out`.
+            until: Deadline as a value of :func:`skinnode.process.clock.perf_counter`, s; −inf if some wires
+                were not solved for lack of time, which is no sign of a fault. A suspicious frame that cannot
+                be examined before the deadline is not trusted. After :data:`PATIENCE` such frames, one frame
+                is examined despite its deadline.
         """
         self._frame += 1
         last = self._last
         if last is not None and last.noise_factor != solved.field.noise_factor:
-            self._list.reset()  # what contradicted the stated noise may not contradict the actual noise
+            self._list.reset()  # faults found at the previous noise level may not be faults at the new level
             self._lead = 0.0
         if self._list.mask is None and self._is_clean(solved):
             field = amended(solved.field, distrust="", wires_trusted=self._all_trusted)
@@ -208,9 +214,9 @@ class DataCheck:
         return field
 
     def _is_clean(self, solved: Solved) -> bool:
-        """Return whether an exact field with all readings passes the test of single readings.
+        """Return whether a field of the exact inverse, solved from all readings, passes the test for faults.
 
-        This is the fast path of :meth:`_find`, which most frames take.
+        This test is the fast path of :meth:`_find` for most frames.
         """
         field, layout = solved.field, self._problem.layout
         clean = (
@@ -231,10 +237,11 @@ class DataCheck:
         return self._needs_no_explanation(max(self._largest_gains(self._present, best, cost, sigma)))
 
     def _needs_no_explanation(self, gain: float) -> bool:
-        """Return whether a gain is small, or hardly larger than one that loads explained just before.
+        """Return whether a frame with this gain in log evidence from a fault needs no explanation.
 
-        Never after a noisy frame. The latter only if the likeliest wrong reading is that one: another may be
-        wrong under a press.
+        It needs none if the gain is small, or if loads clearly explained a recent frame with a similar gain
+        and the same suspected reading; under a press, a different reading may be wrong. After a noisy frame,
+        every frame needs an explanation.
         """
         excused = (
             self._frame < self._excused_until
@@ -244,7 +251,7 @@ class DataCheck:
         return not self._lead and (gain < SUSPICIOUS or excused)
 
     def _find(self, solved: Solved, until: float) -> tuple[Group, ...]:
-        """Return the readings that contradict the others; none if there are none."""
+        """Return the groups of readings that contradict the others; an empty tuple if no readings do."""
         self._doubtful = self._noisy = self._unexamined = False
         status = np.array(solved.field.status)
         enough = solved.used.mean(axis=1) >= OF_WIRE
@@ -289,9 +296,10 @@ class DataCheck:
         return found
 
     def _may_examine(self, gain: float, until: float) -> bool:
-        """Return whether a suspicious frame is examined.
+        """Return whether there is time to examine a suspicious frame.
 
-        Without time for that, it is unexamined, unless it resembles one examined just before.
+        If there is no time, the frame is marked as unexamined, unless it resembles a frame that was recently
+        examined and found without fault.
         """
         if self._overdue or perf_counter() + self._examination_s <= until:
             return True
@@ -299,12 +307,15 @@ class DataCheck:
         if where == self._where and gain < last + EXCUSED:
             if self._frame - frame < EXCUSED_FRAMES:
                 return False
-            self._waiting = PATIENCE  # it is time for another examination
+            self._waiting = PATIENCE  # the last examination of a similar frame is too old
         self._unexamined = not self._in_time(self._examination_s, until)
         return not self._unexamined
 
     def _in_time(self, seconds: float, until: float) -> bool:
-        """Return whether to take ``seconds`` for a suspicious frame: if there is time, or others had none."""
+        """Return whether a suspicious frame may take ``seconds``.
+
+        It may if the deadline permits it, or if :data:`PATIENCE` suspicious frames were not examined.
+        """
         if self._overdue or perf_counter() + seconds <= until:
             return True
         self._waiting += 1
@@ -314,9 +325,10 @@ class DataCheck:
         return self._overdue
 
     def _noisier(self) -> float:
-        """Return the log evidence of the frame if all its readings are noisier than stated.
+        """Return the log evidence of the frame for noise above the stated level in all its readings.
 
-        It is that of z divided by the ratio of the noise, minus ln of that ratio for each reading.
+        For each ratio of actual to stated noise, the log evidence is that of z divided by the ratio, minus ln
+        of the ratio for each reading.
         """
         model, z = self._model, self._z.ravel()
         most = -math.inf
@@ -329,7 +341,7 @@ class DataCheck:
         return most - math.log(len(NOISE_RATIOS))
 
     def _with_both_crossed(self, found: tuple[Group, ...]) -> tuple[Group, ...]:
-        """Return both of two wires that were exchanged just before if one of them is found alone."""
+        """Return ``found``, or both recently crossed wires if ``found`` contains only one of them."""
         if any(group.kind is FaultKind.CROSSED for group in found):
             self._crossed, self._crossed_until = found, self._frame + CROSSED_FRAMES
         elif self._frame <= self._crossed_until:
@@ -339,7 +351,7 @@ class DataCheck:
         return found
 
     def _linearised(self, solved: Solved, present: Mask) -> float:
-        """Write the changes of the readings, as if F were linear, into ``_z``; return the noise."""
+        """Write the readings' changes since rest, linearised, into ``_z``; return their relative noise."""
         field, layout = solved.field, self._problem.layout
         sigma = float(np.median(solved.noise[present]))
         moved = field.displacement_m.reshape(layout.shape[0], -1) / layout.pitch_m
@@ -358,9 +370,10 @@ class DataCheck:
         return sigma
 
     def _remove_gain(self, present: Mask, std: float) -> None:
-        """Subtract the gain errors, N(0, ``std``²) each, that the readings still show.
+        """Subtract the remaining gain errors, each with the prior N(0, ``std``²), from ``_z``.
 
-        The solver's estimate is not enough: its prior takes part of a gain for a displacement of the wire.
+        The solver's gain estimate is too small because its prior attributes part of a gain error to a
+        displacement of the wire.
         """
         upper, lower = self._z.shape
         p = self._model.level(self._evidences(present)).precision
@@ -374,17 +387,17 @@ class DataCheck:
         self._z[~present] = 0.0
 
     def _residuals(self, moved: Float, a: Float, wires: Mask) -> Float:
-        """Return a F − 1 of these wires, (n, K)."""
+        """Return the residuals a F − 1 of the n upper wires in ``wires``, (n, K)."""
         for u in np.flatnonzero(wires).tolist():
             potential(self._problem.rest[u] + moved[u], self._problem.lower, self._f[u])
         return np.asarray(a[wires] * self._f[wires] - 1.0)
 
     def _evidences(self, present: Mask) -> int:
-        """Write the evidence at every κ; return the index of the largest. Fills in the missing readings."""
+        """Fill in missing readings, compute the log evidence at every κ, and return the maximum's index."""
         model, z = self._model, self._z.ravel()
         best = evidences(model.vectors_t, model.shrink, model.log_det, z, self._c, self._evidence)
         missing = np.flatnonzero(~present) if present is not self._present else ()
-        if len(missing):  # with their expectation, given the others
+        if len(missing):  # replace missing readings with their conditional mean
             p, count = model.level(best).precision[missing], len(missing)
             block, unknown = np.ascontiguousarray(p[:, missing]), np.empty(count)
             block.flat[:: count + 1] += LEAST
@@ -395,7 +408,7 @@ class DataCheck:
         return best
 
     def _largest_gains(self, present: Mask, best: int, cost: float, sigma: float) -> tuple[float, float]:
-        """Return the largest gain from a wrong reading or crossed wires, and that from an unfit wire."""
+        """Return the largest gain from a wrong reading or crossed wires, and that from a faulty wire."""
         most, of_wires, z = -math.inf, -math.inf, self._z.ravel()
         for offset in OFFSETS:
             number = best - offset
@@ -414,10 +427,10 @@ class DataCheck:
         return most, of_wires
 
     def _find_coarsely(self, solved: Solved) -> tuple[Group, ...]:
-        """Return the likeliest wrong readings if several upper wires have no solution.
+        """Return the most likely wrong readings if several upper wires have no solution.
 
-        No load explains such a frame, so loads are no alternative here; :meth:`check` compares the readings
-        left out with the field of the others before it names them.
+        Loads cannot explain such a frame, so the search includes no loads. Before :meth:`check` reports these
+        readings, it compares them with the field solved without them.
         """
         with np.errstate(divide="ignore", invalid="ignore"):
             np.log(self._problem.a_rest / solved.a, out=self._z)
@@ -436,11 +449,11 @@ class DataCheck:
         return groups if len(groups) <= COARSE_GROUPS else groups[:1]
 
     def _follow(self, solved: Solved) -> None:
-        """Compare the named readings with the field."""
+        """Compare the readings with confirmed faults with the field, and update the fault list."""
         self._list.follow(*self._deviations(solved))
 
     def _deviations(self, solved: Solved) -> tuple[Float, Mask]:
-        """Return the readings (U, K) minus the field, divided by its std, and which of them exist."""
+        """Return the readings' deviations (U, K) from the field, in standard deviations, and a valid mask."""
         layout = self._problem.layout
         moved = solved.field.displacement_m.reshape(layout.shape[0], -1) / layout.pitch_m
         residual = self._residuals(moved, solved.a, np.ones(len(moved), bool))
@@ -452,7 +465,7 @@ class DataCheck:
         return np.where(known, deviation, np.inf), known
 
     def _contradicting(self, groups: list[Group], solved: Solved) -> list[Group]:
-        """Return the groups without those found coarsely that agree with the field of the others."""
+        """Return the groups, except those found by the coarse search that agree with the field."""
         if not self._coarse:
             return groups
         deviation, known = self._deviations(solved)
@@ -466,7 +479,7 @@ class DataCheck:
 
 
 def _spared(solved: Solved) -> tuple[Solved, list[Group]]:
-    """Return the frame without the upper wires that its solver left out by itself, and these wires."""
+    """Return the frame without the readings of upper wires that its solver left out, and these wires."""
     field = solved.field
     status = np.array(field.status)
     out = (status != Status.CONVERGED) & (solved.used.mean(axis=1) >= OF_WIRE)
@@ -478,6 +491,6 @@ def _spared(solved: Solved) -> tuple[Solved, list[Group]]:
 
 
 def _still(solved: Solved, last: FieldFrame) -> bool:
-    """Return whether no wire was solved in this frame and the last field was assessed with its status."""
+    """Return whether all wires were held in this frame and have the same status as in the last field."""
     held = solved.field.held
     return held is not None and bool(held.all()) and solved.field.status == last.status

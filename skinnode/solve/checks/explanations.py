@@ -1,11 +1,12 @@
-"""Explanations of a frame: loads on the skin, readings that are wrong, or two wires that are crossed.
+"""Explanations of a frame: loads on the skin, wrong readings, or two crossed wires.
 
-A frame that the elastic prior makes unlikely has one of these causes: loads that the prior does not expect at
-their place, as under a contact much narrower than the patch, wrong readings, or two crossed wires. Loads and
-wrong readings are added one at a time, the one that raises the log evidence most first (greedy search, as in
-orthogonal matching pursuit). Readings are at fault only if the best explanation with faults beats the best
-explanation by loads alone by :data:`MARGIN`. So do wires that are crossed, with loads alone explaining the
-exchanged readings.
+If a frame is unlikely under the elastic prior, it has one of three causes: loads where the prior does not
+expect them, for example under a contact much narrower than the patch; wrong readings; or two crossed wires. A
+greedy search, as in orthogonal matching pursuit, adds one load or one group of wrong readings at a time, in
+each step the one with the largest gain in log evidence. Readings are reported as wrong only if the log
+evidence of the best explanation with faults exceeds that of the best explanation by loads alone by
+:data:`MARGIN`. The same margin applies to crossed wires, where loads alone explain the readings after the
+exchange.
 """
 
 from __future__ import annotations
@@ -27,23 +28,25 @@ from skinnode.solve.checks.wire_tests import GAIN_STD, LEAST, WireFinding, least
 from skinnode.solve.linalg.cholesky import multiply_vector
 
 MARGIN: Final = 20.0
-"""Log evidence by which faults must explain a frame better than loads alone to be named, nats. None
-of 6,800 frames of deep slides at a noise of 3e-6, and of 270 frames of presses of six kinds at 1e-5, was then
-taken for a fault."""
+"""Log evidence by which faults must explain a frame better than loads alone to be reported, nats. With this
+margin, no fault was falsely reported in 6,800 frames of deep slides at a noise of 3e-6, nor in 270 frames
+with six kinds of presses at a noise of 1e-5."""
 MARGIN_OF_READING: Final = 50.0
-"""The same for a single reading that is compared at every scale: under a narrow load at the edge of a patch,
-a reading that is right reached 29 nats in 36,000 frames (``bench trust --seed 1 --only hours``)."""
+"""Log evidence by which a single wrong reading, tested at every prior scale, must explain a frame better than
+loads alone to be reported, nats. Under a narrow load at the edge of a patch, a correct reading reached 29
+nats in 36,000 frames (``bench trust --seed 1 --only hours``)."""
 DOUBT: Final = 5.0
-"""Log evidence by which faults must explain a frame better than loads alone to make it doubtful, nats. The
-largest of 144 healthy frames was 0, with up to 8 loads in the explanation by loads."""
+"""Log evidence by which faults must explain a frame better than loads alone for the frame to be doubtful,
+nats. In 144 healthy frames, it was at most 0 nats, with up to 8 loads in the explanation by loads."""
 SCALES: Final = 4
-"""Number of scales, from the one that fits the frame as it is downwards: a wrong reading inflates the scale
-by up to 2⁴, a narrow contact by up to 2³."""
+"""Number of prior scales at which explanations are sought: the scale that fits the frame best, and smaller
+scales. A wrong reading inflates the best-fitting scale by up to 2⁴, a narrow contact by up to 2³."""
 STRIDE: Final = 2
-"""Step in log2 κ between the scales at which explanations are sought."""
+"""Step in log2 κ between the prior scales at which explanations are sought."""
 HOPELESS: Final = 150.0
-"""Log evidence by which loads alone explain a frame better than faults at one scale, nats, from which faults
-are not sought at the next. Of 163 frames with a fault, the largest was 114."""
+"""Limit of the log evidence by which loads alone explain a frame better than faults at one prior scale, nats.
+If the limit is reached, faults are not sought at smaller scales. In 163 frames with a fault, the largest
+difference was 114 nats."""
 
 _PARTS: Final = {CROSSING: FaultyPart.CROSSING, LOWER: FaultyPart.LOWER, UPPER: FaultyPart.UPPER}
 
@@ -52,17 +55,17 @@ Mask = NDArray[np.bool_]
 
 @dataclass(frozen=True, slots=True)
 class Group:
-    """Readings that are wrong together."""
+    """Group of wrong readings: a crossing, or all crossings of a wire."""
 
     part: FaultyPart
     upper: int | None
     lower: int | None
     gain: float
-    """Gain in log evidence, nats."""
+    """Gain in log evidence from treating the readings as wrong, nats."""
     kind: FaultKind = FaultKind.CONTRADICTS
 
     def mask(self, shape: tuple[int, int]) -> Mask:
-        """Return the readings (U, K) of the group."""
+        """Return the (U, K) bool mask of the group's readings."""
         found = np.zeros(shape, bool)
         rows = slice(None) if self.upper is None else self.upper
         found[rows, slice(None) if self.lower is None else self.lower] = True
@@ -81,9 +84,10 @@ class Explainer:
         self._search = GreedySearch(model)
         self._alpha, self._row = np.empty(len(model.response)), np.empty(max(model.shape) + 1)
         self.margin = -math.inf
-        """Log evidence by which faults explained the last frame better than loads or noise alone, nats."""
+        """Log evidence by which faults explained the last frame better than loads alone or noise alone,
+        nats."""
         self.is_noisier = False
-        """Whether more noise than stated explained the last frame better than loads."""
+        """Whether noise above the stated level explained the last frame better than loads."""
 
     def wrong_readings(  # noqa: PLR0913 - the frame, and what is known of it
         self,
@@ -96,17 +100,19 @@ class Explainer:
         noisier: float = -math.inf,
         whole_wires_only: bool = False,
     ) -> tuple[Group, ...]:
-        """Return the groups of readings that are wrong; none if loads explain the frame as well.
+        """Return the groups of wrong readings; an empty tuple if loads alone explain the frame well enough.
 
         Args:
             z: (U, K) changes of the readings since rest, in units of their noise.
-            present: (U, K) readings to be used.
-            evidence: (L,) log evidence at every κ.
-            best: Index of the κ that fits the frame as it is.
-            cost: Cost of a wrong reading: ln of the ratio between its expected error and the noise.
+            present: (U, K) bool, the readings to use.
+            evidence: (L,) log evidence of the frame at every κ.
+            best: Index of the κ with the largest log evidence.
+            cost: Log evidence subtracted for each wrong reading: ln of the ratio between its expected error
+                and the noise.
             sigma: Relative noise of the readings.
-            noisier: Log evidence of the frame without loads or faults, if all its readings are noisier.
-            whole_wires_only: Look only for a wire that does not fit, not for wrong or exchanged readings.
+            noisier: Log evidence of the frame without loads or faults, but with noise above the stated level.
+            whole_wires_only: Whether to search only for a wire that is inconsistent with the others, and not
+                for single wrong readings or crossed wires.
         """
         by_loads, by_faults = -math.inf, -math.inf
         groups: tuple[Group, ...] = ()
@@ -130,14 +136,16 @@ class Explainer:
             if by_pair > by_faults:
                 by_faults, groups = by_pair, _crossed(pair, by_pair - by_loads)
             by_reading, number = self._by_reading(z, present, evidence, best, cost)
-            # a narrow load at the edge of a patch resembles a wrong reading: no doubt follows from less
+            # A narrow load at the edge of a patch resembles a wrong reading, so a smaller difference does not
+            # make the frame doubtful.
             if by_reading > max(by_faults, by_loads + MARGIN_OF_READING):
                 by_faults, groups = by_reading, (self._reading(number, by_reading - by_loads),)
         self.margin = by_faults - by_loads
         finding = least_fitting(level.wires, z, alpha, present, sigma, self._row)
         if finding.gain > DOUBT:
             by_wire = self._by_wire(z, present, cost, finding, alpha, best, GAIN_STD / sigma)
-            # a wire under a load of its own does not fit the others either: no doubt follows from less
+            # A load on only one wire also makes this wire inconsistent with the others, so a smaller
+            # difference does not make the frame doubtful.
             if by_wire > max(by_faults, by_loads + MARGIN):
                 self.margin, groups = by_wire - by_loads, (self._wire(finding.wire, by_wire - by_loads),)
         return groups if self.margin > MARGIN else ()
@@ -145,7 +153,7 @@ class Explainer:
     def wrong_without_loads(
         self, z: Float, present: Mask, evidence: Float, best: int, cost: float
     ) -> tuple[Group, ...]:
-        """Return the groups of readings that are wrong in a frame that no load explains; at least one.
+        """Return the groups of wrong readings in a frame that no load explains.
 
         The arguments are those of :meth:`wrong_readings`.
         """
@@ -161,9 +169,10 @@ class Explainer:
     def _by_reading(
         self, z: Float, present: Mask, evidence: Float, best: int, cost: float
     ) -> tuple[float, int]:
-        """Return the log evidence of the best explanation by loads if one reading is wrong, and that reading.
+        """Return the log evidence of the best explanation by loads and one wrong reading, and its number.
 
-        A search that adds the best group at each step would leave out its whole wire first at small scales.
+        This case needs its own search: at small prior scales, the greedy search would first leave out the
+        whole wire of the reading.
         """
         level = self._model.level(best)
         multiply_vector(level.precision, z.ravel(), self._alpha)
@@ -189,7 +198,7 @@ class Explainer:
     def _by_exchange(
         self, z: Float, present: Mask, cost: float, alpha: Float, level: Level
     ) -> tuple[float, WirePair]:
-        """Return the log evidence of the best explanation by loads with two wires exchanged, and these."""
+        """Return the log evidence of the best explanation by loads with two wires exchanged, and the pair."""
         gain, pair = likeliest(level.precision, alpha, z, present, far=True)
         if gain < DOUBT:
             return -math.inf, pair
@@ -200,7 +209,7 @@ class Explainer:
     def _by_wire(  # noqa: PLR0913 - the frame, and what was found in it
         self, z: Float, present: Mask, cost: float, finding: WireFinding, alpha: Float, best: int, tau: float
     ) -> float:
-        """Return the log evidence of the best explanation by loads if a wire is at fault."""
+        """Return the log evidence of the best explanation by loads if the found wire is faulty."""
         upper, lower = self._model.shape
         wire, choice = finding.wire, math.log(2.0 * (upper + lower))
         rows = (slice(wire, wire + 1), slice(None)) if wire < upper else (slice(None), wire - upper)
@@ -218,7 +227,7 @@ class Explainer:
         tables = self._model.level(best).wires
         of_p = tables.upper_p[wire] if wire < upper else tables.lower_p[wire - upper]
         error = np.linalg.solve(of_p @ of_p.T, alpha.reshape(z.shape)[rows].ravel())
-        z[rows] = (own - error).reshape(z[rows].shape)  # what the others predict
+        z[rows] = (own - error).reshape(z[rows].shape)  # prediction by the other wires
         present[rows] = False
 
         def alone(level: Level) -> float:
@@ -242,14 +251,14 @@ class Explainer:
         )
 
     def _wire(self, wire: int, gain: float) -> Group:
-        """Return a wire as a group of wrong readings."""
+        """Return all readings of a wire as one group of wrong readings."""
         upper = self._model.shape[0]
         if wire < upper:
             return Group(FaultyPart.UPPER, wire, None, gain)
         return Group(FaultyPart.LOWER, None, wire - upper, gain)
 
     def _groups(self) -> tuple[Group, ...]:
-        """Return the groups of readings found by the last search."""
+        """Return the groups of wrong readings found by the last search."""
         found, search = [], self._search
         for kind, number, gain in zip(
             search.kinds.tolist(), search.numbers.tolist(), search.gains.tolist(), strict=True
@@ -268,12 +277,12 @@ class Explainer:
 
 
 def _scales(best: int) -> range:
-    """Return the indices of κ at which explanations are sought, from the one that fits a frame downwards."""
+    """Return the indices of κ at which explanations are sought: ``best`` and smaller indices."""
     return range(best, max(best - STRIDE * SCALES, -1), -STRIDE)
 
 
 def _crossed(pair: WirePair, gain: float) -> tuple[Group, ...]:
-    """Return the two wires of a pair as groups of wrong readings."""
+    """Return the two wires of a crossed pair as two groups of wrong readings."""
     wires = pair.one, pair.other
     if pair.part is FaultyPart.UPPER:
         return tuple(Group(pair.part, wire, None, gain, FaultKind.CROSSED) for wire in wires)

@@ -1,4 +1,7 @@
-"""Named faults of a stream: which readings are left out, since when, and when they are admitted again."""
+"""Confirmed faults of a stream of frames.
+
+The list decides which readings are left out of the next frames, and when they are used again.
+"""
 
 from __future__ import annotations
 
@@ -15,21 +18,21 @@ from skinnode.model.layout import Float
 from skinnode.solve.checks.explanations import Group
 
 FRAMES: Final = 3
-"""Number of frames, among :data:`WITHIN`, in which readings must contradict the others to be named. Not
-tuned."""
+"""Number of frames, out of :data:`WITHIN` successive frames, in which readings must contradict the others
+before their fault is confirmed. Not tuned."""
 WITHIN: Final = 10
-"""Number of frames within which these must lie."""
+"""Number of successive frames within which contradictions are counted to confirm a fault."""
 ADMIT: Final = 64
-"""Number of consecutive frames in which named readings must agree with the field to be admitted again; twice
-as many after each relapse. Not tuned."""
+"""Number of consecutive frames in which readings with a confirmed fault must agree with the field before they
+are used again. It doubles after each relapse. Not tuned."""
 AGREE: Final = 3.0
-"""RMS difference between a reading and the field, in standard deviations, up to which they agree."""
+"""Maximum RMS difference, in standard deviations, at which readings count as agreeing with the field."""
 
 Mask = NDArray[np.bool_]
 
 
 def agree(deviation: Float) -> bool:
-    """Return whether readings agree with a field from which they differ by ``deviation``, in deviations."""
+    """Return whether readings with these deviations from a field, in standard deviations, agree with it."""
     return float(np.mean(deviation**2)) <= AGREE**2
 
 
@@ -42,7 +45,7 @@ class _Named:
 
 
 class FaultList:
-    """Faults of one patch, from frame to frame. Do not share an instance between owners.
+    """Faults of one patch, updated frame by frame. Do not share an instance between owners.
 
     Args:
         shape: Number of upper and lower wires.
@@ -60,12 +63,12 @@ class FaultList:
 
     @property
     def faults(self) -> tuple[DataFault, ...]:
-        """Named faults, oldest first."""
+        """Confirmed faults, oldest first."""
         return tuple(named.fault for named in self._named.values())
 
     @property
     def mask(self) -> Mask | None:
-        """(U, K) readings of the named faults; None if there are none."""
+        """(U, K) bool, the readings of all confirmed faults; None if there are no confirmed faults."""
         if not self._named:
             return None
         found = np.zeros(self._shape, bool)
@@ -74,12 +77,12 @@ class FaultList:
         return found
 
     def add(self, groups: Sequence[Group], frame: int, scan: int) -> tuple[DataFault, ...]:
-        """Record the groups found wrong in a frame; return those that are not named yet as faults.
+        """Record the groups of readings that are wrong in a frame; return the faults not yet confirmed.
 
         Args:
-            groups: Groups found wrong.
-            frame: Number of the frame.
-            scan: Number by which the user knows the frame.
+            groups: Groups of wrong readings.
+            frame: Number of the frame, counted by the data check.
+            scan: Scan number of the frame, for the fault reported to the user.
         """
         passing = []
         for group in groups:
@@ -96,11 +99,11 @@ class FaultList:
         return tuple(passing)
 
     def follow(self, deviation: Float, known: Mask) -> None:
-        """Admit the readings again that have agreed with the field for long enough.
+        """Remove the faults whose readings have agreed with the field for enough successive frames.
 
         Args:
             deviation: (U, K) differences between the readings and the field, in standard deviations.
-            known: (U, K) readings that were received.
+            known: (U, K) bool, the readings that were received.
         """
         for key, named in list(self._named.items()):
             here = named.mask & known

@@ -1,10 +1,10 @@
 """Greedy search for the loads and the wrong readings that explain a frame.
 
-Let A = [I B], with a column for each of the m readings and for the response to each of the 3Q loads. The
-search needs the diagonal of the Gram matrix E = Aᵀ P A, and Aᵀ P z. A load that is added, or a reading that
-is left out, changes P by a matrix of rank one, P' = P − share · v vᵀ: one vector Aᵀ v for each such step
-keeps both up to date, as in batch orthogonal matching pursuit. P' itself is not computed, except for the
-blocks of the wires, which tell whether all readings of a wire are wrong together.
+The matrix A = [I B] has one column for each of the m readings and one for the response to each of the 3Q
+loads. The search needs Aᵀ P z and the diagonal of the Gram matrix E = Aᵀ P A. Adding a load or leaving out a
+reading is a rank-one update of the precision, P' = P − share · v vᵀ. Each such step stores one vector Aᵀ v,
+from which Aᵀ P z and the diagonal are updated, as in batch orthogonal matching pursuit. Of P', only the
+wires' blocks are computed; they are needed to test whether all readings of a wire are wrong.
 """
 
 from __future__ import annotations
@@ -23,28 +23,30 @@ from skinnode.solve.linalg.cholesky import cholesky, multiply_vector, solve_lowe
 from skinnode.solve.linalg.vectors import Index
 
 STEPS: Final = 8
-"""Maximum number of loads and groups of readings in an explanation with faults."""
+"""Maximum total number of loads and groups of wrong readings in an explanation with faults."""
 LOADS: Final = 60
 """Maximum number of loads in an explanation by loads alone: a contact covers up to twenty cells, with three
-loads each. With 8, at a noise of 3e-6, half of all healthy frames of a deep slide were taken for faults."""
+loads each. With a maximum of 8 loads and a noise of 3e-6, faults were falsely reported in half of all healthy
+frames of a deep slide."""
 ENOUGH: Final = 1.0
-"""Gain below which a load or fault is not worth adding, nats."""
+"""Minimum gain in log evidence, nats, for which the search adds a load or a fault."""
 LOAD, CROSSING, LOWER, UPPER = range(4)
-"""Kinds of a step: a load is added; a reading, or all readings of a lower or upper wire, are left out."""
+"""Kinds of a search step: add a load, leave out the reading of a crossing, or leave out all readings of a
+lower or an upper wire."""
 
 Mask = NDArray[np.bool_]
 
 
 class GreedySearch:
-    """Search with its work arrays. Do not share an instance between owners.
+    """Greedy search and its work arrays. Do not share an instance between owners.
 
     Args:
         model: Distribution of the readings.
 
     Attributes:
-        kinds: (LOADS,) kinds of the steps of the last search; −1 after its last step.
-        numbers: (LOADS,) numbers of the loads, readings or wires.
-        gains: (LOADS,) gains in log evidence, nats.
+        kinds: (LOADS,) kind of each step of the last search; −1 after its last step.
+        numbers: (LOADS,) number of the load, reading or wire of each step.
+        gains: (LOADS,) gain of each step in log evidence, nats.
     """
 
     def __init__(self, model: ReadingModel) -> None:
@@ -62,15 +64,15 @@ class GreedySearch:
     def run(  # noqa: PLR0913 - the frame, and which explanations are allowed
         self, number: int, z: Float, present: Mask, cost: float, *, faults: bool, loads: bool = True
     ) -> float:
-        """Return the gain in log evidence of the best explanation found; its steps stay in the arrays.
+        """Find the best explanation, store its steps in the attributes, and return its gain in log evidence.
 
         Args:
             number: Index of κ.
             z: (U, K) changes of the readings since rest, in units of their noise.
-            present: (U, K) readings to be used.
-            cost: Cost of a wrong reading, nats.
-            faults: Whether readings may be wrong.
-            loads: Whether loads may be added.
+            present: (U, K) bool, the readings to use.
+            cost: Log evidence subtracted for each wrong reading, nats.
+            faults: Whether the explanation may contain wrong readings.
+            loads: Whether the explanation may contain loads.
         """
         self.kinds[:] = -1
         m = z.size
@@ -87,9 +89,9 @@ class GreedySearch:
 
 @njit
 def crossing_gain(d: Float, alpha: Float, present: Mask, cost: float) -> tuple[float, int]:
-    """Return the largest gain from treating a reading as wrong, nats, and the number of the reading.
+    """Return the largest gain in log evidence from treating a reading as wrong, and that reading's number.
 
-    ``d`` is the diagonal of P; the choice among m readings costs ln m.
+    ``d`` is the diagonal of P. The choice among m readings reduces the gain by ln m.
     """
     best, where = -math.inf, -1
     for i in range(present.size):
@@ -105,10 +107,10 @@ def crossing_gain(d: Float, alpha: Float, present: Mask, cost: float) -> tuple[f
 def _group_gain(  # noqa: PLR0913 - a kernel: arrays by name
     p: Float, alpha: Float, present: Mask, first: int, step: int, cost: float, block: Float, right: Float
 ) -> float:
-    """Return the gain from treating the readings first, first + step, … as wrong; −inf if fewer than two.
+    """Return the gain in log evidence from treating the readings first, first + step, … as wrong.
 
-    ``p`` is their block of P; ``block`` and ``right`` are scratch. The gain is
-    ½ α_Gᵀ P_GG⁻¹ α_G − ½ ln det P_GG minus the cost of each reading.
+    The gain is ½ α_Gᵀ P_GG⁻¹ α_G − ½ ln det P_GG minus the cost of each reading, or −inf if fewer than two
+    readings are available. ``p`` is the readings' block of P; ``block`` and ``right`` are work arrays.
     """
     n, here = len(p), 0
     for i in range(n):
@@ -141,9 +143,10 @@ def _best_group(  # noqa: PLR0913 - a kernel: arrays by name
     block: Float,
     right: Float,
 ) -> tuple[float, int, int]:
-    """Return the largest gain from treating a group of readings as wrong, its kind and its number.
+    """Return the largest gain from treating a group of readings as wrong, and the group's kind and number.
 
-    The choice among n groups of a kind costs ln n. ``block`` and ``right`` are scratch.
+    A group is a single reading or all readings of a wire. The choice among n groups of a kind reduces the
+    gain by ln n. ``block`` and ``right`` are work arrays.
     """
     upper, lower = len(of_upper), len(of_lower)
     gain, number = crossing_gain(d, alpha, present, cost)
@@ -163,7 +166,7 @@ def _best_group(  # noqa: PLR0913 - a kernel: arrays by name
 def _gram_row(  # noqa: PLR0913 - a kernel: arrays by name
     item: int, p: Float, moved: Float, gram: Float, response_t: Float, row: Float
 ) -> None:
-    """Write a row of E into ``row`` (m + 3Q,), from the matrices if there are any."""
+    """Write row ``item`` of E into ``row`` (m + 3Q,); use ``moved`` and ``gram`` unless they are empty."""
     m = len(p)
     if item < m:
         for j in range(m):
@@ -195,9 +198,9 @@ def _update(  # noqa: PLR0913 - a kernel: arrays by name
     vectors: Float,
     share: Float,
 ) -> None:
-    """Leave out a reading, or add a load with its likeliest variance, (b² − h) / h², as step ``count``.
+    """Update the search vectors for step ``count``, which leaves out a reading or adds a load.
 
-    Elements before ``first`` are not needed and not kept up to date.
+    A load is added with its most likely variance, (b² − h) / h². Elements before ``first`` are not updated.
     """
     row = vectors[count]
     _gram_row(item, p, moved, gram, response_t, row)
@@ -223,7 +226,7 @@ def _update(  # noqa: PLR0913 - a kernel: arrays by name
 
 @njit
 def _copy_blocks(p: Float, of_upper: Float, of_lower: Float) -> None:
-    """Copy the wires' blocks of P."""
+    """Copy the block of P of each upper and lower wire."""
     upper, lower = len(of_upper), len(of_lower)
     for u in range(upper):
         for i in range(lower):
@@ -237,7 +240,7 @@ def _copy_blocks(p: Float, of_upper: Float, of_lower: Float) -> None:
 
 @njit
 def _update_blocks(share: float, row: Float, of_upper: Float, of_lower: Float) -> None:
-    """Subtract share · v vᵀ from the blocks of the wires."""
+    """Subtract share · v vᵀ from the block of P of each upper and lower wire."""
     upper, lower = len(of_upper), len(of_lower)
     for u in range(upper):
         block, first = of_upper[u], u * lower
@@ -255,7 +258,7 @@ def _update_blocks(share: float, row: Float, of_upper: Float, of_lower: Float) -
 
 @njit
 def _best_load(weighted: Float, diagonal: Float, m: int, least: float) -> tuple[float, int]:
-    """Return the largest gain from adding a load, and the number of the load; −1 if none gains."""
+    """Return the largest gain from adding a load, and the load's number, or −1 if no load has a gain."""
     most, number = 1.0, -1
     for j in range(m, diagonal.size):
         if diagonal[j] > least:
@@ -291,7 +294,7 @@ def _search(  # noqa: PLR0913, C901 - a kernel: arrays by name, a greedy search
     numbers: Index,
     gains: Float,
 ) -> float:
-    """Write the best explanation of ``z`` (m,) into the last three arrays; return its gain."""
+    """Write the best explanation of ``z`` (m,) into ``kinds``, ``numbers`` and ``gains``; return its gain."""
     m = z.size
     multiply_vector(p, z, weighted[:m])
     multiply_vector(response_t, weighted[:m], weighted[m:])
@@ -320,7 +323,7 @@ def _search(  # noqa: PLR0913, C901 - a kernel: arrays by name, a greedy search
         total += gain
         kinds[step], numbers[step], gains[step] = kind, number, gain
         if kind == LOAD:
-            first = 0 if faults else m  # without faults, the readings themselves are not needed any more
+            first = 0 if faults else m  # explanations by loads alone do not use the first m elements
             _update(m + number, count, first, p, moved, gram, response_t, weighted, diagonal, vectors, share)
             if faults:
                 _update_blocks(share[count], vectors[count], of_upper, of_lower)

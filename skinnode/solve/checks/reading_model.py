@@ -1,10 +1,11 @@
 """Joint distribution of the readings of one layout, linearised at rest.
 
 A displacement u of the electrodes changes the logarithm of the readings by J u, in units of their noise σ.
-With the elastic prior u ~ N(0, s² C), the changes z are N(0, S) with S = I + κ² J C Jᵀ and κ = s / σ. One
-eigendecomposition of J C Jᵀ gives the evidence of a frame at every κ. The precision P = S⁻¹ gives the
-leave-out tests: with α = P z, the error in predicting a group of readings from all others has the χ²
-α_Gᵀ P_GG⁻¹ α_G (Rasmussen and Williams, Gaussian Processes for Machine Learning, 2006, section 5.4.2).
+With the elastic prior u ~ N(0, s² C), the changes z have the distribution N(0, S) with S = I + κ² J C Jᵀ and
+κ = s / σ. The evidence of a frame at every κ follows from one eigendecomposition of J C Jᵀ. The leave-out
+tests follow from the precision P = S⁻¹: with α = P z, the χ² of predicting a group of readings from all
+others is α_Gᵀ P_GG⁻¹ α_G (Rasmussen and Williams, Gaussian Processes for Machine Learning, 2006, section
+5.4.2).
 """
 
 from __future__ import annotations
@@ -23,14 +24,15 @@ from skinnode.solve.linalg.cholesky import multiply, multiply_vector
 from skinnode.solve.posterior.elastic_prior import ElasticPrior
 
 USUAL: Final = (-17, -3)
-"""Range of log2 s, s in pitches, whose tables for loads :meth:`ReadingModel.prepare` computes."""
+"""Range of log2 s, with the prior scale s in pitches, for which load tables are computed in advance."""
 MOST_USUAL: Final = 9
-"""Number of the largest of these scales that are prepared for a large patch."""
+"""Number of prior scales computed in advance for a large patch: the largest scales within :data:`USUAL`."""
 STORED: Final = 10**8
-"""Most bytes of tables that are computed in advance: computed in the stream, they would delay the first touch
-by up to 0.1 s. The reference patch takes 85 MB. Larger patches compute products with loads when needed."""
+"""Maximum size of tables computed in advance, in bytes. Computing the tables during the stream would delay
+the first touch by up to 0.1 s. The tables of the reference patch take 85 MB. Larger patches compute products
+with loads when they are needed."""
 OCTAVES: Final = (-7, 21)
-"""Range of log2 κ: noise from 1e-6 to 1e-2 and prior scales from 1e-4 to 1 pitch."""
+"""Range of log2 κ, which covers noise from 1e-6 to 1e-2 and prior scales from 1e-4 to 1 pitch."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,34 +40,34 @@ class Level:
     """Distribution of the readings at one κ, with m = U K readings and Q cells of loads."""
 
     precision: Float
-    """(m, m) P."""
+    """(m, m) precision P of the readings."""
     diagonal: Float
-    """(m,) diagonal of P."""
+    """(m,) diagonal of the precision P."""
     wires: WireTables
-    """Factors of the wires' blocks of P and S."""
+    """Cholesky factors of each wire's blocks of P and S."""
 
 
 @dataclass(frozen=True, eq=False)
 class LoadTables:
-    """Products of P at one κ with the responses b of the readings to the loads, the columns of B."""
+    """Products of the precision P at one κ with the matrix B, the responses of the readings to the loads."""
 
     diagonal: Float
     """(m + 3Q,) diagonals of P and of Bᵀ P B."""
     moved: Float
-    """(m, 3Q) P B; empty, as is ``gram``, if the tables would exceed :data:`STORED`."""
+    """(m, 3Q) P B. ``moved`` and ``gram`` are empty if the tables would exceed :data:`STORED`."""
     gram: Float
     """(3Q, 3Q) Bᵀ P B."""
 
 
 class ReadingModel:
-    """Distribution of the readings of one layout. Shared by all patches with the layout; immutable.
+    """Joint distribution of the readings of one layout. Immutable; shared by all patches with that layout.
 
     Args:
         layout: The patch.
 
     Attributes:
         jacobian: (U, K, 3N) ∂(ln F)/∂x at rest, 1/pitch.
-        response: (m, 3Q) change of the readings per load of the elastic prior, B.
+        response: (m, 3Q) matrix B, the changes of the readings per load of the elastic prior.
         response_t: (3Q, m) Bᵀ.
         kappa: (L,) values of κ.
         log_det: (L,) ln det S.
@@ -116,16 +118,16 @@ class ReadingModel:
         return found
 
     def loads(self, number: int) -> LoadTables:
-        """Return what the loads need of :meth:`level`, computed on first use."""
+        """Return the products of the precision at ``kappa[number]`` with the loads, computed on first use."""
         found = self._loads.get(number)
         if found is None:
             found = self._loads[number] = self._load_tables(number)
         return found
 
     def prepare(self, sigma: float) -> None:
-        """Compute the tables that a stream with the noise ``sigma`` usually needs. Others stay for first use.
+        """Compute the tables that a stream with the relative noise ``sigma`` usually needs.
 
-        The reference patch takes 0.25 s.
+        Other tables are computed on first use. The reference patch takes 0.25 s.
         """
         octaves = np.log2(self.kappa * sigma)
         usual: list[int] = np.flatnonzero((octaves >= USUAL[0]) & (octaves <= USUAL[1])).tolist()
@@ -169,7 +171,7 @@ def _model(layout: PatchLayout) -> ReadingModel:
 
 @njit
 def changes(jacobian_: Float, moved: Float, sigma: float, z: Float) -> None:
-    """Write J u / σ into ``z`` (U, K) for displacements ``moved`` (U, 3N), pitches."""
+    """Write J u / σ into ``z`` (U, K) for the displacements u, ``moved`` (U, 3N), in pitches."""
     for u in range(z.shape[0]):
         multiply_vector(jacobian_[u], moved[u], z[u])
         for k in range(z.shape[1]):
@@ -182,7 +184,7 @@ def evidences(  # noqa: PLR0913 - a kernel: arrays by name
 ) -> int:
     """Write the log evidence of ``z`` (m,) at every κ into ``out`` (L,); return the index of the largest.
 
-    The constant −½ m ln 2π is left out. ``c`` (m,) is scratch.
+    The constant −½ m ln 2π is omitted. ``c`` (m,) is a work array.
     """
     multiply_vector(vectors_t, z, c)
     for i in range(c.size):

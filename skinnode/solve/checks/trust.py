@@ -1,7 +1,7 @@
-"""Trust in a field: the one place that says when a field is trusted, and why not.
+"""Trust in a field: decides whether a field is trusted, and if not, states the reason.
 
-A field is trusted if every wire whose readings were used converged, if what was left out can be spared, and
-if nothing contradicts the rest. The host adds that the patch must be alive.
+A field is trusted if every upper wire that was not left out converged, if enough readings and upper wires
+remain, and if the readings do not contradict each other. The host also requires that the patch is alive.
 """
 
 from __future__ import annotations
@@ -17,10 +17,11 @@ from skinnode.model.data_fault import DataFault
 from skinnode.model.status import Status
 
 OF_PATCH: Final = 0.75
-"""Share of a patch's readings, and of its upper wires, that a trusted field needs. Two upper wires and a
-lower wire of the reference patch may be missing (0.77), three upper wires may not (0.7)."""
+"""Minimum share of a patch's readings that must be usable for its field to be trusted, and of its upper wires
+that must be trusted. The reference patch can spare two upper wires and a lower wire (share 0.77), but not
+three upper wires (0.7)."""
 OF_WIRE: Final = 0.8
-"""Share of a wire's readings that a trusted wire needs."""
+"""Minimum share of usable readings for an upper wire to be trusted."""
 CONTRADICTION: Final = "the readings contradict each other, and no wire or crossing explains it"
 UNEXAMINED: Final = (
     "the readings seem to contradict each other, and the deadline left no time to examine them"
@@ -33,16 +34,17 @@ Mask = NDArray[np.bool_]
 def assess(
     status: Sequence[Status], used: Mask, faults: Sequence[DataFault], *, contradiction: str
 ) -> tuple[str, Mask]:
-    """Return why a field is not trusted, in words, and which of its wires are.
+    """Return the reason why a field is not trusted, and a mask of its trusted upper wires.
 
     Args:
         status: Status of each of the U wires.
-        used: (U, K) readings used.
-        faults: What was found and left out.
-        contradiction: What the readings used still contradict, in words; empty if nothing.
+        used: (U, K) bool, the readings used.
+        faults: Faults whose readings were left out.
+        contradiction: Description of a contradiction that remains among the used readings; empty if there is
+            none.
 
     Returns:
-        The reason, empty if the field is trusted, and (U,) wires that are trusted.
+        The reason as text, empty if the field is trusted; and (U,) bool, the trusted upper wires.
     """
     share = used.mean(axis=1)
     converged = np.array([each is Status.CONVERGED for each in status])

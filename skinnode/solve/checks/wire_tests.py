@@ -1,15 +1,16 @@
-"""Tests of whole wires: does a wire fit the others, and is its gain right?
+"""Tests of whole wires: whether the readings of a wire are consistent with the other wires, and its gain.
 
-A wire that lags behind, or whose readings belong elsewhere, differs from what the other wires predict in many
-readings by a little each, which no test of single readings sees. With the readings G of a wire, the precision
-P, the covariance S = P⁻¹ and α = P z, two hypotheses are compared with that of a healthy wire:
+If the readings of a wire lag behind or belong to another wire, each of them deviates only slightly from the
+prediction by the other wires. A test of single readings does not detect such a fault. Let G be the readings
+of a wire, P the precision, S = P⁻¹ the covariance and α = P z. Two hypotheses are tested against that of a
+healthy wire:
 
-unrelated  z_G has its own distribution N(0, S_GG), whatever the other wires read. The log evidence changes by
-           ½ α_Gᵀ P_GG⁻¹ α_G − ½ z_Gᵀ S_GG⁻¹ z_G − ½ ln det P_GG S_GG
-gain       all readings of the wire are off by the same factor 1 + c, c ~ N(0, τ²). The change is
-           ½ (1ᵀα_G)² / (q + τ⁻²) − ½ ln(1 + τ² q) with q = 1ᵀ P_GG 1
+unrelated  z_G has its own distribution N(0, S_GG), independent of the other wires. The log evidence changes
+           by ½ α_Gᵀ P_GG⁻¹ α_G − ½ z_Gᵀ S_GG⁻¹ z_G − ½ ln det P_GG S_GG
+gain       all readings of the wire are wrong by the same factor 1 + c, c ~ N(0, τ²). The log evidence changes
+           by ½ (1ᵀα_G)² / (q + τ⁻²) − ½ ln(1 + τ² q) with q = 1ᵀ P_GG 1
 
-Both follow from the rules for conditioning a normal distribution.
+Both changes follow from the rules for conditioning a normal distribution.
 """
 
 from __future__ import annotations
@@ -25,16 +26,19 @@ from skinnode.compiled.jit import njit, njit_part
 from skinnode.model.layout import Float
 
 GAIN_STD: Final = 0.02
-"""Standard deviation of a wrong gain, as that of drift. Not tuned."""
+"""Standard deviation of a wire's relative gain error; equal to that assumed for gain drift. Not tuned."""
 LEAST: Final = 1e-9
-"""Smallest precision of a reading, relative to its noise; smaller values are rounding errors."""
+"""Minimum precision of a reading, in units of 1 / noise²; smaller values are rounding errors."""
 
 Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, eq=False)
 class WireTables:
-    """Factors of the wires' blocks at one κ; upper wires (U, K, K), lower wires (K, U, U)."""
+    """Cholesky factors of each wire's blocks of P and S at one κ.
+
+    The arrays of upper wires have the shape (U, K, K), those of lower wires (K, U, U).
+    """
 
     upper_p: Float
     """Cholesky factors of P_GG."""
@@ -51,7 +55,7 @@ class WireTables:
 
     @classmethod
     def of(cls, p: Float, s: Float, shape: tuple[int, int]) -> WireTables:
-        """Return the tables of a precision and a covariance (m, m)."""
+        """Compute the tables from the precision ``p`` and the covariance ``s``, both (m, m)."""
         upper, lower = shape
         blocks = [np.arange(u * lower, (u + 1) * lower) for u in range(upper)]
         blocks += [np.arange(k, upper * lower, lower) for k in range(lower)]
@@ -70,28 +74,28 @@ class WireTables:
 
 @dataclass(frozen=True, slots=True)
 class WireFinding:
-    """The wire that fits least."""
+    """The wire that is least consistent with the other wires."""
 
     gain: float
     """Gain in log evidence, nats."""
     wire: int
-    """Number of the upper wire, or U plus that of the lower wire."""
+    """Number of the upper wire, or U plus the number of the lower wire."""
     factor: float
-    """Common error of the wire's readings in units of their noise; nan if the wire is unrelated."""
+    """Common error of the wire's readings, in units of their noise; nan for the hypothesis *unrelated*."""
 
 
 def least_fitting(  # noqa: PLR0913 - the frame, its tables and scratch
     tables: WireTables, z: Float, alpha: Float, present: Mask, sigma: float, work: Float
 ) -> WireFinding:
-    """Return the wire for which one of the two hypotheses gains most.
+    """Return the wire and the hypothesis (unrelated, or wrong gain) with the largest gain in log evidence.
 
     Args:
-        tables: Factors of the blocks.
+        tables: Cholesky factors of the wires' blocks of P and S.
         z: (U, K) changes of the readings since rest, in units of their noise.
         alpha: (m,) P z.
-        present: (U, K) readings that there are; wires with less than half of theirs are not tested.
+        present: (U, K) bool, the available readings; a wire without at least half of its readings is skipped.
         sigma: Relative noise of the readings.
-        work: (max(U, K),) scratch.
+        work: (max(U, K),) work array.
     """
     gain, wire, factor = _least_fitting(
         z.ravel(), alpha, present.ravel(), GAIN_STD / sigma, tables.upper_p, tables.upper_s, tables.lower_p,

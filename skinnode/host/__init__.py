@@ -1,5 +1,21 @@
 """The host: configure, start and supervise nodes; receive, assemble, solve and publish their scans.
 
+**Data flow.** ``host`` owns all parts; ``lifecycle`` starts and stops them. Each bus has a ``link`` (port,
+receive thread, reopening) and a ``served_bus``; each patch has a ``patch_stream`` and a ``node_monitor``::
+
+    link (receive thread) -> drop_oldest_queue -> mainline -> dispatcher (frame to its handler, set up in
+        reception) -> patch_stream (scan assembly; accounting of losses) -> code_watch (which data to use)
+        -> workers, scan_solver -> publish (subscriptions), callback, hand_frame, trust_report
+    code_watch  =  code_runs -> converter_liveness (is the patch frozen?), frozen_parts (is a wire or crossing
+        frozen?), wire_windows and wire_faults (noisy, drifting, open, shorted wires)
+
+    start (bring-up of all nodes) -> configurator (one node: write, verify, store), node_facts, lss_master
+    supervisor -> node_supervision -> supervised (what is due for a node) -> remote_node, sdo_client (by SDO)
+    node_monitor (evidence about a node) -> health (condition) -> health_watch -> events
+
+Producers: ``sync`` (SYNC), ``nmt_master`` (NMT commands). ``containment`` catches exceptions; ``retry_pause``
+spaces repeated attempts; ``tap`` hands frames and fields to recorders.
+
 **Containment.** Exceptions do not end the host's threads. An exception raised while serving a patch makes
 that patch faulty and is recorded as the reason: the scans of the patch are withheld, and the patch is brought
 up again after a pause of 0.1 s, which doubles with each defect, up to 1 s; a boot-up of the node ends the

@@ -1,10 +1,10 @@
 """Watch the codes of a patch, scan by scan: is it alive, and which parts are at fault? No thread, one owner.
 
-Before a scan is solved, :meth:`CodeWatch.judge` compares its codes with the last ones, in about 5 µs. It says
-whether the field can be trusted (:mod:`skinnode.host.patch_life`), which parts are left out of it because
-they are frozen (:mod:`skinnode.host.frozen_parts`), and which wires mark themselves as open or shorted. After
-the fields of all patches are out, :meth:`CodeWatch.on_scan` looks for noisy and drifting wires
-(:mod:`skinnode.host.wire_windows`).
+Before a scan is solved, :meth:`CodeWatch.judge` compares its codes with the previous codes, in about 5 µs.
+The verdict states whether the field can be trusted (:mod:`skinnode.host.converter_liveness`), which parts are
+left out because they are frozen (:mod:`skinnode.host.frozen_parts`), and which wires the node has marked as
+open or shorted. After the fields of all patches have been published, :meth:`CodeWatch.on_scan` looks for
+noisy and drifting wires (:mod:`skinnode.host.wire_windows`).
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skinnode.host import code_runs
+from skinnode.host.converter_liveness import Alive, ConverterLiveness
 from skinnode.host.frozen_parts import FrozenParts
-from skinnode.host.patch_life import Alive, PatchLife
 from skinnode.host.wire_faults import WireFault, broken_wires
 from skinnode.host.wire_windows import WireWindows
 from skinnode.model.data_fault import DataFault, FaultKind, FaultyPart
@@ -74,7 +74,7 @@ class CodeWatch:
     def __init__(self, scale: CodeScale, relative_noise: float) -> None:
         self._scale, self._relative_noise = scale, relative_noise
         self._windows = WireWindows(scale, relative_noise)
-        self._life = PatchLife(scale, relative_noise)
+        self._life = ConverterLiveness(scale, relative_noise)
         self._parts: FrozenParts | None = None  # until the first scan gives the shape
         self._state = code_runs.new_runs((0, 0))
         self._found = np.zeros(8, np.int64)

@@ -8,10 +8,10 @@ converter. In 696 simulated presses of live patches (two layouts, layers of 0.3 
 code for five scans reached a lead of 75 codes; in 1,800 presses without noise (depths from 0.2 %), a wire
 that stayed so for one scan or more reached 25. An indentation by 10 % moves codes by thousands.
 
-**Noise.** A part is also frozen if a live converter would repeat its codes so often with a probability of at
-most :data:`~skinnode.host.patch_life.FALSE_ALARM`, at a tenth of the stated noise or at half of the noise
-that recent windows have shown, while three quarters of the other crossings have not repeated for a quarter
-as long. The last condition excludes converters that are quieter than assumed, because all their crossings
+**Noise.** A part is also frozen if a live converter would repeat its codes so often with a probability of
+:data:`~skinnode.host.converter_liveness.FALSE_ALARM` or less, at a tenth of the stated noise or at half of
+the noise in recent windows, while three quarters of the other crossings have not repeated for a quarter as
+long. The last condition excludes converters that are quieter than assumed, because all their crossings
 repeat.
 
 A part is readmitted as soon as one of its codes changes.
@@ -41,7 +41,7 @@ from skinnode.host.code_runs import (
 )
 from skinnode.host.code_runs import CROSSING_LEAD as _CROSSING_LEAD
 from skinnode.host.code_runs import WIRE_LEAD as _WIRE_LEAD
-from skinnode.host.patch_life import FALSE_ALARM, QUIETER
+from skinnode.host.converter_liveness import FALSE_ALARM, QUIETER
 from skinnode.host.repeat_odds import deviations_of, log_stay
 from skinnode.model.data_fault import DataFault, FaultKind, FaultyPart
 from skinnode.protocol.codes import CodeScale

@@ -12,7 +12,7 @@ from typing import Final
 
 from skinnode.canopen.emergency import register_text
 from skinnode.canopen.nmt import STATE_NAMES, NmtState
-from skinnode.host.patch_life import Alive
+from skinnode.host.converter_liveness import Alive
 from skinnode.host.wire_faults import WireFault
 from skinnode.model.data_fault import DataFault
 from skinnode.model.frames import FieldFrame
@@ -46,7 +46,7 @@ class Condition(enum.StrEnum):
     that restarted once, or that is operational again and has not restarted for 0.5 s, is given the condition
     that fits its current state."""
     FROZEN = "frozen"
-    """Scans arrive, but their converter has stopped: see :mod:`skinnode.host.patch_life`."""
+    """Scans arrive, but their converter has stopped: see :mod:`skinnode.host.converter_liveness`."""
     FAULTY = "faulty"
     """The node's error register is not zero, or serving the patch raised an exception
     (:attr:`PatchHealth.defect`)."""

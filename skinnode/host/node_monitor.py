@@ -12,6 +12,7 @@ from skinnode.canopen.indices import emcy_cob_id, heartbeat_cob_id
 from skinnode.canopen.nmt import STATE_MASK, NmtState
 from skinnode.errors import CodecError
 from skinnode.host.code_watch import CodeWatch
+from skinnode.host.converter_liveness import Alive
 from skinnode.host.health import (
     HEARTBEATS_MISSED,
     SCANS_MISSED,
@@ -20,7 +21,6 @@ from skinnode.host.health import (
     PatchHealth,
     condition_of,
 )
-from skinnode.host.patch_life import Alive
 
 _log = logging.getLogger(__name__)
 

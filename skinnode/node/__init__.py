@@ -1,4 +1,11 @@
-"""A patch as a CANopen device (CiA 301), and the thread that runs patches on a bus."""
+"""A patch as a CANopen device (CiA 301), and the thread that runs patches on a bus.
+
+::
+
+    runner (thread, CAN port) -> device (a frame to its service) -> one file per service -> device -> runner
+
+The sub-package ``patch`` is the application on top of the services: it samples the skin and sends scans.
+"""
 
 from skinnode.canopen.lss import NOT_CONFIGURED
 from skinnode.canopen.nmt import NmtState

@@ -10,6 +10,8 @@ from pathlib import Path
 
 import pytest
 
+from skinnode import cli
+
 SKINNODE = Path(sys.executable).with_name("skinnode")
 
 
@@ -24,11 +26,14 @@ def help_of_all() -> str:
     return skinnode("--help").stdout
 
 
-@pytest.mark.parametrize(
-    "command", ["demo", "host", "scan", "info", "od", "nmt", "lss", "doctor", "eds", "conformance", "bench"]
-)
-def test_help_names_the_command(command: str) -> None:
-    assert command in help_of_all()
+COMMANDS = sorted(path.stem for path in Path(cli.__file__).parent.glob("[a-z]*.py") if path.stem != "main")
+PAGE = (Path(__file__).parents[2] / "docs" / "commands.md").read_text()
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_help_and_page_name_the_command(command: str) -> None:
+    assert f" {command} " in help_of_all()
+    assert f"skinnode {command}" in PAGE
     done = skinnode(command, "--help")
     assert done.returncode == 0
     assert "Usage" in done.stdout

@@ -11,7 +11,7 @@ import pytest
 
 from skinnode.config import parse_hand
 from skinnode.host import Condition, Host
-from skinnode.host.patch_life import Alive
+from skinnode.host.converter_liveness import Alive
 from skinnode.host.publish import Subscription
 from skinnode.model.data_fault import DataFault, FaultKind, FaultyPart
 from skinnode.model.forward import resistance_ohm

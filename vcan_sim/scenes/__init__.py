@@ -2,7 +2,8 @@
 
 ::
 
-    scene file -> tables (keys, checks) -> bind (checks with the hand) -> PatchScene of each patch
+    scene file -> tables (keys, checks) -> bind (touch_checks: is the touch possible on its patch?)
+        -> PatchScene of each patch
     shapes, motions (body at a time) -> window (cells under the body) -> history (contact at each step)
         -> response (displacement of the electrodes) -> patch (state at any time) -> truth
 

@@ -48,6 +48,8 @@ _REQUIRED_OF_MOTION: Final[dict[str, tuple[str, ...]]] = {
     "walk": ("reach_m",),
     "press": (),
 }
+KEY_OF_TRAVEL: Final[dict[str, str]] = {"slide": "by_m", "shear": "by_m", "roll": "by_m", "walk": "reach_m"}
+"""Key that states how far a motion moves the body along the skin, for the motions that do."""
 
 _Coordinate = Annotated[float, Field(ge=-1, le=1, allow_inf_nan=False), Allowed("a number from -1 to 1")]
 _Place = Annotated[

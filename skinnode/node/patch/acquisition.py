@@ -1,4 +1,4 @@
-"""Acquisition of codes from the analogue port: sampling, tare, and selection of the chunks to send."""
+"""Acquisition of codes from the analogue port: sampling and tare."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skinnode.model.layout import Float, require_array
+from skinnode.node.patch.chunk_selection import ChunkSelection
 from skinnode.node.patch.source import ResistanceSource, conversions_of, read_source
 from skinnode.node.patch.wire_faults import WireFaults, find_faults
-from skinnode.protocol.chunk import chunk_of_code
 from skinnode.protocol.codes import Codes, CodeScale, encode
 from skinnode.protocol.profile import PatchProfile
 from skinnode.protocol.summary import PHASES
@@ -54,8 +54,8 @@ class Acquisition:
         self.phase = 0
         """Conversion phase of the last scan; 0 if the source does not count its conversions."""
         self._conversions: int | None = None  # of the source, at the last scan
-        self._sent: Codes | None = None  # codes last sent, which the host holds; None if unknown
-        self._since_full = 0
+        self.selection = ChunkSelection(profile, scale)
+        """Selection of the chunks to send if only changed chunks are sent."""
 
     def read(self, t_ns: int) -> Float:
         """Return (U, K) resistances at ``t_ns``, ohm.
@@ -110,52 +110,16 @@ class Acquisition:
         measured = np.isfinite(mean) & (mean > 0)
         self.baseline_ohm = np.where(measured, mean, self.baseline_ohm)
         self.tared = True
-        self.forget_sent()
+        self.selection.forget()
 
     def set_baseline(self, row: int, column: int, value_ohm: float) -> None:
         """Set one R0, ohm; the client must then set all others too, as the node no longer tares by itself."""
         self.baseline_ohm[row, column] = value_ohm
         self.tared = True
-        self.forget_sent()
+        self.selection.forget()
 
     def set_baselines(self, values_ohm: NDArray[np.float32]) -> None:
         """Set the whole baseline, (U, K) ohm."""
         self.baseline_ohm = values_ohm
         self.tared = True
-        self.forget_sent()
-
-    @property
-    def sent(self) -> Codes:
-        """(U, K) codes last sent in each chunk, when :meth:`changed_chunks` selects the chunks."""
-        return self.codes if self._sent is None else self._sent
-
-    def forget_sent(self) -> None:
-        """Make the next scan a full scan, because the receiver might not hold the codes sent earlier."""
-        self._sent = None
-
-    def changed_chunks(self, threshold: int, full_every: int) -> list[int] | None:
-        """Return the indices of the chunks to send, and record them as sent.
-
-        A chunk is selected if, since it was last sent, one of its codes has changed by more than the
-        threshold, or has changed to or from a reserved code.
-
-        Args:
-            threshold: largest code change that does not cause a chunk to be sent.
-            full_every: number of scans from one full scan to the next; 0 for no full scans.
-
-        Returns:
-            Indices in ascending order; None if a full scan is due.
-        """
-        self._since_full += 1
-        if self._sent is None or (full_every and self._since_full >= full_every):
-            self._since_full = 0
-            self._sent = self.codes
-            return None
-        steps = self.scale.steps
-        moved = np.abs(self.codes.astype(np.int64) - self._sent) > threshold
-        moved |= ((self.codes > steps) | (self._sent > steps)) & (self.codes != self._sent)
-        places = chunk_of_code(self.profile)
-        chunks = np.zeros(self.profile.n_chunks, dtype=np.bool_)
-        chunks[places[moved]] = True
-        self._sent = np.where(chunks[places], self.codes, self._sent)
-        return [int(index) for index in np.flatnonzero(chunks)]
+        self.selection.forget()

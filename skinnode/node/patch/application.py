@@ -67,7 +67,7 @@ class PatchApplication:
         self._counter = -1
         self._period_ns = 0
         self._wire_faults = WireFaultReporter(profile, services.emcy)
-        self.source = SourceMonitor(services.emcy, acquisition.forget_sent)
+        self.source = SourceMonitor(services.emcy, acquisition.selection.forget)
         """Monitor of source failures."""
         self._late = False
         self._baseline_changed = False
@@ -117,7 +117,7 @@ class PatchApplication:
         """Handle a change of the NMT state."""
         self._operational = operational
         if operational:
-            self._acquisition.forget_sent()
+            self._acquisition.selection.forget()
         else:
             self.stream.stop()
             self._end_overrun(self._now())
@@ -225,13 +225,14 @@ class PatchApplication:
         codes = acquisition.codes
         chunks = pack_scan(codes, counter, self._profile)
         if store.integer(od.SEND_POLICY, od.SEND_MODE) == SendMode.CHANGED:
-            changed = acquisition.changed_chunks(
+            changed = acquisition.selection.changed_chunks(
+                codes,
                 store.integer(od.SEND_POLICY, od.SEND_THRESHOLD),
                 store.integer(od.SEND_POLICY, od.SEND_REFRESH),
             )
             if changed is not None:
                 flags |= SummaryFlag.CHANGED_ONLY
-                chunks, codes = [chunks[index] for index in changed], acquisition.sent
+                chunks, codes = [chunks[index] for index in changed], acquisition.selection.sent
         return chunks, flags, codes
 
     def _tare(self, t_ns: int) -> None:
@@ -246,7 +247,7 @@ class PatchApplication:
         store.bind(od.SELF_TEST_RESULT, lambda sub: self._test[result[sub]])
         bind_scan(store, acquisition, self.stream)
         bind_baseline(store, acquisition, self._mark_baseline, self._new_baseline)
-        store.watch(od.SEND_POLICY, lambda _: acquisition.forget_sent())
+        store.watch(od.SEND_POLICY, lambda _: acquisition.selection.forget())
         store.guard(od.ACQUISITION, self._guard_acquisition)
         store.watch(od.ACQUISITION, self._on_acquisition)
 

@@ -78,7 +78,7 @@ class Alive(enum.StrEnum):
     quiet that this proves nothing; or no scan has been received yet."""
 
 
-class PatchLife:
+class ConverterLiveness:
     """State of one patch's converter. Owned by the mainline.
 
     Args:

@@ -1,0 +1,56 @@
+"""Selection of the chunks to send under the send policy "changed chunks only" (object 0x2020)."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from skinnode.protocol.chunk import chunk_of_code
+from skinnode.protocol.codes import Codes, CodeScale
+from skinnode.protocol.profile import PatchProfile
+
+
+class ChunkSelection:
+    """Selector of the chunks whose codes have changed since they were last sent.
+
+    Args:
+        profile: Sizes of the patch.
+        scale: Mapping of R/R0 to codes.
+    """
+
+    def __init__(self, profile: PatchProfile, scale: CodeScale) -> None:
+        self._steps, self._n_chunks = scale.steps, profile.n_chunks
+        self._places = chunk_of_code(profile)
+        self._since_full = 0  # number of scans since the last full scan
+        self._full_scan_due = True
+        self.sent: Codes = np.full((profile.rows, profile.columns), scale.open, dtype=np.uint32)
+        """(U, K) codes last sent in each chunk; all open before the first scan."""
+
+    def forget(self) -> None:
+        """Make the next scan a full scan, because the receiver might not hold the codes sent earlier."""
+        self._full_scan_due = True
+
+    def changed_chunks(self, codes: Codes, threshold: int, full_every: int) -> list[int] | None:
+        """Return the indices of the chunks to send, and record them as sent.
+
+        A chunk is selected if one of its codes has changed by more than the threshold since the chunk was
+        last sent, or has changed to or from a reserved code.
+
+        Args:
+            codes: (U, K) codes of the scan.
+            threshold: Largest code change that does not cause a chunk to be sent.
+            full_every: Number of scans from one full scan to the next; 0 for no full scans.
+
+        Returns:
+            Indices in ascending order; None if a full scan is due.
+        """
+        self._since_full += 1
+        if self._full_scan_due or (full_every and self._since_full >= full_every):
+            self._full_scan_due, self._since_full = False, 0
+            self.sent = codes
+            return None
+        moved = np.abs(codes.astype(np.int64) - self.sent) > threshold
+        moved |= ((codes > self._steps) | (self.sent > self._steps)) & (codes != self.sent)
+        chunks = np.zeros(self._n_chunks, dtype=np.bool_)
+        chunks[self._places[moved]] = True
+        self.sent = np.where(chunks[self._places], codes, self.sent)
+        return [int(index) for index in np.flatnonzero(chunks)]

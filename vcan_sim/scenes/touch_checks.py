@@ -1,0 +1,123 @@
+"""Checks of a touch with the patch that it touches: depth or force, place, distance from other touches.
+
+Checks that need no patch (keys, times, bodies) are in :mod:`vcan_sim.scenes.tables`.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+
+from skinnode.errors import ConfigError
+from skinnode.model.layout import PatchLayout
+from vcan_sim.contact.layer import Layer
+from vcan_sim.scenes.motions import Pose, highest_level, pose_at, yaws_rad
+from vcan_sim.scenes.shapes import Float
+from vcan_sim.scenes.tables import KEY_OF_TRAVEL, SceneConfig, TouchConfig
+from vcan_sim.scenes.window import FRICTION_MARGIN, MARGIN, BodyKey, TooMuch, Window, window_of
+
+DEEPEST: Final = 0.9
+"""Maximum depth of a body, relative to the thickness of the layer and to the height of the electrodes."""
+APART: Final = 3.0
+"""Minimum distance between the contacts of two bodies on a patch, in layer thicknesses or, if that is less,
+in half widths of the larger contact. The simulator neglects the displacement that one contact causes at the
+other, which is at most 3 % of the depth there (incompressible layer 2 mm thick, sphere of radius 40 mm)."""
+
+
+def window_of_touch(
+    scene: SceneConfig, number: int, touch: TouchConfig, layer: Layer, layout: PatchLayout
+) -> Window:
+    """Return the window of a touch. Raises ConfigError if the touch is deeper than the layer."""
+    most = DEEPEST * min(layer.thickness_m, layout.height_m)
+    level, key = highest_level(touch), "force_n" if touch.by_force else "depth_m"
+    path = f"touches[{number}].{key}"
+    for j, motion in enumerate(touch.motions):
+        if motion.kind == "press" and getattr(motion, key) == level != getattr(touch, key):
+            path = f"touches[{number}].motions[{j}].{key}"
+    if not touch.by_force and level > most:
+        allowed = f"at most {most:.3g} m, nine tenths of the layer of {touch.patch!r}"
+        raise error_at(scene, path, level, allowed)
+    body = scene.body(touch.body)
+    shape, margin = BodyKey(body.build()), MARGIN + FRICTION_MARGIN * body.friction
+    try:
+        return window_of(layer, shape, yaws_rad(touch), level, touch.by_force, most, scene.cells, margin)
+    except TooMuch as error:
+        allowed = f"at most {error.most_n:.3g} N, the force at a depth of {most:.3g} m"
+        raise error_at(scene, path, level, allowed) from None
+
+
+def path_of(touch: TouchConfig, step_s: float) -> dict[int, Pose]:
+    """Return the pose at each time step of a touch, each time that it is made."""
+    return {
+        number: pose_at(each, number * step_s)
+        for each in touch.each
+        for number in range(int(each.from_s / step_s), int(each.to_s / step_s) + 2)
+    }
+
+
+def check_on_patch(  # noqa: PLR0913 - what a touch is checked with
+    scene: SceneConfig,
+    number: int,
+    touch: TouchConfig,
+    window: Window,
+    path: dict[int, Pose],
+    places_m: Float,
+    pitch_m: float,
+) -> None:
+    """Raise ConfigError if the deepest contact of a touch would extend half a pitch over the electrodes."""
+    half = np.array(window.half_m)
+    low = places_m.min(axis=0) - 0.5 * pitch_m + half
+    high = places_m.max(axis=0) + 0.5 * pitch_m - half
+    if (low > high).any():
+        size = 2e3 * half
+        allowed = f"a contact that fits on {touch.patch!r}; this one is {size[0]:.3g} × {size[1]:.3g} mm"
+        raise error_at(scene, f"touches[{number}].body", touch.body, allowed)
+    room = (
+        f"x from {low[0]:.4g} to {high[0]:.4g}, y from {low[1]:.4g} to {high[1]:.4g} m on {touch.patch!r}, "
+        "so that the contact stays on the patch"
+    )
+    for step, pose in path.items():
+        place = np.array(pose.place_m)
+        if ((place >= low - 1e-9) & (place <= high + 1e-9)).all():
+            continue
+        key, got = f"touches[{number}].at_m", list(touch.at_m)
+        t = step * scene.step_s
+        for j, motion in enumerate(touch.motions):
+            name = KEY_OF_TRAVEL.get(motion.kind)
+            if name and motion.from_s < t:
+                key, got = f"touches[{number}].motions[{j}].{name}", getattr(motion, name)
+        shown = list(got) if isinstance(got, tuple) else got
+        where = (
+            "" if key.endswith("at_m") else f"; at {t:.3g} s the body is at [{place[0]:.4g}, {place[1]:.4g}]"
+        )
+        raise error_at(scene, key, shown, room + where)
+
+
+def check_apart(
+    scene: SceneConfig,
+    late: tuple[int, TouchConfig, Window, dict[int, Pose]],
+    early: tuple[int, TouchConfig, Window, dict[int, Pose]],
+    layer: Layer,
+) -> None:
+    """Raise ConfigError if two touches come so close at some time that one would move the other's skin."""
+    (i, touch, window, path), (j, _, other_window, other_path) = late, early
+    both = np.array(window.half_m) + np.array(other_window.half_m)
+    gap = APART * min(layer.thickness_m, max(*window.half_m, *other_window.half_m))
+    for number in sorted(path.keys() & other_path.keys()):
+        pose, other = path[number], other_path[number]
+        if not (pose.level > 0.0 and other.level > 0.0):
+            continue
+        beyond = np.maximum(np.abs(np.subtract(pose.place_m, other.place_m)) - both, 0.0)
+        if float(np.hypot(*beyond)) >= gap:
+            continue
+        allowed = (
+            f"a place or time at which its contact stays {1e3 * gap:.3g} mm away from that of touches[{j}]; "
+            f"at {number * scene.step_s:.3g} s it is {1e3 * float(np.hypot(*beyond)):.3g} mm away"
+        )
+        raise error_at(scene, f"touches[{i}].at_m", list(touch.at_m), allowed)
+
+
+def error_at(scene: SceneConfig, key: str, got: object, allowed: str) -> ConfigError:
+    """Return the error for a value of a scene file, with the file, line and column of its key."""
+    return ConfigError(key, got, allowed, where=scene.where(key))

@@ -1,10 +1,11 @@
-"""Watch the codes of a patch, scan by scan: is it alive, and which parts are at fault? No thread, one owner.
+"""Check the codes of a patch scan by scan: is its converter running, and which parts are faulty?
 
-Before a scan is solved, :meth:`CodeWatch.judge` compares its codes with the previous codes, in about 5 µs.
-The verdict states whether the field can be trusted (:mod:`skinnode.host.converter_liveness`), which parts are
-left out because they are frozen (:mod:`skinnode.host.frozen_parts`), and which wires the node has marked as
-open or shorted. After the fields of all patches have been published, :meth:`CodeWatch.on_scan` looks for
-noisy and drifting wires (:mod:`skinnode.host.wire_windows`).
+Before a scan is solved, :meth:`CodeWatch.judge` compares the scan's codes with the previous codes, in about
+5 µs. The resulting :class:`Verdict` states whether the field can be trusted
+(:mod:`skinnode.host.converter_liveness`), which frozen crossings are left out of the field
+(:mod:`skinnode.host.frozen_parts`), and which wires are open or shorted according to their codes. After the
+fields of all patches have been published, :meth:`CodeWatch.on_scan` searches for noisy and drifting wires
+(:mod:`skinnode.host.wire_windows`).
 """
 
 from __future__ import annotations
@@ -32,24 +33,24 @@ _CHANGED_ONLY: Final = int(SummaryFlag.CHANGED_ONLY)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Verdict:
-    """What the codes of a scan say about its patch."""
+    """Result of checking the codes of a scan."""
 
     distrust: str = ""
-    """Why the field of this scan must not be trusted, in words; empty if nothing speaks against it."""
+    """Reason why the scan's field must not be trusted, in words; empty if there is no reason."""
     faults: tuple[DataFault, ...] = ()
-    """Frozen patch, frozen wires and crossings, open and shorted wires."""
+    """Faults found: frozen patch, frozen wires and crossings, open and shorted wires."""
     left_out: NDArray[np.bool_] | None = None
-    """(U, K) crossings to leave out of the field; None if there are none."""
+    """(U, K) bool: crossings to leave out of the solve; None if all crossings are used."""
 
     def admitted(self, scan: Scan) -> Scan:
-        """Return the scan without the crossings that are left out."""
+        """Return the scan with the left-out crossings marked as missing."""
         if self.left_out is None:
             return scan
         codes = np.where(self.left_out, np.uint32(MISSING), scan.codes)
         return replace(scan, codes=codes, valid=scan.valid & ~self.left_out)
 
     def applied(self, field: FieldFrame) -> FieldFrame:
-        """Return the field of the scan with these faults, and not trusted if the patch may be frozen."""
+        """Return the scan's field with these faults added; not trusted if the patch may be frozen."""
         if not (self.faults or self.distrust):
             return field
         faults = (*self.faults, *field.faults)
@@ -75,13 +76,14 @@ class CodeWatch:
         self._scale, self._relative_noise = scale, relative_noise
         self._windows = WireWindows(scale, relative_noise)
         self._life = ConverterLiveness(scale, relative_noise)
-        self._parts: FrozenParts | None = None  # until the first scan gives the shape
+        self._parts: FrozenParts | None = None  # created at the first scan, when the shape is known
         self._state = code_runs.new_runs((0, 0))
         self._found = np.zeros(8, np.int64)
         code_runs.compile_kernels()
         self._seen_windows = 0
         self._broken: tuple[WireFault, ...] = ()
-        self._since: dict[WireFault | None, int] = {}  # first scan of each broken wire, and of a frozen patch
+        # first scan with each broken wire, and (key None) with a frozen patch
+        self._since: dict[WireFault | None, int] = {}
         self._verdict = FAULTLESS
 
     @property
@@ -91,25 +93,25 @@ class CodeWatch:
 
     @property
     def frozen(self) -> bool:
-        """Whether the converter has stopped."""
+        """Whether the patch's converter has stopped."""
         return self._life.alive is Alive.NO
 
     @property
     def words(self) -> str:
-        """Why the converter is not known to be running, in words; empty if it is."""
+        """Reason why the converter may not be running, in words; empty if it is running."""
         return self._life.words
 
     @property
     def wires(self) -> tuple[WireFault, ...]:
-        """Wires that are open, shorted, noisy or drifting."""
+        """Faults of all open, shorted, noisy and drifting wires."""
         return tuple(sorted({*self._broken, *self._windows.wires}))
 
     def judge(self, scan: Scan, number: int | None = None) -> Verdict:
-        """Evaluate the next scan before it is solved.
+        """Check the codes of the next scan, before the scan is solved.
 
         Args:
-            scan: The scan.
-            number: Number by which faults refer to the scan; default: its own.
+            scan: Scan to check.
+            number: Scan number to record in new faults; the scan's own number by default.
         """
         parts = self._parts
         if parts is None:
@@ -161,6 +163,6 @@ class CodeWatch:
         return Verdict(distrust, (*faults, *parts.faults), parts.left_out)
 
     def on_scan(self, scan: Scan) -> None:
-        """Look for noisy and drifting wires. Call :meth:`judge` first."""
+        """Search the scan for noisy and drifting wires. :meth:`judge` must have been called for the scan."""
         if scan.complete and not scan.flags & _CHANGED_ONLY:
             self._windows.on_scan(scan)

@@ -1,24 +1,25 @@
-"""Decide whether the converter of a patch is alive, from the conversion phase and from repeated codes.
+"""Detect whether a patch's converter is running, from the conversion phase and from repeated codes.
 
-**Phase.** If the patch supplies it (:attr:`~skinnode.protocol.summary.SummaryFlag.CONVERSIONS`), two
-successive scans with the same phase and the same codes hold the same conversion. After missed scans, or a
-lost summary, any phase may follow, so an equal phase then decides nothing; a different phase always proves a
-conversion.
+**Phase.** Some patches count their conversions and send the conversion phase
+(:attr:`~skinnode.protocol.summary.SummaryFlag.CONVERSIONS`). Two successive scans with the same phase and the
+same codes then contain the same conversion. After missed scans or a lost summary, an equal phase proves
+nothing, because any phase may follow. A different phase always proves that a conversion took place.
 
-**Repeats.** Without a phase, only the codes remain. A run of scans in which no code changes counts as frozen
-if a live converter would produce it with a probability below ``FALSE_ALARM`` at the noise stated in the hand
-file, and below ``FALSE_ALARM_QUIET`` even if the noise is ``QUIETER`` times smaller, unless recent windows
-have shown that it is larger (:mod:`skinnode.host.wire_windows`). In addition, the stream must itself have
-shown noise before, that is, ``FLICKERS`` scans in which a code returned to its previous value, and the run
-must be ``LONGER`` times as long as any earlier run that ended on its own. Runs of skin at rest and of pressed
-skin are counted separately, because the same converter repeats its codes for minutes at rest and for two or
-three scans under a press.
+**Repeats.** Without a phase, the decision must be based on the codes. A run is a sequence of scans in which
+no code changes. A run counts as frozen if a live converter would produce the run with a probability below
+``FALSE_ALARM`` at the noise stated in the hand file. The probability must also be below ``FALSE_ALARM_QUIET``
+at a noise that is ``QUIETER`` times smaller, or at the noise found by :mod:`skinnode.host.wire_windows` if
+that noise is larger. In addition, the stream must have shown noise before: ``FLICKERS`` scans in which a code
+returned to its previous value. Finally, the run must be ``LONGER`` times as long as any earlier run that
+ended with a live converter. Runs at rest and runs under a press are compared separately, because the same
+converter repeats its codes for minutes at rest, but only for two or three scans under a press.
 
-**Doubt.** A patch is not frozen after one scan, but a press moves on meanwhile. If a patch that supplies no
-phase, has shown noise and has never repeated its codes stops moving from one scan to the next, the first
-``DOUBT_RUN`` fields are not trusted.
+**Doubt.** Repeated codes cannot prove within a few scans that a patch is frozen, but a press may change in
+that time. If the codes of a patch suddenly stop changing in mid-movement, the first ``DOUBT_RUN`` fields are
+therefore not trusted. This rule applies to patches that send no phase, have shown noise and have never
+repeated their codes.
 
-If neither decides and no code has changed for a second, the answer is *cannot tell*.
+If neither the phase nor the codes decide, and no code has changed for a second, the result is *cannot tell*.
 """
 
 from __future__ import annotations
@@ -40,32 +41,35 @@ from skinnode.text.words import counted
 _SOURCE_FAILED: Final = int(SummaryFlag.SOURCE_FAILED)
 
 FALSE_ALARM: Final = 1e-12
-"""Maximum probability that a live part repeats its codes so often, at the assumed noise. A patch of 10 × 30
-wires has 341 parts (crossings, wires, patch): at 100 scans/s, 1.2e9 parts and scans in ten hours, and so
-0.001 false alarms. The limit set for all of them together is one."""
+"""Maximum probability that a live part (crossing, wire or patch) repeats its codes as often as observed, at
+the assumed noise. A patch of 10 × 30 wires has 341 parts. At 100 scans/s, all parts together are tested 1.2e9
+times in ten hours, so 0.001 false alarms are expected; the requirement is at most one."""
 FALSE_ALARM_QUIET: Final = 1e-8
-"""The same for a whole patch, at a noise ``QUIETER`` times smaller than stated: 3.6e6 scans in ten hours give
-0.04 false alarms, and few converters are so much better than stated."""
+"""Maximum probability that a live patch repeats its codes as often as observed, at a noise ``QUIETER`` times
+smaller than stated. For the 3.6e6 scans of ten hours, this limit corresponds to 0.04 false alarms, and few
+converters have so little noise."""
 QUIETER: Final = 10.0
-"""Ratio by which the noise may be smaller than stated."""
+"""Maximum ratio of the noise stated in the hand file to a converter's actual noise."""
 ABRUPT: Final = 16
-"""Minimum change of a code in the last scan of a movement that ends abruptly, codes. Not tuned."""
+"""Minimum change of a code in the last scan before a movement counts as ended abruptly, codes. Not tuned."""
 DOUBT_RUN: Final = 64
-"""Number of scans after such a movement whose fields are not trusted; later, probability alone decides. In
-most test streams of patches that froze in mid-press, it took up to 11 scans, in some more than 16."""
+"""Number of scans after an abruptly ended movement whose fields are not trusted; after these scans, only the
+probability of the repeats decides. For most simulated patches that froze in mid-press, the decision took up
+to 11 scans, for some more than 16."""
 FLICKERS: Final = 5
-"""Number of scans in which a code must return to its previous value to prove that the codes contain noise."""
+"""Minimum number of scans in which a code returns to its previous value, as proof that the codes contain
+noise."""
 LONGER: Final = 4
-"""Minimum ratio of the length of a frozen run to that of the longest run that ended on its own."""
+"""Minimum ratio of the length of a frozen run to the length of the longest run of the live converter."""
 PROOF_NS: Final = 1_000_000_000
-"""Time for which a change of a code or of the phase proves that the converter is alive, ns."""
+"""Time for which the converter counts as running after a change of a code or of the phase, ns."""
 PHASES_REPEATED: Final = 3
-"""Number of scans without a conversion after which the patch counts as frozen, as many as without a scan make
-it stale. Fields are not trusted from the first of them on."""
+"""Number of scans without a new conversion after which a patch counts as frozen; a patch counts as stale
+after the same number of missed scans. Fields are not trusted from the first scan without a new conversion."""
 _MOVED: Final = 16
-"""Minimum distance, in codes, from the code at rest at which a code's place within its step is random."""
+"""Minimum distance from the code at rest at which the quantization error of a code is random, codes."""
 _SPREAD: Final = 30
-"""Minimum number of such codes, all different, in a patch that counts as pressed."""
+"""Minimum number of different codes at least ``_MOVED`` away from the code at rest in a pressed patch."""
 
 
 class Alive(enum.StrEnum):
@@ -74,12 +78,12 @@ class Alive(enum.StrEnum):
     YES = "yes"
     NO = "no"
     CANNOT_TELL = "cannot tell"
-    """No code has changed for a second, the patch does not count its conversions, and its converter is so
-    quiet that this proves nothing; or no scan has been received yet."""
+    """No code has changed for a second, but the patch does not count its conversions, and its converter has
+    so little noise that repeated codes prove nothing; or no scan has been received yet."""
 
 
 class ConverterLiveness:
-    """State of one patch's converter. Owned by the mainline.
+    """Tracker of the state of one patch's converter. Owned by the mainline.
 
     Args:
         scale: Scale of the codes.
@@ -90,32 +94,33 @@ class ConverterLiveness:
         self._scale, self._stated = scale, relative_noise / scale.step
         self._rest = round((1.0 - scale.lo) / scale.step)
         self.measured_noise = 0.0
-        """Noise shown by recent windows, codes; 0 if they show none."""
-        self._log_p = 0.0  # of the current run, if it counts as frozen
-        self._abrupt = False  # whether movement ended abruptly before the current run
-        self._improbable = False  # whether a live converter would hardly repeat its codes so often
-        self._largest = 0  # change in the last scan with changes
+        """Noise measured over recent windows of scans, codes; 0 if none was measurable."""
+        self._log_p = 0.0  # log probability of the current run, if the run counts as frozen
+        self._abrupt = False  # whether a movement ended abruptly at the start of the current run
+        self._improbable = False  # whether the current run counts as frozen
+        self._largest = 0  # largest change of a code in the last scan with changes, codes
         self._run = self._codes = self._flickers = self._check_at = 0
         self._pressed = False
         self._longest = {False: 0, True: 0}
-        self._noise_before = 0.0  # noise shown before the run: the run itself shows none
+        # noise measured before the current run, because constant codes have no noise
+        self._noise_before = 0.0
         self._phase = self._phase_scan = self._same_phase = self._missing = 0
         self._t_ns = 0
         self._t_proof_ns: int | None = None
 
     @property
     def stopped(self) -> bool:
-        """Whether the newest scan repeats a conversion, or codes that no live converter would repeat."""
+        """Whether the newest scan repeats a conversion, or codes that a live converter would have changed."""
         return self._same_phase > 0 or self._improbable
 
     @property
     def doubtful(self) -> bool:
-        """Whether movement ended from one scan to the next, so recently that nothing else decides."""
+        """Whether a movement ended abruptly within the last ``DOUBT_RUN`` scans."""
         return self._abrupt and self._run <= DOUBT_RUN
 
     @property
     def deviations(self) -> float:
-        """Number of standard deviations by which a stopped converter differs from a live one."""
+        """Improbability of the current run for a live converter, in standard deviations."""
         return math.inf if self._same_phase else deviations_of(self._log_p)
 
     @property
@@ -129,7 +134,7 @@ class ConverterLiveness:
 
     @property
     def words(self) -> str:
-        """Why the converter is not known to be alive, in words; empty if it is."""
+        """Reason why the converter may not be running, in words; empty if it is running."""
         if self._same_phase:
             return f"its converter has completed no conversion for {counted(self._same_phase, 'scan')}"
         if self.stopped:
@@ -149,19 +154,20 @@ class ConverterLiveness:
     def on_scan(
         self, scan: Scan, counts: tuple[int, int, int, int, int], last: NDArray[Any], run: NDArray[Any]
     ) -> None:
-        """Evaluate the next scan.
+        """Evaluate the next scan of the patch.
 
         Args:
-            scan: The scan.
-            counts: Number of crossings measured, changed and returned; largest change; smallest code.
+            scan: Scan to evaluate.
+            counts: Numbers of crossings measured, changed, and returned to their previous code; largest
+                change, codes; smallest code.
             last: (U, K) last code of each crossing.
-            run: (U, K) run of each crossing.
+            run: (U, K) number of scans since each crossing's code last changed.
         """
         measured, changed, returned, largest, least = counts
         self._t_ns = scan.t_last_ns
         if changed:
             self._end_run(returned, largest)
-        # a code that was missing from the scan before differs from an older one
+        # up to `_missing` codes may have changed because the previous scan lacked them
         self._compare_phase(scan, unchanged=measured > 0 and changed <= self._missing)
         self._missing = 0 if scan.flags & SummaryFlag.CHANGED_ONLY else scan.codes.size - measured
         if changed or not measured or scan.flags & SummaryFlag.CHANGED_ONLY:
@@ -172,7 +178,8 @@ class ConverterLiveness:
             unheard = not self._phase and not any(self._longest.values())
             self._abrupt = unheard and self._largest >= ABRUPT and self._flickers >= FLICKERS
         if self._run >= self._check_at and not self._improbable:
-            self._check_at = self._run + 1 + self._run // 4  # the probability falls slowly: look rarely
+            # the probability falls slowly, so evaluate at increasing intervals
+            self._check_at = self._run + 1 + self._run // 4
             self._evaluate_run(last, run, least)
 
     def _repeats_frozen(self) -> bool:
@@ -181,7 +188,8 @@ class ConverterLiveness:
     def _compare_phase(self, scan: Scan, *, unchanged: bool) -> None:
         phase = scan.phase
         if not phase:
-            if scan.device_time_us is not None:  # the summary was not lost: the patch does not count
+            # the summary arrived without a phase: the patch does not count
+            if scan.device_time_us is not None:
                 self._phase = self._same_phase = 0
             return
         if self._phase and phase != self._phase:
@@ -193,7 +201,7 @@ class ConverterLiveness:
     def _end_run(self, returned: int, largest: int) -> None:
         self._t_proof_ns = self._t_ns
         self._flickers += returned > 0
-        if self._run and (not self._repeats_frozen() or largest <= 1):  # else an end of freezing
+        if self._run and (not self._repeats_frozen() or largest <= 1):  # otherwise the end of a frozen run
             self._longest[self._pressed] = max(self._longest[self._pressed], self._run)
         self._run = self._codes = self._check_at = self._same_phase = 0
         self._pressed = self._abrupt = self._improbable = False

@@ -1,4 +1,4 @@
-"""A remote node: a patch as the host sees it, with its SDO client, its facts and its stream."""
+"""Remote node: the host's view of a patch over the bus, with its SDO client, parameters and stream."""
 
 from __future__ import annotations
 
@@ -22,24 +22,24 @@ from skinnode.protocol.command import pack_command
 from skinnode.protocol.profile import PatchProfile
 
 _MAINLINE_S: Final = 1.0
-"""Maximum wait in s for a short job on the mainline, which runs jobs fifty times a second unless the node's
-bus is unavailable."""
+"""Maximum wait for a short job on the mainline, s. Unless the node's bus is unavailable, the mainline runs
+waiting jobs at least fifty times a second."""
 
 _ANSWER_S: Final = 0.05
-"""Time to wait for the responses to a single SDO request, s. If no other node has the node-ID, two such waits
-are added to the duration of a failed bring-up."""
+"""Time to wait for the responses to a single SDO request, s. The check for a second node with the same
+node-ID prolongs a failed bring-up by at least two such waits."""
 
 _MUTE_S: Final = 0.4
 _MUTE_SCANS: Final = 5
-"""Time in s, and number of SYNC periods, without a scan after which a node's configuration is read back
-(whichever is longer): the stream must recover within a second."""
+"""Time without a scan after which a node's configuration is read back: ``_MUTE_S`` seconds or ``_MUTE_SCANS``
+SYNC periods, whichever is longer. The stream must recover within a second."""
 
 
 class RemoteNode:
-    """One patch and its node.
+    """One patch of the hand, and its CANopen node.
 
-    Threads: one thread at a time, other than the mainline, may bring the node up; that thread calls all
-    methods except those documented for any thread.
+    Threads: one thread at a time, which must not be the mainline, may bring the node up. Only that thread may
+    call the methods, except those marked "Any thread".
     """
 
     def __init__(
@@ -55,14 +55,15 @@ class RemoteNode:
         self.bus = hand.bus(patch.bus)
         self.has_other_master = self.bus.role == "guest"
         self.listen_only = self.has_other_master and self.bus.guest_sends == "nothing"
-        """Whether nothing at all may be sent to the node."""
+        """Whether the hand file forbids sending any frame to the node."""
         self.facts: NodeFacts | None = None
         self.boot_ups = 0
-        """Number of boot-up messages when bring-up began; if more arrive, bring-up must be repeated."""
+        """Number of the node's boot-up messages at the start of bring-up. If another boot-up message arrives,
+        bring-up must be repeated."""
         self.t_answer_ns = 0
-        """Monotonic time of the node's newest SDO response."""
+        """Monotonic time of the node's newest SDO response, ns."""
         self._answers = 0
-        """Number of SDO responses with the node's node-ID."""
+        """Number of SDO responses received with the node's node-ID."""
         self._hand, self._lss = hand, bus.lss
         self._profile = PatchProfile.from_config(patch, self.bus)
         self._remote = self.link.remote_od(patch.node_id, self._on_answer, defects)
@@ -91,12 +92,12 @@ class RemoteNode:
         abandoned: Callable[[], bool],
         on_answer: Callable[[PatchConfig], None] | None = None,
     ) -> ScanSolver:
-        """Configure the node, with its scans withheld.
+        """Configure the node while its scans are withheld.
 
         Args:
             deadline_s: Maximum time until the node's first response, s.
             abandoned: Called repeatedly; once it returns True, configuration raises Abandoned.
-            on_answer: Called when the node has answered.
+            on_answer: Called when the node has responded.
 
         Returns:
             The solver for the node's scans.
@@ -107,10 +108,11 @@ class RemoteNode:
         """
         self.boot_ups = self.monitor.boot_ups
         if self.monitor.running and self.monitor.nmt_state == NmtState.STOPPED and not self.has_other_master:
-            nmt_master.stand_by(self.link.send, self.patch.node_id)  # SDO needs a node that is not stopped
+            # a stopped node does not respond to SDO requests
+            nmt_master.stand_by(self.link.send, self.patch.node_id)
 
         def answered(patch: PatchConfig) -> None:
-            self.boot_ups = self.monitor.boot_ups  # earlier boot-ups were expected
+            self.boot_ups = self.monitor.boot_ups  # ignore the expected boot-ups
             if on_answer is not None:
                 on_answer(patch)
 
@@ -128,21 +130,21 @@ class RemoteNode:
             raise kind(node_id, f"{text}; {why}") from error
         try:
             return ScanSolver(self.facts, self._hand.solver)
-        except ValueError as error:  # the electrode layout was read from the node
+        except ValueError as error:  # the node's electrode layout is invalid
             raise NodeError(self.patch.node_id, f"patch {self.patch.name!r}: {error}") from None
 
     def start(self, solver: ScanSolver, withholdings: int) -> None:
         """Start passing scans to ``solver`` and, if the host is the master, start the node.
 
         Args:
-            solver: Decodes and solves the scans.
-            withholdings: As returned by :meth:`withhold`.
+            solver: Solver that decodes and solves the scans.
+            withholdings: Number returned by :meth:`withhold`.
 
         Raises:
             BusError: if the command cannot be sent.
         """
-        # If another master runs the node, the node's stream has continued since the bus was opened, unless
-        # the node has booted since.
+        # If another master runs the node, the stream has been running since the bus was opened, unless the
+        # node has booted in the meantime.
         anew = not self.has_other_master or self.monitor.boot_ups > 0
         self.link.call(lambda: self.stream.resume(solver, withholdings, anew=anew), self.defects)
         if not self.has_other_master:
@@ -150,16 +152,16 @@ class RemoteNode:
         self.monitor.running = True
 
     def renew_baseline(self, deadline_s: float, abandoned: Callable[[], bool]) -> ScanSolver | None:
-        """Read the node's current baseline.
+        """Read the node's current baseline, and create a solver if the baseline has changed.
 
         Returns:
-            A solver with this baseline; None if the baseline is unchanged and scans are being passed on.
+            A solver with the new baseline; None if the baseline is unchanged and no scans are withheld.
 
         Raises:
             SkinError: as raised by :meth:`Configurator.settle_baseline`.
         """
         facts = self.facts
-        assert facts is not None  # only called for running nodes
+        assert facts is not None  # called only for running nodes
         configurator = self._configurator(deadline_s, abandoned, lambda patch: None)
         with self._remote.abort_if(abandoned):
             baseline_ohm = configurator.settle_baseline(self.patch, self._profile, self._remote)
@@ -167,11 +169,11 @@ class RemoteNode:
             return None
         facts = facts.with_baseline(baseline_ohm)
         solver = ScanSolver(facts, self._hand.solver)
-        self.facts = facts  # set last: without a solver, the old baseline stays in use
+        self.facts = facts  # set last: if no solver can be created, the old baseline stays in use
         return solver
 
     def renew_register(self) -> None:
-        """Read the error register, because the emergency that clears an error may have been lost.
+        """Read the node's error register, in case the emergency that clears an error was lost.
 
         Raises:
             NodeError: as raised by :class:`RemoteOd`.
@@ -181,19 +183,20 @@ class RemoteNode:
         self.link.call(lambda: self.monitor.on_register_read(register, said), self.defects)
 
     def is_mute(self, since_ns: int) -> bool:
-        """Return whether an operational node is not sending scans and so may have lost its configuration.
+        """Return whether an operational node sends no scans, possibly because it has lost its configuration.
 
-        Always False on another master's bus, because only that master may restore the configuration.
+        The result is always False if another master runs the bus, because only that master may restore the
+        configuration.
 
         Args:
-            since_ns: Monotonic time since which the node has been operational.
+            since_ns: Monotonic time since which the node has been operational, ns.
         """
         scan_ns = max(self.monitor.t_scan_ns or 0, since_ns)
         patience_ns = max(_MUTE_S, _MUTE_SCANS * self._hand.sync.period_s) * 1e9
         return not self.has_other_master and self.link.t_dispatched_ns > scan_ns + patience_ns
 
     def is_configured(self) -> bool:
-        """Return whether the node is configured: see :func:`~skinnode.host.configurator.is_configured`."""
+        """Return the result of :func:`~skinnode.host.configurator.is_configured` for the node."""
         return is_configured(self.patch, self._hand, self._remote)
 
     def tare(self) -> None:
@@ -205,7 +208,7 @@ class RemoteNode:
         node_id, said = self.patch.node_id, f"patch {self.patch.name!r} on {self.patch.bus}: not tared"
         if self.has_other_master:
             raise NodeError(node_id, f"{said}: another master runs the bus")
-        if self.patch.baseline is not None:  # the host would restore the file's baseline at once
+        if self.patch.baseline is not None:  # the host would immediately restore the baseline from the file
             raise NodeError(node_id, f"{said}: its baseline is kept in {self.patch.baseline}")
         if (
             not self.monitor.running or self.monitor.nmt_state != NmtState.OPERATIONAL
@@ -214,13 +217,13 @@ class RemoteNode:
         self.link.send(od.command_cob_id(node_id), pack_command(tare=True))
 
     def withhold(self) -> int:
-        """Make the mainline withhold scans.
+        """Make the mainline withhold the node's scans.
 
         Returns:
-            The number to pass to :meth:`start`.
+            Number to pass to :meth:`start` as ``withholdings``.
 
         Raises:
-            NodeTimeout: if the mainline is delayed, for example while the bus is unavailable.
+            NodeTimeout: if the mainline does not respond in time, for example because the bus is unavailable.
         """
         answer: queue.SimpleQueue[int] = clock.simple_queue()
         self.link.call(lambda: answer.put(self.stream.withhold()), self.defects)
@@ -232,7 +235,7 @@ class RemoteNode:
             ) from None
 
     def probe(self) -> None:
-        """Ask the node for its device type, without waiting for the response.
+        """Request the node's device type, without waiting for the response.
 
         Raises:
             BusError: if the request cannot be sent.
@@ -241,10 +244,10 @@ class RemoteNode:
         self.link.send(od.sdo_request_cob_id(self.patch.node_id), request)
 
     def _answers_to_one_question(self) -> int:
-        """Return the number of responses to a single SDO request: two if two nodes have this node-ID.
+        """Return the number of responses to a single SDO request: two if two nodes share the node-ID.
 
-        The result is the smaller of the counts for two requests, because a response to an earlier request may
-        be late.
+        Two requests are sent, and the smaller count is returned, because a late response to an earlier
+        request would be counted too.
         """
         clock.sleep(_ANSWER_S)
         counts = []
@@ -259,13 +262,13 @@ class RemoteNode:
 
     @property
     def searchable(self) -> bool:
-        """Whether the hand file states the serial number and the host is the master of the bus."""
+        """Whether the host can search for the node by LSS, as a bus master that has the serial number."""
         return not self.has_other_master and self.patch.serial is not None
 
     def search(self) -> bool:
-        """Search for the patch by its serial number, if known. Returns whether the patch was found.
+        """Search for the node by LSS, using its serial number. Returns whether the node was found.
 
-        If found, the patch will boot with its node-ID.
+        After a successful search, the node boots with the node-ID from the hand file.
         """
         if self.has_other_master or self.patch.serial is None:
             return False

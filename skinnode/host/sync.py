@@ -1,4 +1,4 @@
-"""SYNC: a producer with a counter and a fixed, drift-free rate, and a follower of another producer."""
+"""Produce SYNC with a counter at a drift-free rate, or follow the SYNC of another producer."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from skinnode.process import clock
 
 
 class Tick(NamedTuple):
-    """One SYNC."""
+    """Number and monotonic time of one SYNC."""
 
     number: int
     t_ns: int
@@ -26,53 +26,53 @@ class SyncStats:
 
     sent: int
     missed: int
-    """Number of periods skipped because the thread woke too late."""
+    """Number of SYNC periods skipped because the sending thread woke too late."""
     failed: int
-    """SYNC messages that a bus did not accept."""
+    """Number of SYNC messages that a bus did not accept."""
     latest_ns: int
-    """Longest delay of a SYNC relative to its due time."""
+    """Maximum delay of a SYNC relative to its due time, ns."""
     received: int = 0
-    """SYNC messages from other producers on buses that another master runs."""
+    """Number of SYNC messages from other producers, on buses that another master runs."""
     irregular: int = 0
-    """Received SYNC messages whose counter is missing or does not follow the previous counter: a SYNC was
-    lost, or there is a second producer."""
+    """Number of received SYNC messages whose counter is missing or does not follow the previous counter. Such
+    a message indicates a lost SYNC or a second producer."""
 
 
 class Ticks:
-    """Newest SYNC for each counter value.
+    """Table of the newest SYNC for each counter value.
 
-    Written by the thread that sends or follows SYNC, read by the mainline.
+    The table is written by the thread that sends or follows SYNC, and read by the mainline.
     """
 
     def __init__(self, counter_overflow: int) -> None:
         self.counter_overflow = counter_overflow
         self._ticks: list[Tick | None] = [None] * (counter_overflow + 1)
         self.newest = 0
-        """Number of the newest SYNC, 0 before the first."""
+        """Number of the newest SYNC; 0 before the first."""
 
     def note(self, number: int, t_ns: int) -> int:
-        """Store the time of SYNC ``number``. Returns its counter, 1 to ``counter_overflow``."""
+        """Store the time of SYNC ``number``. Returns the SYNC's counter, 1 to ``counter_overflow``."""
         counter = (number - 1) % self.counter_overflow + 1
         self._ticks[counter] = Tick(number, t_ns)
         self.newest = number
         return counter
 
     def find(self, counter: int) -> Tick | None:
-        """Return the newest SYNC with this counter, or None if there was none."""
+        """Return the newest SYNC with this counter value, or None if there was no such SYNC."""
         return self._ticks[counter] if 0 < counter <= self.counter_overflow else None
 
 
 class SyncFollower:
-    """Follower that numbers another producer's SYNC messages for ``ticks``. Mainline only."""
+    """Follower of another producer, which stores its SYNC messages in ``ticks``. Mainline only."""
 
     def __init__(self, ticks: Ticks) -> None:
         self._ticks = ticks
         self.received = self.irregular = 0
         self.t_newest_ns = 0
-        """Monotonic time of the newest SYNC; 0 before the first."""
+        """Monotonic time of the newest SYNC, ns; 0 before the first."""
 
     def on_sync(self, data: bytes, t_ns: int) -> None:
-        """Process a SYNC. A SYNC whose counter is missing or out of range cannot be numbered."""
+        """Process a received SYNC. If its counter is missing or out of range, the SYNC is only counted."""
         self.received += 1
         self.t_newest_ns = t_ns
         overflow = self._ticks.counter_overflow
@@ -82,7 +82,7 @@ class SyncFollower:
         if not overflow:
             return
         newest = self._ticks.newest
-        ahead = (data[0] - newest - 1) % overflow + 1  # 1 is the next
+        ahead = (data[0] - newest - 1) % overflow + 1  # 1 if no SYNC was lost
         if newest == 0:
             self._ticks.note(data[0], t_ns)
             return
@@ -94,19 +94,20 @@ Send = Callable[[int, bytes], None]
 
 
 class SyncProducer:
-    """Producer of SYNC on every bus, at the same instant or staggered, until :meth:`close`.
+    """Producer that sends SYNC on all buses, at the same instant or staggered, until :meth:`close`.
 
-    The counter runs from 1 to its overflow value (CiA 301, 0x1019). SYNC number n is due n periods after the
-    first; if the thread wakes a whole period late, it skips that period rather than sending two SYNC messages
-    in a row. Once a SYNC has been sent on one bus, it is sent on all buses.
+    The counter runs from 1 to its overflow value (CiA 301, 0x1019). SYNC number n + 1 is due n periods after
+    the first SYNC. If the thread wakes a whole period late, that period is skipped, because sending two SYNC
+    messages in quick succession would disturb the scans. A SYNC that has been sent on one bus is always sent
+    on the other buses too.
 
-    Threads: a dedicated thread sends the messages.
+    Threads: a dedicated thread sends the SYNC messages.
 
     Args:
-        buses: For each bus, the function that sends frames, and the SYNC counters.
+        buses: For each bus, the function that sends frames, and the table of SYNC times.
         period_s: SYNC period, s.
-        stagger_s: Delay from one bus to the next, s.
-        defects: For each bus, the collector of exceptions raised while sending on it.
+        stagger_s: Delay between the SYNC messages of successive buses, s.
+        defects: For each bus, the collector of exceptions raised while sending on that bus.
     """
 
     def __init__(
@@ -130,7 +131,7 @@ class SyncProducer:
         return SyncStats(self._sent, self._missed, self._failed, self._latest_ns)
 
     def close(self) -> None:
-        """Stop sending; end and join the thread."""
+        """Stop sending SYNC, and join the sending thread."""
         self._stop.set()
         self._thread.join()
 
@@ -147,16 +148,16 @@ class SyncProducer:
         keep_on(self._turn, self._defects[0], "sending SYNC")
 
     def _turn(self) -> bool:
-        """Wait until the next SYNC is due and send it. Returns False when the thread must end."""
+        """Wait until the next SYNC is due, and send it. Returns False if the thread must end."""
         if self._wait(self._due_ns):
             return False
         self._number += 1
         due_ns, self._due_ns = self._due_ns, self._due_ns + self._period_ns
-        now_ns = clock.monotonic_ns()  # one instant for all buses
+        now_ns = clock.monotonic_ns()  # the same instant for all buses
         for i in range(len(self._buses)):
             try:
                 self._send(i, due_ns + i * self._stagger_ns, now_ns)
-            except BusError:  # a full or silent bus may recover; lost scans are counted elsewhere
+            except BusError:  # the bus may recover, and lost scans are counted by the assembler
                 self._failed += 1
             except Exception as error:
                 self._failed += 1
@@ -173,9 +174,10 @@ class SyncProducer:
             self._wait(due_ns)
             now_ns = clock.monotonic_ns()
         self._latest_ns = max(self._latest_ns, now_ns - due_ns)
-        payload = bytes([ticks.note(self._number, now_ns)])  # before sending, so that scans find this SYNC
+        # store the SYNC before sending it, so that its scans find it
+        payload = bytes([ticks.note(self._number, now_ns)])
         send(SYNC_COB_ID, payload)
 
     def _wait(self, until_ns: int) -> bool:
-        """Wait until ``until_ns``, or until :meth:`close`. Returns whether to end."""
+        """Wait until ``until_ns`` or :meth:`close`. Returns whether the producer was closed."""
         return self._stop.wait(max(0.0, (until_ns - clock.monotonic_ns()) * 1e-9))

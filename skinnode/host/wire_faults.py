@@ -1,4 +1,4 @@
-"""Faults of wires as health reports them, and the wires that their codes mark as open or shorted."""
+"""Wire faults in a patch's health report, and detection of open and shorted wires from their codes."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from skinnode.protocol.codes import CodeScale
 
 
 class WireState(enum.StrEnum):
-    """Fault of a wire."""
+    """Type of fault of a wire."""
 
     OPEN = "open"
     SHORT = "short"
@@ -23,7 +23,7 @@ class WireState(enum.StrEnum):
 
 @dataclass(frozen=True, slots=True, order=True)
 class WireFault:
-    """A wire and its fault."""
+    """Fault of one upper or lower wire."""
 
     side: str
     """``upper`` or ``lower``."""
@@ -35,7 +35,7 @@ def broken_wires(codes: NDArray[Any], scale: CodeScale) -> tuple[WireFault, ...]
     """Return the wires whose crossings are all open, or all shorted.
 
     Args:
-        codes: (U, K) codes.
+        codes: (U, K) codes of one scan.
         scale: Scale of the codes.
     """
     found = []

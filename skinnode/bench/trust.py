@@ -1,10 +1,11 @@
-"""``skinnode bench trust``: is every number that a field calls trusted right, and is a sound patch trusted?
+"""Benchmark ``skinnode bench trust``: tests that trusted values are right and that sound patches are trusted.
 
 ::
 
     loads, faults -> signal (codes and truth) -> solver of the host -> score -> rows, verdicts
 
-Every stream is drawn from the seed and from its own name, so parts of a run can be repeated alone.
+The random numbers of each stream depend only on the seed and the stream's name, so any part of a run can be
+repeated on its own.
 """
 
 from __future__ import annotations
@@ -35,30 +36,30 @@ from skinnode.process.child_processes import starting_children
 from skinnode.text.json_values import plain
 
 PAIRS: Final = 500
-"""Number of pairs of faults."""
+"""Number of streams with a random pair of faults."""
 PARTS: Final = ("table", "speed", "road")
-"""Parts beside the streams: the table of scenes, speed against error, faults over a bus."""
+"""Names of the additional parts: table of earlier failures, speed versus error, and faults over a bus."""
 SHORT: Final[dict[str, Any]] = {
     "pairs": 20,
     "hours": 0.0,
     "settings": (Setting("staggered", 0.5, 1e-5), Setting("staggered", 0.5, 1e-4)),
 }
-"""Options of a short run."""
+"""Options of :func:`run` for a short run."""
 WATCHED: Final = 4000
-"""Scans of a stream that is watched for false namings: ten touches."""
+"""Number of scans in a stream that counts false alarms; the stream contains ten touches."""
 QUIET: Final = Timeline(rest=200, press=10, hold=30, slide=40, release=10, after=110)
-"""Phases of a touch in the streams that are watched for false namings."""
+"""Phases of each touch in the streams that count false alarms."""
 PAIRED: Final = Timeline(rest=9, press=6, hold=7, slide=6, release=4, after=6)
-"""Phases of a stream with two faults; shorter, because there are many."""
+"""Phases of a stream with two faults; the phases are short because there are many such streams."""
 
 
 @dataclass(frozen=True)
 class Item:
-    """A stream to solve."""
+    """Description of a stream to solve."""
 
     section: str
     row: str
-    """Row of the report to which the stream belongs."""
+    """Row of the report that includes this stream."""
     setting: Setting
     load: str
     faults: tuple[str, ...] = ()
@@ -66,18 +67,18 @@ class Item:
 
     @property
     def name(self) -> str:
-        """Name from which the stream is drawn."""
+        """Unique name; it seeds the stream's random generator."""
         return f"{self.section} {self.row} {self.setting.name} {self.load} {self.number}"
 
 
 def items(seed: int, *, pairs: int = PAIRS, hours: float = 0.1, settings: Sequence[Setting]) -> list[Item]:
-    """Return every stream of a run.
+    """List all streams of a run.
 
     Args:
-        seed: Seed of the pairs.
+        seed: Seed that selects the pairs of faults.
         pairs: Number of pairs of faults.
-        hours: Patch-hours to watch for false namings.
-        settings: Layouts and noises.
+        hours: Duration in patch-hours of the streams that count false alarms.
+        settings: Layouts and noise levels.
     """
     found = [Item("healthy", load, setting, load) for load in LOADS for setting in settings]
     for i, fault in enumerate(singles()):
@@ -104,7 +105,7 @@ def _pair(rng: np.random.Generator, settings: Sequence[Setting], number: int) ->
 
 
 def solve_item(item: Item, seed: int) -> Score:
-    """Solve and score a stream."""
+    """Generate, solve and score a stream."""
     rng = np.random.default_rng([seed, zlib.crc32(item.name.encode())])
     if item.section == "hours":
         return _watch(item, rng)
@@ -116,7 +117,7 @@ def solve_item(item: Item, seed: int) -> Score:
 
 
 def _watch(item: Item, rng: np.random.Generator) -> Score:
-    """Score touches in one long stream, and count false namings."""
+    """Score the touches of one long fault-free stream, and count false alarms."""
     total, known, number = Score(), set[Naming](), 0
     patch = None
     for touch in range(WATCHED // QUIET.scans):
@@ -132,10 +133,10 @@ def _watch(item: Item, rng: np.random.Generator) -> Score:
 
 
 class Kept:
-    """Scores of streams already solved, in a file with a line per stream; without a file nothing is kept.
+    """File of the scores of solved streams, one line per stream, from which a run can be resumed.
 
     Args:
-        path: File to append to; None for none.
+        path: File to which scores are appended; None to store no scores.
         seed: Seed of the run; lines with another seed are ignored.
     """
 
@@ -150,7 +151,7 @@ class Kept:
                 self.scores[kept["stream"]] = Score(**kept["score"])
 
     def keep(self, item: Item, score: Score) -> None:
-        """Append a score."""
+        """Append the score of a stream to the file."""
         if self._path is not None:
             line = json.dumps({"seed": self._seed, "stream": item.name, "score": asdict(score)})
             with self._path.open("a", encoding="utf-8") as file:
@@ -192,17 +193,20 @@ def run(  # noqa: PLR0913 - options of a command
     progress: Callable[[str], object] = lambda line: None,
     kept: Path | None = None,
 ) -> dict[str, Any]:
-    """Solve healthy streams, every fault, pairs of faults, and long streams; return figures and verdicts.
+    """Solve fault-free streams, streams with one and two faults, and long streams, and check the targets.
 
     Args:
         seed: Seed of all streams.
         pairs: Number of pairs of faults.
-        hours: Patch-hours to watch for false namings.
-        only: Parts of the names of sections or rows to run; default: all.
-        settings: Layouts and noises; default: all.
+        hours: Duration in patch-hours of the streams that count false alarms.
+        only: Substrings of the names of the sections and rows to run; default: all.
+        settings: Layouts and noise levels; default: all.
         jobs: Number of processes; it does not affect the streams.
-        progress: Called with a line from time to time.
-        kept: File to which the score of each stream is appended; a run continues from it.
+        progress: Function that receives a line of text after every 20 streams.
+        kept: File to which the score of each stream is appended, and from which an interrupted run resumes.
+
+    Returns:
+        Rows and targets of the report, as plain values.
     """
     chosen = all_settings() if settings is None else settings
     work = [
@@ -227,13 +231,13 @@ def run(  # noqa: PLR0913 - options of a command
 def with_parts(
     figures: dict[str, Any], seed: int, parts: Sequence[str], progress: Callable[[str], object]
 ) -> dict[str, Any]:
-    """Return the figures with the parts that are not streams of :func:`run`.
+    """Measure additional parts of the benchmark, and return ``figures`` with their results.
 
     Args:
-        figures: Figures of :func:`run`.
+        figures: Result of :func:`run`.
         seed: Seed of all streams.
-        parts: Some of :data:`PARTS`.
-        progress: Called with a line from time to time.
+        parts: Names from :data:`PARTS`.
+        progress: Function that receives a line of text for each completed step.
     """
     found = dict(figures)
     if "table" in parts:
@@ -242,7 +246,7 @@ def with_parts(
             found["table"].append(plain(row))
             progress(f"table: {row['tried']}")
     if "speed" in parts:
-        progress("speed against error")
+        progress("speed versus error")
         found["speed"] = plain(trust_speed.rows(seed))
     if "road" in parts:
         progress("faults over the bus")

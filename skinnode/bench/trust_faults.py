@@ -1,14 +1,15 @@
-"""Faults for ``skinnode bench trust``: those of the simulator that change values, and others, on arrays.
+"""Faults for ``skinnode bench trust``, applied to arrays of readings and codes.
 
-A fault acts where it occurs in a real patch:
+They include the simulator's faults that change values. Each fault acts at the stage at which it occurs in a
+real patch:
 
-made    how the patch differs from its layout, before its baseline is measured
-wired   wires, before the converter's noise
-read    readings, after the noise
+made    deviation of the patch from its layout, present when the baseline is measured
+wired   wiring, before the converter adds noise
+read    readings, after the converter has added noise
 sent    codes, on their way to the host
-stated  what the hand file says
+stated  noise or tolerances stated in the hand file
 
-``Signal.bad`` marks the readings that a fault changes; naming any other reading is a false naming.
+``Signal.bad`` marks the readings that a fault changes. Reporting any other reading is a false alarm.
 """
 
 from __future__ import annotations
@@ -29,14 +30,14 @@ CHUNK: Final = 3
 NOISY: Final = 3e-3
 """Relative noise of a wire with a bad contact, as in the simulator."""
 SETTLE: Final = 50
-"""Number of scans at rest after which a wrong noise must have been noticed."""
+"""Number of scans at rest after which the host must have detected a wrong noise figure."""
 
 InPlace = Callable[[Signal], None]
 
 
 @dataclass(frozen=True, eq=False)
 class Fault:
-    """A fault, drawn anew for every stream."""
+    """A fault, whose location and time are chosen at random for each stream."""
 
     name: str
     made: Callable[[Skin, np.random.Generator], Skin] | None = None
@@ -45,27 +46,27 @@ class Fault:
     sent: InPlace | None = None
     timeline: Callable[[Timeline], Timeline] | None = None
     stated: float = 1.0
-    """Ratio of the stated to the true noise."""
+    """Ratio of the noise stated in the hand file to the true noise."""
     ordinary: bool = False
-    """Whether the hand file states ordinary tolerances."""
+    """Whether the hand file states ordinary tolerances, not exact positions."""
     local: bool = False
-    """Whether the fault concerns single crossings or wires, so that the rest of the patch can be trusted."""
+    """Whether only single crossings or wires are affected, so that the rest of the patch can be trusted."""
     scored_from: int = 0
-    """First scan that counts."""
+    """First scan that is scored."""
     group: str = ""
-    """Faults of the same group, if it has a name, exclude each other."""
+    """Name of a group of mutually exclusive faults; empty if the fault can be combined with any other."""
 
 
 # --- places and times
 
 
 def _one(signal: Signal, axis: int, many: int = 1) -> int:
-    """Draw a wire (the first of ``many`` neighbours): of the upper layer if ``axis`` is 1, else the lower."""
+    """Choose the first of ``many`` neighbouring wires at random: upper if ``axis`` is 1, lower if it is 2."""
     return int(signal.rng.integers(signal.shape[axis] - many + 1))
 
 
 def _pressed_wire(signal: Signal, axis: int) -> int:
-    """Draw a wire among those that the load changes most: upper if ``axis`` is 1, else lower."""
+    """Choose one of the three wires that the load changes most: upper if ``axis`` is 1, lower if it is 2."""
     middle = (signal.pressed.start + signal.pressed.stop) // 2
     change = np.abs(signal.ohm[middle] / signal.rest_ohm - 1.0).max(axis=2 - axis)
     most = np.argsort(change)[-3:]
@@ -73,7 +74,7 @@ def _pressed_wire(signal: Signal, axis: int) -> int:
 
 
 def _crossing(signal: Signal) -> tuple[int, int]:
-    """Draw a crossing among those that the load changes most."""
+    """Choose one of the 30 crossings that the load changes most."""
     middle = (signal.pressed.start + signal.pressed.stop) // 2
     change = np.abs(signal.ohm[middle] / signal.rest_ohm - 1.0).ravel()
     at = int(signal.rng.choice(np.argsort(change)[-30:]))
@@ -85,13 +86,13 @@ def _at_rest(signal: Signal) -> int:
 
 
 def _pressing(signal: Signal) -> int:
-    """Draw a scan while the load is coming down."""
+    """Choose a scan at random during which the load is being applied."""
     first = max(1, signal.pressed.start - 6)
     return int(signal.rng.integers(first, max(first + 1, signal.pressed.start - 1)))
 
 
 def _row(signal: Signal, axis: int, wire: int, start: int = 0) -> tuple[slice | int, ...]:
-    """Return the index of a wire's readings from scan ``start`` on."""
+    """Return the array index of a wire's readings in scan ``start`` and all later scans."""
     scans = slice(start, None)
     return (scans, wire, slice(None)) if axis == 1 else (scans, slice(None), wire)
 
@@ -110,7 +111,7 @@ def _lose(share: float) -> InPlace:
 
 
 def _tear(signal: Signal) -> None:
-    """Lose the second half of every fourth scan."""
+    """Mark the second half of every fourth scan as missing."""
     signal.codes.reshape(len(signal.codes), -1)[::4, signal.codes[0].size // 2 :] = MISSING
 
 
@@ -125,7 +126,7 @@ def _leave_one(signal: Signal) -> None:
 
 
 def _freeze(start: Callable[[Signal], int], *, counted: bool = True) -> InPlace:
-    """Repeat the codes of a scan; ``counted`` tells whether the patch counts its conversions."""
+    """Repeat the codes of one scan in all later scans; ``counted``: whether the patch counts conversions."""
 
     def sent(signal: Signal) -> None:
         t = start(signal)
@@ -167,7 +168,7 @@ def _flip(signal: Signal, scans: slice, u: int, k: int, bit: int) -> None:
 
 
 def _flip_once(signal: Signal) -> None:
-    """Flip a bit in one scan, among the bits above the noise."""
+    """Flip one bit above the noise, in one code of one scan."""
     t = int(signal.rng.integers(2, signal.shape[0] - 2))
     _flip(signal, slice(t, t + 1), *_crossing(signal), int(signal.rng.integers(6, 16)))
 
@@ -189,7 +190,7 @@ def _flip_for_ever(signal: Signal) -> None:
 
 
 def _corrupt(signal: Signal) -> None:
-    """Change a byte of a random code in every tenth scan, which only a patch without a check lets through."""
+    """Corrupt a byte of a random code in every tenth scan, as on a patch whose scans carry no check."""
     for t in range(4, signal.shape[0], 10):
         u, k = _one(signal, 1), _one(signal, 2)
         low = signal.rng.random() < 0.5
@@ -221,7 +222,7 @@ def _shorted_to_all(axis: int) -> InPlace:
 
 
 def _open_unmarked(axis: int) -> InPlace:
-    """Break a wire whose converter input then floats near the top of its range."""
+    """Break a wire, so that the converter input floats near the top of its range."""
 
     def wired(signal: Signal) -> None:
         at, t = _one(signal, axis), _pressing(signal)
@@ -234,7 +235,7 @@ def _open_unmarked(axis: int) -> InPlace:
 
 
 def _two_shorted(axis: int) -> InPlace:
-    """Connect two neighbouring wires: both read the two resistances in parallel."""
+    """Short two neighbouring wires, so that both read the two resistances in parallel."""
 
     def wired(signal: Signal) -> None:
         at, t = _one(signal, axis, 2), _pressing(signal)
@@ -247,7 +248,7 @@ def _two_shorted(axis: int) -> InPlace:
 
 
 def _crossed(axis: int, *, tared: bool) -> InPlace:
-    """Swap two wires that the load moves, before the baseline was measured (``tared``) or afterwards."""
+    """Swap two wires that the load moves, before (``tared``) or after the baseline is measured."""
 
     def wired(signal: Signal) -> None:
         at = _pressed_wire(signal, axis)
@@ -264,7 +265,7 @@ def _crossed(axis: int, *, tared: bool) -> InPlace:
 
 
 def _gain(axis: int, by: float) -> InPlace:
-    """Change the gain of a wire after its baseline was measured."""
+    """Change the gain of a wire after the baseline has been measured."""
 
     def wired(signal: Signal) -> None:
         rows = _row(signal, axis, _pressed_wire(signal, axis), _at_rest(signal))
@@ -327,7 +328,7 @@ def some_bits() -> Fault:
 
 
 def singles() -> list[Fault]:
-    """Return every fault."""
+    """Return all faults that the benchmark applies alone or in pairs."""
     upper, lower = 1, 2
     return [
         Fault("5 % of chunks lost", sent=_lose(0.05)),

@@ -1,11 +1,11 @@
-"""Loads for ``skinnode bench trust``: presses that are not of the kind that the elastic prior expects.
+"""Loads for ``skinnode bench trust`` that violate the assumptions of the posterior's prior.
 
-The prior of the posterior expects independent loads on the cells of a lattice. The loads here have no
-lattice: closed forms for a sphere and a flat punch, line loads at any angle, a dent that is no solution of a
-half-space, a rigid plate on the whole patch. Forces are known if the body presses on a half-space or layer.
+The prior assumes independent loads on the cells of a lattice. The loads in this module use no lattice: closed
+forms for a sphere and a flat punch, line loads at any angle, a dent that no load on a half-space can produce,
+and a rigid plate on the whole patch. The force is known if the body presses on a half-space or on a layer.
 
-Frictional shear is proportional to the pressure. The rubber is incompressible (ν = ½), so on a half-space
-pressure does not move the surface sideways and shear does not move it up or down.
+Frictional shear is proportional to the pressure. The rubber is incompressible (ν = ½). On a half-space,
+pressure therefore causes no tangential displacement, and shear causes no normal displacement.
 """
 
 from __future__ import annotations
@@ -21,23 +21,23 @@ from skinnode.model.layout import Float, PatchLayout
 
 LOADS: Final = ("sphere", "punch", "ridge", "dent", "edge", "whole patch")
 DEPTH: Final = (0.1, 0.3)
-"""Range of the depth of a load, in clearances."""
+"""Minimum and maximum depth of a load, as fractions of the layer height."""
 SHEAR: Final = 0.3
-"""Maximum friction."""
+"""Maximum coefficient of friction."""
 LINES: Final = 16
-"""Number of line loads across a ridge, at most 0.15 pitches apart."""
+"""Number of line loads across the width of a ridge; they are at most 0.15 pitches apart."""
 
 WAVES: Final = 1500
-"""Number of wave numbers in a Hankel transform."""
+"""Number of wave numbers at which a Hankel transform is sampled."""
 WAVE_MAX: Final = 60.0
-"""Largest wave number, in inverse contact radii: Hertz's pressure has 1e-4 of its weight beyond."""
+"""Maximum wave number times contact radius; higher wave numbers contain 1e-4 of Hertz's pressure."""
 
 _UNKNOWN: Final = np.full(3, np.nan)
 
 
 @dataclass(frozen=True)
 class Punch:
-    """A rigid, flat-ended cylinder (Johnson, Contact Mechanics, eqs. 3.34 to 3.37)."""
+    """Press by a rigid, flat-ended cylinder (Johnson, Contact Mechanics, eqs. 3.34 to 3.37)."""
 
     center_m: tuple[float, float]
     radius_m: float
@@ -45,9 +45,9 @@ class Punch:
     traction_ratio: tuple[float, float] = (0.0, 0.0)
 
     def displacement_m(self, points_m: Float, share: float) -> Float:
-        """Return the displacement of the pressure p₀/√(1 − r²/a²) and of a shear proportional to it.
+        """Return the displacement under the pressure p₀/√(1 − r²/a²) and a proportional shear traction.
 
-        Φ = ∫ p/|d| and S = ∫₀ʳ Φ s ds / r² give ∫ p d dᵀ/|d|³ = (Φ − S) I + (2S − Φ) d dᵀ/r².
+        With Φ = ∫ p/|d| and S = ∫₀ʳ Φ s ds / r², ∫ p d dᵀ/|d|³ = (Φ − S) I + (2S − Φ) d dᵀ/r².
         """
         offset, a = points_m - self.center_m, self.radius_m
         r = np.maximum(np.hypot(*offset.T), 1e-12)
@@ -59,21 +59,21 @@ class Punch:
         phi = np.where(r <= a, 2.0, phi)
         along = (offset / r[:, None]) @ np.array(self.traction_ratio)
         moved = np.empty((len(r), 3))
-        # (1 − ν) Φ I + ν ∫ p d dᵀ/|d|³ with ν = ½, in units in which the depth (1 − ν) Φ(0) is 1
+        # The displacement is (1 − ν) Φ I + ν ∫ p d dᵀ/|d|³ with ν = ½, scaled to the depth (1 − ν) Φ(0) = 1.
         moved[:, :2] = (0.5 * phi + 0.5 * (phi - s))[:, None] * np.array(self.traction_ratio)
         moved[:, :2] += (0.5 * (2 * s - phi) * along / r)[:, None] * offset
         moved[:, 2] = -0.5 * phi
         return share * self.depth_m * moved
 
     def force_n(self, share: float) -> Float:
-        """Return 2 a E* δ and the shear."""
+        """Return the normal force 2 a E* δ and the shear force, newtons."""
         normal = 2.0 * self.radius_m * RUBBER.contact_modulus_pa * share * self.depth_m
         return normal * np.array([*self.traction_ratio, -1.0])
 
 
 @dataclass(frozen=True)
 class Ridge:
-    """An edge of finite length at any angle: line loads side by side under an elliptic pressure."""
+    """Press by a straight edge of finite length: parallel line loads with an elliptic pressure profile."""
 
     center_m: tuple[float, float]
     angle: float
@@ -83,17 +83,17 @@ class Ridge:
     traction_ratio: tuple[float, float] = (0.0, 0.0)
 
     def _lines(self) -> tuple[Float, Float]:
-        """Return the places (L,) of the lines across the ridge, metres, and their share of the load."""
+        """Return the lines' offsets (L,) from the ridge's axis, metres, and their fractions of the load."""
         step = np.pi * np.arange(1, LINES + 1) / (LINES + 1)
         weight = np.sin(step) ** 2
         return self.half_width_m * np.cos(step), weight / weight.sum()
 
     def _unit(self, points_m: Float) -> Float:
-        """Return the displacement (P, 3, 3) per newton: Boussinesq and Cerruti, integrated along lines."""
+        """Return the displacement (P, 3, 3), m/N, by Boussinesq's and Cerruti's integrated solutions."""
         turn = np.array([[np.cos(self.angle), np.sin(self.angle)], [-np.sin(self.angle), np.cos(self.angle)]])
         along, across = turn @ (points_m - self.center_m).T
         places, weight = self._lines()
-        # A line is as wide as the distance to the next line, so its potential stays finite.
+        # Each line has the width of the spacing between lines, which keeps its potential finite.
         blur = self.half_width_m / LINES
         t = across[:, None] - places
         total = np.zeros((len(points_m), 3, 3))
@@ -116,18 +116,18 @@ class Ridge:
         return total
 
     def force_n(self, share: float) -> Float:
-        """Return the load that sinks the middle of the ridge by its depth."""
+        """Return the force (3,) that presses the middle of the ridge to its depth, newtons."""
         normal = share * self.depth_m / self._unit(np.array([self.center_m]))[0, 2, 2]
         return np.asarray(normal * np.array([*self.traction_ratio, -1.0]))
 
     def displacement_m(self, points_m: Float, share: float) -> Float:
-        """Return the displacement of all lines together."""
+        """Return the displacement (P, 3) caused by all line loads, metres."""
         return np.asarray(self._unit(points_m) @ self.force_n(share))
 
 
 @dataclass(frozen=True)
 class Dent:
-    """A smooth Gaussian dent that drags the skin towards its centre, as no half-space does."""
+    """Gaussian dent that pulls the skin towards its centre, which no load on a half-space does."""
 
     center_m: tuple[float, float]
     spread_m: float
@@ -135,7 +135,7 @@ class Dent:
     traction_ratio: tuple[float, float] = (0.0, 0.0)
 
     def displacement_m(self, points_m: Float, share: float) -> Float:
-        """Return the displacement of the dent."""
+        """Return the displacement (P, 3) of the dent, metres."""
         offset = (points_m - self.center_m) / self.spread_m
         shape = share * self.depth_m * np.exp(-0.5 * (offset**2).sum(axis=1))
         moved = np.empty((len(points_m), 3))
@@ -144,13 +144,13 @@ class Dent:
         return moved
 
     def force_n(self, share: float) -> Float:
-        """Return NaN: the shape does not determine a force."""
+        """Return NaN, because the shape of the dent does not determine a force."""
         return _UNKNOWN
 
 
 @dataclass(frozen=True)
 class Plate:
-    """A rigid plate, slightly tilted, that lies on the whole patch."""
+    """Press by a rigid, slightly tilted plate that covers the whole patch."""
 
     center_m: tuple[float, float]
     depth_m: float
@@ -159,22 +159,23 @@ class Plate:
     traction_ratio: tuple[float, float] = (0.0, 0.0)
 
     def displacement_m(self, points_m: Float, share: float) -> Float:
-        """Return the displacement of a rigid plate."""
+        """Return the displacement (P, 3) under the plate, metres."""
         depth = share * self.depth_m * (1.0 + (points_m - self.center_m) @ np.array(self.tilt))
         return np.asarray(depth[:, None] * np.array([*self.traction_ratio, -1.0]))
 
     def force_n(self, share: float) -> Float:
-        """Return NaN: the force depends on the skin beside the patch."""
+        """Return NaN, because the force also depends on the skin around the patch."""
         return _UNKNOWN
 
 
 @dataclass(frozen=True)
 class Bonded:
-    """Hertz's pressure on a layer of incompressible rubber that is bonded to a rigid base.
+    """Hertz pressure on an incompressible rubber layer that is bonded to a rigid base.
 
-    Hankel transforms: with x = k h, the layer's deflection is L(x) times that of a half-space, and its
-    surface moves sideways by −2x²/(sinh 2x − 2x) times the deflection (from the biharmonic solution that
-    is at rest at the base and free of shear at the surface).
+    The displacement is computed by Hankel transforms. With x = k h, the transformed deflection of the layer
+    is L(x) = (sinh 2x − 2x)/(cosh 2x + 2x² + 1) times that of a half-space. The tangential displacement is
+    −2x²/(sinh 2x − 2x) times the deflection. Both follow from the biharmonic solution with no displacement
+    at the base and no shear stress at the surface.
     """
 
     center_m: tuple[float, float]
@@ -184,13 +185,13 @@ class Bonded:
     depth_m: float
 
     def _unit(self, offset_m: Float) -> tuple[Float, Float]:
-        """Return the displacement along the surface, outwards, and out of it, per pascal of peak pressure."""
+        """Return the radial and the normal displacement (P,), metres per pascal of peak pressure."""
         from scipy.special import j0, j1
 
         k = (np.arange(WAVES) + 0.5) * (WAVE_MAX / WAVES) / self.radius_m
         ka, x = k * self.radius_m, k * self.thickness_m
         pressure = self.radius_m**2 * (np.sin(ka) / ka - np.cos(ka)) / ka**2
-        x = np.minimum(x, 100.0)  # beyond, the layer is a half-space
+        x = np.minimum(x, 100.0)  # for larger x, the layer behaves like a half-space
         below = np.cosh(2 * x) + 2 * x * x + 1.0
         deflect = pressure * (2.0 / RUBBER.contact_modulus_pa) * (k[1] - k[0])
         r = np.hypot(*offset_m.T)
@@ -203,7 +204,7 @@ class Bonded:
         return share * self.depth_m / -float(self._unit(np.zeros((1, 2)))[1][0])
 
     def displacement_m(self, points_m: Float, share: float) -> Float:
-        """Return the displacement of the layer's surface."""
+        """Return the displacement (P, 3) of the layer's surface, metres."""
         offset = points_m - self.center_m
         outwards, up = self._unit(offset)
         r = np.maximum(np.hypot(*offset.T), 1e-12)
@@ -211,24 +212,24 @@ class Bonded:
         return np.asarray(moved * self._peak_pa(share))
 
     def force_n(self, share: float) -> Float:
-        """Return Hertz's load, ⅔ π a² p₀."""
+        """Return the force (3,), newtons; Hertz's normal force is ⅔ π a² p₀."""
         return np.array([0.0, 0.0, -2.0 / 3.0 * math.pi * self.radius_m**2 * self._peak_pa(share)])
 
 
 def surface_m(layout: PatchLayout) -> tuple[Float, Float, Float]:
-    """Return the electrodes (P, 2) along the surface and their lowest and highest coordinates, metres."""
+    """Return the (x, y) positions (P, 2) of the upper electrodes, with their minimum and maximum, metres."""
     points = layout.upper_m[..., :2].reshape(-1, 2)
     return points, points.min(axis=0), points.max(axis=0)
 
 
 def draw(kind: str, layout: PatchLayout, rng: np.random.Generator, depth: float | None = None) -> Load:
-    """Return a random load.
+    """Choose a random load.
 
     Args:
         kind: One of :data:`LOADS`.
         layout: Patch to press.
         rng: Random generator.
-        depth: Depth in clearances; default: random within :data:`DEPTH`.
+        depth: Depth as a fraction of the layer height; default: random within :data:`DEPTH`.
     """
     pitch = layout.pitch_m
     _, low, high = surface_m(layout)
@@ -249,7 +250,7 @@ def draw(kind: str, layout: PatchLayout, rng: np.random.Generator, depth: float 
         middle = 0.5 * (low + high)
         tilt = 0.2 * tilts / (high - low)
         return Plate((float(middle[0]), float(middle[1])), sunk, (float(tilt[0]), float(tilt[1])), traction)
-    if kind == "edge":  # the centre is on the outermost electrodes or the outermost wire
+    if kind == "edge":  # centred on an outermost column of electrodes or an outermost wire
         border = (low, high)[side // 2]
         center = (float(border[0]), center[1]) if side % 2 else (center[0], float(border[1]))
     elif kind != "sphere":

@@ -1,4 +1,4 @@
-"""Verdicts and text of ``skinnode bench trust``."""
+"""Targets and text output of ``skinnode bench trust``."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from skinnode.bench.trust_signal import RATE_HZ, Setting
 
 SECTIONS: Final = ("healthy", "single", "pair", "hours")
 HEALTHY: Final = 0.99
-"""Minimum share of trusted fields without a fault, at a noise of 1e-5 and 1e-4."""
+"""Minimum fraction of fault-free fields that must be trusted, at relative noises of 1e-5 and 1e-4."""
 FALSE_PER_HOUR: Final = 0.1
-"""Maximum number of false namings per patch-hour."""
+"""Maximum number of false alarms per patch-hour."""
 
 
 def _sum(rows: Iterable[dict[str, Any]], key: str) -> float:
@@ -24,7 +24,7 @@ def _sum(rows: Iterable[dict[str, Any]], key: str) -> float:
 
 
 def verdicts(rows: Sequence[dict[str, Any]], settings: Sequence[Setting]) -> list[dict[str, Any]]:
-    """Return the targets that apply to ``rows``, each with its figure and whether it was reached."""
+    """Return each target that applies to ``rows``, with its measured value and whether it was reached."""
     by_section = {name: [row for row in rows if row["section"] == name] for name in SECTIONS}
     found = []
     for section, what in (("healthy", "no fault"), ("single", "one fault"), ("pair", "two faults")):
@@ -50,18 +50,20 @@ def verdicts(rows: Sequence[dict[str, Any]], settings: Sequence[Setting]) -> lis
     if named:
         after = _sum(named, "after")
         share = _sum(named, "after_trusted") / after if after else 0.0
-        found.append(_must("trusted fields with one fault, once named", share, trust_table.NAMED, least=True))
+        found.append(
+            _must("trusted fields with one fault, after its detection", share, trust_table.NAMED, least=True)
+        )
     if by_section["hours"]:
         found.append(_false_namings(by_section["hours"]))
     return found
 
 
 def part_verdicts(figures: dict[str, Any]) -> list[dict[str, Any]]:
-    """Return the targets of the table and of the road."""
+    """Return the targets for the table of earlier failures and for the faults over a bus."""
     found = []
     if "table" in figures:
         missed = sum(not row["reached"] for row in figures["table"])
-        found.append(_must("scenes that are not as they should be", missed, 0))
+        found.append(_must("earlier failures that persist", missed, 0))
     if "road" in figures:
         share = _sum(figures["road"], "beyond") / max(1.0, _sum(figures["road"], "coordinates"))
         found.append(_must("trusted coordinates beyond 5 deviations, over the bus", share, BEYOND))
@@ -74,10 +76,10 @@ def _must(what: str, got: float, asked: float, *, least: bool = False) -> dict[s
 
 
 def _false_namings(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """Compare the rate with the target. A short run without false namings proves little, and says so."""
+    """Compare the false-alarm rate with its target; the note gives the confidence bounds of the rate."""
     hours, events = _sum(rows, "frames") / RATE_HZ / 3600.0, round(_sum(rows, "false_names"))
     low, high = rate_bounds(events, hours)
-    verdict = _must("false namings per patch-hour", events / hours, FALSE_PER_HOUR)
+    verdict = _must("false alarms per patch-hour", events / hours, FALSE_PER_HOUR)
     bounds = f"{low:.2g} to {high:.2g}" if events else f"at most {high:.2g}"
     verdict["note"] = f"{events} in {hours:.2f} patch-hours: {bounds} per hour with 95 % confidence"
     return verdict
@@ -90,15 +92,17 @@ HEAD: Final = (
     f"{'then':>8}{'false':>7}{'contacts':>10}{'force':>7}  worst setting"
 )
 LEGEND: Final = (
-    "trusted: share of the fields; beyond 5: coordinates of trusted fields and wires with an error above 5\n"
-    "reported deviations, and the worst; named: streams whose fault was named, after how many scans\n"
-    "(median), and the share of trusted fields from then on; false: namings of readings that are right;\n"
-    "contacts: trusted fields with the right number; force: contacts within 5 deviations."
+    "trusted: fraction of fields that are trusted. beyond 5: fraction of trusted coordinates whose error\n"
+    "exceeds 5 reported standard deviations. worst: largest such error, in standard deviations.\n"
+    "named: fraction of streams in which the fault was identified. scans: median number of scans until\n"
+    "then. then: fraction of trusted fields from then on. false: faults reported for correct readings.\n"
+    "contacts: fraction of trusted fields with the right number of contacts.\n"
+    "force: fraction of contact forces within 5 standard deviations."
 )
 
 
 def lines(figures: dict[str, Any]) -> Iterator[str]:
-    """Return the report as text."""
+    """Yield the lines of the whole report."""
     if figures["rows"]:
         yield HEAD
     for section, rows in itertools.groupby(figures["rows"], key=lambda row: str(row["section"])):
@@ -113,18 +117,18 @@ def lines(figures: dict[str, Any]) -> Iterator[str]:
 
 
 def _parts(figures: dict[str, Any]) -> Iterator[str]:
-    """Return the parts that are not streams."""
+    """Yield the lines of the table, of the speed measurement and of the faults over a bus."""
     for name, title, head, text in (
-        ("table", "scenes that were trusted and wrong", "", trust_table.text),
+        ("table", "scenes whose fields were trusted but wrong in an earlier version", "", trust_table.text),
         (
             "speed",
-            "speed against error, staggered h=0.5, noise 1e-5, touched frames",
+            "speed versus error, staggered h=0.5, noise 1e-5, touched frames",
             trust_speed.HEAD,
             _one(trust_speed.text),
         ),
         (
             "road",
-            "faults of the simulator, from node to host over a bus",
+            "faults injected by the simulator, from node to host over a bus",
             trust_road.HEAD,
             _one(trust_road.text),
         ),
@@ -143,7 +147,7 @@ def _one(text: Callable[[dict[str, Any]], str]) -> Callable[[dict[str, Any]], It
 
 
 def line(row: dict[str, Any]) -> str:
-    """Return a row of the report as text."""
+    """Format a row of the report."""
     return (
         f"  {row['row']:32}{row['frames']:8}{_percent(row['share_trusted']):>9}"
         f"{_percent(row['share_beyond']):>10}{_number(row['worst']):>9}{_percent(row['share_named']):>7}"
@@ -154,7 +158,7 @@ def line(row: dict[str, Any]) -> str:
 
 
 def verdict_lines(must: Iterable[dict[str, Any]]) -> Iterator[str]:
-    """Return one line per target."""
+    """Yield one line for each target."""
     for row in must:
         bound = "at least" if row["least"] else "at most"
         verdict = "reached" if row["reached"] else "NOT reached"

@@ -1,7 +1,8 @@
-"""Faults of the simulator, from nodes over virtual buses to a host, for ``skinnode bench trust``.
+"""Runs simulated nodes with faults and a host over virtual buses, for ``skinnode bench trust``.
 
-A hand of full-size patches is pressed by the simulator's spheres. Each patch has its own fault; it begins
-when the stream has run for a while. This file may import the simulator, because it needs a source of faults.
+The simulator's spheres press on a hand of full-size patches. Each patch has a different fault, which is
+injected after a period of fault-free operation. This module may import the simulator, because the simulator
+provides the faults.
 """
 
 from __future__ import annotations
@@ -46,21 +47,21 @@ ROAD: Final[tuple[dict[str, Any], ...]] = (
     {"crossed_lower": 13},
     {"flipped": 0.2},
 )
-"""Faults that change, withhold or repeat values, one or none per patch."""
+"""Injected faults by patch; each fault changes, withholds or repeats values. The first patch has none."""
 AT_ONCE: Final = 4
-"""Number of patches whose nodes and host this process runs at a time."""
+"""Number of patches that this process simulates at the same time."""
 CLEAN_S: Final = 1.2
-"""Time without a fault, s: bring-up is over, and the first press has begun."""
+"""Fault-free time after bring-up, s: long enough for the first press to begin."""
 FAULTY_S: Final = 4.0
 PERIOD_MS: Final = 80
 
 
 def rows(seed: int) -> list[dict[str, Any]]:
-    """Return what the fields of each fault were worth."""
+    """Inject each fault and compare the resulting fields with the truth; return one row per fault."""
     found = []
     kept = logging.getLogger("skinnode")
     level = kept.level
-    kept.setLevel(logging.CRITICAL)  # the faults cause warnings
+    kept.setLevel(logging.CRITICAL)  # the injected faults cause expected warnings
     try:
         for first in range(0, len(ROAD), AT_ONCE):
             found += _together(ROAD[first : first + AT_ONCE], seed)
@@ -92,7 +93,7 @@ def _together(kinds: tuple[dict[str, Any], ...], seed: int) -> list[dict[str, An
 
 
 def _patch(field: FieldFrame) -> str:
-    assert field.stamp is not None  # the host stamps every field
+    assert field.stamp is not None  # the host attaches a stamp to every field
     return field.stamp.patch
 
 
@@ -138,7 +139,7 @@ def _row(
 
 
 def _truth_m(field: FieldFrame, source: SimulatedPatch) -> Float:
-    """Return the true electrodes, at the time of the SYNC if a frozen converter did not read."""
+    """Return the true electrode positions at the time of the conversion, or of the SYNC if there was none."""
     stamp = field.stamp
     assert stamp is not None
     try:
@@ -149,7 +150,7 @@ def _truth_m(field: FieldFrame, source: SimulatedPatch) -> Float:
 
 
 def known_faults() -> set[str]:
-    """Return the names of the simulator's faults."""
+    """Return the names of all faults that the simulator supports."""
     return {entry.name for entry in fields(Faults)}
 
 
@@ -157,7 +158,7 @@ HEAD: Final = f"  {'':24}{'fields':>8}{'trusted':>9}{'beyond 5':>10}{'worst':>9}
 
 
 def text(row: dict[str, Any]) -> str:
-    """Return a row as text."""
+    """Format a row of the table."""
     worst = row["worst"]
     off = "-" if worst is None else f"{worst:.3g}"
     named = "; ".join(row["named"][:3]) + (

@@ -1,6 +1,6 @@
-"""Scores of fields against the truth for ``skinnode bench trust``: what is trusted must be right.
+"""Scores trusted fields by comparison with the true displacement, for ``skinnode bench trust``.
 
-Counts only, so that scores add up over streams and processes.
+Scores consist of counts, so that the scores of several streams and processes can be added.
 """
 
 from __future__ import annotations
@@ -24,90 +24,90 @@ LIMIT: Final = 5.0
 """Maximum error of a trusted coordinate, in reported standard deviations."""
 
 BEYOND: Final = 1e-3
-"""Maximum share of trusted coordinates beyond :data:`LIMIT`."""
+"""Maximum fraction of trusted coordinates whose error may exceed :data:`LIMIT`."""
 
 Mask = NDArray[np.bool_]
 
 
 @dataclass
 class Score:
-    """Counts over streams."""
+    """Counts of fields, coordinates and detected faults in one or more streams."""
 
     streams: int = 0
     frames: int = 0
     trusted: int = 0
-    """Fields that are trusted."""
+    """Number of trusted fields."""
     coordinates: int = 0
-    """Coordinates of trusted fields on wires that are trusted."""
+    """Number of trusted coordinates: those of trusted wires in trusted fields."""
     beyond: int = 0
-    """Such coordinates with an error beyond :data:`LIMIT`."""
+    """Number of trusted coordinates whose error exceeds :data:`LIMIT`."""
     worst: float = 0.0
-    """Largest error of such a coordinate, in reported standard deviations."""
+    """Maximum error of a trusted coordinate, in reported standard deviations."""
     named: int = 0
-    """Streams in which readings of the fault were named."""
+    """Number of streams in which the field reported the fault that was present."""
     nameable: int = 0
-    """Streams with readings that a fault changed."""
+    """Number of streams in which a fault changed at least one reading."""
     scans_to_name: list[int] = dataclasses.field(default_factory=list)
-    """Scans from the first changed reading to the first right naming, one per stream."""
+    """Number of scans from the first changed reading to the first correct fault report, for each stream."""
     after: int = 0
-    """Fields from the first right naming on."""
+    """Number of fields from the first correct fault report onwards."""
     after_trusted: int = 0
-    """Such fields that are trusted."""
+    """Number of trusted fields from the first correct fault report onwards."""
     false_names: int = 0
-    """Namings of parts whose readings no fault changed; a part that is named twice counts twice."""
+    """Number of false alarms: faults reported for parts whose readings were correct."""
     touches: int = 0
-    """Trusted fields with the load at full depth, or of a patch at rest."""
+    """Number of trusted fields with the load at full depth or with the patch at rest."""
     touches_right: int = 0
-    """Such fields with the right number of contacts: one, or none at rest."""
+    """Number of fields in ``touches`` with the right number of contacts: one, or none at rest."""
     forces: int = 0
-    """Trusted fields with one contact whose true force is known."""
+    """Number of trusted fields with exactly one contact, whose true force is known."""
     forces_right: int = 0
-    """Such fields whose normal force is within :data:`LIMIT` deviations."""
+    """Number of fields in ``forces`` whose normal force is within :data:`LIMIT` standard deviations."""
 
     def add(self, other: Score) -> None:
-        """Add the counts of ``other``."""
+        """Add the counts of ``other`` to this score."""
         for entry in dataclasses.fields(self):
             own, its = getattr(self, entry.name), getattr(other, entry.name)
             setattr(self, entry.name, max(own, its) if entry.name == "worst" else own + its)
 
     @property
     def share_beyond(self) -> float:
-        """Share of the trusted coordinates beyond the limit; 0 if none is trusted."""
+        """Fraction of the trusted coordinates whose error exceeds the limit; 0 if there are none."""
         return self.beyond / max(self.coordinates, 1)
 
     @property
     def share_trusted(self) -> float:
-        """Share of the fields that are trusted."""
+        """Fraction of the fields that are trusted."""
         return self.trusted / self.frames if self.frames else math.nan
 
     @property
     def share_after(self) -> float:
-        """Share of the fields that are trusted from the first right naming on."""
+        """Fraction of the fields that are trusted, from the first correct fault report onwards."""
         return self.after_trusted / self.after if self.after else math.nan
 
     @property
     def share_named(self) -> float:
-        """Share of the streams whose fault was named rightly."""
+        """Fraction of the streams in which the fault was identified correctly."""
         return self.named / self.nameable if self.nameable else math.nan
 
     @property
     def share_contacts(self) -> float:
-        """Share of the fields with the right number of contacts."""
+        """Fraction of the fields that have the right number of contacts."""
         return self.touches_right / self.touches if self.touches else math.nan
 
     @property
     def share_forces(self) -> float:
-        """Share of the contacts whose force is within its deviations."""
+        """Fraction of the contacts whose force is within the limit of its standard deviation."""
         return self.forces_right / self.forces if self.forces else math.nan
 
     @property
     def median_scans(self) -> float:
-        """Median number of scans until a fault is named."""
+        """Median number of scans until a fault is identified."""
         return float(np.median(self.scans_to_name)) if self.scans_to_name else math.nan
 
 
 def trusted_wires(field: FieldFrame) -> Mask:
-    """Return the wires (U,) whose displacement a user may use; none if the field is not trusted."""
+    """Return a mask (U,) of the trusted wires; all False if the field is not trusted."""
     if not field.trusted:
         return np.zeros(len(field.status), bool)
     if field.wires_trusted is not None:
@@ -116,7 +116,7 @@ def trusted_wires(field: FieldFrame) -> Mask:
 
 
 def deviations(field: FieldFrame, truth_m: Float) -> Float:
-    """Return the errors (U, N, 3) in reported standard deviations; inf where not finite."""
+    """Return the errors (U, N, 3) in reported standard deviations; inf for values that are not finite."""
     with np.errstate(all="ignore"):
         error = np.abs(field.displacement_m - truth_m)
         ratio = np.where(error == 0.0, 0.0, error / field.displacement_std_m)
@@ -124,7 +124,7 @@ def deviations(field: FieldFrame, truth_m: Float) -> Float:
 
 
 def covered(fault: DataFault, shape: tuple[int, int]) -> Mask:
-    """Return the readings (U, K) that a fault names."""
+    """Return a mask (U, K) of the readings to which a reported fault refers."""
     mask = np.zeros(shape, bool)
     upper = slice(None) if fault.upper is None else fault.upper
     lower = slice(None) if fault.lower is None else fault.lower
@@ -133,21 +133,21 @@ def covered(fault: DataFault, shape: tuple[int, int]) -> Mask:
 
 
 def is_right(fault: DataFault, bad: Mask) -> bool:
-    """Return whether at least half of the readings named were changed by a fault, so far or in this scan."""
+    """Return whether at least half of the readings that ``fault`` covers are marked in ``bad`` (U, K)."""
     return bool(bad[covered(fault, bad.shape)].mean() >= 0.5)
 
 
 Naming = tuple[FaultyPart, int | None, int | None, int]
-"""Part, upper wire, lower wire and first scan of a fault that was named."""
+"""Part, upper wire, lower wire and first scan of a reported fault."""
 
 
 def judge(taken: CodeStream, fields: Sequence[FieldFrame], known: set[Naming] | None = None) -> Score:
     """Score the fields of a stream, one per scan.
 
     Args:
-        taken: Stream.
-        fields: Field of every scan.
-        known: False namings that were counted before; receives those of this stream.
+        taken: The stream.
+        fields: The field of every scan.
+        known: False alarms that have already been counted; this stream's false alarms are added.
     """
     score = Score(streams=1)
     bad_so_far = np.zeros(taken.bad.shape[1:], bool)
@@ -196,7 +196,7 @@ def _judge_field(score: Score, taken: CodeStream, t: int, field: FieldFrame) -> 
 
 
 def rate_bounds(events: int, hours: float) -> tuple[float, float]:
-    """Return the one-sided 95 % confidence bounds of a Poisson rate, lower and upper, per hour."""
+    """Return the lower and the upper one-sided 95 % confidence bound of a Poisson rate, per hour."""
     from scipy.stats import chi2
 
     low = 0.0 if events == 0 else 0.5 * float(chi2.ppf(0.05, 2 * events)) / hours

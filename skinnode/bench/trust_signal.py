@@ -1,10 +1,11 @@
-"""Code streams for ``skinnode bench trust``: a load in time, a patch, a converter, faults, and the truth.
+"""Generates streams of codes with known true displacements, for ``skinnode bench trust``.
 
 ::
 
     load, timeline -> displacement -> resistances of the true patch -> noise -> faults -> codes -> faults
 
-A stream rests, is pressed, held, slides, is released and rests again.
+In each stream, the patch is first at rest. A load then presses, holds, slides and is released, and the patch
+rests again.
 """
 
 from __future__ import annotations
@@ -25,16 +26,16 @@ if TYPE_CHECKING:
 
 PITCH_M: Final = 4e-3
 LAYOUTS: Final = (("staggered", 0.5), ("staggered", 1.0), ("aligned", 0.5))
-"""Presets and their heights in pitches."""
+"""Preset names and layer heights in pitches."""
 NOISES: Final = (1e-5, 1e-4, 1e-3)
 SCALE: Final = CodeScale(16)
 RATE_HZ: Final = 100.0
-"""Scans per second of a patch, to convert scans to hours."""
+"""Scan rate of a patch, Hz; converts numbers of scans to hours."""
 
 
 @dataclass(frozen=True)
 class Timeline:
-    """Number of scans in each phase of a stream; a stream at 12.5 scans/s takes about five seconds."""
+    """Number of scans in each phase of a stream; at 12.5 scans/s, a stream lasts about five seconds."""
 
     rest: int = 12
     press: int = 8
@@ -45,12 +46,12 @@ class Timeline:
 
     @property
     def scans(self) -> int:
-        """Number of scans."""
+        """Total number of scans."""
         return self.rest + self.press + self.hold + self.slide + self.release + self.after
 
     @property
     def shares(self) -> Float:
-        """Share (T,) of the full depth."""
+        """Depth of the load at each scan (T,), as a fraction of the full depth."""
         ramp = 0.5 - 0.5 * np.cos(np.pi * np.arange(1, self.press + 1) / self.press)
         lift = 0.5 + 0.5 * np.cos(np.pi * np.arange(1, self.release + 1) / self.release)
         held = np.ones(self.hold + self.slide)
@@ -58,7 +59,7 @@ class Timeline:
 
     @property
     def slid(self) -> Float:
-        """Share (T,) of the slide's way."""
+        """Position of the load at each scan (T,), as a fraction of the slide's length."""
         way = np.zeros(self.scans)
         start = self.rest + self.press + self.hold
         way[start : start + self.slide] = np.arange(1, self.slide + 1) / max(self.slide, 1)
@@ -68,60 +69,60 @@ class Timeline:
 
 @dataclass(eq=False)
 class Signal:
-    """What a converter reads and sends, while faults change it in place."""
+    """Readings and codes of a converter, which faults modify in place."""
 
     rng: np.random.Generator
     rest_ohm: Float
-    """(U, K) resistances stored as baseline."""
+    """(U, K), resistances that the node stores as its baseline, ohm."""
     ohm: Float
-    """(T, U, K) readings, ohm."""
+    """(T, U, K), readings in ohm."""
     bad: NDArray[np.bool_]
-    """(T, U, K) readings that differ from those of the intact patch by more than noise."""
+    """(T, U, K), whether a reading differs from that of the intact patch by more than noise."""
     pressed: slice
-    """Scans in which the load is at full depth."""
+    """Range of the scans in which the load is at full depth."""
     phase: NDArray[np.int64]
-    """(T,) conversion phase in the summaries, 1 to 3 in turn; 0 if the patch does not count conversions."""
+    """(T,), conversion phase in the summaries: 1, 2, 3, 1, …; 0 if the patch does not count conversions."""
     codes: Codes = field(default_factory=lambda: np.zeros(0, np.uint32))
 
     @property
     def shape(self) -> tuple[int, int, int]:
-        """Shape of the stream, (T, U, K)."""
+        """Numbers of scans, upper wires and lower wires (T, U, K)."""
         scans, upper, lower = self.ohm.shape
         return scans, upper, lower
 
 
 @dataclass(frozen=True, eq=False)
 class CodeStream:
-    """Scans of a patch as a host receives them, and the truth."""
+    """Scans of a patch as the host receives them, with the true displacements and forces."""
 
     layout: PatchLayout
     baseline_ohm: Float
-    """(U, K), as stored in the node."""
+    """(U, K), baseline resistances stored in the node, ohm."""
     stated_noise: float
     """Relative noise stated in the hand file."""
     ordinary: bool
-    """Whether the hand file states that the patch is made to ordinary tolerances."""
+    """Whether the hand file states ordinary manufacturing tolerances for the patch."""
     codes: Codes
-    """(T, U, K); MISSING if the chunk was lost."""
+    """(T, U, K), received codes; MISSING where the chunk was lost."""
     truth_m: Float
-    """(T, U, N, 3) displacement, metres."""
+    """(T, U, N, 3), true displacement, metres."""
     force_n: Float
-    """(T, 3) load on the skin, newtons; NaN if unknown."""
+    """(T, 3), true force on the skin, newtons; NaN if unknown."""
     bad: NDArray[np.bool_]
-    """(T, U, K) readings changed by a fault."""
+    """(T, U, K), whether a fault changed the reading."""
     touched: NDArray[np.bool_]
-    """(T,) scans with the load at full depth."""
+    """(T,), whether the load is at full depth."""
     untouched: NDArray[np.bool_]
-    """(T,) scans with the patch at rest."""
+    """(T,), whether the patch is at rest."""
     phase: NDArray[np.int64]
-    """(T,) conversion phase in the summaries; 0 if the patch does not count conversions."""
+    """(T,), conversion phase in the summaries; 0 if the patch does not count conversions."""
     scored_from: int = 0
-    """First scan that counts."""
+    """First scan that is scored."""
 
 
 @dataclass(frozen=True)
 class Setting:
-    """A patch and its converter."""
+    """Layout of a patch and noise of its converter."""
 
     preset: str
     height: float
@@ -130,7 +131,7 @@ class Setting:
 
     @property
     def name(self) -> str:
-        """Short description."""
+        """Short description, used in reports and to seed streams."""
         return f"{self.preset} h={self.height:g}, {self.noise:.0e}".replace("e-0", "e-")
 
     def layout(self) -> PatchLayout:
@@ -139,20 +140,20 @@ class Setting:
 
 
 def all_settings() -> list[Setting]:
-    """Return every layout with every noise."""
+    """Return all combinations of layout and noise level."""
     return [Setting(preset, height, noise) for preset, height in LAYOUTS for noise in NOISES]
 
 
 def make(
     setting: Setting, load: Load, faults: Sequence[Fault], rng: np.random.Generator, timeline: Timeline
 ) -> CodeStream:
-    """Return the codes of a load on a patch with faults.
+    """Generate the code stream of a loaded patch with faults.
 
     Args:
-        setting: Patch and converter.
-        load: Body that presses.
+        setting: Layout and noise.
+        load: Load on the patch.
         faults: Faults, in the order in which they take effect.
-        rng: Random generator of noise and faults.
+        rng: Random generator for noise and faults.
         timeline: Phases of the stream.
     """
     layout = setting.layout()
@@ -207,9 +208,9 @@ def make(
 def motion(
     layout: PatchLayout, load: Load, timeline: Timeline, rng: np.random.Generator
 ) -> tuple[Float, Float]:
-    """Return the displacement (T, U, N, 3) and the force (T, 3) of a load that slides in a random direction.
+    """Return the displacement (T, U, N, 3), metres, and the force (T, 3), newtons, of a sliding load.
 
-    The load slides by two pitches, towards the middle so that it stays on the patch.
+    The load slides by two pitches in a random direction that points towards the middle of the patch.
     """
     points = layout.upper_m[..., :2].reshape(-1, 2)
     toward = 0.5 * (points.min(axis=0) + points.max(axis=0)) - load.center_m

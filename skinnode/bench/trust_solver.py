@@ -1,7 +1,7 @@
-"""The path of a patch through the host, fed with the codes of a stream, for ``skinnode bench trust``.
+"""Processes a code stream with the host's own solver and fault detection, for ``skinnode bench trust``.
 
-As in the host, a scan is judged (frozen parts, open wires), solved without the readings left out, and then
-watched for slower faults.
+As in the host, each scan is first checked for frozen parts and open wires. The scan is then solved without
+the excluded readings, and finally added to the statistics that reveal slowly developing faults.
 """
 
 from __future__ import annotations
@@ -24,18 +24,18 @@ from skinnode.protocol.summary import SummaryFlag
 
 CONVERSIONS: Final = int(SummaryFlag.CONVERSIONS)
 PERIOD_NS: Final = 10_000_000
-"""Time between scans, ns."""
+"""Time between consecutive scans, ns."""
 
 
 @dataclass
 class HostPatch:
-    """What a host keeps of a patch: its watch and its solver."""
+    """State that a host keeps for a patch: solver and fault detection."""
 
     solver: ScanSolver
     watch: CodeWatch
 
     def field(self, codes: Codes, number: int, phase: int) -> FieldFrame:
-        """Return the field of the scan ``number`` with ``codes`` (U, K) and the conversion phase."""
+        """Solve scan ``number``, given its codes (U, K) and its conversion phase."""
         scan, stamp = _scan_of(self.solver.facts.profile, codes, number, phase)
         verdict = self.watch.judge(scan, number)
         field = verdict.applied(self.solver.solve(verdict.admitted(scan), stamp)[0])
@@ -44,12 +44,12 @@ class HostPatch:
 
 
 def host_patch(taken: CodeStream, config: PatchConfig | None = None, **options: Any) -> HostPatch:
-    """Return what a host keeps of a patch with this stream's layout, noise and tolerances.
+    """Create the host's state for a patch with the stream's layout, noise and tolerances.
 
     Args:
-        taken: Stream.
-        config: Patch of a hand file; default: one that states the stream's noise and tolerances.
-        **options: Keys of ``[solver]`` in a hand file.
+        taken: The stream.
+        config: Patch entry of a hand file; default: an entry with the stream's noise and tolerances.
+        **options: Keys of the table ``[solver]`` in a hand file.
     """
     layout = taken.layout
     stated: dict[str, Any] = {
@@ -71,7 +71,7 @@ def host_patch(taken: CodeStream, config: PatchConfig | None = None, **options: 
 
 
 def fields_of(taken: CodeStream, patch: HostPatch | None = None) -> list[FieldFrame]:
-    """Return the field of every scan."""
+    """Solve every scan of a stream and return the fields."""
     patch = host_patch(taken) if patch is None else patch
     scans = enumerate(zip(taken.codes, taken.phase.tolist(), strict=True))
     return [patch.field(codes, number, phase) for number, (codes, phase) in scans]

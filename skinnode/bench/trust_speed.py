@@ -1,4 +1,4 @@
-"""Speed against error for ``skinnode bench trust``: exact inverse without and with tests, posterior."""
+"""Measures speed and error for ``skinnode bench trust``: exact inverse without and with tests, posterior."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ METHODS: Final = ("exact, no tests", "exact", "posterior")
 
 
 def rows(seed: int) -> list[dict[str, Any]]:
-    """Return time per touched frame and error of each method, on the same streams, in turn."""
+    """Solve the same streams with each method; return the time per touched frame and the error."""
     times: dict[str, list[float]] = {name: [] for name in METHODS}
     errors: dict[str, list[float]] = {name: [] for name in METHODS}
     worst = dict.fromkeys(METHODS, 0.0)
@@ -50,7 +50,7 @@ def rows(seed: int) -> list[dict[str, Any]]:
 
 
 def _fields(name: str, taken: CodeStream) -> list[tuple[Any, float]]:
-    """Return the field of each scan and the time it took, s."""
+    """Solve every scan of a stream; return each field with its solution time, s."""
     found = []
     if name == METHODS[0]:
         bare = _bare(taken)
@@ -88,7 +88,7 @@ def _bare(taken: CodeStream) -> ExactTracker:
 
 
 def text(row: dict[str, Any]) -> str:
-    """Return a row as text."""
+    """Format a row of the table."""
     return (
         f"  {row['method']:20}{row['p50_ms']:9.2f}{row['p99_ms']:9.2f}{100 * row['error']:9.2f}%"
         f"{row['worst_deviations']:9.3g}"

@@ -1,4 +1,4 @@
-"""Scenes whose fields were once trusted and wrong, measured again."""
+"""Regression tests for ``skinnode bench trust``: scenes whose fields were trusted but wrong in the past."""
 
 from __future__ import annotations
 
@@ -31,21 +31,20 @@ from skinnode.solve.paths.step_control import Uniform
 FINE: Final = Setting("staggered", 0.5, 1e-5)
 COARSE: Final = Setting("staggered", 0.5, 1e-4)
 NAMED: Final = 0.95
-"""Minimum share of trusted fields with one faulty wire or crossing, once it is named."""
+"""Minimum fraction of trusted fields after a faulty wire or crossing has been identified."""
 BRIEF: Final = Timeline(rest=4, press=5, hold=6, slide=0, release=0, after=0)
-"""Phases of a stream whose contacts are counted."""
+"""Phases of a short stream, which ends while the load is held."""
 BLUNT_M: Final = 100e-6
-"""Error above which a field with half of its readings should not be called trusted and precise: 5 % of the
-layer."""
+"""Maximum error, m, of a trusted and precise field with half of its readings: 5 % of the layer height."""
 STEADY: Final = 0.95
-"""Minimum share of fields with the right number of contacts."""
+"""Minimum fraction of fields that must have the right number of contacts or a correct force."""
 
 Solved = tuple[CodeStream, list[FieldFrame]]
 
 
 @dataclass(frozen=True)
 class Line:
-    """A line of the table. ``measure`` returns the new figure in words and whether it is as it should be."""
+    """A scene of the table; ``measure`` returns its result as text, and whether the target is reached."""
 
     tried: str
     before: str
@@ -53,7 +52,7 @@ class Line:
 
 
 def rows(seed: int, only: Sequence[str] = ()) -> Iterator[dict[str, Any]]:
-    """Measure the lines whose description contains a text of ``only``; default: all."""
+    """Measure the scenes whose descriptions contain any of the strings ``only``; default: all scenes."""
     for line in LINES:
         if only and not any(part in line.tried for part in only):
             continue
@@ -72,7 +71,7 @@ def _streams(  # noqa: PLR0913 - parts of a stream
     timeline: Timeline | None = None,
     config: PatchConfig | None = None,
 ) -> Iterator[Solved]:
-    """Solve ``count`` streams drawn from the seed and a name: presses by a sphere or by ``load``."""
+    """Solve ``count`` streams seeded by ``seed`` and ``name``; the default load is a sphere."""
     for number in range(count):
         rng = np.random.default_rng([seed, zlib.crc32(name.encode()), number])
         layout = setting.layout()
@@ -86,7 +85,7 @@ def _fault(name: str) -> Fault:
 
 
 def _with_fault(name: str, setting: Setting, count: int = 4) -> Callable[[int], tuple[str, bool]]:
-    """Return a measurement of the fields from the first changed reading on."""
+    """Return a function that measures the fields from the first reading that the fault changes."""
 
     def measure(seed: int) -> tuple[str, bool]:
         fault = some_bits() if name == "some bits" else _fault(name)
@@ -100,10 +99,13 @@ def _with_fault(name: str, setting: Setting, count: int = 4) -> Callable[[int], 
                 trusted += field.trusted
                 wrong += off > LIMIT
                 worst = max(worst, off)
-        named = f"named in {total.named} of {total.nameable} streams"
+        named = f"fault identified in {total.named} of {total.nameable} streams"
         if total.scans_to_name:
             named += f", after {total.median_scans:g} scans"
-        text = f"{trusted} of {fields} trusted, {wrong} of them beyond 5 deviations, up to {worst:.3g}"
+        text = (
+            f"{trusted} of {fields} fields trusted, {wrong} of them wrong by more than 5 deviations, "
+            f"at most {worst:.3g}"
+        )
         goes_on = total.share_after if total.after else trusted / max(fields, 1)
         is_good = total.share_beyond <= BEYOND and (goes_on >= NAMED or not fault.local)
         return f"{text}; {named}", is_good
@@ -139,8 +141,8 @@ def _half_lost(seed: int) -> tuple[str, bool]:
                     worst = max(worst, one)
     error_m, std_m, off = worst
     text = (
-        f"{trusted} of {fields} fields trusted; the worst that is also precise {1e6 * error_m:.0f} ± "
-        f"{1e6 * std_m:.0f} µm"
+        f"{trusted} of {fields} fields trusted; largest error of a trusted and precise field "
+        f"{1e6 * error_m:.0f} ± {1e6 * std_m:.0f} µm"
     )
     return text, error_m <= BLUNT_M and off <= LIMIT
 
@@ -168,7 +170,7 @@ def _whole(seed: int) -> tuple[str, bool]:
 
 
 def _paths(seed: int) -> tuple[str, bool]:
-    """Follow 72 sheared presses of 10 wires on noise-free samples."""
+    """Solve the paths of 72 sheared presses, each with 10 wires, on noise-free samples."""
     skin = Skin(PatchLayout.preset("aligned", pitch_m=PITCH_M, height_m=0.5 * PITCH_M))
     right, wrong, errors = 0, 0, []
     for number in range(72):
@@ -198,7 +200,10 @@ def _paths(seed: int) -> tuple[str, bool]:
 
 
 def _placed(off: float, *, stated: float | None = None) -> Callable[[int], tuple[str, bool]]:
-    """Return a measurement of wires placed ``off``, if the hand file states that or ordinary tolerances."""
+    """Return a function that measures fields of wires misplaced by ``off`` pitches.
+
+    ``stated`` is the placement tolerance in the hand file, pitches; default: ordinary tolerances.
+    """
     fault = _fault(f"wires placed {off:g} pitch off")
     config = None
     if stated is not None:
@@ -216,25 +221,25 @@ def _placed(off: float, *, stated: float | None = None) -> Callable[[int], tuple
             errors.append(np.linalg.norm(field.displacement_m - truth) / np.linalg.norm(truth))
             trusted += field.trusted
             worst = max(worst, float(deviations(field, truth).max()))
-        text = f"error {100 * np.median(errors):.0f} %, up to {worst:.3g} deviations off"
+        text = f"error {100 * np.median(errors):.0f} %, at most {worst:.3g} deviations"
         return f"{text}, {trusted} of 8 trusted", total.share_beyond <= BEYOND
 
     return measure
 
 
 def _placed_beyond_ordinary(off: float) -> Callable[[int], tuple[str, bool]]:
-    """Return a measurement that succeeds if fields are right once the hand file states the placement."""
+    """Return a function that tests whether fields are right if the hand file states the placement error."""
 
     def measure(seed: int) -> tuple[str, bool]:
         ordinary, _ = _placed(off)(seed)
         text, is_good = _placed(off, stated=off)(seed)
-        return f"placement {off:g} stated: {text}; {ORDINARY.placement:g} stated: {ordinary}", is_good
+        return f"with a stated placement of {off:g}: {text}; of {ORDINARY.placement:g}: {ordinary}", is_good
 
     return measure
 
 
 def _new_hand(seed: int) -> tuple[str, bool]:
-    """Press the first patch of the hand file that ``skinnode hand new`` prints."""
+    """Press the first patch of the hand file that ``skinnode hand new`` generates."""
     command = [sys.executable, "-c", "from skinnode.cli.main import main; main()", "hand", "new"]
     text = subprocess.run(command, check=True, capture_output=True, timeout=120).stdout.decode()
     hand = parse_hand(tomllib.loads(text))
@@ -253,7 +258,8 @@ def _new_hand(seed: int) -> tuple[str, bool]:
                 within += abs(contact.normal_force_n + force[2]) <= LIMIT * contact.normal_force_std_n
     by = " and ".join(sorted(methods))
     text = (
-        f"method {by}: one contact in {right} of {touched} touched fields, {within} of {forces} forces right"
+        f"method {by}: one contact in {right} of {touched} touched fields, "
+        f"{within} of {forces} forces correct"
     )
     return text, right >= STEADY * touched and within >= STEADY * forces
 
@@ -276,19 +282,19 @@ def _bonded(seed: int) -> tuple[str, bool]:
         off = max(off, abs(force - truth) / std)
     if not ratios:
         return "no contact in 6 presses", False
-    text = f"force {np.median(ratios):.2f} of the true one, up to {off:.3g} deviations off"
+    text = f"force {np.median(ratios):.2f} of the true force, at most {off:.3g} deviations off"
     return text + (f"; no contact in {missing} of 6 presses" if missing else ""), off <= LIMIT and not missing
 
 
 LINES: Final = (
     Line(
         "50 % of chunks lost",
-        "97 of 97 fields trusted, the worst 495 ± 383 µm and 3.55 ± 0.64 N",
+        "97 of 97 fields trusted, largest errors 495 ± 383 µm and 3.55 ± 0.64 N",
         _half_lost,
     ),
     Line(
         "patch frozen in mid-press",
-        "operational and trusted for ever; at noise 1e-4 known to be frozen and still trusted",
+        "always operational and trusted; at noise 1e-4 detected as frozen but still trusted",
         _both(
             ("1e-5", _with_fault("patch frozen in mid-press", FINE)),
             ("1e-4", _with_fault("patch frozen in mid-press", COARSE)),
@@ -296,7 +302,7 @@ LINES: Final = (
     ),
     Line(
         "one wire frozen under the press, noise 1e-4",
-        "36 of 36 trusted, all beyond 6 deviations, up to 54",
+        "36 of 36 fields trusted, all wrong by 6 to 54 deviations",
         _both(
             ("upper", _with_fault("upper wire frozen", COARSE)),
             ("lower", _with_fault("lower wire frozen", COARSE)),
@@ -304,7 +310,7 @@ LINES: Final = (
     ),
     Line(
         "one crossing stuck",
-        "21 of 36 trusted, all beyond 6 deviations",
+        "21 of 36 fields trusted, all wrong by more than 6 deviations",
         _both(
             ("at its value", _with_fault("crossing stuck at its value", FINE)),
             ("at a constant", _with_fault("crossing stuck at a constant", FINE)),
@@ -312,12 +318,12 @@ LINES: Final = (
     ),
     Line(
         "one bit of one code flipped",
-        "429 of 843 exact fields trusted and beyond 5 deviations",
+        "429 of 843 exact fields trusted but wrong by more than 5 deviations",
         _with_fault("some bits", FINE, 8),
     ),
     Line(
         "lower wire open or two shorted, unmarked",
-        "all wires MAX_STEPS: the patch is gone",
+        "all wires MAX_STEPS: the whole patch is lost",
         _both(
             ("open", _with_fault("lower wire open, unmarked", FINE)),
             ("shorted", _with_fault("two lower wires shorted", FINE)),
@@ -325,33 +331,33 @@ LINES: Final = (
     ),
     Line(
         "centre of a touch on the outermost row",
-        "contacts in 2 of 15 presses, even at noise 1e-5",
+        "contact found in only 2 of 15 presses, even at noise 1e-5",
         _edge,
     ),
-    Line("the whole patch pressed", "0, 1, 2 or 4 contacts from frame to frame", _whole),
+    Line("the whole patch pressed", "number of contacts changes between 0, 1, 2 and 4", _whole),
     Line(
         "aligned, shear 0.8 of pressure, 70 % presses, 20 samples, LM",
         "27 of 720 wires CONVERGED and wrong by 6 to 105 %",
         _paths,
     ),
-    Line("wires placed 0.01 pitch off", "error 14 %, 78 deviations off, 8 of 8 trusted", _placed(0.01)),
-    Line("wires placed 0.02 pitch off", "error 26 %, 150 deviations off, 6 of 8 trusted", _placed(0.02)),
+    Line("wires placed 0.01 pitch off", "error 14 %, at most 78 deviations, 8 of 8 trusted", _placed(0.01)),
+    Line("wires placed 0.02 pitch off", "error 26 %, at most 150 deviations, 6 of 8 trusted", _placed(0.02)),
     Line(
         "wires placed 0.05 pitch off",
-        "error 52 %, 327 deviations off, 4 of 8 trusted",
+        "error 52 %, at most 327 deviations, 4 of 8 trusted",
         _placed_beyond_ordinary(0.05),
     ),
-    Line("a hand file of `hand new`", "method exact: no contacts and no forces", _new_hand),
+    Line("a hand file of `hand new`", "method exact, which reports neither contacts nor forces", _new_hand),
     Line(
         "a press on 2 mm of rubber bonded to metal",
-        "force 0.02 of the true one, with a small deviation",
+        "force 0.02 of the true force, with a small standard deviation",
         _bonded,
     ),
 )
 
 
 def text(row: dict[str, Any]) -> Iterator[str]:
-    """Return a line of the table as text."""
-    yield f"{row['tried']}: {'as it should be' if row['reached'] else 'NOT as it should be'}"
+    """Yield the lines of text for a scene."""
+    yield f"{row['tried']}: {'target reached' if row['reached'] else 'target NOT reached'}"
     yield f"    before  {row['before']}"
     yield f"    now     {row['now']}"

@@ -119,7 +119,8 @@ def trust(
         typer.Option(metavar="TEXT", help="Run only rows whose section and name contain TEXT; repeatable."),
     ] = None,
     hours: Annotated[
-        float, typer.Option(min=0, help="Patch-hours at 100 scans/s to watch for false namings.")
+        float,
+        typer.Option(min=0, help="Duration of the search for false alarms, in patch-hours at 100 scans/s."),
     ] = 0.1,
     jobs: Annotated[int, typer.Option(min=1, help="Number of processes that solve streams.")] = 1,
     resume: Annotated[

@@ -284,9 +284,9 @@ def row(section: str, name: str, **changes: float) -> dict:
         (row("healthy", "sphere", beyond=2), "trusted coordinates beyond 5 deviations, no fault"),
         (row("healthy", "sphere", trusted=98), "trusted fields without a fault, noise up to 1e-4"),
         (row("single", "upper wire open", beyond=2), "faults with more than 1 in 1000 such coordinates"),
-        (row("single", "upper wire open", after_trusted=47), "trusted fields with one fault, once named"),
+        (row("single", "upper wire open", after_trusted=47), "trusted fields with one fault, after its detection"),
         (row("pair", "a pair", beyond=2), "trusted coordinates beyond 5 deviations, two faults"),
-        (row("hours", "1e-05", frames=360_000, false_names=1), "false namings per patch-hour"),
+        (row("hours", "1e-05", frames=360_000, false_names=1), "false alarms per patch-hour"),
     ],
 )
 def test_each_target_is_missed_by_what_it_forbids(changed: dict, missed: str) -> None:

@@ -284,7 +284,10 @@ def row(section: str, name: str, **changes: float) -> dict:
         (row("healthy", "sphere", beyond=2), "trusted coordinates beyond 5 deviations, no fault"),
         (row("healthy", "sphere", trusted=98), "trusted fields without a fault, noise up to 1e-4"),
         (row("single", "upper wire open", beyond=2), "faults with more than 1 in 1000 such coordinates"),
-        (row("single", "upper wire open", after_trusted=47), "trusted fields with one fault, after its detection"),
+        (
+            row("single", "upper wire open", after_trusted=47),
+            "trusted fields with one fault, after its detection",
+        ),
         (row("pair", "a pair", beyond=2), "trusted coordinates beyond 5 deviations, two faults"),
         (row("hours", "1e-05", frames=360_000, false_names=1), "false alarms per patch-hour"),
     ],

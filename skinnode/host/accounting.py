@@ -1,6 +1,6 @@
-"""Check that a host's counters add up: everything received has been passed on or counted as lost.
+"""Check that a host's counters add up: every received frame must be passed on or counted as lost.
 
-Counters are read one after another rather than simultaneously, so check only a closed or idle host.
+Counters are not read at the same instant, so the sums agree only if the host is closed or idle.
 """
 
 from __future__ import annotations
@@ -13,15 +13,15 @@ from skinnode.text.words import counted
 
 
 def discrepancies(stats: HostStats) -> list[str]:
-    """Return one line for each mismatch between sums; an empty list if all sums agree.
+    """Return one line for each counter that differs from its sum; an empty list if all counters agree.
 
     ===========  ==========================================================================================
-    of a bus     frames read = received + ignored + error frames + dropped + waiting
-    of a bus     received = foreign + handled, the PDOs of its patches among the handled
-    of a bus     malformed = those of wrong length or form of its patches, and of SDO, heartbeat, EMCY
-    of a patch   frames = accepted + duplicates + conflicts + late + of wrong length, index, counter, form
-    of a patch   scans assembled, complete, torn or unchecked = offered + withheld + partial
-    of a patch   offered = solved + failed + skipped
+    bus          frames read = received + ignored + error frames + dropped + waiting
+    bus          received = foreign + handled; the PDOs of its patches are among the handled frames
+    bus          malformed = PDOs, SDO responses, heartbeats and EMCY messages of wrong length or format
+    patch        frames = accepted + duplicates + conflicts + late + wrong length, index, counter or format
+    patch        assembled scans (complete, torn or unchecked) = offered + withheld + partial
+    patch        offered = solved + failed + skipped
     ===========  ==========================================================================================
     """
     found: list[str] = []
@@ -44,7 +44,7 @@ def discrepancies(stats: HostStats) -> list[str]:
 
 
 def losses_of_bus(bus: BusStats) -> dict[str, str]:
-    """Return a phrase for each nonzero counter of a bus's losses and errors, by counter name."""
+    """Return a phrase for each nonzero loss or error counter of a bus, by counter name."""
     counts = (
         ("dropped", "frame dropped", "frames dropped"),
         ("kernel_dropped", "frame dropped by the kernel", "frames dropped by the kernel"),
@@ -56,7 +56,7 @@ def losses_of_bus(bus: BusStats) -> dict[str, str]:
 
 
 def losses_of_stream(stream: StreamStats) -> dict[str, str]:
-    """Return a phrase for each nonzero counter of a patch's losses, by counter name."""
+    """Return a phrase for each nonzero loss counter of a patch, by counter name."""
     assembler = stream.assembler
     counts = (
         ("scans_torn", "scan torn", "scans torn"),
@@ -70,7 +70,7 @@ def losses_of_stream(stream: StreamStats) -> dict[str, str]:
 
 
 def frames_counted(assembler: AssemblerStats) -> int:
-    """Return the total number of chunks and summaries recorded in the assembler's counters."""
+    """Return the total number of chunks and summaries counted by an assembler."""
     return (
         assembler.chunks_accepted
         + assembler.summaries_accepted

@@ -1,4 +1,4 @@
-"""Read the baseline and the error register of running nodes again when they may have changed."""
+"""Reread the baseline and the error register of running nodes if they may have changed."""
 
 from __future__ import annotations
 
@@ -17,27 +17,27 @@ from skinnode.process import clock
 _log = logging.getLogger(__name__)
 
 _DOUBT_NS: Final = 2_000_000_000
-"""Minimum interval between readings of a baseline that may have changed unnoticed."""
+"""Minimum interval between readings of a baseline that may have changed unnoticed, ns."""
 
 _REGISTER_NS: Final = 500_000_000
-"""Minimum interval between readings of an error register that is not zero. The emergency message that clears
-an error may be lost, yet the patch must be considered operational within a second of the end of the error.
-These readings require four SDO frames per second."""
+"""Minimum interval between readings of a nonzero error register, ns. The emergency message that clears an
+error may be lost, but the patch must count as operational within a second after the end of the error. The
+readings require four SDO frames per second."""
 
 
 class BaselineWatch:
     """Reader of the baselines and error registers of running nodes. Owned by the supervisor's thread.
 
-    Transfers run on ``pool``, one job per node at a time.
+    SDO transfers run on ``pool``, with at most one job per node at a time.
     """
 
     def __init__(self, pool: Executor) -> None:
         self._pool = pool
 
     def look(self, node: Supervised, now_ns: int) -> None:
-        """Read the baseline again if the node announced a new one, possibly in a lost summary.
+        """Reread the baseline if the node announced a new baseline, or may have done so in a lost summary.
 
-        After an announcement, scans are withheld until the baseline has been read.
+        After an announcement, scans are withheld until the new baseline has been read.
         """
         remote, stream, job = node.remote, node.remote.stream, node.job
         if job is not None:
@@ -64,13 +64,13 @@ class BaselineWatch:
         node.job = self._pool.submit(read)
 
     def _watch_register(self, node: Supervised, now_ns: int) -> None:
-        """Read the error register of a node in error: the frame clearing the error may have been lost."""
+        """Reread a nonzero error register, because the emergency that clears the error may have been lost."""
         remote = node.remote
         if not remote.monitor.error_register or remote.listen_only or now_ns < node.register_ns:
             return
 
         def read() -> Joined | None:
-            with contextlib.suppress(BusError, ConfigError):  # the register is read again later
+            with contextlib.suppress(BusError, ConfigError):  # the register will be read again
                 remote.renew_register()
             return None
 
@@ -78,13 +78,13 @@ class BaselineWatch:
         node.job = self._pool.submit(read)
 
     def _take_baseline(self, node: Supervised, job: Future[Joined | None], now_ns: int) -> None:
-        if job.exception() is None and job.result() is None:  # the job read the error register
+        if job.exception() is None and job.result() is None:  # this job only read the error register
             return
         remote, stream = node.remote, node.remote.stream
         node.read_ns = now_ns + (LEAST_NS if stream.withholding else _DOUBT_NS)
         try:
             read = job.result()
-        except (BusError, ConfigError) as error:  # if the node is gone, missing heartbeats will reveal it
+        except (BusError, ConfigError) as error:  # if the node has gone, missing heartbeats will show this
             stream.doubtful = True
             _log.warning("%s; reading its baseline again", error)
             return
@@ -97,15 +97,15 @@ class BaselineWatch:
         solver = read.solver
         if solver is not None:
             remote.link.call(lambda: stream.resume(solver, read.withholdings, anew=False), remote.defects)
-            node.announced = True  # even if the change was found only after a lost summary
+            node.announced = True  # set even if the announcement was in a lost summary
             note_baseline(node)
 
 
 def note_baseline(node: Supervised) -> None:
-    """Record the baseline with which scans are now solved, and count it if it is new.
+    """Record the baseline with which scans are now solved, and count a new baseline.
 
-    A bring-up may also find a new baseline: after a failed reading, or if the baseline changed while the node
-    was away.
+    A new baseline may also be found during bring-up, after a failed reading or a change while the node was
+    absent.
     """
     facts, before = node.remote.facts, node.baseline_ohm
     assert facts is not None  # called only after bring-up

@@ -1,7 +1,7 @@
-"""Count the frames on a bus and dispatch them to handlers by COB-ID; uses neither threads nor a clock.
+"""Count the frames on a bus and dispatch them to handlers by COB-ID, without threads or a clock.
 
-A :class:`~skinnode.host.link.BusLink` feeds the dispatcher with the frames from a bus; a replay feeds it with
-the frames from a recording.
+In a host, a :class:`~skinnode.host.link.BusLink` passes the frames from a bus to the dispatcher; in a replay,
+the frames come from a recording.
 """
 
 from __future__ import annotations
@@ -23,16 +23,16 @@ from skinnode.transport.bus_state import BusState, bus_state
 _log = logging.getLogger(__name__)
 
 Handler = Callable[[bytes, int], None]
-"""Called with the data of a frame and the monotonic time at which the frame was received, ns."""
+"""Function called with a frame's data and monotonic arrival time, ns."""
 
 _MARK_NS: Final = 100_000_000
-"""Interval at which the bits are summed, ns."""
+"""Interval at which the bits of the frames are summed for the bus load, ns."""
 _MARKS: Final = 10
-"""Number of intervals over which the load is averaged."""
+"""Number of summing intervals over which the bus load is averaged."""
 
 _POLL_NS: Final = 2_000_000
-"""Minimum interval between calls to the pollers, ns. The pollers' timeouts are at least 5 ms, and batches of
-frames arrive a millisecond apart."""
+"""Minimum interval between calls to the pollers, ns. A finer resolution is not needed, because the pollers'
+timeouts are at least 5 ms. Batches of frames arrive about a millisecond apart."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,34 +40,35 @@ class BusStats:
     """Counters for a bus since the host opened it."""
 
     received: int
-    """Data frames read, excluding the host's own."""
+    """Number of data frames received, excluding the host's own frames."""
     sent: int
     foreign: int
-    """Data frames with a COB-ID that is not used anywhere in the hand file."""
+    """Number of data frames with a COB-ID that the host does not expect on this bus."""
     ignored: int
-    """Remote and extended frames; on a bus without ``fd`` also CAN FD frames."""
+    """Number of remote and extended frames; on a bus without ``fd``, also of CAN FD frames."""
     error_frames: int
-    """Error frames, with which the interface reports bus errors and controller states."""
+    """Number of error frames, with which the interface reports bus errors and controller states."""
     bus_offs: int
     """Number of times the interface reported that its controller had gone bus-off."""
     controller: BusState | None
-    """Newest reported state of the controller; None if none was reported."""
+    """Most recently reported state of the controller; None if no state has been reported."""
     foreign_ids: Mapping[int, int]
     """Number of frames for each foreign COB-ID."""
     read: int
-    """Frames of all kinds read from the interface."""
+    """Number of frames of all types read from the interface."""
     waiting: int
-    """Frames read but not dispatched yet."""
+    """Number of frames read but not yet dispatched."""
     kernel_dropped: int
-    """Frames dropped by the kernel for lack of buffer space; 0 if the interface does not report them."""
+    """Number of frames dropped because the kernel's buffer was full; 0 if the interface does not report
+    drops."""
     dropped: int
-    """Frames dropped because the receive queue was full."""
+    """Number of frames dropped because the receive queue was full."""
     malformed: int
-    """Frames with a known COB-ID whose length or form is wrong."""
+    """Number of frames with an expected COB-ID but a wrong length or format."""
     outages: int
     """Number of times the interface failed and was reopened."""
     bits: int
-    """Exact total length in bits of all data frames received and sent; the value is up to a tenth of a second
+    """Exact total length of all data frames received and sent, bits. The value is up to a tenth of a second
     old."""
     load: float
     """Bus load over the last second, as a fraction of the capacity."""
@@ -75,19 +76,19 @@ class BusStats:
 
 @dataclass(frozen=True, slots=True)
 class PortCounters:
-    """Counters kept by the source of a dispatcher's frames."""
+    """Counters of the interface or recording that supplies a dispatcher with frames."""
 
     sent: int = 0
     dropped: int = 0
     outages: int = 0
     read: int | None = None
-    """Number of frames read; None if all of them have been dispatched."""
+    """Number of frames read; None if all frames read have been dispatched."""
     waiting: int = 0
     kernel_dropped: int = 0
 
 
 class Dispatcher:
-    """Dispatcher and counter of the frames on one bus of the hand.
+    """Dispatcher that counts the frames on one bus of the hand and passes them to handlers.
 
     Threads: owned by the mainline; :meth:`count` and :meth:`count_sent` may be called from any thread.
     """
@@ -113,31 +114,31 @@ class Dispatcher:
         self._polled_ns = 0
 
     def handle(self, cob_id: int, handler: Handler, defects: Defects | None = None) -> None:
-        """Pass data frames with ``cob_id`` to ``handler`` from now on, on the mainline.
+        """Pass all further data frames with ``cob_id`` to ``handler``, on the mainline.
 
         Args:
             cob_id: Identifier of the frames.
-            handler: Replaces the previous handler.
-            defects: Collects the handler's exceptions; the bus's collector by default.
+            handler: Handler for the frames, which replaces the previous handler.
+            defects: Collector of the handler's exceptions; the bus's collector by default.
         """
         if defects is not None:
             self._owners[cob_id] = defects
         self._handlers[cob_id] = handler
 
     def listen(self, listener: Callable[[Sequence[Frame]], None]) -> None:
-        """Pass each batch, with frames of all kinds, to ``listener`` before any handler. Mainline only."""
+        """Pass each batch of frames of all types to ``listener`` before the handlers. Mainline only."""
         self._listeners = (*self._listeners, listener)
 
     def unlisten(self, listener: Callable[[Sequence[Frame]], None]) -> None:
-        """Undo :meth:`listen` for this listener. Mainline only."""
+        """Stop passing batches of frames to ``listener``. Mainline only."""
         self._listeners = tuple(each for each in self._listeners if each is not listener)
 
     def poll_with(self, poller: Callable[[int], None], defects: Defects | None = None) -> None:
-        """Call ``poller`` with the monotonic time after batches of frames, and also when no frames arrive.
+        """Call ``poller`` with the monotonic time, ns, after batches of frames and while no frames arrive.
 
         Args:
-            poller: Called at most every 2 ms.
-            defects: Collects the poller's exceptions; the bus's collector by default.
+            poller: Function to call, at most every 2 ms.
+            defects: Collector of the poller's exceptions; the bus's collector by default.
         """
         self._pollers = (*self._pollers, (poller, defects))
 
@@ -145,19 +146,19 @@ class Dispatcher:
         """Handle ``error``, which was raised by the operation ``doing``.
 
         Raises:
-            Exception: ``error`` itself, because a replay has no live bus to keep running.
+            Exception: always ``error`` itself, because a replay has no live bus to keep running.
         """
         raise error
 
     def expect(self, what: str, times_ns: tuple[int, ...]) -> None:
-        """Ignore a prediction: only a live bus can fetch a frame early."""
+        """Ignore the predicted arrival times, which matter only on a live bus."""
 
     def count_sent(self, can_id: int, data: bytes) -> None:
         """Count a sent frame towards the bus load. Any thread."""
         self._outgoing.append((can_id, data))
 
     def dispatch(self, batch: Sequence[Frame]) -> None:
-        """Pass frames to their handlers, in order. If a handler raises, only that frame is lost."""
+        """Pass frames to their handlers, in order. An exception in a handler loses only that frame."""
         for listener in self._listeners:
             try:
                 listener(batch)
@@ -181,7 +182,7 @@ class Dispatcher:
                         continue
                     handler(data, t_ns)
                 going_on = False
-            except Exception as defect:  # ``frames`` continues after the lost frame
+            except Exception as defect:  # the iterator ``frames`` continues after the lost frame
                 self.contain(self._owners.get(can_id), f"frame 0x{can_id:03X}", defect)
         try:
             self._tally(batch, others)
@@ -189,7 +190,7 @@ class Dispatcher:
             self.contain(None, "counting frames", defect)
 
     def _tally(self, batch: Sequence[Frame], others: Sequence[Frame]) -> None:
-        """Count the frames in a batch; ``others`` are the frames whose type no handler accepts."""
+        """Count the frames in a batch, including ``others``, the frames of types that no handler accepts."""
         takes_fd = self.config.fd
         if others:
             set_aside = {id(frame) for frame in others}
@@ -206,7 +207,7 @@ class Dispatcher:
         self._meter.add_all(batch)
 
     def poll(self, now_ns: int) -> None:
-        """Call the pollers with the monotonic time, unless they were called within the last 2 ms."""
+        """Call the pollers with the monotonic time, ns, unless they were called within the last 2 ms."""
         if not 0 <= now_ns - self._polled_ns < _POLL_NS:
             self._polled_ns = now_ns
             for poll, owner in self._pollers:
@@ -216,16 +217,16 @@ class Dispatcher:
                     self.contain(owner, "polling", defect)
 
     def measure(self, now_ns: int) -> None:
-        """Compute the load if an interval has passed.
+        """Compute the bus load if a summing interval has passed.
 
-        The computation takes as long as handling forty frames, so a mainline with several buses calls this
-        method for only one bus per iteration.
+        The computation takes as long as handling forty frames. A mainline with several buses therefore calls
+        this method for only one bus per iteration.
         """
         if now_ns >= self._marks[-1][0] + _MARK_NS:
             self._mark(now_ns)
 
     def reject(self, error: CodecError) -> None:
-        """Count a malformed frame; log the first with its COB-ID. Mainline only."""
+        """Count a malformed frame, and log the first malformed frame with each COB-ID. Mainline only."""
         self._malformed += 1
         if self.first_malformed is None:
             self.first_malformed = error
@@ -237,7 +238,7 @@ class Dispatcher:
         """Return all counters. Any thread.
 
         Args:
-            port: Counters of the interface that feeds the dispatcher.
+            port: Counters of the interface that supplies the dispatcher with frames.
         """
         return BusStats(
             received=self._received,
@@ -267,7 +268,7 @@ class Dispatcher:
                 self._bus_offs += state is BusState.OFF and before is not BusState.OFF
 
     def _mark(self, now_ns: int) -> None:
-        """Sum the bits so far. The meter has one owner, so only the mainline may call this method."""
+        """Sum the bits of all frames so far. Mainline only, because the meter is not thread-safe."""
         while self._outgoing:
             self._meter.add(*self._outgoing.popleft())
         bits = self._meter.bits

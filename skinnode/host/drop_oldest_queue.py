@@ -1,7 +1,7 @@
-"""A bounded queue for a subscriber: a slow reader loses its own oldest items and never delays the host.
+"""Provide a bounded queue for a subscriber: a slow reader loses its oldest items and never delays the host.
 
-``queue.Queue`` blocks or refuses a new item instead; ``collections.deque(maxlen=…)`` drops items without
-counting them, and its reader cannot wait for an item.
+The standard library has no such queue: a full ``queue.Queue`` blocks or rejects a new item;
+``collections.deque(maxlen=…)`` drops items without counting them, and its reader cannot wait for an item.
 """
 
 from __future__ import annotations
@@ -18,15 +18,15 @@ T = TypeVar("T")
 
 @dataclass(frozen=True, slots=True)
 class End:
-    """Last item of a queue, appended when the host has closed or ``error`` has stopped it."""
+    """End marker of a queue, appended when the host has closed or been stopped by ``error``."""
 
     error: SkinError | None = None
 
 
 class DropOldestQueue(Generic[T]):
-    """A queue of up to ``capacity`` items that ends with an :class:`End`. Thread-safe; writing never blocks.
+    """Queue of up to ``capacity`` items, ended by an :class:`End`. Thread-safe; writing never blocks.
 
-    An :class:`End` is never dropped, and every reader receives it, because :meth:`get` puts it back.
+    The end marker is never dropped, and every reader receives it, because :meth:`get` puts it back.
     """
 
     def __init__(self, capacity: int) -> None:
@@ -34,7 +34,7 @@ class DropOldestQueue(Generic[T]):
         self._capacity = capacity
 
     def put(self, item: T | End) -> int:
-        """Append an item and drop the oldest items beyond the capacity.
+        """Append an item, and drop the oldest items if the capacity is exceeded.
 
         Returns:
             Number of items dropped.
@@ -44,7 +44,7 @@ class DropOldestQueue(Generic[T]):
         while self._items.qsize() > self._capacity:
             try:
                 oldest = self._items.get_nowait()
-            except queue.Empty:  # the reader was faster
+            except queue.Empty:  # a reader took the item first
                 break
             if isinstance(oldest, End):
                 end = oldest
@@ -55,10 +55,10 @@ class DropOldestQueue(Generic[T]):
         return dropped
 
     def get(self, timeout_s: float | None = None) -> T | End:
-        """Remove and return the oldest item; an end stays in the queue.
+        """Remove and return the oldest item; an end marker stays in the queue.
 
         Args:
-            timeout_s: Maximum wait, s; None: no limit, 0: no wait.
+            timeout_s: Maximum wait for an item, s; None for no limit, 0 for no wait.
 
         Raises:
             queue.Empty: if no item arrived in time.

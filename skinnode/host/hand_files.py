@@ -1,4 +1,4 @@
-"""Check the EDS and baseline files named in a hand file against its wire format."""
+"""Check that the EDS and baseline files named in a hand file match the patches."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def check_files(hand: HandConfig) -> None:
     """Check the EDS and baseline files of every patch.
 
     Raises:
-        ConfigError: if a file is not valid, or does not fit its patch.
+        ConfigError: if a file is invalid or does not match its patch.
     """
     for patch in hand.patches:
         profile = PatchProfile.from_config(patch, hand.bus(patch.bus))
@@ -35,7 +35,7 @@ def check_files(hand: HandConfig) -> None:
 
 
 def load_baseline(path: Path, profile: PatchProfile) -> Float:
-    """Read a baseline from a text file.
+    """Read a patch's baseline from a text file.
 
     Returns:
         (U, K) resistances at rest, ohm, rounded to REAL32.
@@ -85,7 +85,7 @@ def check_eds(path: Path, profile: PatchProfile) -> None:
     check_form(text, str(path))
     try:
         described = import_eds(io.StringIO(text), None)  # type: ignore[no-untyped-call]
-    except Exception as error:  # canopen does not catch its parser's exceptions
+    except Exception as error:  # canopen's parser may raise any exception
         raise no_eds(error, str(path), text) from None
     checked = described.get_variable(od.SUMMARY, od.SUMMARY_CHECK) is not None
     for item in replace(profile, checked=checked).objects():

@@ -1,4 +1,4 @@
-"""One bus of the hand: opens its port, and sends and receives its frames."""
+"""Send and receive frames on one bus of the hand, and reopen its interface after a failure."""
 
 from __future__ import annotations
 
@@ -26,21 +26,21 @@ _REOPEN_S: Final = 0.1
 
 
 class BusLink(Dispatcher):
-    """An open bus, from construction to :meth:`close` or the end of a ``with`` block.
+    """Connection to a bus, open from construction until :meth:`close` or the end of a ``with`` block.
 
-    If a handler, a poller, a listener or a job raises an exception, only the current frame or call is lost;
-    after an exception in the mainline's own work, the bus is paused, and received frames wait. If the
-    interface fails after it has been opened, the bus keeps trying to reopen it.
+    If a handler, a poller, a listener or a job raises an exception, only the current frame or call is lost.
+    If the dispatching itself raises an exception, dispatching pauses for this bus while received frames wait
+    in the queue. If the interface fails after it has been opened, a thread repeatedly tries to reopen it.
 
-    Threads: :meth:`send`, :meth:`ask_remote`, :meth:`call` and :meth:`stats` may be called from any thread; a
-    :class:`~skinnode.host.mainline.Mainline` calls the other methods. A separate thread reopens the
-    interface.
+    Threads: :meth:`send`, :meth:`ask_remote`, :meth:`call` and :meth:`stats` may be called from any thread.
+    The other methods may be called only by a :class:`~skinnode.host.mainline.Mainline`. A separate thread
+    reopens the interface.
 
     Args:
-        config: The bus.
-        handlers: Called on the mainline with the data frames that have their COB-IDs.
-        on_defect: Called with the first occurrence of each distinct message, on the thread that raised it.
-        open_port: Opens the interface.
+        config: Configuration of the bus.
+        handlers: Handlers by COB-ID, called on the mainline with the data frames that have this COB-ID.
+        on_defect: Called with the first occurrence of each distinct defect, on the thread that raised it.
+        open_port: Function that opens the interface.
 
     Raises:
         BusError: if the interface cannot be opened.
@@ -55,16 +55,16 @@ class BusLink(Dispatcher):
     ) -> None:
         super().__init__(config, handlers, clock.monotonic_ns())
         self.defects = Defects(config.name, on_defect)
-        """Collector of the exceptions raised while serving the bus itself rather than one of its patches."""
+        """Collector of exceptions raised while serving the bus itself rather than one of its patches."""
         self._sent_listeners: tuple[Callable[[Frame], None], ...] = ()
         self._jobs: deque[tuple[Callable[[], object], Defects]] = deque()
         self.failure: BusError | None = None
-        """Why the bus is unavailable; None while it works."""
-        self._due_s = 0.0  # time from which a reopened interface counts as working, unless it fails first
+        """Error that makes the bus unavailable; None while the bus works."""
+        self._due_s = 0.0  # a reopened interface counts as working from then on
         self._outages = 0
         self.t_dispatched_ns = 0
-        """Monotonic time up to which all received frames have been dispatched."""
-        self._rests = False  # True while the bus is unavailable, and for a while after a defect
+        """Monotonic time up to which all received frames have been dispatched, ns."""
+        self._rests = False  # whether dispatching is paused: the bus is unavailable, or a defect occurred
         self._rest_end_s = 0.0
         self._opening = False
         self._pause = Pause()
@@ -75,18 +75,18 @@ class BusLink(Dispatcher):
         self._stop = clock.event()
         self._port = open_port(config)
         self.intake = Intake(self._port)
-        """Queue of received frames."""
+        """Queue of received frames that await dispatch."""
         self.network = SkinNetwork(self.send)
 
     def send(self, can_id: int, data: bytes) -> None:
         """Send a data frame. Any thread.
 
         Raises:
-            BusError: if the interface does not accept it.
+            BusError: if the interface does not accept the frame.
         """
         t_ns = clock.monotonic_ns()
         self._port.send(can_id, data)
-        try:  # the frame has been sent; a listener's exception must not reach the caller
+        try:  # the frame has been sent, so the caller must not see a listener's exception
             if can_id != SYNC_COB_ID:
                 self.intake.asked(t_ns)
             self.count_sent(can_id, data)
@@ -101,13 +101,13 @@ class BusLink(Dispatcher):
         on_answer: Callable[[int], None] = lambda t_ns: None,
         defects: Defects | None = None,
     ) -> RemoteOd:
-        """Return the object dictionary of a node on this bus.
+        """Return an SDO client for the object dictionary of a node on this bus.
 
         Args:
             node_id: Node-ID of the node.
-            on_answer: Called with the monotonic time of each SDO response, on the mainline.
-            defects: As in :meth:`handle`; if given, an exception that causes a transfer to be retried is
-                counted for the bus.
+            on_answer: Called with the monotonic time of each SDO response, ns, on the mainline.
+            defects: Collector of the response handler's exceptions, as in :meth:`handle`. If given,
+                exceptions after which a transfer is retried are reported to the bus's collector.
         """
 
         def on_response(data: bytes, t_ns: int) -> None:
@@ -124,10 +124,10 @@ class BusLink(Dispatcher):
         return RemoteOd(self.network, node_id, lambda error: self.defects.report(doing, error))
 
     def ask_remote(self, can_id: int) -> None:
-        """Send a remote frame, as node guarding does. Any thread.
+        """Send a remote frame, as used for node guarding. Any thread.
 
         Raises:
-            BusError: if the interface does not accept it.
+            BusError: if the interface does not accept the frame.
         """
         t_ns = clock.monotonic_ns()
         self._port.send(can_id, b"", remote=True)
@@ -136,19 +136,19 @@ class BusLink(Dispatcher):
             listener(Frame(can_id, b"", t_ns, remote=True))
 
     def listen_to_sent(self, listener: Callable[[Frame], None]) -> None:
-        """Pass every sent frame, with its send time, to ``listener`` on the sending thread."""
+        """Pass every sent frame, with the time of sending, to ``listener`` on the sending thread."""
         self._sent_listeners = (*self._sent_listeners, listener)
 
     def unlisten_to_sent(self, listener: Callable[[Frame], None]) -> None:
-        """Undo :meth:`listen_to_sent` for this listener. Mainline only."""
+        """Stop passing sent frames to ``listener``. Mainline only."""
         self._sent_listeners = tuple(each for each in self._sent_listeners if each is not listener)
 
     def call(self, job: Callable[[], object], defects: Defects | None = None) -> None:
-        """Run ``job`` on the mainline, before any frame received from now on is dispatched. Any thread.
+        """Run ``job`` on the mainline, before any frame received later is dispatched. Any thread.
 
         Args:
-            job: The function to run.
-            defects: Collects its exception; the bus's collector by default.
+            job: Function to run.
+            defects: Collector of the job's exceptions; the bus's collector by default.
         """
         self._jobs.append((job, self.defects if defects is None else defects))
 
@@ -170,7 +170,7 @@ class BusLink(Dispatcher):
         )
 
     def close(self) -> None:
-        """Close the interface. The mainline must have ended."""
+        """Close the interface. The mainline must have ended before the call."""
         self._port.close()
 
     def __enter__(self) -> Self:
@@ -184,11 +184,11 @@ class BusLink(Dispatcher):
     # --- called by the mainline
 
     def expect(self, what: str, times_ns: tuple[int, ...]) -> None:
-        """Predict arrivals, as :meth:`Intake.expect` does."""
+        """Predict the arrival times of a group of frames; see :meth:`Intake.expect`."""
         self.intake.expect(what, times_ns)
 
     def begin(self, resume: Callable[[], None]) -> None:
-        """Prepare for the first :meth:`turn`; ``resume`` restarts reception on a reopened interface."""
+        """Prepare for the first :meth:`turn`. ``resume`` must restart reception on a reopened interface."""
         self._resume = resume
 
     def turn(self) -> None:
@@ -209,7 +209,7 @@ class BusLink(Dispatcher):
             self.defects.report("dispatching frames", error)
 
     def measure_load(self) -> None:
-        """Measure the load at the time up to which frames were dispatched. Never raises."""
+        """Compute the bus load if a summing interval has passed. Never raises."""
         try:
             if not self._rests and self.t_dispatched_ns * 1e-9 >= self._load_due_s:
                 self.measure(self.t_dispatched_ns)
@@ -218,14 +218,14 @@ class BusLink(Dispatcher):
             self.defects.report("measuring the load", error)
 
     def end(self) -> None:
-        """Stop reopening the interface. Called after the last :meth:`turn`."""
+        """Stop trying to reopen the interface. Called after the last :meth:`turn`."""
         self._stop.set()
         if self._reopening is not None:
             self._reopening.join()
 
     def _dispatch_received(self) -> bool:
         """Dispatch one batch of frames. Returns whether any frame was received."""
-        seen_ns = self.intake.seen_ns  # read first, so that the batch holds all frames up to this time
+        seen_ns = self.intake.seen_ns  # read before the batch, which thus contains all frames up to this time
         batch = self.intake.take()
         while self._jobs:
             job, owner = self._jobs.popleft()
@@ -233,8 +233,8 @@ class BusLink(Dispatcher):
                 job()
             except Exception as error:
                 owner.report("a job of the mainline", error)
-        # While frames wait, here or in the interface, the time of the newest dispatched frame counts as now,
-        # so that a delay in the host does not make any node appear late.
+        # While frames wait in the queue or the interface, pollers receive the time of the newest dispatched
+        # frame instead of the current time, so that a delay in the host does not make nodes appear late.
         if batch:
             self.dispatch(batch)
             self.t_dispatched_ns = batch[-1].t_ns
@@ -246,12 +246,12 @@ class BusLink(Dispatcher):
         return bool(batch)
 
     def _rest(self) -> None:
-        """End a pause that is over, or try again to start the thread that reopens the interface."""
+        """End a pause that is over, or restart the reopening if its thread did not start."""
         if not self._opening:
             self._rests = clock.monotonic() < self._rest_end_s
         elif (
             self._reopening is None or not self._reopening.is_alive()
-        ) and self._opening:  # the thread did not start
+        ) and self._opening:  # the reopening thread did not start
             self._begin_reopening()
 
     def _go_away(self, error: Exception) -> None:
@@ -267,20 +267,20 @@ class BusLink(Dispatcher):
         self._begin_reopening()
 
     def _begin_reopening(self) -> None:
-        """Start a thread that reopens the interface, which may take some time."""
+        """Start a thread that reopens the interface, because reopening may block."""
         if self._stop.is_set():
             return
         name = f"reopen {self.config.name}"
         thread = clock.thread(target=self._reopen, name=name)
         thread.start()
-        self._reopening = thread  # set after start(): a thread that did not start cannot be joined
+        self._reopening = thread  # set after start(): a thread that was not started cannot be joined
 
     def _reopen(self) -> None:
-        """Reopen the interface. Failures are retried after a pause, which is longer after a defect."""
+        """Try to reopen the interface until successful, with pauses that are longer after a defect."""
         keep_on(self._reopens_not, self.defects, "reopening the interface")
 
     def _reopens_not(self) -> bool:
-        """Try once to reopen the interface. Returns whether to try again."""
+        """Make one attempt to reopen the interface. Returns whether another attempt is needed."""
         if self._stop.wait(self._reopen_s):
             return False
         try:

@@ -1,4 +1,4 @@
-"""The mainline: one thread that dispatches the frames received on all buses."""
+"""Run the mainline: one thread that dispatches the frames received on all buses."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ class Mainline:
 
     A failure on one bus does not affect the others.
 
-    Threads: one thread serves all buses, because their frames arrive at the same time and waking a thread
-    costs as much as handling twenty frames.
+    Threads: a single thread serves all buses, because their frames arrive at the same time, and waking a
+    thread takes as long as handling twenty frames.
 
     Args:
-        links: The buses.
-        defects: Collects exceptions that do not concern a particular bus; the first bus's collector by
+        links: Connections to the buses.
+        defects: Collector of exceptions that do not concern a particular bus; the first bus's collector by
             default.
     """
 
@@ -45,7 +45,7 @@ class Mainline:
         self._thread.start()
 
     def stop(self) -> None:
-        """End and join all threads; frames can still be sent. Stopping twice is allowed."""
+        """End and join all threads of the mainline. Frames can still be sent; a second call is allowed."""
         self._stop.set()
         self._thread.join()
         for link in self._links:

@@ -1,4 +1,4 @@
-"""Pass fields from the workers to subscribers, each with a bounded queue."""
+"""Pass fields from the worker threads to subscribers, each of which has a bounded queue."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def check_timeout(timeout_s: float | None) -> None:
     """Check a timeout.
 
     Raises:
-        ValueError: if the timeout is negative, not a number, or longer than the system supports.
+        ValueError: if the timeout is negative, not a number, or longer than the operating system supports.
     """
     if timeout_s is not None and not 0 <= timeout_s <= threading.TIMEOUT_MAX:
         raise ValueError(f"timeout_s: got {timeout_s!r}, must be from 0 to {threading.TIMEOUT_MAX:.0f}")
@@ -39,34 +39,34 @@ def check_capacity(capacity: int) -> None:
 
 
 class Subscription:
-    """Subscription to fields, oldest first. Iterate with ``for`` or ``async for``, or use :meth:`get`.
+    """Subscription to fields, read in order of publication with ``for``, ``async for`` or :meth:`get`.
 
-    When the queue is full, its oldest field is dropped and counted in ``dropped``. The subscription ends with
-    :meth:`close`, at the end of a ``with`` block, or when the last reference to it is deleted. Any thread or
-    event loop may read.
+    If the subscription's queue is full, its oldest field is dropped and counted in ``dropped``. The
+    subscription ends with :meth:`close`, at the end of a ``with`` block, or when the last reference to it is
+    deleted. Any thread or event loop may read.
     """
 
     def __init__(self, capacity: int, timeout_s: float | None, patches: frozenset[str]) -> None:
         self._queue: DropOldestQueue[FieldFrame] = DropOldestQueue(capacity)
         self._timeout_s = timeout_s
         self._subscribed = patches
-        # One counter per patch: a patch has one worker at a time, so each counter has a single writer.
+        # Each patch has its own counter, which only one worker writes at a time.
         self._dropped = dict.fromkeys([*patches, ""], 0)
         self._wakers: dict[object, Callable[[], object]] = {}  # one per waiting event loop
 
     @property
     def dropped(self) -> int:
-        """Fields lost because this subscriber was too slow."""
+        """Number of fields lost because this subscriber was too slow."""
         return sum(self._dropped.values())
 
     def get(self, timeout_s: float | None = None) -> FieldFrame | None:
-        """Return the next field, or None.
+        """Return the next field, or None if no field arrives.
 
         Args:
-            timeout_s: Maximum wait, s; None: no limit.
+            timeout_s: Maximum wait for a field, s; None for no limit.
 
         Returns:
-            The field; None if no field arrived in time, or immediately if the host has closed.
+            The field; None if no field arrived in time or the host has closed.
 
         Raises:
             SkinError: the error that stopped the host, if any.
@@ -87,12 +87,12 @@ class Subscription:
         return self._open(self._queue.get(timeout_s))
 
     async def take_async(self, timeout_s: float | None) -> FieldFrame | None:
-        """Return the next field as :meth:`take` does, but asynchronously."""
+        """Return the next field; asynchronous version of :meth:`take`."""
         check_timeout(timeout_s)
         loop, arrived, key = asyncio.get_running_loop(), asyncio.Event(), object()
 
         def wake() -> None:
-            with contextlib.suppress(RuntimeError):  # the loop has closed
+            with contextlib.suppress(RuntimeError):  # the event loop has closed
                 loop.call_soon_threadsafe(arrived.set)
 
         self._wakers[key] = wake
@@ -100,25 +100,25 @@ class Subscription:
         try:
             async with limit:
                 while True:
-                    await asyncio.sleep(0)  # let other tasks run, however fast fields arrive
+                    await asyncio.sleep(0)  # let other tasks run even if fields arrive continuously
                     arrived.clear()
                     try:
                         return self._open(self._queue.get(0.0))
                     except queue.Empty:
                         await arrived.wait()
         except TimeoutError:
-            if not limit.expired():  # the host was stopped by a TimeoutError
+            if not limit.expired():  # this TimeoutError is the error that stopped the host
                 raise
             raise queue.Empty from None
         finally:
             del self._wakers[key]
 
     def close(self) -> None:
-        """Stop accepting fields. Fields still queued are lost."""
+        """Stop accepting fields. Fields that are still queued are lost."""
         self._subscribed = frozenset()
 
     def end(self) -> None:
-        """Stop accepting fields, and end the reading loop once it has read the queued fields. Any thread."""
+        """Stop accepting fields, and end the reader's loop after the queued fields. Any thread."""
         self.close()
         self.offer(End(), "")
 
@@ -139,7 +139,7 @@ class Subscription:
             yield field
 
     async def __aiter__(self) -> AsyncIterator[FieldFrame]:
-        """Yield fields asynchronously; otherwise like :meth:`__iter__`."""
+        """Yield fields until the host closes; asynchronous version of :meth:`__iter__`."""
         while True:
             try:
                 field = await self.take_async(self._timeout_s)
@@ -161,7 +161,7 @@ class Subscription:
         self.close()
 
     def offer(self, item: FieldFrame | End, patch: str) -> None:
-        """Queue an end marker, or a field if ``patch`` is subscribed to. Never blocks; any thread."""
+        """Queue an end marker, or a field if its patch is subscribed to. Never blocks. Any thread."""
         if patch and patch not in self._subscribed:
             return
         self._dropped[patch] += self._queue.put(item)
@@ -170,7 +170,7 @@ class Subscription:
     def _open(self, item: FieldFrame | End) -> FieldFrame | None:
         if isinstance(item, FieldFrame):
             return item
-        self._wake()  # wake the other readers: each must receive the end marker
+        self._wake()  # wake the other readers, each of which must receive the end marker
         if item.error is not None:
             raise item.error
         return None
@@ -183,10 +183,11 @@ class Subscription:
 class Publisher:
     """All subscriptions of a host, and the newest field of each patch.
 
-    An exception while passing a field to a subscriber is reported to ``defects``, and that subscriber loses
-    the field.
+    If passing a field to a subscriber raises an exception, the exception is reported to ``defects``, and that
+    subscriber loses the field.
 
-    Threads: workers publish, one worker per patch at a time; any thread may call the other methods.
+    Threads: only worker threads publish, one worker per patch at a time. Any thread may call the other
+    methods.
     """
 
     def __init__(self, patches: tuple[str, ...], defects: Defects | None = None) -> None:
@@ -198,7 +199,7 @@ class Publisher:
         self._last: End | None = None
 
     def subscribe(self, capacity: int, timeout_s: float | None, patch: str | None) -> Subscription:
-        """Create a subscription to one patch, or to all patches.
+        """Create a subscription to the fields of one patch, or of all patches if ``patch`` is None.
 
         Raises:
             ValueError: if the capacity is below 1, the timeout is out of range, or there is no such patch.
@@ -210,7 +211,7 @@ class Publisher:
         chosen = self._patches if patch is None else frozenset([patch])
         subscription = Subscription(capacity, timeout_s, chosen)
         key = next(self._keys)
-        # Setting and removing a dict item are atomic, and readers take a copy, so no lock is needed.
+        # No lock is needed, because setting and removing a dict item are atomic, and readers copy the dict.
         forget = self._subscriptions
         self._subscriptions[key] = weakref.ref(subscription, lambda _: forget.pop(key, None))
         if self._last is not None:
@@ -218,7 +219,7 @@ class Publisher:
         return subscription
 
     def latest(self, patch: str) -> FieldFrame | None:
-        """Return the newest field of a patch, or None before the first.
+        """Return the newest field of a patch, or None before the patch's first field.
 
         Raises:
             ValueError: if there is no such patch.
@@ -228,22 +229,22 @@ class Publisher:
         return self._latest.get(patch)
 
     def publish(self, field: FieldFrame, patch: str) -> None:
-        """Pass a field to its subscribers. Called by the worker that owns the patch; never blocks."""
+        """Pass a field to its subscribers. Called by the worker that owns the patch. Never blocks."""
         self._latest[patch] = field
         self._offer(field, patch)
 
     @property
     def failure(self) -> SkinError | None:
-        """The error that stopped the host, or None."""
+        """Error that stopped the host; None if no error did."""
         return None if self._last is None else self._last.error
 
     def fail(self, error: SkinError) -> None:
-        """End every subscription with ``error`` after its queued fields: the host cannot continue."""
+        """End every subscription with ``error`` after its queued fields, because the host cannot continue."""
         self._last = self._last or End(error)
         self._offer(self._last, "")
 
     def end(self) -> None:
-        """End every subscription after its queued fields: the host has closed."""
+        """End every subscription after its queued fields, because the host has closed."""
         self._last = self._last or End()
         self._offer(self._last, "")
 

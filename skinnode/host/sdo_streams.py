@@ -1,4 +1,4 @@
-"""Streams for SDO transfers: canopen 2.4's streams, with fixes for lost frames.
+"""Transfer SDO data with canopen 2.4's streams, modified to recover from lost frames.
 
 ==================  =========================================================  ==============================
 stream              canopen 2.4.1                                              here
@@ -35,39 +35,39 @@ from skinnode.canopen.sdo import ABORT
 from skinnode.process import clock
 
 _QUIET_S: Final = 0.02
-"""Duration in s of the silence after an abort that rules out further responses to the old transfer."""
+"""Duration of silence after an abort that rules out further responses to the aborted transfer, s."""
 
 _SETTLE_S: Final = 0.1
-"""Maximum wait for that silence, s: another SDO client may keep the node busy."""
+"""Maximum wait for the silence after an abort, s. Another SDO client may keep the node busy for longer."""
 
 _RETRANSMISSIONS: Final = 20
-"""Maximum number of retransmitted blocks in one transfer; a node that needs more is assumed not to accept
-any."""
+"""Maximum number of retransmitted blocks in one transfer. A node that requires more retransmissions is
+assumed to reject every block."""
 
 
 class Client(SdoClient):
-    """canopen's SDO client for the server on node ``node_id``, without an object dictionary."""
+    """canopen's SDO client for the SDO server of node ``node_id``, without an object dictionary."""
 
     def __init__(self, network: canopen.Network, node_id: int) -> None:
-        empty: Any = ObjectDictionary  # its constructor is not typed
+        empty: Any = ObjectDictionary  # the class's constructor is not typed
         cob_ids = sdo_request_cob_id(node_id), sdo_response_cob_id(node_id)
-        super().__init__(*cob_ids, empty())  # type: ignore[no-untyped-call]  # as all of canopen
+        super().__init__(*cob_ids, empty())  # type: ignore[no-untyped-call]  # canopen is not typed
         self.network = network
         network.subscribe(self.tx_cobid, self.on_response)
         self._abort_code: int = AbortCode.TIMED_OUT
 
     def abort(self, abort_code: int = AbortCode.TIMED_OUT) -> None:
-        """Store the code for :meth:`give_up`, which receives the object as an argument."""
+        """Store the abort code for :meth:`give_up`, which sends the abort."""
         self._abort_code = abort_code
 
     def request_response(self, sdo_request: bytes) -> bytes:
-        """Send a request and return the response.
+        """Send an SDO request and return the response.
 
-        For a request that begins a transfer, the first response that names the same object is returned,
-        because a slow node may still be sending frames from the previous transfer.
+        If the request begins a transfer, responses for other objects are skipped, because a slow node may
+        still be sending frames from the previous transfer.
 
         Raises:
-            SdoError: if there is no response, or the response is an abort.
+            SdoError: if no response arrives in time, or the response is an abort.
         """
         begins = sdo_request[0] >> 5 in (1, 2) or (sdo_request[0] >> 5, sdo_request[0] & 1) in (
             (5, 0),
@@ -93,10 +93,10 @@ class Client(SdoClient):
             late = response
 
     def give_up(self, index: int, subindex: int) -> None:
-        """Abort the transfer of this object at the node, and discard late responses.
+        """Abort the transfer of an object on the node, and discard late responses.
 
         Raises:
-            BusError: if the abort cannot be sent.
+            BusError: if the abort message cannot be sent.
         """
         code, self._abort_code = self._abort_code, AbortCode.TIMED_OUT
         self.send_request(struct.pack("<BHBI", ABORT, index, subindex, code))  # type: ignore[no-untyped-call]
@@ -107,39 +107,39 @@ class Client(SdoClient):
 
 
 class BlockUpload(BlockUploadStream):
-    """A block upload.
+    """Block upload that tolerates late segments.
 
-    canopen 2.4 requests a late segment twice and drops the first response, so every pause longer than its
-    timeout results in a wrong CRC. canopen requests an out-of-order segment only once, so this class makes a
-    late segment look out of order.
+    canopen 2.4 requests a late segment twice and drops the first response, so every pause longer than
+    canopen's timeout results in a wrong CRC. An out-of-order segment is requested only once. This class
+    therefore presents a late segment to canopen as an out-of-order segment.
     """
 
     def read(self, size: int = -1) -> bytes:
-        """Read one segment, as canopen does."""
+        """Read one segment of the upload, with the interface of canopen's method."""
         if size >= 0 and not self._done:
             try:
                 response = self.sdo_client.read_response()
             except SdoCommunicationError:
                 response = bytes(8)  # no segment has number 0
             self.sdo_client.responses.queue.appendleft(response)
-        return bytes(super().read(size))  # type: ignore[no-untyped-call]  # as all of canopen
+        return bytes(super().read(size))  # type: ignore[no-untyped-call]  # canopen is not typed
 
     def abort(self, abort_code: int) -> None:
-        """Store the code. canopen calls this method if the end of the transfer does not arrive."""
+        """Store the abort code. canopen calls this method if the end of the transfer does not arrive."""
         self._error = True
         self.sdo_client.abort(abort_code)
 
 
 class Download(WritableStream):
-    """An expedited or segmented download."""
+    """Expedited or segmented SDO download."""
 
     def close(self) -> None:
-        """Send nothing: the final segment has already been marked as the last."""
+        """Close the stream without sending a frame: the final segment is already marked as the last."""
         io.RawIOBase.close(self)
 
 
 class BlockDownload(BlockDownloadStream):
-    """A block download of ``data``, ended by :meth:`finish`."""
+    """SDO block download of ``data``, completed by :meth:`finish`."""
 
     def __init__(self, client: Client, index: int, data: bytes) -> None:
         super().__init__(client, index, 0, len(data))  # type: ignore[no-untyped-call]
@@ -148,19 +148,19 @@ class BlockDownload(BlockDownloadStream):
         self._left = _RETRANSMISSIONS
 
     def close(self) -> None:
-        """Send nothing: a failed transfer has been aborted."""
+        """Close the stream without sending a frame, because a failed transfer has already been aborted."""
         io.RawIOBase.close(self)
 
     def finish(self) -> None:
-        """Send the CRC and wait for the end of the transfer.
+        """Send the CRC and wait for the node to confirm the end of the transfer.
 
         Raises:
-            SdoError: if the node does not confirm the end.
+            SdoError: if the node does not confirm the end of the transfer.
         """
         super().close()  # type: ignore[no-untyped-call]
 
     def _retransmit(self, ackseq: int, blksize: int) -> None:
-        """Send the segments after number ``ackseq`` of the block again."""
+        """Retransmit the segments of the current block after segment number ``ackseq``."""
         self._left -= 1
         if self._left < 0:
             raise SdoCommunicationError("the node does not acknowledge any segment")

@@ -1,4 +1,4 @@
-"""Start a host: configure all nodes in parallel, and make them operational."""
+"""Configure all nodes of a hand in parallel, and make them operational."""
 
 from __future__ import annotations
 
@@ -19,25 +19,25 @@ from skinnode.process import clock
 from skinnode.text.words import known
 
 BRING_UP_THREADS: Final = 16
-"""Maximum number of nodes configured in parallel; more would only wait for the bus."""
+"""Maximum number of nodes configured in parallel; additional nodes would only wait for the bus."""
 
 _BRING_UPS: Final = 3
-"""Maximum number of attempts to configure a node that boots during an attempt, as nodes just found by LSS
-do, or whose configuration raises an unexpected exception."""
+"""Maximum number of attempts to configure a node. Another attempt is made if the node boots during an
+attempt, as nodes just found by LSS do, or if an unexpected exception is raised."""
 
 _START_AGAIN_NAPS: Final = 50
-"""Number of polling pauses (a quarter of a second in total) after which an unconfirmed start command is sent
-again, because it may have been lost."""
+"""Number of polling pauses after which an unconfirmed start command is repeated, because the command may have
+been lost. The pauses last a quarter of a second in total."""
 
 _POLL_S: Final = 0.005
 
 
 class BringUpCancelled(SkinError):
-    """Bring-up was cancelled by the caller."""
+    """Cancellation of bring-up by the caller."""
 
 
 class _Defective(NodeError):
-    """The last attempt to configure the node raised an unexpected exception."""
+    """Unexpected exception during the last attempt to configure a node."""
 
 
 def go_on_unless(cancelled: Callable[[], bool]) -> None:
@@ -54,18 +54,18 @@ def configure_all(
     The first failure stops the configuration of the other nodes at their next transfer.
 
     Args:
-        nodes: The nodes.
-        missing: ``wait`` if silent nodes may join later, ``refuse`` if all must be present.
+        nodes: Nodes to configure.
+        missing: ``wait`` if silent nodes may join later, ``refuse`` if all nodes must be present.
         deadline_s: Maximum time until the first response from a node, s.
-        cancelled: Called repeatedly; once it returns True, configuration ends.
+        cancelled: Called repeatedly. If the result is True, configuration ends.
 
     Returns:
-        The nodes that are present, each with the solver for its scans.
+        Nodes that are present, each with the solver for its scans.
 
     Raises:
         NodeTimeout: if a node is silent and ``missing`` is ``refuse``.
-        BusError: if all nodes on a bus are silent and ``missing`` is ``refuse``, or as raised by
-            :meth:`RemoteNode.configure`.
+        BusError: if all nodes on a bus are silent and ``missing`` is ``refuse``, or if
+            :meth:`RemoteNode.configure` raises it.
         BringUpCancelled: if ``cancelled`` returned True.
     """
     return _Start(nodes, missing, deadline_s, cancelled).run()
@@ -127,7 +127,7 @@ class _Start:
         return self._waits and (silent or isinstance(failure, _Defective))
 
     def _wait_for(self, jobs: dict[RemoteNode, Future[ScanSolver]]) -> None:
-        """Wait until all jobs have ended, or one fails in a way that prevents the start."""
+        """Wait until all jobs have ended, or until a job fails in a way that prevents the start."""
         ended: SimpleQueue[RemoteNode] = clock.simple_queue()
 
         def put_when_done(node: RemoteNode) -> Callable[[Future[ScanSolver]], None]:
@@ -142,7 +142,7 @@ class _Start:
                 break
 
     def _result(self, node: RemoteNode, job: Future[ScanSolver]) -> ScanSolver | None:
-        """Return a node's solver, or None if the node is absent; raise a failure that must end the start."""
+        """Return a node's solver, or None if the node may join later; raise a failure that stops the start."""
         failure = None if job.cancelled() else job.exception()
         if job.cancelled() or isinstance(failure, Abandoned):
             return None
@@ -156,10 +156,10 @@ class _Start:
 
 
 def start_all(ready: dict[RemoteNode, ScanSolver]) -> None:
-    """Start the nodes whose master is the host; wait for heartbeats that report the operational state.
+    """Start the nodes without another master, and wait until their heartbeats report operational.
 
-    The deadline is counted in polling pauses, so that time during which the host's machine is suspended does
-    not count.
+    The deadline is measured in polling pauses, so that time during which the computer is suspended does not
+    count.
 
     Raises:
         NodeTimeout: if a node does not become operational in time.
@@ -185,7 +185,7 @@ def start_all(ready: dict[RemoteNode, ScanSolver]) -> None:
 
 
 def _listen(node: RemoteNode, deadline_s: float, abandoned: Callable[[], bool]) -> None:
-    """Wait for a frame from a node to which nothing may be sent; raise NodeTimeout after the deadline."""
+    """Wait for a frame from a node to which the host may not send; raise NodeTimeout after the deadline."""
     end_s = clock.monotonic() + deadline_s
     while not node.heard:
         if abandoned():
@@ -204,8 +204,8 @@ def _silence(
 ) -> BusError:
     """Return the error for a silent node.
 
-    If all nodes on a bus are silent, the error concerns the bus, and its cable, supply or bit rate is
-    suspect.
+    If all nodes on a bus are silent, the error names the bus instead, because its cable, supply or bit rate
+    is probably at fault.
     """
     bus, patch = node.bus, node.patch
     on_bus = [other.patch for other in nodes if other.bus is bus]

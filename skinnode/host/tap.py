@@ -1,4 +1,4 @@
-"""Taps: pass all frames to and from a host, and the events that affect their decoding, to a recorder."""
+"""Pass all frames to and from a host, and the events that affect their decoding, to a recorder."""
 
 from __future__ import annotations
 
@@ -14,46 +14,46 @@ from skinnode.transport import Frame
 
 
 class HostTap(StreamTap, Protocol):
-    """Recorder of all frames, and of the events that affect how a host decodes them. Never waits."""
+    """Recorder of all frames, and of the events that affect how a host decodes the frames. Never waits."""
 
     def received(self, bus: str, frames: Sequence[Frame]) -> None:
-        """Record a batch that is about to be dispatched. Called on the mainline."""
+        """Record a batch of frames about to be dispatched. Called on the mainline."""
 
     def sent(self, bus: str, frame: Frame) -> None:
         """Record a frame that the interface accepted. Called on the sending thread."""
 
 
 class ContainedTap:
-    """Wrapper for a tap; never raises.
+    """Wrapper that contains the exceptions of a tap.
 
-    An exception is reported to ``defects``, and the tap loses that entry.
+    If the tap raises an exception, the exception is reported to ``defects``, and the tap loses that entry.
     """
 
     def __init__(self, tap: HostTap, defects: Defects) -> None:
         self._tap, self._defects = tap, defects
 
     def received(self, bus: str, frames: Sequence[Frame]) -> None:
-        """As :meth:`HostTap.received`."""
+        """Call :meth:`HostTap.received` of the tap."""
         self._do(lambda: self._tap.received(bus, frames))
 
     def sent(self, bus: str, frame: Frame) -> None:
-        """As :meth:`HostTap.sent`."""
+        """Call :meth:`HostTap.sent` of the tap."""
         self._do(lambda: self._tap.sent(bus, frame))
 
     def resumed(self, patch: str, solver: ScanSolver, *, anew: bool) -> None:
-        """As :meth:`StreamTap.resumed`."""
+        """Call :meth:`StreamTap.resumed` of the tap."""
         self._do(lambda: self._tap.resumed(patch, solver, anew=anew))
 
     def withheld(self, patch: str) -> None:
-        """As :meth:`StreamTap.withheld`."""
+        """Call :meth:`StreamTap.withheld` of the tap."""
         self._do(lambda: self._tap.withheld(patch))
 
     def polled(self, patch: str, t_ns: int) -> None:
-        """As :meth:`StreamTap.polled`."""
+        """Call :meth:`StreamTap.polled` of the tap."""
         self._do(lambda: self._tap.polled(patch, t_ns))
 
     def overtaken(self, patch: str, scan: int, t_receive_ns: int) -> None:
-        """As :meth:`StreamTap.overtaken`."""
+        """Call :meth:`StreamTap.overtaken` of the tap."""
         self._do(lambda: self._tap.overtaken(patch, scan, t_receive_ns))
 
     def _do(self, entry: Callable[[], None]) -> None:
@@ -64,10 +64,10 @@ class ContainedTap:
 
 
 def tap_link(tap: HostTap, link: BusLink) -> Callable[[], None]:
-    """Start passing every frame to ``tap``. Call on the mainline, or before the mainline runs.
+    """Start passing every frame on a bus to ``tap``. Mainline only, except before the mainline starts.
 
     Returns:
-        A function that ends the recording, to be called under the same condition.
+        A function that ends the recording, subject to the same restriction.
     """
     received = functools.partial(tap.received, link.config.name)
     sent = functools.partial(tap.sent, link.config.name)
@@ -82,7 +82,7 @@ def tap_link(tap: HostTap, link: BusLink) -> Callable[[], None]:
 
 
 def tap_bus(tap: HostTap, link: BusLink, streams: Sequence[PatchStream]) -> Callable[[], None]:
-    """Make the mainline pass the streams' state, then every frame and stream change, to ``tap``.
+    """Make the mainline pass to ``tap`` the state of all streams, then every frame and change of state.
 
     Returns:
         A function that ends the recording; any thread may call it.

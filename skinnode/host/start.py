@@ -142,7 +142,7 @@ class _Start:
                 break
 
     def _result(self, node: RemoteNode, job: Future[ScanSolver]) -> ScanSolver | None:
-        """Return a node's solver, or None if the node may join later; raise a failure that stops the start."""
+        """Return a node's solver, or None if it may join later. Raises a failure that prevents the start."""
         failure = None if job.cancelled() else job.exception()
         if job.cancelled() or isinstance(failure, Abandoned):
             return None

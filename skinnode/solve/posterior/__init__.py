@@ -1,11 +1,15 @@
 """Bayesian estimate of a whole patch, tracked through a stream of frames.
 
-The entry point is ``posterior``, which turns a stream of frames into fields and tests their readings;
-``frame_estimator`` solves a frame from the readings it is given. Each frame becomes an ``observation``;
-``gating`` tests by χ² which wires moved; ``map_estimate`` finds the maximum a posteriori displacement in
-steps of ``measurement_update`` (the linear algebra of one step); ``geometry_error`` adds the errors of a
-patch made to tolerances. The prior combines elasticity (``elastic_prior``) with expected loads
-(``load_prior``); ``hyperparameters`` sets the prior's scale and the noise from the evidence.
-``load_posterior`` estimates the loads of a frame, ``contact_regions`` divides them into contacts,
-``contacts`` measures each contact, and ``data_share`` says how much of a field comes from the data.
+The entry point is ``posterior``, which estimates a field from each frame of a stream and tests the readings.
+``frame_estimator`` solves a frame without testing its readings.
+
+``observation`` converts each frame to residuals with weights. ``gating`` finds the wires that moved with χ²
+tests. ``map_estimate`` computes the maximum a posteriori (MAP) displacement; ``measurement_update`` contains
+the linear algebra of one of its steps. ``geometry_error`` models the manufacturing errors of a patch within
+its tolerances.
+
+The prior combines the elasticity of the rubber (``elastic_prior``) with the expected loads (``load_prior``).
+``hyperparameters`` sets the scale of the prior and the noise from the evidence. ``load_posterior`` estimates
+the loads of a frame, ``contact_regions`` divides them into contacts, and ``contacts`` measures each contact.
+``data_share`` computes how much of a displacement comes from the data.
 """

@@ -1,17 +1,20 @@
-"""Division of the loads on a patch into contacts: which cells belong to which body.
+"""Contact regions: assigns the loaded cells of a patch to contacts.
 
-Sums of the pressing loads of 3 × 3 cells have peaks. Cells are visited in the order of their sums, the
-largest first, and join the neighbouring peak. Where the areas of two peaks meet, the peaks belong to one body
-unless the sum between them is much smaller than both and the difference is significant (topological
-persistence). A peak is a contact if its load is significant: its 3 × 3 cells in sum, the same cells as a
-whole (χ²), or the sum over its area. The strongest peak is also a contact if the skin under it is
-significantly pressed in: something touches, even if the loads cannot be located.
+The load sum of a cell is the sum of the pressing loads of its 3 × 3 neighbourhood. The cells are visited in
+order of decreasing load sum, and each cell joins the area of a neighbouring peak. Where the areas of two
+peaks meet, the peaks belong to the same body, unless the load sum between the peaks is much smaller than both
+and the difference is significant (topological persistence).
 
-Only cells with an electrode decide, because beyond the outermost electrodes a load of any size at any
-distance gives nearly the same displacement. The cells beyond are added to the contact next to them.
+A peak is a contact if one of three tests is significant: the load sum of its 3 × 3 cells, the χ² of the loads
+of these cells, or the sum of the loads over its area. The strongest peak is also a contact if the skin under
+it is significantly pressed in. The patch is then touched, even if the loads cannot be located.
 
-The thresholds depend on the last frame, so that noise does not switch a contact on and off: the loads between
-two peaks must change by a third before one contact becomes two or two become one.
+Only cells with an electrode are tested: beyond the outermost electrodes, loads of different sizes at
+different distances cause nearly the same displacement. Cells beyond these electrodes are added to the
+adjacent contact.
+
+The thresholds depend on the last frame, so that noise does not switch a contact on and off. The loads between
+two peaks must change by a third before one contact becomes two or two contacts become one.
 """
 
 from __future__ import annotations
@@ -27,41 +30,45 @@ from skinnode.model.layout import Float
 from skinnode.solve.linalg.vectors import Index
 
 SIGNIFICANT: Final = 5.0
-"""Significance, in standard deviations, above which a load is a contact; with 100 sums per frame, noise
-reaches it about once in ten thousand frames."""
+"""Significance, in standard deviations, above which a load is a contact. With 100 load sums per frame, noise
+exceeds this threshold about once in ten thousand frames."""
 SIGNIFICANT_STILL: Final = 4.0
-"""Significance above which a contact of the last frame remains a contact."""
+"""Significance, in standard deviations, above which a contact of the last frame remains a contact."""
 BLOCK_EXTRA: Final = 22.0
-"""Extra χ² that the nine loads of a box need beyond the squared significance of a sum. With nine degrees of
-freedom, χ² exceeds 47 as rarely as a normal variable exceeds five standard deviations."""
+"""Amount by which the χ² of the nine loads around a peak must exceed the squared significance threshold. With
+nine degrees of freedom, χ² exceeds 47 as rarely as a normal variable exceeds five standard deviations."""
 PRESSED: Final = 6.0
-"""Depth of the skin in standard deviations at which something touches the patch."""
+"""Indentation of the skin, in standard deviations, above which the strongest peak is a contact."""
 PRESSED_STILL: Final = 5.0
-"""The same for a patch that was touched in the last frame."""
+"""Indentation of the skin, in standard deviations, above which a contact of the last frame remains a
+contact."""
 RELEVANT: Final = 0.2
-"""Ratio of a peak to the strongest contact's above which it is a contact; ringing next to a contact reaches a
-tenth."""
+"""Minimum ratio of a peak's load sum to that of the strongest contact for the peak to be another contact.
+Ringing next to a contact reaches a tenth."""
 RELEVANT_STILL: Final = 0.15
-"""The same for a contact of the last frame."""
+"""Minimum ratio of a peak's load sum to that of the strongest contact for a contact of the last frame to
+remain."""
 PART: Final = 0.1
-"""Ratio of a cell's sum to the peak's above which the cell belongs to the contact."""
+"""Minimum ratio of a cell's load sum to the peak's load sum for the cell to belong to the contact."""
 PART_SIGNIFICANT: Final = 3.0
-"""Sum of a cell in standard deviations of the peak's above which the cell belongs to the contact. Around a
-touch at the limit of detection, pressing loads made by noise would otherwise shift the centre by a pitch."""
+"""Minimum load sum for a cell to belong to a contact, in standard deviations of the peak's load sum. Without
+this limit, noise around a touch near the detection limit would shift the centre by a pitch."""
 PART_MOST: Final = 0.6
-"""Ratio of a cell's sum to the peak's above which the cell belongs to the contact in any case."""
+"""Ratio of a cell's load sum to the peak's load sum above which the cell belongs to the contact even if its
+load sum is not significant."""
 GAP: Final = 0.5
-"""Ratio of the sum between two peaks to the smaller peak below which the peaks are two contacts. Measured on
-ten families of loads (spheres inside, on the edge and half off the patch, punches, plates, ridges, dents,
-large areas; ``tests/solve/test_contact_number.py``): with 0.4, 0.5 and 0.6 no single body was split; with
-0.75 the ringing of plates at the edge splits them. Two spheres are told apart from 5 pitches on."""
+"""Ratio of the load sum between two peaks to that of the smaller peak, below which the peaks are two
+contacts. Measured on ten families of loads (spheres inside, on the edge and half off the patch, punches,
+plates, ridges, dents, large areas; ``tests/solve/test_contact_number.py``): with 0.4, 0.5 and 0.6, no single
+body was split. With 0.75, plates at the edge were split because of ringing. Two spheres are separated if they
+are at least 5 pitches apart."""
 GAP_ONE: Final = 0.4
-"""The same for two peaks that were one contact in the last frame."""
+"""Ratio of load sums like :data:`GAP`, for two peaks that were one contact in the last frame."""
 GAP_TWO: Final = 0.6
-"""The same for two peaks that were two contacts in the last frame."""
+"""Ratio of load sums like :data:`GAP`, for two peaks that were two contacts in the last frame."""
 GAP_SIGNIFICANT: Final = 3.0
-"""Significance of the difference between the smaller peak and the sum between the peaks, in standard
-deviations."""
+"""Minimum difference between the load sum of the smaller peak and the load sum between two peaks for the
+peaks to be two contacts, in standard deviations."""
 
 
 RegionScratch = tuple[
@@ -70,7 +77,7 @@ RegionScratch = tuple[
 
 
 def region_scratch(cells: int) -> RegionScratch:
-    """Return the scratch arrays of :func:`find_regions` for a lattice of ``cells`` cells."""
+    """Return the work arrays of :func:`find_regions` for a lattice of ``cells`` cells."""
     return (
         np.empty(cells), np.ones(cells), np.empty((9, 9)), np.empty(9), np.empty(18),
         np.empty(cells, np.int64), np.empty(cells, np.int64), np.empty(cells, np.int64),
@@ -83,7 +90,7 @@ def region_scratch(cells: int) -> RegionScratch:
 def _variance(  # noqa: PLR0913 - a kernel: loads and their posterior by name
     cells: Index, signs: Float, count: int, rows: Float, weight: Float, share: Float, scale2: float
 ) -> float:
-    """Return the variance of the sum of the normal loads of ``cells``, each with its sign."""
+    """Return the posterior variance of the signed sum of the normal loads of ``cells``."""
     own, seen = 0.0, 0.0
     for c in range(count):
         own += signs[c] * signs[c] * share[cells[c]]
@@ -108,9 +115,9 @@ def _block_chi2(  # noqa: PLR0913, C901 - a kernel: loads and their posterior by
     s: Float,
     b: Float,
 ) -> float:
-    """Return qᵀ Σ⁻¹ q for the normal loads q of up to nine cells with the posterior covariance Σ.
+    """Return the χ² qᵀ Σ⁻¹ q for the normal loads q of up to nine cells with the posterior covariance Σ.
 
-    ``s`` (9, 9) and ``b`` (9,) are scratch.
+    ``s`` (9, 9) and ``b`` (9,) are work arrays.
     """
     for c in range(count):
         for d in range(count):
@@ -125,7 +132,7 @@ def _block_chi2(  # noqa: PLR0913, C901 - a kernel: loads and their posterior by
     for c in range(count):
         s[c, c] = max(s[c, c] + scale2 * share[cells[c]], 1e-9 * scale2 * share[cells[c]])
     chi2 = 0.0
-    for c in range(count):  # Cholesky factor of Σ and L⁻¹ q, row by row
+    for c in range(count):  # compute the Cholesky factor L of Σ and L⁻¹ q, row by row
         value = press[cells[c]]
         for d in range(c):
             entry = s[c, d]
@@ -144,7 +151,7 @@ def _block_chi2(  # noqa: PLR0913, C901 - a kernel: loads and their posterior by
 
 @njit_part
 def _box(cell: int, near: Index, own: NDArray[np.bool_], out: Index) -> int:
-    """Write the own cells among a cell and its neighbours into ``out``; return their number."""
+    """Write a cell and its neighbours, if they have an electrode, into ``out``; return their number."""
     count = 0
     for i in near[cell]:
         if i >= 0 and own[i]:
@@ -169,9 +176,9 @@ def _apart(  # noqa: PLR0913 - a kernel: loads and their posterior by name
     cells: Index,
     signs: Float,
 ) -> bool:
-    """Return whether ``peak`` and the smaller peak ``other`` are two contacts, with ``between`` between.
+    """Return whether ``peak`` and the smaller peak ``other``, with the cell ``between``, are two contacts.
 
-    ``cells`` (27,) and ``signs`` (18,) are scratch.
+    ``cells`` (27,) and ``signs`` (18,) are work arrays.
     """
     gap = GAP
     if before[peak] > 0 and before[other] > 0:
@@ -199,7 +206,7 @@ def _apart(  # noqa: PLR0913 - a kernel: loads and their posterior by name
 
 @njit_part
 def _sort_peaks(press: Float, own: NDArray[np.bool_], near: Index, total: Float, order: Index) -> int:
-    """Write the sum of the pressing loads around each electrode, and the cells by falling sum.
+    """Write the load sums into ``total``, and the cells in order of decreasing load sum into ``order``.
 
     Returns the number of cells with an electrode.
     """
@@ -239,7 +246,7 @@ def _grow_areas(  # noqa: PLR0913, C901 - a kernel: loads, their posterior and s
     signs: Float,
     split: NDArray[np.bool_],
 ) -> None:
-    """Write to ``area`` (Q,) the peak that each cell belongs to; −1 for cells with small sums."""
+    """Write each cell's peak into ``area`` (Q,), or −1 for cells with a small load sum."""
     cells, top = total.size, total[order[0]]
     for cell in range(cells):
         area[cell], parent[cell] = -1, cell
@@ -306,7 +313,7 @@ def _number_contacts(  # noqa: PLR0913, C901 - a kernel: loads, their posterior 
     block: Float,
     number: Index,
 ) -> int:
-    """Number the areas of the peaks that are contacts; return their number."""
+    """Number the cells of the peaks that are contacts, and return the number of contacts."""
     cells = total.size
     found, strongest = 0, 0.0
     for k in range(electrodes):
@@ -361,21 +368,22 @@ def find_regions(  # noqa: PLR0913 - a kernel: loads, their posterior, lattice a
     outside: Index,
     scratch: RegionScratch,
 ) -> int:
-    """Number the cells of each contact from 1, the strongest peak first; return the number of contacts.
+    """Find the contacts, number their cells from 1, strongest peak first, and return the number of contacts.
 
     Args:
         press: (Q,) pressing loads.
         depth: (Q,) depth of the skin at the electrode of each cell, in standard deviations.
         rows: (m, 3Q) L⁻¹ J G, before its rows are multiplied by ``weight``.
-        weight: (m,) factors of the rows.
+        weight: (m,) factors by which the rows are multiplied.
         share: (Q,) prior variances of the loads, relative to ``scale2``.
-        scale2: s², pitch².
-        own: (Q,) cells with an electrode.
-        near: (Q, 9) each cell and its neighbours; −1 outside the lattice.
-        before: (Q,) numbers of the last frame.
-        number: (Q,) receives the number of each cell's contact; 0 for none, and in the outermost ring.
-        outside: (Q,) receives the numbers of the cells in the outermost ring.
-        scratch: Arrays of :func:`region_scratch`.
+        scale2: Squared scale s² of the prior, pitch².
+        own: (Q,) bool, whether a cell has an electrode.
+        near: (Q, 9) indices of each cell and its neighbours; −1 outside the lattice.
+        before: (Q,) contact numbers of the cells in the last frame.
+        number: (Q,) receives each cell's contact number; 0 for cells without contact and in the outermost
+            ring.
+        outside: (Q,) receives the contact numbers of the cells in the outermost ring; 0 for other cells.
+        scratch: Work arrays from :func:`region_scratch`.
     """
     total, ones, block_cov, block, signs, order, parent, area, patch, around, few, split = scratch
     for cell in range(press.size):
@@ -400,7 +408,7 @@ def find_regions(  # noqa: PLR0913 - a kernel: loads, their posterior, lattice a
 def _dilate(  # noqa: C901 - neighbours as loops
     total: Float, near: Index, number: Index, outside: Index, added: Index
 ) -> None:
-    """Add the neighbours of each contact's cells, and number the outermost ring behind them."""
+    """Add the neighbouring cells to each contact, and number the adjacent cells of the outermost ring."""
     cells = number.size
     for cell in range(cells):
         added[cell] = 0

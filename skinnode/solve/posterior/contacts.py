@@ -1,11 +1,11 @@
-"""Contacts on the skin, found from the posterior of the loads.
+"""Contacts on the skin, measured from the posterior of the loads.
 
-The loads q ~ N(0, s² D) of the prior move the electrodes by u = G q + slack. Given the displacement, the mean
-of q is D Gᵀ C⁻¹ u. Given the frame, the variance of a sum wᵀ q is s² wᵀ D w − ‖L⁻¹ J G s² D w‖², in the
+In the prior, the loads q ~ N(0, s² D) move the electrodes by u = G q + slack. The posterior mean of q for a
+displacement u is D Gᵀ C⁻¹ u. The posterior variance of a sum wᵀ q is s² wᵀ D w − ‖L⁻¹ J G s² D w‖², in the
 notation of :mod:`skinnode.solve.posterior.measurement_update`.
 
-:mod:`skinnode.solve.posterior.contact_regions` decides which cells belong to which contact. This module
-measures force, centre, area and shear of each, with standard deviations.
+:mod:`skinnode.solve.posterior.contact_regions` assigns the cells to contacts. This module measures the force,
+centre, area and shear of each contact, with standard deviations.
 """
 
 from __future__ import annotations
@@ -27,53 +27,54 @@ from skinnode.solve.posterior.elastic_prior import ElasticPrior
 from skinnode.solve.posterior.map_estimate import PRIOR_DOUBT
 
 HERTZ_SPREAD: Final = 2.5
-"""Ratio of a² to the mean of r² under Hertz's pressure √(1 − r²/a²)."""
+"""Ratio of the squared contact radius a² to the mean of r² weighted by the Hertz pressure √(1 − r²/a²)."""
 PULLING: Final = 0.25
-"""Ratio of the sum of all loads of a contact to the sum of its pressing loads, below which the pulling loads
-are left out. Nothing pulls on the skin, but a half-space can form the displacement of a layer on a support
-only by pulling at the rim of the contact: 16 mm of rubber bonded to metal give a ratio of 0.5, 8 mm give
-0.15, 4 mm and less about 0. On a half-space it is 0.8 to 1, and from 0.33 if the contact is much smaller
-than a cell."""
+"""Ratio of the sum of all loads of a contact to the sum of its pressing loads, below which pulling loads are
+left out. Nothing pulls on the skin, but the half-space model reproduces the displacement of a layer on a
+support only with pulling loads at the rim of the contact. The ratio is 0.5 for 16 mm of rubber bonded to
+metal, 0.15 for 8 mm, and about 0 for 4 mm or less. On a half-space, the ratio is 0.8 to 1, or at least 0.33
+if the contact is much smaller than a cell."""
 PULLED_OFF: Final = 0.1
-"""Standard deviation of the centre along the surface if pulling loads were left out, in cell widths. Measured
-on layers of 2, 4 and 8 mm: 0.11, 0.08 and 0.05 RMS, 0.25 at most. The area is then known to a factor only."""
+"""Standard deviation of a contact's centre along the surface if pulling loads were left out, in cell widths.
+Measured RMS errors on layers of 2, 4 and 8 mm were 0.11, 0.08 and 0.05; the maximum was 0.25. The standard
+deviation of the contact's area is then as large as the area."""
 BEYOND: Final = 1.0
-"""Standard deviation of the loads in the outermost ring of cells, relative to the loads themselves, which
-stand for all loads beyond the patch. With 0.5, the forces of plates larger than the patch are up to 4.8
-standard deviations off."""
+"""Standard deviation of the loads in the outermost ring of cells, relative to these loads. The ring
+represents all loads beyond the patch. With a value of 0.5, the force errors of plates larger than the patch
+reached 4.8 standard deviations."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LoadEstimate:
-    """Loads given a frame, with their posterior covariance s² (D − s² D Wᵀ W D), W = diag(weight) rows."""
+    """Loads estimated from a frame, with posterior covariance s² (D − s² D Wᵀ W D), W = diag(weight) rows."""
 
     mean: Float
     """(Q, 3) mean loads, in units of the prior's loads."""
     rows: Float
-    """(m, 3Q) rows of W before weighting."""
+    """(m, 3Q) rows of W before they are multiplied by ``weight``."""
     weight: Float
-    """(m,) factors of the rows."""
+    """(m,) factors by which the rows of W are multiplied."""
     share: Float
-    """(Q,) D: load variance of each cell relative to s²."""
+    """(Q,) diagonal of D: load variance of each cell relative to s²."""
     scale2: float
-    """s², pitch²."""
+    """Squared scale s² of the prior, pitch²."""
 
 
 class ContactFinder:
     """Finder of the contacts on one patch, frame by frame. Do not share an instance between owners.
 
-    The number of contacts has a memory of one frame (:mod:`skinnode.solve.posterior.contact_regions`);
-    :meth:`reset` clears it.
+    The number of contacts depends on the contacts of the last frame
+    (:mod:`skinnode.solve.posterior.contact_regions`), which :meth:`reset` discards.
 
     Args:
         prior: Elasticity of the patch.
         layout: The patch.
         rubber: Material of the skin.
-        calibrated: Whether the forces are calibrated. If not, the standard deviation of a normal force covers
-            a layer as thick as the clearance, bonded to a rigid support.
+        calibrated: Whether the forces are calibrated. If not, the standard deviation of a normal force
+            includes the difference to a layer as thick as the clearance, bonded to a rigid support.
         thickness: Tolerance of the thickness, as a fraction of the clearance.
-        outermost: Whether the loads of the outermost ring of cells count for a contact next to it. They do if
-            the prior knows where loads are; a prior that expects equal loads everywhere spreads them too far.
+        outermost: Whether to add the loads of the outermost ring of cells to an adjacent contact. Use False
+            if the prior expects equal loads everywhere, because it spreads the loads too far.
     """
 
     def __init__(  # noqa: PLR0913 - what the patch is
@@ -104,23 +105,24 @@ class ContactFinder:
         self._number, self._outside, self._before = np.zeros((3, cells), np.int64)
         self._depth_m, self._depth = np.zeros((2, cells))
         self._press = np.zeros(cells)
-        self._field = np.zeros((2, len(self._own), 3))  # displacement and standard deviations, m
+        self._field = np.zeros((2, len(self._own), 3))  # displacement and its standard deviations, m
         self._scratch = region_scratch(cells)
         self._work = np.empty(cells, np.int64), np.empty(cells), np.empty((cells, 5))
 
     def reset(self) -> None:
-        """Forget the contacts of the last frame."""
+        """Discard the contacts of the last frame."""
         self._number[:] = 0
 
     def find(
         self, loads: LoadEstimate, displacement_m: Float, std_m: Float
     ) -> tuple[Float, tuple[Contact, ...]]:
-        """Return the loads on the electrodes and the contacts.
+        """Return the forces on the electrodes' cells, and the contacts.
 
         Args:
-            loads: Loads of the frame.
+            loads: Estimate of the frame's loads.
             displacement_m: (U, N, 3) displacement, metres.
-            std_m: (U, N, 3) standard deviation of the displacement, metres; inf where nothing is known.
+            std_m: (U, N, 3) standard deviation of the displacement, metres; inf for unsolved
+                electrodes.
 
         Returns:
             (U, N, 3) forces on the electrodes' cells, N, and the contacts, largest normal force first.
@@ -143,20 +145,20 @@ class ContactFinder:
         return force, tuple(found)
 
     def warm_up(self, loads: LoadEstimate) -> None:
-        """Compile the kernels that contact finding needs."""
+        """Compile the kernels that find contacts."""
         pressed = LoadEstimate(-np.ones_like(loads.mean), loads.rows, loads.weight, loads.share, loads.scale2)
         self.find(pressed, -self._own_frame[:, 2].reshape(self._electrodes), np.ones(self._electrodes))
         self.reset()
 
     def _contact(self, number: int, loads: LoadEstimate) -> Contact:
-        """Return the contact on the cells of ``number``."""
+        """Measure the contact whose cells have this number."""
         prior, mean, std = self._prior, np.empty(7), np.empty(7)
         middle, pulls, pressing_n = _measure(
             number, self._number, self._outside, self._outermost, loads.mean, prior.load_n, prior.cell_m,
             loads.rows, loads.weight, loads.share, loads.scale2, mean, std, *self._work,
         )  # fmt: skip
         force_n, force_std_n = float(mean[0]), float(std[0])
-        # mean r² of a load that is uniform over its cell
+        # cell_area / 6 is the mean r² of a load that is uniform over its cell
         area = math.pi * HERTZ_SPREAD * (max(float(mean[4]), 0.0) + prior.cell_area_m2 / 6.0)
         if not self._calibrated:
             depth_m = max(float(self._depth_m[self._number == number].max()), 0.0)
@@ -194,10 +196,10 @@ def _prepare(  # noqa: PLR0913 - a kernel: loads, field and outputs by name
     depth: Float,
     force: Float,
 ) -> None:
-    """Write pressing loads (Q,), depths (Q,) in m and in deviations, and forces (UN, 3) in N.
+    """Write pressing loads (Q,), depths (Q,) in m and in standard deviations, and forces (UN, 3) in N.
 
-    ``field`` (2, UN, 3) holds the displacement and its standard deviations, m. Depths are 0 where a standard
-    deviation is infinite, and in cells without an electrode, where they are not written.
+    ``field`` (2, UN, 3) contains the displacement and its standard deviations, m. The depth is 0 where the
+    standard deviation is infinite. Depths of cells without an electrode are not written.
     """
     for cell in range(press.size):
         press[cell] = -q[cell, 2]
@@ -234,12 +236,13 @@ def _measure(  # noqa: PLR0913, C901 - a kernel: cells, loads and outputs by nam
     r2: Float,
     slopes: Float,
 ) -> tuple[int, bool, float]:
-    """Measure one contact: force in N, centre (3) in m, mean r² in m² and shear (2) in N.
+    """Measure the force in N, centre (3) in m, mean r² in m² and shear (2) in N of one contact.
 
-    Writes the seven figures to ``mean`` and their standard deviations, by the delta method, to ``std``.
+    Writes the seven values into ``mean``, and their standard deviations, by the delta method, into ``std``.
     Returns the cell closest to the centre, whether pulling loads were left out, and the sum of the pressing
-    loads in N. The prior largely determines how a contact's load is distributed over its cells, so variances
-    are multiplied by ``PRIOR_DOUBT``. ``cells`` (Q,), ``r2`` (Q,) and ``slopes`` (Q, 5) are scratch.
+    loads in N. The variances are multiplied by ``PRIOR_DOUBT``, because mainly the prior determines how a
+    contact's load is distributed over its cells. ``cells`` (Q,), ``r2`` (Q,) and ``slopes`` (Q, 5) are work
+    arrays.
     """
     size, every, pressing = 0, 0.0, 0.0
     for cell in range(number.size):

@@ -1,4 +1,4 @@
-"""Share of the data in a posterior: how much of a displacement comes from the frame, not from the prior."""
+"""Data share: how much of an estimated displacement comes from the frame rather than from the prior."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from skinnode.solve.posterior.map_estimate import PRIOR_DOUBT, SMOOTH_SHARE
 
 
 def data_share(std: Float, core: Float, prior_variance: Float) -> Float:
-    """Return 1 minus the ratio of the posterior's variance to the prior's; 0 where nothing is known.
+    """Return 1 minus the ratio of the posterior variance to the prior variance; 0 where ``std`` is infinite.
 
-    ``std`` and ``core`` count the variance that only the prior determines several times or in part. Their
-    difference gives it back, and with it the variance of the posterior.
+    ``std`` and ``core`` weight the variance that only the prior determines by :data:`PRIOR_DOUBT` and by
+    :data:`SMOOTH_SHARE`. This variance, and thus the posterior variance, is recovered from their difference.
 
     Args:
         std: (U, f) standard deviations, pitches.
@@ -20,7 +20,7 @@ def data_share(std: Float, core: Float, prior_variance: Float) -> Float:
         prior_variance: (U f,) variances of the prior, pitch².
 
     Returns:
-        (U, f) shares from 0 to 1.
+        (U, f) data shares, from 0 to 1.
     """
     with np.errstate(invalid="ignore"):
         square = std * std

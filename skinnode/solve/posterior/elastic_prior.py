@@ -2,13 +2,13 @@
 
 Each electrode site lies in a cell one pitch wide. Independent surface loads on the cells displace the
 electrodes by the response G of an elastic half-space (Boussinesq, Cerruti;
-:func:`skinnode.model.elastic.rectangle_compliance`), so that
+:func:`skinnode.model.elastic.rectangle_compliance`). The prior of the displacement u is
 
     u ~ N(0, s² C),   C = G diag(q) Gᵀ + ε² I
 
-with one scale s for the patch, set from the data. The cells extend beyond the outermost electrodes, because
-the skin can be pressed there too. ε allows for small independent deviations of each electrode from the
-half-space.
+The data set one scale s for the whole patch. The cells extend beyond the outermost electrodes, because the
+skin can also be pressed there. The term with ε allows for small independent deviations of each electrode from
+the half-space.
 
 Curved skin is unrolled: distances are chords, and the response to a load is expressed in the tangent frame
 of each electrode.
@@ -28,40 +28,43 @@ from skinnode.model.layout import Float, PatchLayout
 from skinnode.solve.linalg.cholesky import multiply
 
 MARGIN: Final = 2
-"""Number of rings of cells beyond the outermost electrodes. A third and a fourth ring change the evidence for
-Hertz presses, on the patch or half outside it, by less than 1 in 800."""
+"""Number of rings of cells beyond the outermost electrodes. A third and a fourth ring would change the
+evidence for Hertz presses by less than 1 in 800, whether the press is on the patch or half outside it."""
 SHEAR_SHARE: Final = 0.4
 """Ratio of the standard deviations of shear and normal loads; a contact that slides with a friction
-coefficient of 0.6 has a shear of 1.5 standard deviations. The evidence changes by 2 % between ratios of 0.25
-and 0.4. With smaller ratios, layouts that are insensitive to shear (`aligned`) report standard deviations
-that are too small."""
+coefficient of 0.6 has a shear load of 1.5 standard deviations. The evidence changes by 2 % between ratios of
+0.25 and 0.4. With smaller ratios, the standard deviations are too small on layouts that are insensitive to
+shear (`aligned`)."""
 SLACK: Final = 0.005
-"""Ratio of ε to the standard deviation of the normal displacement; keeps C regular. Values from 0.001 to 0.02
-give the same results."""
+"""Ratio of ε to the standard deviation of the normal displacement. It keeps C regular. Values from 0.001 to
+0.02 give the same results."""
 
 
 @dataclass(frozen=True, eq=False)
 class ElasticPrior:
-    """Prior of one layout for s = 1; the median standard deviation of the normal displacement is 1 pitch."""
+    """Elastic prior of one layout for s = 1.
+
+    The median standard deviation of the normal displacement is 1 pitch.
+    """
 
     covariance: Float
-    """(3UN, 3UN) C, pitch²."""
+    """(3UN, 3UN) covariance C of the displacement, pitch²."""
     response: Float
-    """(3UN, 3Q) displacement per load, pitches; loads have a standard deviation of 1 at s = 1."""
+    """(3UN, 3Q) displacement per unit load, pitches; loads have a standard deviation of 1 at s = 1."""
     load_n: Float
     """(3,) force of a unit load along the wire, across the wire and along the normal, N."""
     cell_m: Float
     """(Q, 3) centres of the cells, m."""
     frame: Float
-    """(Q, 3, 3) unit vectors as rows: tangent along the wire, tangent across it, outward normal."""
+    """(Q, 3, 3) unit vectors as rows: tangent along the wire, tangent across the wire, outward normal."""
     cell_area_m2: float
     """Area of a cell, m²."""
     shape: tuple[int, int]
-    """Number of cells across and along the wires; the product is Q."""
+    """Number of cells across and along the wires; their product is Q."""
 
     @classmethod
     def of(cls, layout: PatchLayout, rubber: Rubber | None = None) -> ElasticPrior:
-        """Return the prior for ``layout`` on ``rubber``, whose modulus only scales the forces."""
+        """Return the prior for ``layout`` on ``rubber``; the rubber's modulus only scales the forces."""
         rubber = Rubber() if rubber is None else rubber
         wires, electrodes = layout.upper_m.shape[:2]
         cell, along, across, normal = _lattice(layout)
@@ -97,29 +100,29 @@ class ElasticPrior:
         return cls(covariance, response, load_n, cell, frame, area, shape)
 
     def own_cells(self) -> NDArray[np.int64]:
-        """Return the index (U, N) of the cell around each electrode."""
+        """Return the indices (U, N) of the cells around the electrodes."""
         index = np.arange(self.shape[0] * self.shape[1]).reshape(self.shape)
         return index[MARGIN : self.shape[0] - MARGIN, MARGIN : self.shape[1] - MARGIN]
 
 
 def _lattice(layout: PatchLayout) -> tuple[Float, Float, Float, Float]:
-    """Return electrode sites (U+, N+, 3), m, extended by :data:`MARGIN` at each edge, and their surface.
+    """Return the electrode sites, extended by :data:`MARGIN` sites at each edge, and their surface.
 
-    The surface consists of the steps along and across the wires, m, and the unit normals, which point away
-    from the lower layer.
+    The sites (U + 2 MARGIN, N + 2 MARGIN, 3) are in m. The surface consists of the steps along and across the
+    wires, m, and the unit normals, which point away from the lower layer.
     """
     site = layout.upper_m
     lower = layout.lower_m.reshape(-1, 3)
     nearest = np.argmin(((site[:, :, None] - lower) ** 2).sum(axis=-1), axis=-1)
     up = (site - lower[nearest]).mean(axis=(0, 1))
     wires, electrodes = site.shape[:2]
-    if min(wires, electrodes) == 1:  # a single row defines no surface: use the lower layer
+    if min(wires, electrodes) == 1:  # a single row of electrodes defines no surface, so use the lower layer
         flat = np.linalg.svd(lower - lower.mean(axis=0))[2][-1]
         up = flat * np.sign(flat @ up) if len(lower) > 2 and flat @ up != 0 else up
     up = up / np.linalg.norm(up)
     if electrodes > 1:
         along = np.gradient(site, axis=1)
-    else:  # a wire with one electrode has no direction
+    else:  # a wire with one electrode has no direction of its own, so derive one
         axis = np.diff(site[:, 0], axis=0).mean(axis=0) if wires > 1 else np.eye(3)[np.argmin(np.abs(up))]
         along = np.broadcast_to(_sized(np.cross(axis, up), layout.pitch_m), site.shape)
     if wires > 1:

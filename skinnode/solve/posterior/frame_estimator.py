@@ -1,12 +1,12 @@
-"""Posterior of a patch, tracked through a stream of frames whose readings are taken as they are.
+"""Posterior of a patch, tracked through a stream of frames without testing their readings for faults.
 
-gate      use the equations of wires whose resistances differ from those at rest by more than noise
-hold      if the last field explains the whole frame within noise, solve nothing
+gate      use only the equations of wires whose resistances differ from those at rest by more than the noise
+hold      keep the last field if it explains the whole frame within the noise
 track     take chord or Gauss-Newton steps from the last field; after a jump, anneal from rest
           (``map_estimate``)
-adapt     set the prior's scale, the load locations and, on request, the noise from the evidence
-reject    mark a wire as INCONSISTENT if no deformation explains its residual, leave it out, and solve the
-          others again
+adapt     set the prior's scale, the expected load locations and, on request, the noise from the evidence
+reject    mark a wire as INCONSISTENT if no deformation explains its residual, leave the wire out, and solve
+          the other wires again
 """
 
 from __future__ import annotations
@@ -39,14 +39,14 @@ from skinnode.solve.wires.decode import A_MAX, A_MIN
 from skinnode.solve.wires.problem import PatchProblem
 
 NOISE_LEAST: Final = 1e-6
-"""Smallest relative noise, a fifth of a 16-bit code; the forward model is no more accurate. Lower noise
-forces the field onto a root of F = b, which can be a wrong root. On layouts with folds, this happens even
-with up to ten times as much noise."""
+"""Minimum relative noise, equal to a fifth of a 16-bit code; the forward model is not more accurate. Lower
+noise would force the field onto a root of F = b, which can be a wrong root. On layouts with folds, wrong
+roots occur even at ten times this noise."""
 LEFT_OUT: Final = 3
-"""Maximum number of wires to leave out, one after another, before the whole frame is INCONSISTENT."""
+"""Maximum number of wires left out of a frame, one at a time, before the whole frame is INCONSISTENT."""
 LEAST_STEPS: Final = 3.0
-"""Minimum time for a solve from rest, in factorisations of all wires including standard deviations; 11 to 20
-were measured for presses on 1 to 10 wires."""
+"""Minimum duration of a solve from rest, as a multiple of the time to factorise all wires and compute their
+standard deviations. Measured solves of presses on 1 to 10 wires took 11 to 20 times as long."""
 
 Mask = NDArray[np.bool_]
 
@@ -54,8 +54,8 @@ Mask = NDArray[np.bool_]
 class FrameEstimator:
     """Estimator of the displacement, loads and contacts of one patch, frame by frame.
 
-    It trusts every reading; :class:`skinnode.Posterior` finds the wrong ones. Do not share an instance
-    between owners. Compiled code releases the GIL; :meth:`warm_up` compiles it.
+    This class uses all available readings; :class:`skinnode.Posterior` also detects wrong readings. Do not
+    share an instance between owners. Compiled code releases the GIL; :meth:`warm_up` compiles it.
 
     Args:
         layout: The patch, with any number of lower wires.
@@ -65,10 +65,10 @@ class FrameEstimator:
     Attributes:
         layout: The patch.
         options: Options in effect.
-        from_rest_s: Minimum time to solve a touched frame from rest, s; 0 before :meth:`warm_up` and without
-            a deadline.
-        noise_estimate: Estimate of the stream's noise, which scales the stated noise; None if the noise is
-            taken as stated.
+        from_rest_s: Minimum time to solve a touched frame from rest, s; 0 before :meth:`warm_up` or if no
+            deadline is set.
+        noise_estimate: Estimate of the stream's noise, which scales the stated noise; None if the stated
+            noise is used unchanged.
 
     Raises:
         ValueError: If an option has the wrong shape or is out of range.
@@ -124,7 +124,7 @@ class FrameEstimator:
         touched = self.layout.upper_m.copy()
         touched[0, 0, 2] -= 0.1 * self._problem.clearance[0, 0] * self.layout.pitch_m
         potential = potential_per_m(self.layout, touched) * self.layout.pitch_m
-        seconds, self._seconds = self._seconds, math.inf  # with a deadline, some kernels might not run
+        seconds, self._seconds = self._seconds, math.inf  # a deadline could prevent some kernels from running
         a = 1.0 / (potential * self._problem.gain)
         self.estimate(a, np.ones(self.layout.shape, bool), 1e-4)
         self._seconds = seconds
@@ -150,7 +150,7 @@ class FrameEstimator:
         self._gate.reset()
         self._members: Index = np.arange(0)
         self._share = np.zeros_like(self._estimator.moved)
-        self._trusted = np.zeros_like(self._estimator.moved)  # last accepted field; its nuisances follow
+        self._trusted = np.zeros_like(self._estimator.moved)  # displacement of the last accepted field
         self._trusted_g = np.zeros_like(self._estimator.g)
         if self._contacts is not None:
             self._contacts.reset()
@@ -164,12 +164,12 @@ class FrameEstimator:
         self._seen = np.zeros(self.layout.shape, bool)  # resistances used for the trusted field
 
     def estimate(self, frame_ohm: ArrayLike, valid: ArrayLike, relative_noise: ArrayLike) -> FieldFrame:
-        """Estimate the field of one frame, as :meth:`skinnode.Posterior.update` does, from all its readings.
+        """Estimate the field of one frame like :meth:`skinnode.Posterior.update`, without the data check.
 
         Args:
             frame_ohm: (U, K) resistances, ohm; values that are not positive and finite are ignored.
             valid: (U, K) bool, False if a reading is missing.
-            relative_noise: Noise of this frame, a number or (U, K).
+            relative_noise: Relative noise of this frame, a number or (U, K).
 
         Returns:
             The field, with one status per wire.
@@ -201,15 +201,15 @@ class FrameEstimator:
         return self._field(observation, status, held, start)
 
     def stop_at(self, until: float) -> None:
-        """Set the deadline for subsequent updates; inf for no limit.
+        """Set the deadline for subsequent updates; inf removes the deadline.
 
         Args:
-            until: Value of :func:`skinnode.process.clock.perf_counter`, s.
+            until: Deadline as a value of :func:`skinnode.process.clock.perf_counter`, s.
         """
         self._until = until
 
     def covariance_m2(self) -> Float:
-        """Return the covariance of the last frame's displacement, from that frame's factors.
+        """Return the covariance of the last frame's displacement, computed from that frame's factors.
 
         The covariance does not include the allowance for errors of the prior (``PRIOR_DOUBT``).
 
@@ -228,7 +228,9 @@ class FrameEstimator:
         return full
 
     def energy(self, moved: Float) -> float:
-        """Return uᵀ (s² C)⁻¹ u, which is −2 log of the last frame's prior density up to a constant.
+        """Return uᵀ (s² C)⁻¹ u: −2 log of the prior density of a displacement, up to a constant.
+
+        The prior is that of the last frame.
 
         Args:
             moved: (U, 3N) displacement, pitches.
@@ -250,7 +252,7 @@ class FrameEstimator:
         estimate = self.noise_estimate
         if estimate is not None:
             if estimate.see(frame, noise, rounding_ohm, mask):
-                self._seen = np.zeros_like(self._seen)  # the trusted field has the former deviations
+                self._seen = np.zeros_like(self._seen)  # the trusted field has the previous noise
             if estimate.factor != 1.0:
                 noise = estimate.factor * noise
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
@@ -268,18 +270,19 @@ class FrameEstimator:
         return self._model.observe(readings, self._hyper.noise_factor)
 
     def _beyond_prior(self, observation: Observation, deviations: float) -> bool:
-        # one of a hundred errors of the geometry may exceed three standard deviations
+        # among a hundred geometry errors, one may exceed three standard deviations by chance
         count = self._model.fixed if deviations < roots.BELIEVABLE else observation.d.size
         return roots.beyond_prior(self._estimator.g[:count], observation.d[:count], deviations)
 
     def _is_quiet(self, observation: Observation) -> bool:
         """Return whether the last field explains the frame within noise.
 
-        The residual of a wire in use contains noise from two sources: this frame and the last field.
+        The residual of a wire used for the last field contains noise from two sources: this frame and the
+        last field.
         """
         seen_before = self._known and np.array_equal(observation.weight > 0, self._seen)
         if not (self.options.hold and seen_before):
-            return False  # with different resistances, the uncertainty of the field differs
+            return False  # the uncertainty of the field depends on which resistances are used
         if self._beyond_prior(observation, roots.SUSPICIOUS):
             return False
         noises = np.ones(len(self._wires))
@@ -296,7 +299,7 @@ class FrameEstimator:
         self._gate.next_frame()
         at_rest = self._estimator.fit(observation, None)
         touched = self._gate.touched(at_rest, observation.count, self._members)
-        # only all wires together can show that nothing touches the patch
+        # an untouched patch can be confirmed only from all wires together
         wanted = touched if self.options.hold and touched.size else self._wires
         seen = readings.usable
         for _ in range(LEFT_OUT + 3):
@@ -327,7 +330,7 @@ class FrameEstimator:
         return self._give_up(Status.INCONSISTENT)
 
     def _joining(self, fit: Fit, observation: Observation, wanted: Index) -> Index:
-        """Find the wires outside ``wanted`` that contradict the other wires' field; keep and return them."""
+        """Return the wires outside ``wanted`` that contradict the current field, and keep them in use."""
         moved = self._gate.moved(fit, observation.count)
         moved[wanted] = False
         joining = np.flatnonzero(moved)
@@ -337,7 +340,7 @@ class FrameEstimator:
     def _accept(
         self, status: NDArray[np.int64], members: Index, seen: Mask
     ) -> tuple[NDArray[np.int64], Mask]:
-        """Trust the current field if it is within reach."""
+        """Accept the current field as the trusted field, unless an electrode is out of reach."""
         estimator = self._estimator
         if self._problem.out_of_reach(self._problem.rest + estimator.moved).any():
             return self._give_up(Status.ILL_CONDITIONED)
@@ -358,7 +361,7 @@ class FrameEstimator:
     # -- finding the maximum ---------------------------------------------------------------------------
 
     def _converge(self, observation: Observation, members: Index) -> bool:
-        """Solve from the last trusted field or, if that fails, by annealing from rest."""
+        """Solve by tracking from the last trusted field or, if tracking fails, by annealing from rest."""
         estimator = self._estimator
         estimator.moved[:] = self._trusted
         estimator.g[:] = self._trusted_g
@@ -374,9 +377,9 @@ class FrameEstimator:
         return estimator.anneal(observation, members)
 
     def _anneal_and_compare(self, observation: Observation, members: Index) -> bool:
-        """Keep the likelier of the current field and the annealed field.
+        """Anneal from rest, and keep the more likely of the tracked and the annealed field.
 
-        Far from the field of the last comparison, tracking may have found a wrong maximum.
+        A field far from the last compared field may be a wrong maximum found by tracking.
         """
         estimator = self._estimator
         self._compared[:] = estimator.moved
@@ -394,11 +397,11 @@ class FrameEstimator:
     def _refine(
         self, observation: Observation, readings: Readings, members: Index, *, local: bool
     ) -> Observation:
-        """Adapt the hyperparameters and, if the layout has folds, select the likelier of two maxima.
+        """Adapt the hyperparameters and, if the layout has folds, select the more likely of two maxima.
 
-        The prior that expects loads everywhere may have led to a wrong maximum. The field is therefore
-        annealed again with loads expected where they were found, and replaced if the new field is likelier
-        by :data:`skinnode.solve.roots.LIKELIER`.
+        A prior that expects loads everywhere may have led to a wrong maximum. The field is therefore annealed
+        again with loads expected where they were found. The new field replaces the old field if its −2 log
+        posterior is lower by at least :data:`skinnode.solve.roots.LIKELIER`.
         """
 
         def observe(noise_factor: float) -> Observation:
@@ -419,7 +422,7 @@ class FrameEstimator:
     # -- the field -------------------------------------------------------------------------------------
 
     def _data_share(self) -> Float:
-        """Return the share of the data in each coordinate, (U, 3N); 0 for coordinates that are not free."""
+        """Return the data share of each coordinate, (U, 3N); 0 for coordinates that are not free."""
         prior, share = self._estimator.load_prior, np.zeros_like(self._trusted)
         variance = prior.scale2 * prior.covariance.diagonal()
         share[:, self._free] = data_share(self._estimator.std, self._estimator.core, variance)
@@ -432,7 +435,7 @@ class FrameEstimator:
         displacement = problem.displacement_m(problem.rest + self._trusted)
         std, core = np.zeros_like(self._trusted), np.zeros_like(self._trusted)
         std[:, self._free], core[:, self._free] = estimator.std, estimator.core
-        if held.all():  # cover half of the displacement that the gate may overlook
+        if held.all():  # include half of the displacement that the gate may have missed
             for each in (std, core):
                 each[:, self._free] = np.maximum(each[:, self._free], 0.5 * self._overlooked)
         if self._contacts is not None and self._known and not held.all():

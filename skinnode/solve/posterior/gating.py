@@ -1,7 +1,7 @@
 """Gating: χ² tests for wires that moved and for wires whose resistances no deformation explains.
 
-Each wire is tested by the χ² of its residuals and by the apparent movement of each coordinate, because χ²
-alone overlooks an electrode that moved by 7 standard deviations.
+Each wire is tested with the χ² of its residuals and with the apparent movement of each coordinate. The χ²
+test alone can miss an electrode that moved by 7 standard deviations.
 """
 
 from __future__ import annotations
@@ -18,15 +18,15 @@ from skinnode.solve.roots import IMPOSSIBLE_CHANCE
 QUIET_CHANCE: Final = 0.005
 """Probability per frame that the χ² test reports an unmoved wire as moved."""
 QUIET_DEVIATIONS: Final = 3.7
-"""Apparent movement of a single coordinate, in standard deviations, at which its wire counts as moved. With
-300 coordinates at rest, noise alone reaches this limit in one frame in 15."""
+"""Apparent movement of a single coordinate, in standard deviations, above which its wire counts as moved.
+With 300 coordinates at rest, noise alone exceeds this limit in one frame in 15."""
 KEPT: Final = 50
-"""Number of frames for which a wire's equations stay in use after a movement that the other wires' equations
-did not show."""
+"""Number of frames for which a wire's equations remain in use after the wire moved although the field
+computed from the other wires did not predict the movement."""
 
 
 class Fit(NamedTuple):
-    """Misfit between a displacement and a frame."""
+    """Misfit between a displacement and the resistances of a frame."""
 
     chi_squared: Float
     """(U,) χ² of each wire."""
@@ -37,7 +37,7 @@ class Fit(NamedTuple):
 
 
 class Gate:
-    """χ² tests for one patch, with the list of wires kept in the estimate.
+    """χ² tests for one patch, and the list of wires that are kept in the estimate.
 
     Args:
         wires: Number of upper wires.
@@ -48,14 +48,14 @@ class Gate:
         self._quiet, self._impossible = (
             chi_squared_limits(equations, chance) for chance in (QUIET_CHANCE, IMPOSSIBLE_CHANCE)
         )
-        self._kept = np.zeros(wires, np.int64)  # frames left for each kept wire
+        self._kept = np.zeros(wires, np.int64)  # remaining frames of each kept wire
 
     def reset(self) -> None:
-        """Release all kept wires."""
+        """Remove all wires from the list of kept wires."""
         self._kept[:] = 0
 
     def next_frame(self) -> None:
-        """Count down the frames left for the kept wires."""
+        """Decrement the number of frames for which each kept wire remains in the estimate."""
         self._kept -= self._kept > 0
 
     def keep(self, wires: Index) -> None:
@@ -63,7 +63,7 @@ class Gate:
         self._kept[wires] = KEPT
 
     def moved(self, fit: Fit, count: Index, noises: float | Float = 1.0) -> NDArray[np.bool_]:
-        """Return the wires (U,) whose residuals exceed their noise.
+        """Return a (U,) bool mask of the wires whose residuals exceed their noise.
 
         Args:
             fit: Misfit of the tested displacement.
@@ -92,12 +92,12 @@ class Gate:
         return np.flatnonzero(touched)
 
     def excess(self, fit: Fit, count: Index) -> Float:
-        """Return χ² of each wire (U,), relative to the limit above which the model is rejected."""
+        """Return the ratio of each wire's χ² to the limit above which the model is rejected, (U,)."""
         return np.asarray(fit.chi_squared / self._impossible[count])
 
 
 def chi_squared_limits(most: int, chance: float) -> Float:
-    """Return the χ² (most + 1,) exceeded with probability ``chance`` at 0, 1, … degrees of freedom."""
+    """Return the χ² (most + 1,) exceeded with probability ``chance`` for 0, 1, … degrees of freedom."""
     from scipy.special import chdtri
 
     return np.concatenate([[1e-300], chdtri(np.arange(1.0, most + 1.0), chance)])

@@ -18,17 +18,18 @@ from skinnode.solve.posterior.map_estimate import MapEstimator
 from skinnode.solve.posterior.observation import Observation
 
 SCALE_WORTH: Final = 2.0
-"""Weight of the prior on s², as a number of directions; the data determine 100 to 200 directions."""
+"""Weight of the prior on s², as a number of directions in data space; the data determine 100 to 200."""
 SCALE_REST: Final = 0.005
-"""Scale that the prior on s² expects, in clearances: typical of presses that indent the layer by a tenth."""
+"""Expected value of the prior scale s, in clearances; typical of presses that indent the layer by a tenth."""
 SCALE_MOST: Final = 1.0
-"""Largest scale, in clearances; above it the surface would lie below the lower layer."""
+"""Maximum prior scale s, in clearances; with a larger scale, the surface could be below the lower layer."""
 SCALE_STEP: Final = math.log(1.25)
-"""Logarithm of the scale change that triggers an update; the standard deviations change by less."""
+"""Logarithm of the change of the prior scale above which it is updated. Smaller changes of the scale change
+the standard deviations by even less."""
 SCALE_LEAST: Final = 1.0
-"""Smallest scale, relative to the scale of a field that on average changes the resistances by as much as
-their noise. A smaller field would go unnoticed, so the standard deviations of an untouched patch must allow
-for it."""
+"""Minimum prior scale, relative to the scale of a field whose mean change of the resistances equals their
+noise. A smaller field cannot be detected, so the standard deviations of an untouched patch must include
+it."""
 ADAPTIONS: Final = 5
 """Maximum number of updates of the prior or the noise per frame."""
 REFINEMENTS: Final = 3
@@ -36,19 +37,19 @@ REFINEMENTS: Final = 3
 NOISE_WORTH: Final = 20.0
 """Weight of the configured noise in the noise estimate, as a number of resistances."""
 NOISE_STEP: Final = math.log(1.1)
-"""Logarithm of the noise change that triggers an update."""
+"""Logarithm of the change of the estimated noise above which the noise is updated."""
 
 Observe = Callable[[float], Observation]
 """Function that returns the observation of a frame for a given noise factor."""
 
 
 class Hyperparameters:
-    """Scale, expected load locations and noise for one patch. Do not share an instance between owners.
+    """Prior scale, expected load locations and noise of one patch. Do not share an instance between owners.
 
     Args:
-        estimator: Estimator of the patch.
+        estimator: MAP estimator of the patch.
         clearance: Median clearance, pitches.
-        scale2: s², pitch², if it is fixed; otherwise None.
+        scale2: Fixed s², pitch²; None if s² is set from the evidence.
         estimate_noise: Whether the noise is estimated.
 
     Attributes:
@@ -75,36 +76,36 @@ class Hyperparameters:
         self._least = self._expected
 
     def set_least(self, observation: Observation) -> None:
-        """Set the smallest scale from the noise of a frame."""
+        """Set the minimum prior scale from the noise of a frame."""
         power = float((observation.weight**2 * self._signal).sum())
         count = np.count_nonzero(observation.weight)
         least = SCALE_LEAST**2 * count / power if power > 0 else math.inf
         self._least = min(least, self._most)
 
     def spread(self, observation: Observation, members: Index) -> None:
-        """Reset the prior to equal loads over the whole patch, then set the scale the frame suggests."""
+        """Reset the prior to equal loads over the whole patch, then set its scale from the frame."""
         self._prior.spread(self._fixed or self._expected)
         if self._fixed is None:
             self._prior.scale2 = self._bounded(self._estimator.guess_scale(observation, members))
 
     def spread_as_seen(self, observation: Observation, members: Index) -> None:
-        """Reset the prior to equal loads, at the scale the frame suggests under the old prior."""
+        """Reset the prior to equal loads, with the scale guessed from the frame and the old prior."""
         guess = self._fixed or self._bounded(self._estimator.guess_scale(observation, members))
         self._prior.spread(guess)
 
     def adapt(
         self, observation: Observation, observe: Observe, members: Index, *, local: bool
     ) -> Observation:
-        """Set the hyperparameters from the current field, and solve again until they no longer change.
+        """Set the hyperparameters from the current field, and solve again until they stop changing.
 
         Args:
             observation: The frame.
             observe: Function that returns the observation of the frame for another noise factor.
-            members: Wires of the estimate.
+            members: Wires whose equations are used.
             local: Whether to set the expected load locations too.
 
         Returns:
-            The observation at the estimated noise.
+            The observation with the estimated noise.
         """
         estimator, prior = self._estimator, self._prior
         if not local and self._fixed is None and (prior.share != 1.0).any():
@@ -150,7 +151,7 @@ class Hyperparameters:
         return changed
 
     def _noise_found(self, observation: Observation, members: Index) -> float:
-        """Return the noise factor at which the residuals match the noise (MacKay)."""
+        """Return the noise factor at which the residuals are consistent with the noise (MacKay)."""
         residuals: Float = self._estimator.residuals(observation)
         total = float((residuals[members] ** 2).sum())
         count = float(np.count_nonzero(observation.weight[members]))

@@ -1,4 +1,4 @@
-"""Posterior of the loads on a patch: mean, covariance, and the loads found in a frame.
+"""Posterior of the loads on a patch: their mean and covariance, and the significant loads of a frame.
 
 All results use the current factors of a :class:`skinnode.solve.posterior.map_estimate.MapEstimator`.
 """
@@ -16,12 +16,12 @@ from skinnode.solve.posterior.contacts import LoadEstimate
 from skinnode.solve.posterior.map_estimate import MapEstimator
 
 LOCAL_SIGNIFICANT: Final = 4.0
-"""Squared significance at which a load counts as found, in standard deviations squared."""
+"""Squared significance above which a load counts as found, in squared standard deviations."""
 LOCAL_CERTAIN: Final = 100.0
-"""Squared significance at which a press is certain, in standard deviations squared. At 25, with high noise,
-the first locations found are unreliable and errors are 1 % larger. At 1000 and above, on layouts with low
-sensitivity (`aligned`), half of the expected load is still spread over the whole patch, which increases
-errors by 14 %."""
+"""Squared significance above which a press is certain, in squared standard deviations. With a value of 25 and
+high noise, the first load locations are unreliable and errors are 1 % larger. With values of 1000 and above,
+on layouts with low sensitivity (`aligned`), half of the expected load is still spread over the whole patch,
+which increases errors by 14 %."""
 
 
 class LoadPosterior:
@@ -37,7 +37,7 @@ class LoadPosterior:
         self._whitened = np.empty((estimator.equations, loads))
         self._ones = np.ones(estimator.equations)
         self._stiffness = np.empty(loads)
-        self._factors = -1  # the factors from which the last two arrays were computed
+        self._factors = -1  # serial number of the factors used for the last two arrays
 
     def estimate(self) -> LoadEstimate:
         """Return the loads and their covariance; the arrays are valid until the next frame."""
@@ -45,11 +45,11 @@ class LoadPosterior:
         return LoadEstimate(self.mean(), rows, self._ones[: len(rows)], prior.share, prior.scale2)
 
     def mean(self) -> Float:
-        """Return the mean loads (Q, 3), given the displacement, in units of the prior's loads."""
+        """Return the mean loads (Q, 3) for the current displacement, in units of the prior's loads."""
         return self._prior.loads(self._estimator.free_displacement())
 
     def expected(self, least: float) -> Float:
-        """Return the load variances (Q,) in pitch² implied by the loads found; at least ``least``.
+        """Return the load variances (Q,) in pitch² that the loads of the frame imply, at least ``least``.
 
         Without its own prior, a load has the estimate q / (s² k) and the variance 1/k − s², where k is the
         increase in χ² per unit of the load (Tipping and Faul, Fast marginal likelihood maximisation for
@@ -63,7 +63,7 @@ class LoadPosterior:
         return prior.expected(found, least, certain=most > LOCAL_CERTAIN)
 
     def _whiten(self) -> Float:
-        """Return L⁻¹ J G (m, 3Q) for the current factors; also updates k of each load."""
+        """Return L⁻¹ J G (m, 3Q) for the current factors, and update k of each load."""
         rows = self._whitened[: self._estimator.factored_rows]
         if self._factors != self._estimator.factors:
             self._factors = self._estimator.factors
@@ -76,8 +76,9 @@ class LoadPosterior:
 def _found(q: Float, own: Float, stiffness: Float, significant: float, found: Float) -> float:
     """Write the largest squared load of each cell, estimated without its own prior, into ``found`` (Q,).
 
-    Loads that are not significant count as 0. ``q`` (Q, 3) are the loads, ``own`` (Q,) their prior variances
-    and ``stiffness`` (3Q,) their k. Returns the largest ratio of a squared load to its noise variance.
+    Loads below the significance threshold count as 0. ``q`` (Q, 3) contains the loads, ``own`` (Q,) their
+    prior variances and ``stiffness`` (3Q,) their k. Returns the largest ratio of a squared load to its noise
+    variance.
     """
     most = 0.0
     for cell in range(found.size):

@@ -1,10 +1,10 @@
-"""Prior of the loads on a patch and of the displacement they cause.
+"""Prior of the loads on a patch, and of the displacement that the loads cause.
 
-At first, equal loads are expected over the whole patch, at one scale s². Once loads are found, the prior
-expects loads there and hardly any elsewhere (:meth:`LoadPrior.localise`), so the skin next to a contact moves
-only as far as the loads of the contact require. Compared with one scale for the whole patch, localisation
-reduces the error by a factor of two to three, and the error of a narrow contact no longer exceeds the
-reported standard deviation.
+Initially, equal loads are expected over the whole patch, with one scale s². After loads have been found, the
+prior expects loads at these locations and hardly any elsewhere (:meth:`LoadPrior.localise`). The skin next to
+a contact then moves only as far as the contact's loads require. Compared with one scale for the whole patch,
+localisation reduces the error by a factor of two to three, and the error of a narrow contact no longer
+exceeds the reported standard deviation.
 """
 
 from __future__ import annotations
@@ -25,24 +25,25 @@ from skinnode.solve.linalg.vectors import Index
 from skinnode.solve.posterior.elastic_prior import SLACK, ElasticPrior
 
 LOCAL_SPREAD: Final = 0.7
-"""Standard deviation, in cells, of the Gaussian that spreads the squared loads found over neighbouring cells.
-A smaller value relies on single cells, which is better if the rubber matches the prior but overconfident if
-it does not; a value of 1 loses a quarter of the improvement."""
+"""Standard deviation, in cells, of the Gaussian that spreads the squared loads over neighbouring cells. A
+smaller value relies on single cells; the estimate is then better if the rubber matches the prior, but
+overconfident if it does not. With a value of 1, a quarter of the improvement is lost."""
 LOCAL_FLOOR: Final = 0.05
-"""Mean square load expected in cells where no load was found, relative to the mean over the patch; allows for
+"""Mean square load expected in cells without a found load, relative to the mean over the patch. It allows for
 light touches near a press."""
 LOCAL_CHANGE: Final = 0.35
-"""Fraction of the expected loads that must move elsewhere before the prior is rebuilt. At 0.5, errors in a
-slow press reach 6 standard deviations; at 0.25, twice as many frames need a rebuild."""
+"""Fraction of the expected loads that must move elsewhere before the prior is rebuilt. With a value of
+0.5, errors in a slow press reach 6 standard deviations; with 0.25, twice as many frames need a rebuild."""
 LOCAL_SURPRISE: Final = 16.0
 """Ratio of the squared load of a cell to its expected square above which the prior is rebuilt even if little
-of the expected load moved elsewhere. Without this limit, a press twice as deep as in the previous frame was 7
-standard deviations off after an unusual motion that left small expected loads. A value of 16 costs nothing:
-slow presses need a factorisation in as many frames as without the limit."""
+of the expected load moved elsewhere. Without this limit, the error of a press twice as deep as in the
+previous frame was 7 standard deviations after an unusual motion that left small expected loads. A value of 16
+costs no time: in slow presses, the number of frames that need a factorisation is the same as without the
+limit."""
 
 
 class LoadPrior:
-    """Prior u ~ N(0, s² C) of a patch's free coordinates, displaced by loads of unequal variance.
+    """Prior u ~ N(0, s² C) of a patch's free coordinates, which loads of unequal variance displace.
 
     Args:
         elastic: Elasticity of the patch.
@@ -51,8 +52,8 @@ class LoadPrior:
     Attributes:
         scale2: s², pitch².
         share: (Q,) load variance of each cell relative to s²; the mean is 1.
-        covariance: (U f, U f) C.
-        uniform: (U f, U f) C if equal loads are expected over the whole patch.
+        covariance: (U f, U f) matrix C.
+        uniform: (U f, U f) matrix C for equal expected loads over the whole patch.
         response: (U f, 3Q) displacement caused by unit loads, pitches.
         version: Number of times C has been rebuilt.
     """
@@ -66,7 +67,7 @@ class LoadPrior:
         self.scale2 = 1.0
         self.share = np.ones(len(self._blur))
         self.version = 0
-        self._loads: tuple[Float, Float] | None = None  # displacement and its loads
+        self._loads: tuple[Float, Float] | None = None  # last displacement and its mean loads
 
     def spread(self, scale2: float) -> None:
         """Reset the prior to equal loads over the whole patch, at scale s²."""
@@ -76,13 +77,13 @@ class LoadPrior:
         self._made_anew(self.uniform)
 
     def localise(self, variance: Float) -> bool:
-        """Set the variances of the loads.
+        """Set the variances of the loads, and rebuild the prior if they have changed enough.
 
         Args:
             variance: (Q,) variance of the loads of each cell, pitch².
 
         Returns:
-            False, with the prior unchanged, if hardly any of the expected load moved elsewhere.
+            Whether the prior was rebuilt; False if hardly any of the expected load moved elsewhere.
         """
         mean = float(variance.mean())
         share = variance / mean
@@ -97,15 +98,15 @@ class LoadPrior:
         return True
 
     def expected(self, found: Float, least: float, *, certain: bool) -> Float:
-        """Return the variances (Q,) in pitch² implied by the loads found; at least ``least``.
+        """Return the load variances (Q,) in pitch² that the found loads imply, at least ``least``.
 
-        The variances move halfway from their current values to the implied values, because with full steps
-        neighbouring cells would alternate. If a press is certain and equal loads were expected over the whole
-        patch, the full step is taken.
+        The variances move halfway from their current values to the implied values, because full steps would
+        make neighbouring cells alternate. A full step is taken if a press is certain and equal loads were
+        expected over the whole patch.
 
         Args:
-            found: (Q,) squared loads found.
-            least: Smallest variance of a cell, pitch².
+            found: (Q,) squared loads found in the frame, pitch².
+            least: Minimum variance of a cell, pitch².
             certain: Whether a press is certain.
         """
         floor = LOCAL_FLOOR * float(found.mean()) + least
@@ -117,13 +118,13 @@ class LoadPrior:
         return np.asarray(0.5 * (wanted + self.scale2 * self.share))
 
     def loads(self, displacement: Float) -> Float:
-        """Return the mean of the loads given a displacement.
+        """Return the mean of the loads for a given displacement.
 
         Args:
             displacement: (U f,) free coordinates, pitches.
 
         Returns:
-            (Q, 3) loads of each cell, in units of the prior's loads.
+            (Q, 3) mean loads of each cell, in units of the prior's loads.
         """
         if self._loads is not None and np.array_equal(self._loads[0], displacement):
             return self._loads[1]
@@ -137,7 +138,7 @@ class LoadPrior:
     def roughness(self, displacement: Float) -> float:
         """Return uᵀ C⁻¹ u in pitch² for a displacement (U f,), which is overwritten.
 
-        The value is the number of unknowns times the squared scale that fits the displacement best.
+        The result is the number of unknowns times the squared scale s² that fits the displacement best.
         """
         solve_lower_vector(self._root, displacement, displacement.size)
         return float(displacement @ displacement)
@@ -150,7 +151,7 @@ class LoadPrior:
 
 
 def _blur(shape: tuple[int, int]) -> Float:
-    """Return Gaussian weights (Q, Q) of :data:`LOCAL_SPREAD` cells around each cell; each row sums to 1."""
+    """Return Gaussian weights (Q, Q) around each cell, :data:`LOCAL_SPREAD` cells wide; rows sum to 1."""
     cell = np.indices(shape).reshape(2, -1)
     square = ((cell[:, :, None] - cell[:, None, :]) ** 2).sum(axis=0)
     weight = np.exp(-0.5 * square / LOCAL_SPREAD**2)

@@ -1,9 +1,10 @@
 """Observation model of a frame: residuals, weights, and the effect of the nuisances.
 
-A wire's residual is r = w (a F(x) − 1) with w = 1/σ. The model is r(x) − H g = noise of variance 1, with a
-few nuisances g ~ N(0, diag(d)): a gain error of the patch or of each wire (drift), an error of the
-forward model that is proportional to the change in each resistance, and errors of the geometry, whose H
-depends on the displacement (:mod:`skinnode.solve.posterior.geometry_error`).
+A wire's residual is r = w (a F(x) − 1) with w = 1/σ. In the model, r(x) − H g is noise of variance 1, where H
+is the effect of the nuisances g ~ N(0, diag(d)). The nuisances are a gain error of the patch or of each wire
+(drift), an error of the forward model proportional to the change in each resistance, and errors of the
+geometry. H of the geometry errors depends on the displacement
+(:mod:`skinnode.solve.posterior.geometry_error`).
 """
 
 from __future__ import annotations
@@ -24,38 +25,38 @@ from skinnode.solve.wires.problem import PatchProblem
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Readings:
-    """Resistances of one frame in the units of the problem."""
+    """Resistances of one frame, in the units of the :class:`PatchProblem`."""
 
     a: Float
-    """(U, K) R · gain; the value at rest for an unusable resistance."""
+    """(U, K) resistances times gain, R · gain; the value at rest for unusable resistances."""
     noise: Float
-    """(U, K) relative standard deviation of R."""
+    """(U, K) relative standard deviation of the resistances R."""
     usable: NDArray[np.bool_]
-    """(U, K) whether the resistance is usable."""
+    """(U, K) bool, whether the resistance is usable."""
 
     def without(self, wires: list[int]) -> Readings:
-        """Return a copy that marks the readings of ``wires`` as unusable."""
+        """Return a copy in which the readings of ``wires`` are marked as unusable."""
         usable = self.usable.copy()
         usable[wires] = False
         return Readings(self.a, self.noise, usable)
 
     def except_for(self, left_out: NDArray[np.bool_]) -> Readings:
-        """Return a copy that marks the readings ``left_out`` (U, K) as unusable."""
+        """Return a copy in which the readings ``left_out`` (U, K) are marked as unusable."""
         return Readings(self.a, self.noise, self.usable & ~left_out)
 
 
 @dataclass
 class Observation:
-    """Input of the estimator for one frame, with U wires, K resistances per wire and p nuisances."""
+    """Estimator input for one frame, with U wires, K resistances per wire and p nuisances."""
 
     a: Float
-    """(U, K) R · gain."""
+    """(U, K) resistances times gain, R · gain."""
     weight: Float
-    """(U, K) 1/σ, 0 if a resistance is missing."""
+    """(U, K) weights 1/σ of the resistances; 0 if a resistance is missing."""
     h: Float
-    """(U, K, p) H, change in the residual per unit of each nuisance; without errors of the geometry."""
+    """(U, K, p) H, change in the residual per unit of each nuisance, excluding errors of the geometry."""
     d: Float
-    """Prior variances of the nuisances; those of the geometry follow the p others."""
+    """Prior variances of the nuisances: p variances, followed by those of the geometry errors."""
 
     @functools.cached_property
     def count(self) -> Index:
@@ -64,19 +65,19 @@ class Observation:
 
 
 class ObservationModel:
-    """Conversion of readings to observations.
+    """Converter of readings to observations.
 
     Args:
         problem: The patch.
         drift: ``none``, ``patch`` (one gain error) or ``wire`` (one gain error per upper wire).
         drift_std: Prior standard deviation of a gain error.
         model_error: Standard error of the forward model, as a fraction of the change in each resistance.
-        tolerances: Tolerances to which the patch was made.
+        tolerances: Manufacturing tolerances of the patch.
 
     Attributes:
-        gains: Number of gain errors; they come first among the nuisances.
+        gains: Number of gain errors, which are the first nuisances.
         fixed: Number of nuisances whose H does not depend on the displacement, p.
-        variance: Prior variances of the nuisances; those of the geometry follow the p others.
+        variance: Prior variances of the nuisances: p variances, followed by those of the geometry errors.
     """
 
     def __init__(
@@ -101,7 +102,7 @@ class ObservationModel:
             self.variance = np.concatenate([self.variance, np.ones(geometry)])
 
     def observe(self, readings: Readings, noise_factor: float) -> Observation:
-        """Return the observation of a frame whose noise is ``noise_factor`` times the configured noise."""
+        """Return the observation of a frame with ``noise_factor`` times the noise of its readings."""
         a = readings.a
         change = a / self._problem.a_rest - 1.0
         variance = (noise_factor * readings.noise) ** 2 + 0.5 * (self._model_error * change) ** 2
@@ -117,7 +118,7 @@ class ObservationModel:
 
 
 def eased(observation: Observation, level: float) -> Observation:
-    """Return the observation with noise of standard deviation ``level`` added, for annealing."""
+    """Return a copy with added noise of relative standard deviation ``level``, for annealing."""
     weight = observation.weight
     loose = 1.0 / np.hypot(
         level, np.divide(1.0, weight, out=np.full_like(weight, math.inf), where=weight > 0)

@@ -1,7 +1,7 @@
 """Posterior of a patch: fields estimated from a stream of frames, with tests of their readings.
 
-A frame is solved (``frame_estimator``) and its readings are tested against the field
-(:mod:`skinnode.solve.checks.data_check`), which may solve it again without some of them.
+Each frame is solved by ``frame_estimator``. :mod:`skinnode.solve.checks.data_check` then tests the readings
+for consistency with the field; if it finds wrong readings, the frame is solved again without them.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from skinnode.solve.options import PosteriorArguments, PosteriorOptions, merged
 from skinnode.solve.posterior.frame_estimator import FrameEstimator, Mask
 
 PLACED: Final = 2.0
-"""Error of a reading, relative to the largest change, per pitch of misplacement; not measured."""
+"""Assumed error of a reading, relative to the readings' largest change, per pitch of placement error."""
 
 
 class Posterior(FrameEstimator):
@@ -38,10 +38,10 @@ class Posterior(FrameEstimator):
     Attributes:
         layout: The patch.
         options: Options in effect.
-        check: Test of the readings.
-        from_rest_s: Minimum time to solve a touched frame from rest, s; 0 without a deadline.
-        noise_estimate: Estimate of the stream's noise, which scales the stated noise; None if the noise is
-            taken as stated.
+        check: Data check of the readings.
+        from_rest_s: Minimum time to solve a touched frame from rest, s; 0 if no deadline is set.
+        noise_estimate: Estimate of the stream's noise, which scales the stated noise; None if the stated
+            noise is used unchanged.
 
     Raises:
         ValueError: If an option has the wrong shape or is out of range.
@@ -80,10 +80,10 @@ class Posterior(FrameEstimator):
 
         Args:
             frame_ohm: (U, K) resistances, ohm; values that are not positive and finite are ignored.
-            valid: (U, K) bool, False if a chunk or wire is missing; default all True.
-            relative_noise: Noise of this frame only, a number or (U, K). Resistances whose noise is not
-                positive and finite are ignored.
-            rounding_ohm: (U, K) standard deviation of the rounding to codes, ohm, in addition to
+            valid: (U, K) bool, False if a reading is missing; all True by default.
+            relative_noise: Relative noise of this frame only, a number or (U, K). Resistances whose noise is
+                not positive and finite are ignored.
+            rounding_ohm: (U, K) standard deviation of the error from rounding to codes, ohm; added to
                 ``relative_noise``.
 
         Returns:
@@ -108,7 +108,7 @@ class Posterior(FrameEstimator):
 
 
 def _model_std(options: PosteriorOptions) -> float:
-    """Return the error of the forward model that the options state, relative to the largest change."""
+    """Return the forward model's standard error set in the options, relative to the largest change."""
     made = options.tolerances or EXACT
     placed = PLACED * math.hypot(made.placement, made.electrode_radius)
     return math.hypot(options.model_error, placed, made.thickness, made.gain)

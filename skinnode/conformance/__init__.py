@@ -1,11 +1,11 @@
-"""Conformance suite for CANopen nodes: 127 cases built on raw frames, for any node on any interface.
+"""Conformance suite for CANopen nodes: 127 cases that test any node on any interface with raw frames.
 
 ``eds_reader`` parses the device's EDS, and ``tester`` sends and receives frames. ``sdo`` and ``dut`` (the
-device under test) build on both and are used by the cases. ``run`` resets the device before each case and
-restores its configuration; ``report`` and ``html_report`` write the results.
+device under test) build on both, and the cases use ``sdo`` and ``dut``. ``run`` resets the device before each
+case and restores its configuration; ``report`` and ``html_report`` write the results.
 
 The suite relies only on a node's EDS and its frames. It deliberately has its own tester, SDO client,
-EDS reader and constants, because code shared with the node would share the node's errors.
+EDS reader and constants, because an error in code shared with the node would go unnoticed.
 """
 
 from skinnode.conformance.case import Case, NotApplicable, Result, Verdict

@@ -14,24 +14,24 @@ if TYPE_CHECKING:
 
 
 class Verdict(StrEnum):
-    """One-word result of a case."""
+    """Verdict on a conformance case."""
 
     PASSED = "passed"
     WARNING = "warning"
-    """The device passes, but does something that CiA advises against or that some tools cannot handle."""
+    """The device passes, but its behaviour is discouraged by CiA or cannot be handled by some tools."""
     FAILED = "failed"
     NOT_APPLICABLE = "not applicable"
 
 
 class NotApplicable(Exception):
-    """The device does not offer the feature that the case checks.
+    """Raised if the device does not offer the feature that the case checks.
 
-    The text names the object, EDS entry or response that shows that the feature is absent.
+    The exception text names the object, EDS entry or response that shows that the feature is absent.
     """
 
 
 class Warned(Exception):
-    """The device passes, but something is doubtful. The text explains it."""
+    """Raised if the device passes with a doubt. The exception text explains the doubt."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,7 +42,7 @@ class Case:
     """
 
     id: str
-    """Area and number: "SDO-07"."""
+    """Area and number, such as "SDO-07"."""
     title: str
     clause: str
     """Clause that the case checks, in CiA 301 v4.2.0 unless another document is named."""
@@ -61,7 +61,8 @@ class Result:
     case: Case
     verdict: Verdict
     why: str = ""
-    """Expected and received data, the doubtful point, or why the case does not apply; empty for a pass."""
+    """Reason for the verdict: expected and received data, the doubt, or why the case does not apply; empty
+    if the device passed without a doubt."""
     seconds: float = 0.0
     trace: tuple[TraceLine, ...] = field(default=(), repr=False)
     """Frames sent and received during the case."""

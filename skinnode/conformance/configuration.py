@@ -16,12 +16,13 @@ _PDO_PARAMETERS: Final = (*range(0x1400, 0x1600), *range(0x1800, 0x1A00))
 _MAPPINGS: Final = (*range(0x1600, 0x1800), *range(0x1A00, 0x1C00))
 _INVALID: Final = 1 << 31
 _LAST: Final = {_SYNC_COUNTER: 1, _PERIOD: 2, _SYNC: 3, _VERIFY: 4}
-"""Write order: the overflow value can be written only while the period is 0; the producer starts after both;
-0x1020 comes last, because writing any other object clears it."""
+"""Write order of these objects, after all others. The SYNC counter overflow value can be written only while
+the period is 0, and the producer starts after both. 0x1020 is last, because writing any other object clears
+it."""
 
 
 def read_configuration(dut: Dut) -> dict[tuple[int, int], bytes]:
-    """Read all readable and writable values, except commands and values of variable length."""
+    """Read all values that are readable and writable, except commands and values of variable length."""
     values: dict[tuple[int, int], bytes] = {}
     for entry in dut.eds.between(0x1000, 0x9FFF):
         if entry.index in _COMMANDS or not entry.size or not (entry.readable and entry.writable):
@@ -29,14 +30,15 @@ def read_configuration(dut: Dut) -> dict[tuple[int, int], bytes]:
         try:
             values[entry.index, entry.subindex] = dut.sdo.read(entry.index, entry.subindex)
         except Failed:
-            continue  # the OD cases report the failure
+            continue  # the OD cases report read failures
     return values
 
 
 def write_back(dut: Dut, before: Values) -> list[str]:
-    """Put back the configuration of a node that was reset after a case stored or restored parameters.
+    """Undo what a case stored or restored on the node, which must have been reset since.
 
-    Restores the defaults, writes each value in ``before`` that differs from them, and stores the result.
+    Restores the defaults, writes the values of ``before`` that differ from the defaults, and stores the
+    result.
 
     Args:
         dut: The device.
@@ -71,7 +73,7 @@ def write_back(dut: Dut, before: Values) -> list[str]:
 
 
 def _parameter_of(index: int) -> int:
-    """Return the index of the PDO communication parameter to which ``index`` belongs; 0 for other objects."""
+    """Return the index of the PDO communication parameter to which ``index`` belongs; 0 if to none."""
     if index in _MAPPINGS:
         return index - 0x200
     return index if index in _PDO_PARAMETERS else 0

@@ -32,13 +32,13 @@ _ABSENT: Final = (0x0602_0000, 0x0609_0011)
 
 
 class Dut:
-    """Node ``node_id`` with its EDS."""
+    """Device under test: node ``node_id`` on a bus, and its EDS."""
 
     def __init__(self, bus: Tester, node_id: int, eds: Eds) -> None:
         self.bus, self.node_id, self.eds = bus, node_id, eds
         self.sdo = SdoClient(bus, node_id)
         self.stored = False
-        """Whether a case has stored or restored parameters since the configuration was last put back."""
+        """Whether a case has stored or restored parameters since the configuration was last restored."""
         self.up = False
         """Whether the node came up after the last reset."""
 
@@ -66,7 +66,7 @@ class Dut:
             self.error_control_id,
             "the boot-up message",
             BOOT_S,
-            lambda frame: frame.data not in _HEARTBEATS,  # heartbeats sent before the reset
+            lambda frame: frame.data not in _HEARTBEATS,  # ignore heartbeats sent before the reset
         )
         self.bus.forget()
         if frame.data != b"\0":
@@ -75,8 +75,8 @@ class Dut:
     def prepare(self) -> None:
         """Reset the node and bring it to PRE-OPERATIONAL.
 
-        A node that answers counts as ready here, and is commanded to enter PRE-OPERATIONAL. Case STATE-01
-        checks the boot-up message and whether the node starts by itself.
+        Accepts a boot-up message or an SDO response as a sign that the node is ready. Case STATE-01
+        checks the boot-up message itself.
 
         Raises:
             NodeTimeout: The node does not answer.
@@ -121,7 +121,7 @@ class Dut:
     def state(self, what: str) -> int:
         """Return the NMT state from a heartbeat, or from guarding if the node has no heartbeat.
 
-        Uses the second heartbeat to arrive, because the first may have been sent before the call. Call
+        Uses the second heartbeat received, because the first may have been sent before the call. Call
         :meth:`start_heartbeat` first.
         """
         if self.eds.find(HEARTBEAT) is None:
@@ -134,7 +134,7 @@ class Dut:
         return frame.data[0]
 
     def expect_state(self, state: int, what: str) -> None:
-        """Raise Failed unless heartbeats carry ``state``."""
+        """Raise Failed unless the node reports the NMT state ``state``."""
         got = self.state(what)
         if got != state:
             raise Failed(f"{STATES[state]} {what}", STATES.get(got, f"state {got}"))
@@ -151,7 +151,7 @@ class Dut:
     # --- object dictionary
 
     def need(self, index: int, subindex: int = 0) -> EdsEntry:
-        """Return an entry of the EDS. Raises NotApplicable if the EDS has no such entry."""
+        """Return the EDS entry of an object. Raises NotApplicable if the EDS has no such entry."""
         entry = self.eds.find(index, subindex)
         if entry is None:
             raise NotApplicable(f"the EDS has no object 0x{index:04X}:{subindex:02X}")
@@ -175,14 +175,14 @@ class Dut:
             raise NotApplicable(f"{entry} = 0x{capability:08X}: bit 0, {what}, is not set")
 
     def to_defaults(self) -> None:
-        """Restore the node's defaults, provided that it supports 0x1011, and reset it."""
+        """Restore the node's defaults if it supports 0x1011, and reset the node."""
         with contextlib.suppress(NotApplicable):
             self.need_storage(RESTORE, 1)
             self.restore(1)
         self.reset()
 
     def store(self, subindex: int, signature: bytes = b"save") -> None:
-        """Store parameters (0x1010). The configuration is put back after the case."""
+        """Store parameters (0x1010). The original configuration is restored after the case."""
         self.stored = True
         self.sdo.write(STORE, subindex, signature)
 

@@ -1,8 +1,8 @@
 """Reads the electronic data sheet (CiA 306) of a device under test.
 
 The reader uses only :mod:`configparser`, so that its result depends neither on the EDS writer of this project
-nor on the canopen library. Contradictions within the file are kept for case EDS-01 (:func:`parse_eds`); a
-file that cannot be read raises ProfileError.
+nor on the canopen library. Case EDS-01 reports the contradictions within the file; a file
+that cannot be parsed raises ProfileError.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ class EdsEntry:
     flags: int
     """ObjFlags: bit 0 is "refuse write on download", bit 1 is "refuse read on scan"."""
     given: bytes | None = None
-    """Default as raw bytes if the file gives bytes; :attr:`default` is then empty."""
+    """Default as raw bytes if the file specifies bytes; :attr:`default` is then empty."""
 
     @property
     def size(self) -> int:
@@ -92,14 +92,14 @@ class EdsEntry:
         return self.index << 16 | self.subindex << 8 | 8 * self.size
 
     def default_bytes(self, node_id: int) -> bytes | None:
-        """Return the default as transferred by SDO.
+        """Return the entry's default as the bytes of an SDO transfer.
 
         Args:
             node_id: Replaces $NODEID.
 
         Returns:
-            The bytes; a string is transferred as in the file. None if the file gives no default, or a default
-            that the type cannot encode.
+            The bytes; text is transferred as written in the file. None if the file specifies no default, or a
+            default that the data type cannot encode.
 
         Raises:
             ValueError: A number is malformed.
@@ -138,7 +138,7 @@ class Eds:
     """Contradictions within the file."""
 
     def find(self, index: int, subindex: int = 0) -> EdsEntry | None:
-        """Return an entry; None if the EDS has none."""
+        """Return the entry of an object; None if the EDS does not describe it."""
         return self.entries.get((index, subindex))
 
     def has(self, index: int) -> bool:
@@ -230,7 +230,7 @@ def parse_eds(text: str, source: str, codec: str = "utf-8") -> Eds:
     try:
         found += _listed(sections, {index for index, _ in entries})
         dummy_types = [kind for kind in range(1, 0x20) if number(dummies.get(f"dummy{kind:04x}", "0") or "0")]
-    except ValueError as error:  # text in place of a number
+    except ValueError as error:  # the file has text where a number is required
         allowed = "numbers in CiA 306 format in the lists of objects and dummy entries"
         raise ProfileError("EDS", Shown(str(error)), allowed, where=source) from None
     return Eds(
@@ -267,7 +267,7 @@ def _entries(
 
 
 def _order(title: str) -> tuple[int, str]:
-    """Sort objects before their sub-objects."""
+    """Return a sort key that places objects before their sub-objects."""
     return len(title), title
 
 
@@ -284,7 +284,7 @@ def _object(
     if compact > 254:
         found.append(f"[{index:04X}]: CompactSubObj={compact}, must be at most 254")
         compact = 0
-    if compact:  # identical sub-objects without sections of their own
+    if compact:  # CompactSubObj declares identical sub-objects that have no sections in the file
         count = {"parametername": "NrOfObjects", "datatype": "5", "accesstype": "ro", "pdomapping": "0"}
         _add(entries, index, 0, {**count, "defaultvalue": str(compact)})
         for subindex in range(1, compact + 1):
@@ -311,7 +311,7 @@ def _add(
 
 
 def _listed(sections: Mapping[str, Mapping[str, str]], described: set[int]) -> Iterator[str]:
-    """Yield a line for each object that is only listed or only described, and for each wrong count."""
+    """Yield a line for each object that is either listed or described but not both, and each wrong count."""
     listed: set[int] = set()
     for name in ("mandatoryobjects", "optionalobjects", "manufacturerobjects"):
         options = sections.get(name, {})

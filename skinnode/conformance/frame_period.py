@@ -1,4 +1,4 @@
-"""Checks frame intervals against a period.
+"""Checks whether frames arrive with an expected period.
 
 A busy machine delays individual frames, so both mean and median are checked. A delayed frame lengthens one
 interval and shortens the next, which hardly changes the mean; a few late frames do not change the median.
@@ -24,7 +24,7 @@ def check_period(frames: Sequence[Frame], period_ms: float, what: str, *, or_soo
 
     Args:
         frames: At least two frames.
-        period_ms: Expected period.
+        period_ms: Expected period, ms.
         what: Name of the frames, for the message.
         or_sooner: Whether events may trigger additional frames between the periodic frames.
     """
@@ -33,4 +33,6 @@ def check_period(frames: Sequence[Frame], period_ms: float, what: str, *, or_soo
     too_seldom = mean > 1.3 or median > 1.25
     too_often = (mean < 0.9 or median < 0.8) and not or_sooner
     if too_seldom or too_often:
-        raise Failed(f"{what} each {period_ms:g} ms", f"gaps of {', '.join(f'{gap:.1f}' for gap in gaps)} ms")
+        raise Failed(
+            f"{what} every {period_ms:g} ms", f"gaps of {', '.join(f'{gap:.1f}' for gap in gaps)} ms"
+        )

@@ -18,7 +18,7 @@ INVALID: Final = 1 << 31
 NO_REMOTE: Final = 1 << 30
 CAN_ID: Final = 0x7FF
 COB_ID, KIND, INHIBIT, EVENT_TIMER, SYNC_START = 1, 2, 3, 5, 6
-"""Sub-indices of a communication parameter."""
+"""Sub-indices of a PDO communication parameter."""
 
 SYNC_ID: Final = 0x80
 
@@ -34,7 +34,7 @@ class Pdo:
 
     @property
     def mapping(self) -> int:
-        """Index of the mapping parameter."""
+        """Index of the PDO's mapping parameter."""
         return self.parameter + 0x200
 
     @property
@@ -73,7 +73,7 @@ def disable(dut: Dut, pdo: Pdo) -> int:
 
 
 def mapped(dut: Dut, pdo: Pdo) -> list[int]:
-    """Read the entries of the mapping parameter."""
+    """Read and return the mapping entries of a PDO."""
     count = dut.sdo.integer(pdo.mapping, 0)
     return [dut.sdo.integer(pdo.mapping, subindex) for subindex in range(1, count + 1)]
 
@@ -145,7 +145,9 @@ Trial = Callable[[Dut, Pdo], None]
 
 
 def each_tpdo(dut: Dut, trial: Trial) -> None:
-    """Run ``trial`` on each TPDO that maps an object, with all others disabled; reset the node each time.
+    """Run ``trial`` on each TPDO that maps an object, with all other TPDOs disabled.
+
+    Resets the node after each trial.
 
     Raises:
         NotApplicable: No TPDO supports the trial.
@@ -181,7 +183,7 @@ def expect_pdo(dut: Dut, can_id: int, length: int, what: str) -> Frame:
 
 
 def drain(dut: Dut, can_id: int) -> None:
-    """Discard frames until none arrives for a while, but for at most half a second."""
+    """Discard frames with ``can_id`` until none arrives for 20 ms, but for at most half a second."""
     end_s = time.monotonic() + 0.5
     while time.monotonic() < end_s and dut.bus.take(can_id, _PAUSE_S) is not None:
         pass

@@ -70,7 +70,9 @@ def beat(dut: Dut, node_id: int, times: int = 1, each_s: float = 0.0, state: int
 
 
 def lose_partner(dut: Dut, within_ms: int = 100) -> None:
-    """Withhold a heartbeat that the device expects or, if it has no heartbeat consumer, a guarding request.
+    """Provoke a communication error by withholding heartbeats or guarding requests.
+
+    Withholds guarding requests only if the device has no heartbeat consumer.
 
     Raises:
         NotApplicable: The device has neither heartbeat consumer nor life guarding.
@@ -90,5 +92,5 @@ def lose_partner(dut: Dut, within_ms: int = 100) -> None:
 def not_before(frame: Frame, since_ns: int, least_ms: int, what: str) -> None:
     """Raise Failed if ``frame`` arrived less than ``least_ms`` after ``since_ns``."""
     elapsed_ms = (frame.t_ns - since_ns) * 1e-6
-    if elapsed_ms < least_ms - 1:  # 1 ms tolerance: the timestamps come from two clocks
+    if elapsed_ms < least_ms - 1:  # 1 ms tolerance, because the two timestamps come from different clocks
         raise Failed(f"{what} not before {least_ms} ms", f"after {elapsed_ms:.1f} ms")

@@ -25,7 +25,7 @@ SILENT_CASES: Final = 3
 
 @dataclass(frozen=True, slots=True)
 class Report:
-    """Results of a run, and any problems while restoring the configuration."""
+    """Results of a conformance run, and problems encountered while restoring the node's configuration."""
 
     results: tuple[Result, ...]
     problems: tuple[str, ...]
@@ -48,7 +48,7 @@ def connect(port: CanPort, node_id: int, eds: Eds | None = None) -> Dut:
     Args:
         port: The bus.
         node_id: The node.
-        eds: Its EDS. A patch of this project needs none, because its EDS is derived from its descriptor
+        eds: The node's EDS; optional for a patch of this project, whose EDS is derived from its descriptor
             (0x2000).
 
     Raises:
@@ -92,13 +92,13 @@ def _own_eds(sdo: SdoClient) -> Eds:
 def run_cases(dut: Dut, cases: Iterable[Case], say: Callable[[Result], None] = lambda _: None) -> Report:
     """Run ``cases`` one after another.
 
-    Every case yields a result, however the node behaves. At the end the node is reset and has its
-    original configuration back.
+    Every case yields a result, however the node behaves. At the end, the node is reset and its original
+    configuration is restored.
 
     Args:
         dut: The device.
         cases: Cases to run.
-        say: Receives each result.
+        say: Callback that receives each result.
 
     Raises:
         BusError: The interface failed.
@@ -110,7 +110,7 @@ def run_cases(dut: Dut, cases: Iterable[Case], say: Callable[[Result], None] = l
     try:
         for case in cases:
             if silent == SILENT_CASES:
-                why = f"not run: the node did not come up for {SILENT_CASES} cases"
+                why = f"not run: the node did not come up in {SILENT_CASES} consecutive cases"
                 result = Result(case, Verdict.FAILED, why)
             else:
                 result = run_case(dut, case)
@@ -141,7 +141,7 @@ def run_case(dut: Dut, case: Case) -> Result:
         verdict, why = Verdict.FAILED, str(failure)
     except BusError:
         raise
-    except Exception as error:  # an unexpected response fails the case, not the run
+    except Exception as error:  # an unexpected response fails this case and does not abort the run
         verdict, why = Verdict.FAILED, f"unexpected response ({type(error).__name__}: {error})"
     return Result(case, verdict, why, time.monotonic() - begun_s, dut.bus.trace)
 
@@ -154,7 +154,7 @@ def _put_back(dut: Dut, before: dict[tuple[int, int], bytes]) -> list[str]:
         dut.prepare()
         return write_back(dut, before)
     except (Failed, NodeTimeout) as failure:
-        return [f"the configuration could not be put back: {failure}"]
+        return [f"the configuration could not be restored: {failure}"]
 
 
 def _reset(dut: Dut) -> None:

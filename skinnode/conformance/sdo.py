@@ -1,6 +1,6 @@
 """SDO client built on raw frames (CiA 301 v4.2.0, 7.2.4.3): expedited, segmented and block transfer.
 
-The client is made for testing: it checks every response byte by byte, and can violate the protocol on
+The client is designed for tests: it checks every response byte by byte and can violate the protocol on
 request. It shares no code with this project's server.
 """
 
@@ -50,10 +50,10 @@ MEANINGS: Final = {
     0x0800_0023: "no object dictionary",
     0x0800_0024: "no data",
 }
-"""Abort codes of CiA 301 v4.2.0, table 22."""
+"""Meanings of the SDO abort codes (CiA 301 v4.2.0, table 22)."""
 
 _SEGMENT: Final = 7
-_MOST_BYTES: Final = 1 << 20  # stops an upload whose last segment never arrives
+_MOST_BYTES: Final = 1 << 20  # ends an upload that never sends its last segment
 _BLOCK_SIZE: Final = 20
 
 
@@ -95,7 +95,7 @@ class SdoClient:
     # --- frames
 
     def send(self, request: bytes) -> None:
-        """Send a request, padded to eight bytes."""
+        """Send an SDO request, padded to eight bytes."""
         self._bus.send(self.request_id, request.ljust(8, b"\0"))
 
     def answer(self, what: str) -> bytes:
@@ -134,7 +134,7 @@ class SdoClient:
     def check_abort(answer: bytes, index: int, subindex: int, codes: Collection[int], what: str) -> int:
         """Return the abort code of ``answer``.
 
-        Raises Failed unless it names the object and has one of ``codes`` or the general-error code.
+        Raises Failed unless the abort names the object and has one of ``codes`` or the general-error code.
         """
         allowed = " or ".join(f"0x{code:08X}" for code in sorted({*codes, GENERAL_ERROR}))
         expected = f"{what} aborted with {allowed}"
@@ -150,7 +150,7 @@ class SdoClient:
     # --- upload
 
     def read(self, index: int, subindex: int = 0) -> bytes:
-        """Upload a value, expedited or segmented as the device chooses."""
+        """Upload a value by expedited or segmented transfer, as the device chooses."""
         what = f"read of 0x{index:04X}:{subindex:02X}"
         answer = self.served(b"\x40" + mux(index, subindex), what)
         if answer[0] & 0xE0 != 0x40 or answer[1:4] != mux(index, subindex):
@@ -217,7 +217,7 @@ class SdoClient:
         return data
 
     def _read_sub_block(self, size: int, what: str) -> tuple[bytes, int, bool]:
-        """Return the bytes, the number of segments, and whether the transfer's last segment is among them."""
+        """Read a sub-block; return its bytes, its number of segments, and whether it ends the transfer."""
         data = b""
         for number in range(1, size + 1):
             segment = _not_aborted(self.answer(f"segment {number}, {what}"), what)
@@ -231,7 +231,7 @@ class SdoClient:
     # --- download
 
     def write(self, index: int, subindex: int, data: bytes) -> None:
-        """Download a value: expedited for one to four bytes, otherwise segmented."""
+        """Download a value by expedited transfer if it has one to four bytes, otherwise in segments."""
         if len(data) > 4 or not data:
             self.write_segments(index, subindex, data)
             return
@@ -244,7 +244,7 @@ class SdoClient:
         self.write(index, subindex, value.to_bytes(size, "little"))
 
     def write_segments(self, index: int, subindex: int, data: bytes) -> None:
-        """Download in segments, even if the value would fit in an expedited transfer."""
+        """Download a value in segments, even if the value would fit in an expedited transfer."""
         what = f"segmented write to 0x{index:04X}:{subindex:02X}"
         start = b"\x21" + mux(index, subindex) + struct.pack("<I", len(data))
         _check(self.served(start, what), b"\x60" + mux(index, subindex) + bytes(4), what)

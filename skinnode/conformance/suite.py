@@ -1,4 +1,4 @@
-"""All cases in order, and their selection by area or ID."""
+"""Lists all conformance cases in order, and selects cases by area or ID."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from skinnode.errors import ConfigError
 CASES: Final[tuple[Case, ...]] = tuple(
     item for area in AREAS for item in vars(area).values() if isinstance(item, Case)
 )
-"""All 127 cases, in the order of the test plan."""
+"""All 127 conformance cases, in the order of the test plan."""
 
 
 def select(names: Sequence[str]) -> tuple[Case, ...]:
-    """Select cases by area or ID.
+    """Select conformance cases by area or ID.
 
     Args:
         names: Areas and IDs; empty for all cases.

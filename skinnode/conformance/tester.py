@@ -14,10 +14,10 @@ from typing import Final, NamedTuple
 from skinnode.transport import CanPort, Frame
 
 ANSWER_S: Final = 1.0
-"""Maximum wait for a response; far longer than a device needs, so that no case fails on a busy machine."""
+"""Maximum wait for a response, s; far longer than a device needs, so that no case fails on a busy machine."""
 
 QUIET_S: Final = 0.06
-"""Time without frames that counts as silence."""
+"""Time without frames that counts as silence, s."""
 
 _INBOX_FRAMES: Final = 20_000
 _TRACE_FRAMES: Final = 400
@@ -66,14 +66,14 @@ class Tester:
         self._begun_ns = time.monotonic_ns()
 
     def begin(self) -> None:
-        """Begin a case: discard all frames received so far."""
+        """Begin a case: discard all frames received so far and clear the trace."""
         self.clear()
         self._trace.clear()
         self._begun_ns = time.monotonic_ns()
 
     @property
     def trace(self) -> tuple[TraceLine, ...]:
-        """Newest frames since :meth:`begin`."""
+        """Newest frames sent or received since :meth:`begin`."""
         return tuple(self._trace)
 
     def send(self, can_id: int, data: bytes = b"", *, remote: bool = False) -> int:
@@ -84,12 +84,12 @@ class Tester:
         return now_ns
 
     def clear(self) -> None:
-        """Discard everything received so far."""
+        """Discard all frames received so far, including those still queued at the interface."""
         self._fetch()
         self.forget()
 
     def forget(self) -> None:
-        """Empty the inbox; frames still queued at the interface arrive later."""
+        """Empty the inbox without discarding frames that are still queued at the interface."""
         self._inbox.clear()
 
     def take(
@@ -100,7 +100,7 @@ class Tester:
         Args:
             can_id: CAN-ID of a data frame.
             within_s: Maximum wait.
-            match: Additional condition that the frame must meet.
+            match: Additional condition on the frame.
 
         Returns:
             The frame; None if none arrives within ``within_s``.
@@ -139,7 +139,7 @@ class Tester:
         return self.pending(can_id)
 
     def wait(self, for_s: float) -> None:
-        """Wait; frames that arrive meanwhile are kept in the inbox."""
+        """Wait ``for_s`` seconds, keeping frames that arrive in the inbox."""
         end_s = time.monotonic() + for_s
         while (left_s := end_s - time.monotonic()) > 0:
             self._receive(left_s)
@@ -159,7 +159,8 @@ class Tester:
             raise Failed(f"no {what}", describe(frame))
 
     def _fetch(self) -> None:
-        for _ in range(_INBOX_FRAMES):  # bounded, because a fully loaded bus is never silent
+        # The loop is bounded, because frames may arrive continuously on a fully loaded bus.
+        for _ in range(_INBOX_FRAMES):
             if not self._receive(0.0):
                 return
 

@@ -4,7 +4,7 @@
 :mod:`skinnode.cli` call plain functions that take a connection: ``discovery`` (which nodes are present),
 ``node_info``, ``object_dictionary`` with ``data_sheet``, ``standard_objects`` and ``dcf``,
 ``pdo_parameters``, ``nmt_commands``, ``lss_commissioning``, ``tare``. A function writes to a node only if its
-name says so.
+name indicates a write.
 
 ``skinnode doctor`` builds on these modules: ``collect_facts`` (with ``scan_capture``) gathers the facts about
 a bus, :mod:`skinnode.diagnose.checks` derives findings from the facts (with ``noise``), ``root_causes``

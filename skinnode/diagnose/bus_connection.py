@@ -1,4 +1,4 @@
-"""An open bus: SDO to any node, LSS, NMT, and a record of all messages received."""
+"""Opens a bus for SDO, LSS and NMT services, and records all messages received."""
 
 from __future__ import annotations
 
@@ -19,10 +19,11 @@ from skinnode.host.mainline import Mainline
 from skinnode.host.sdo_client import RemoteOd
 
 LONGEST_HEARTBEAT_S: Final = 2.5
-"""Maximum wait for a heartbeat; nodes with a longer period are not detected by their heartbeats."""
+"""Maximum wait for a heartbeat, s; heartbeats with a longer period are not detected."""
 
 GUARD_ANSWERS_S: Final = (0.15, 0.5)
-"""Maximum waits for the responses to a first and a second remote frame; a node may be busy the first time."""
+"""Maximum waits for a response to the first and to the second remote frame, s; a busy node may miss the
+first."""
 
 _POLL_S: Final = 0.002
 
@@ -40,14 +41,17 @@ class State(NamedTuple):
 
 
 def no_answer(wrong: str) -> str:
-    """Describe a node without a valid SDO response; ``wrong`` is its newest invalid response, or empty."""
+    """Return a message about a node that sent no valid SDO response.
+
+    ``wrong`` is the newest invalid response of the node; empty if the node did not respond.
+    """
     if not wrong:
         return "does not answer SDO requests"
     return f"sends SDO frames that do not respond to the request (newest: {wrong})"
 
 
 class BusConnection:
-    """An open bus, closed by :meth:`close` or a ``with`` block.
+    """Connection to a bus, closed by :meth:`close` or a ``with`` block.
 
     Args:
         bus: The bus.
@@ -84,8 +88,8 @@ class BusConnection:
         """Wait for a condition.
 
         Args:
-            condition: Called repeatedly until true.
-            within_s: Maximum wait.
+            condition: Called repeatedly until it returns a true value.
+            within_s: Maximum wait, s.
 
         Returns:
             Whether the condition became true.
@@ -131,7 +135,7 @@ class BusConnection:
 
         Args:
             node_id: A node that sent no valid response.
-            since_ns: Earliest reception time of the frame.
+            since_ns: Earliest reception time of the frame, ns.
 
         Returns:
             Hexadecimal text; empty if there was no frame.
@@ -142,7 +146,7 @@ class BusConnection:
         return newest[1].hex(" ") or "no data"
 
     def heartbeat_s(self, node_id: int) -> float | None:
-        """Return the heartbeat period (0x1017) in s; 0 if off, None if the node does not answer."""
+        """Read the heartbeat period (0x1017) of a node, s; 0 if off, None if the node does not answer."""
         try:
             return float(self.od(node_id).read(od.HEARTBEAT_PRODUCER, 0, "u16")) * 1e-3
         except NodeError:
@@ -161,13 +165,13 @@ class BusConnection:
             return False
 
     def state(self, node_id: int, heartbeat_s: float | None, *, guarding: bool, since_ns: int = 0) -> State:
-        """Return the NMT state from the next heartbeat, or from guarding if there is none.
+        """Return the NMT state from the next heartbeat, or from guarding if no heartbeat arrives.
 
         Args:
             node_id: The node.
             heartbeat_s: Result of :meth:`heartbeat_s`.
             guarding: Whether remote frames are allowed.
-            since_ns: Earliest reception time of the heartbeat.
+            since_ns: Earliest reception time of the heartbeat, ns.
         """
         if heartbeat_s != 0:
             wait_s = LONGEST_HEARTBEAT_S if heartbeat_s is None else 1.5 * heartbeat_s + 0.1

@@ -1,4 +1,4 @@
-"""Records the messages received on a bus: heartbeats, emergencies, SDO responses, COB-IDs in use.
+"""Records the messages received on a bus: heartbeats, emergencies, SDO responses and the COB-IDs in use.
 
 One thread writes the record; other threads read copies, because the record has no lock.
 """
@@ -15,7 +15,7 @@ from skinnode.canopen.nmt import STATE_MASK, NmtState
 from skinnode.transport import Frame
 
 _KEPT: Final = 256
-"""Number of messages kept per kind and node: at 4 Hz, more than half a minute of heartbeats."""
+"""Maximum number of messages kept per kind and node; covers more than half a minute of heartbeats at 4 Hz."""
 
 
 class Beat(NamedTuple):
@@ -43,31 +43,32 @@ class NodeTraffic:
     boot_ups: int = 0
     emergencies: deque[Emergency] = field(default_factory=lambda: deque(maxlen=_KEPT))
     sdo_answers: deque[tuple[int, bytes]] = field(default_factory=lambda: deque(maxlen=_KEPT))
-    """Time and the eight data bytes of each SDO response."""
+    """Reception time in ns and the eight data bytes of each SDO response."""
     newest_sdo: tuple[int, bytes] | None = None
-    """Time and data of the newest frame on the COB-ID for SDO responses, whatever its length."""
+    """Reception time in ns and data of the newest frame on the COB-ID for SDO responses, whatever its
+    length."""
 
 
 class BusListener:
-    """Record of the messages received since construction; a link calls :meth:`on_frames`."""
+    """Record of the messages received since construction. The bus link calls :meth:`on_frames`."""
 
     def __init__(self) -> None:
         self._nodes: dict[int, NodeTraffic] = {}
         self.cob_ids: Counter[int] = Counter()
-        """Number of data frames by 11-bit COB-ID."""
+        """Number of data frames, keyed by 11-bit COB-ID."""
         self.nmt: Counter[bytes] = Counter()
-        """Number of NMT commands by their two bytes, command specifier and node-ID; ``b""`` for commands of
-    another length."""
+        """Number of NMT commands, keyed by their two data bytes (command specifier and node-ID); ``b""``
+        counts the commands of any other length."""
         self.extended = self.remote = self.errors = 0
         """Counts of frames with 29-bit identifiers, remote frames and error frames."""
 
     @property
     def nodes(self) -> dict[int, NodeTraffic]:
-        """Copy of the messages, by node-ID."""
+        """Copy of the messages received, keyed by node-ID."""
         return dict(self._nodes)
 
     def node(self, node_id: int) -> NodeTraffic:
-        """Return the messages of one node-ID; empty if none were received."""
+        """Return the messages received from one node-ID; empty if there are none."""
         return self._nodes.get(node_id) or NodeTraffic()
 
     def newest_beat(self, node_id: int, since_ns: int = 0) -> Beat | None:
@@ -77,7 +78,7 @@ class BusListener:
         return newest if newest is not None and newest.t_ns > since_ns else None
 
     def on_frames(self, frames: Sequence[Frame]) -> None:
-        """Record a batch of frames."""
+        """Record a batch of received frames."""
         for frame in frames:
             if frame.error:
                 self.errors += 1

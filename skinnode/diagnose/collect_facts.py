@@ -1,6 +1,7 @@
 """Collects the facts about one bus.
 
-It listens and reads. Unless ``active`` is set, nothing is changed, so a running hand continues undisturbed.
+Facts are collected by listening and by reading objects. Unless ``active`` is set, nothing is changed on the
+bus, so a running hand is not disturbed.
 """
 
 from __future__ import annotations
@@ -35,14 +36,14 @@ SCANS: Final = 50
 """Number of scans needed for a noise estimate accurate to 10 %."""
 
 LONGEST_S: Final = 15.0
-"""Maximum wait for scans, regardless of the SYNC period."""
+"""Maximum wait for scans, s, regardless of the SYNC period."""
 
 DEFAULT_NOISE: Final = 3e-6
 """Relative noise assumed for the converter if there is no hand file."""
 
 _PAUSES_S: Final = (0.0, 0.1, 0.3, 0.6)
-"""Pauses before successive attempts to read a node; a host reading a baseline keeps the node busy for 0.1 to
-0.3 s."""
+"""Pauses before successive attempts to read a node, s; a host reading a baseline keeps the node busy for 0.1
+to 0.3 s."""
 
 _FIRST_SYNC_S: Final = 0.5
 _KNOWN_TO_ALL: Final = frozenset(
@@ -60,7 +61,7 @@ def collect_facts(
 
     Args:
         bus: The bus.
-        hand: The hand; None without a hand file.
+        hand: The hand; None if no hand file is given.
         active: Whether to start nodes that are not running, and to send SYNC if no other node does. The
             started nodes are returned to PRE-OPERATIONAL at the end.
         progress: Called with a description of each step.
@@ -168,9 +169,10 @@ def _examine(
 
 
 def _asked(question: Callable[[], Answer]) -> tuple[Answer | None, str]:
-    """Try to read, several times if necessary; return the result, or the reason for the failure.
+    """Call ``question`` until it succeeds; return its answer, or None and the reason for the last failure.
 
-    A running host may access the node at the same time, and a server handles one transfer at a time.
+    Retries are needed because a running host may access the node at the same time, and an SDO server handles
+    only one transfer at a time.
     """
     failure = ""
     for pause_s in _PAUSES_S:
@@ -235,7 +237,7 @@ def _scan_s(patch: PatchFacts, profiles: dict[int, PatchProfile]) -> float:
     """Return the minimum SYNC period in s for a node that no host has configured; 0 for any other node.
 
     With its default inhibit time, a node needs at least this period to finish each scan before the next SYNC.
-    Bring-up sets an inhibit time that fits the hand's period.
+    Bring-up later sets an inhibit time that fits the hand's period.
     """
     profile = profiles.get(patch.node_id)
     if profile is None or patch.info is None or patch.found is None or patch.found.state == "operational":
@@ -272,7 +274,7 @@ def _with_scans(
 def _commands_of_others(heard: BusListener, node_ids: Collection[int]) -> int:
     """Count the NMT commands that a host of this hand would not send.
 
-    A host only starts its patches and commands them to PRE-OPERATIONAL, each by its node-ID. A second host of
+    A host sends only start and enter pre-operational, addressed to one patch at a time. A second host of
     the same hand is detected by its SYNCs.
     """
     return sum(
@@ -285,8 +287,9 @@ def _commands_of_others(heard: BusListener, node_ids: Collection[int]) -> int:
 
 
 def _foreign(heard: BusListener, node_ids: Collection[int], bus: BusConfig) -> dict[int, int]:
-    """Count, by COB-ID, the frames that no service, node or entry of ``others`` in the hand file explains.
+    """Return the number of unexplained frames, keyed by COB-ID.
 
+    Services, detected nodes, and the entries of ``others`` in the hand file explain frames.
     COB-IDs in the pre-defined connection set of a detected node are attributed to that node, whatever the
     device. Frames with the COB-IDs of a patch that does not answer are attributed to a host that polls the
     patch.

@@ -1,7 +1,7 @@
-"""The electronic data sheet of a node: generated for a patch, read from a file for another device.
+"""Provides the electronic data sheet (EDS) of a node: generated for a patch, otherwise read from a file.
 
 This module uses the conformance suite's EDS reader, which preserves defaults as written; the canopen library
-does not. The host checks a patch's EDS with that library, as an independent reader.
+does not. The host uses the canopen library as an independent reader to check a patch's EDS.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ class DataSheet(NamedTuple):
 
     eds: Eds
     text: str
-    """Content; see :class:`~skinnode.canopen.eds_encoding.EdsText`."""
+    """Content of the file; see :class:`~skinnode.canopen.eds_encoding.EdsText`."""
     codec: str = "utf-8"
     """Codec of the non-ASCII characters in the text."""
     note: str = ""
@@ -30,7 +30,10 @@ class DataSheet(NamedTuple):
 
 
 def read_profile(remote: RemoteOd) -> PatchProfile | None:
-    """Return the sizes of a patch; None for another device. Raises NodeError if the node does not answer."""
+    """Read the sizes of a patch; None if the device is not a patch.
+
+    Raises NodeError if it does not answer.
+    """
     try:
         identity = [remote.read(od.IDENTITY, sub, "u32") for sub in (od.IDENTITY_VENDOR, od.IDENTITY_PRODUCT)]
         if identity != [od.VENDOR_ID, od.PRODUCT_CODE]:
@@ -41,7 +44,9 @@ def read_profile(remote: RemoteOd) -> PatchProfile | None:
         bus: BusType = "classic" if pdo_bytes == 8 else "fd"
         return PatchProfile(rows, columns, upper, lower, bits, bus=bus, checked=checked)
     except ConfigError as error:
-        raise NodeError(remote.node_id, f"its descriptor (0x2000) describes no patch: {error}") from None
+        raise NodeError(
+            remote.node_id, f"its descriptor (0x2000) does not describe a patch: {error}"
+        ) from None
 
 
 def load_data_sheet(path: Path) -> DataSheet:
@@ -60,7 +65,7 @@ def data_sheet_of(remote: RemoteOd, path: Path | None) -> DataSheet:
 
     Args:
         remote: The node.
-        path: Its EDS; a patch needs none.
+        path: EDS file of the node; not needed for a patch.
 
     Raises:
         ProfileError: The node is not a patch, and no file is given.

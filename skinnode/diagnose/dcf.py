@@ -1,9 +1,9 @@
 """Writes and reads the configuration of one device as a file (DCF, CiA 306) without losing a byte.
 
-Numbers and printable ASCII are written to ``ParameterValue``, as in the standard; an OCTET_STRING and a
-DOMAIN there in hexadecimal. The standard has no form for text that a reader of INI files would change (bytes
-other than printable ASCII, leading or trailing blanks, comment signs): it is written in a comment, which
-other tools skip and :func:`expected` reads::
+Numbers and printable ASCII text are written to ``ParameterValue`` as CiA 306 specifies. An OCTET_STRING or a
+DOMAIN is written there in hexadecimal. CiA 306 has no notation for text that an INI reader would change, such
+as bytes other than printable ASCII, leading or trailing blanks, and comment signs. Such text is written as a
+comment, which other tools skip and :func:`expected` reads::
 
     ;ParameterBytes=63 61 66 c3 a9
 """
@@ -27,7 +27,7 @@ _BYTES_KEY: Final = ";ParameterBytes"
 _BYTES_LINE: Final = re.compile(r"^;(ParameterBytes=)", re.MULTILINE)
 _SECTION: Final = re.compile(r"([0-9A-Fa-f]{4})(?:sub([0-9A-Fa-f]{1,2}))?", re.IGNORECASE)
 _VALUES: Final = ("parametervalue", "parameterbytes", _BYTES_KEY.lower())
-_COMMISSIONING: Final = "DeviceComissioning"  # the spelling of CiA 306
+_COMMISSIONING: Final = "DeviceComissioning"  # CiA 306 spells it this way
 _STRINGS: Final = {"VISIBLE_STRING": "ascii", "UNICODE_STRING": "utf-16-le"}
 _OCTETS: Final = ("OCTET_STRING", "DOMAIN")
 _VISIBLE_STRING: Final = 0x09
@@ -42,7 +42,7 @@ class Dcf(NamedTuple):
     values: int
     """Number of the node's values in the file."""
     as_bytes: tuple[Reading, ...]
-    """Readings that CiA 306 cannot express; they are written byte by byte."""
+    """Readings that CiA 306 notation cannot express; their bytes are written as comments."""
 
 
 def as_dcf(sheet: DataSheet, readings: Sequence[Reading], node_id: int, bitrate_bps: int, name: str) -> Dcf:
@@ -111,8 +111,8 @@ def _with_value(entry: EdsEntry, value: str | None, as_bytes: str | None) -> Eds
         try:
             return replace(entry, given=bytes.fromhex(as_bytes))
         except ValueError:
-            return entry  # not hexadecimal, so another tool wrote it
-    if value and entry.data_type == _VISIBLE_STRING:  # exact, because trailing zeros are written as bytes
+            return entry  # another tool wrote this text, which is not hexadecimal
+    if value and entry.data_type == _VISIBLE_STRING:  # no trailing zeros: those are written as bytes
         return replace(entry, given=octets(value.strip()))
     return replace(entry, default=value.strip()) if value else entry
 

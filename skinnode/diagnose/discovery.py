@@ -21,22 +21,24 @@ from skinnode.text.printable import printable
 from skinnode.text.words import counted
 
 PACE_S: Final = 0.001
-"""Interval between requests; at 1 Mbit/s they take up a sixth of the bus, so PDOs are not delayed."""
+"""Interval between requests, s; at 1 Mbit/s, the requests use a sixth of the bus and do not delay PDOs."""
 
 ANSWER_S: Final = 0.12
-"""Time to wait for responses after the last request of a sweep."""
+"""Time to wait for responses after the last request of a sweep, s."""
 
 SWEEPS: Final = 2
-"""Number of sweeps; a busy node gets a second request."""
+"""Number of sweeps over all node-IDs; a node that is busy during the first sweep receives a second
+request."""
 
 LISTEN_S: Final = 1.2
-"""Minimum listening time; stopped nodes send nothing but heartbeats."""
+"""Minimum listening time, s; stopped nodes are detected only by their heartbeats."""
 
 LSS_S: Final = 1.5
-"""Maximum time to search for nodes without a node-ID; nodes not found in this time are reported as "more"."""
+"""Maximum time to search for nodes without a node-ID, s; nodes not found in this time are reported as
+"more"."""
 
 OTHERS_S: Final = 1.0
-"""Maximum wait for other SDO clients to finish."""
+"""Maximum wait for other SDO clients to finish, s."""
 
 _QUIET_S: Final = 0.1
 _THREADS: Final = 16
@@ -46,7 +48,7 @@ _ASK_SERIAL: Final = upload_request(od.IDENTITY, od.IDENTITY_SERIAL)
 
 @dataclass(frozen=True, slots=True)
 class FoundNode:
-    """A node that was found. Values are None if the node lacks them or did not answer."""
+    """Node found on a bus. A value is None if the node lacks the object or did not answer."""
 
     node_id: int
     answers: bool
@@ -91,20 +93,20 @@ class FoundNode:
 
     @property
     def is_patch(self) -> bool:
-        """Whether vendor and product are those of a patch."""
+        """Whether the vendor-ID and product code are those of a patch."""
         return (self.vendor_id, self.product_code) == (od.VENDOR_ID, od.PRODUCT_CODE)
 
 
 @dataclass(frozen=True, slots=True)
 class Discovery:
-    """The nodes found."""
+    """Result of a search for nodes."""
 
     nodes: tuple[FoundNode, ...]
     """Nodes with a node-ID, by ascending node-ID."""
     unconfigured: tuple[LssAddress, ...]
     """Nodes without a node-ID."""
     more_unconfigured: bool
-    """Whether there are further nodes without a node-ID."""
+    """Whether there are further nodes without a node-ID that were not found in time."""
     seconds: float
 
 
@@ -131,7 +133,7 @@ def discover(connection: BusConnection, progress: Callable[[str], None] = lambda
             nodes = [job.result() for job in jobs]
             connection.wait_until(lambda: False, max(0.0, begun_s + LISTEN_S - time.monotonic()))
             unconfigured, more = lss.result()
-        except BaseException:  # also after Ctrl-C: the pool's threads must end
+        except BaseException:  # the pool's threads must end after Ctrl-C, too
             connection.abandon()
             raise
     heard = connection.listener.nodes
@@ -159,7 +161,7 @@ def _sdo_frames(connection: BusConnection) -> int:
 
 
 def find_unconfigured(connection: BusConnection) -> tuple[tuple[LssAddress, ...], bool]:
-    """Return the nodes without a node-ID, and whether there are more that were not found in time.
+    """Find the nodes without a node-ID; return them, and whether the search ended before all were found.
 
     The nodes return to LSS waiting mode.
     """
@@ -179,7 +181,7 @@ def find_unconfigured(connection: BusConnection) -> tuple[tuple[LssAddress, ...]
 
 
 def _sweep(connection: BusConnection) -> dict[int, int]:
-    """Return the node-IDs that respond, each with its number of responses to one request."""
+    """Query all node-IDs; return the number of responses to one request, keyed by node-ID."""
     answers: dict[int, int] = {}
     for _ in range(SWEEPS):
         asked_ns = time.monotonic_ns()

@@ -1,4 +1,4 @@
-"""Facts about a bus and its patches, as plain data; the checks use nothing else."""
+"""Defines the facts about a bus and its patches as plain data, which is the only input of the checks."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ class Sure(StrEnum):
     CERTAIN = "certain"
     """A node or a counter reports the fault."""
     LIKELY = "likely"
-    """The evidence leaves hardly any other cause."""
+    """Hardly any other cause can explain the evidence."""
     POSSIBLE = "possible"
     """The condition may be intended; a person must decide."""
 
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """One fault."""
+    """Fault found by a check."""
 
     area: str
     """Area: bus, nodes, configuration, wires, baseline, timing or losses."""
@@ -61,17 +61,17 @@ class ScanFacts:
     device_us: Counts
     """(T,) clock of the node, µs; -1 if the summary was lost."""
     complete: NDArray[np.bool_]
-    """(T,)"""
+    """(T,) whether each scan is complete."""
     step: float
     """Width of one code relative to R0."""
     stated_noise: float
     """Relative noise of the converter, from the hand file."""
     stats: AssemblerStats
     conversions: int | None = None
-    """Number of scans that hold a new conversion, of those that can be compared with the scan before; None if
-    the patch does not count its conversions."""
+    """Number of scans with a new conversion, among the scans that can be compared with the previous scan;
+    None if the patch does not count its conversions."""
     repeated: int = 0
-    """Number of scans that repeat the conversion of the scan before."""
+    """Number of scans that repeat the conversion of the previous scan."""
 
     @property
     def scans(self) -> int:
@@ -89,7 +89,8 @@ class PatchFacts:
     layout_hash: int | None = None
     """Hash of the layout in the hand file."""
     inhibit_100us: int | None = None
-    """Inhibit time that the host sets; None if the host does not configure the nodes of this bus."""
+    """Inhibit time that the host sets, in units of 100 µs; None if the host does not configure the nodes of
+    this bus."""
     eds_problem: str = ""
     """Why the EDS in the hand file does not match the patch; empty if it matches or no EDS is given."""
     found: FoundNode | None = None
@@ -104,7 +105,7 @@ class PatchFacts:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BusFacts:
-    """One bus and the patches on it."""
+    """Facts about one bus and the patches on it."""
 
     name: str
     interface: str
@@ -116,7 +117,7 @@ class BusFacts:
     """State of the CAN controller according to the kernel (ERROR-ACTIVE …)."""
     link_bitrate_bps: int | None = None
     seconds: float = 0.0
-    """Listening time."""
+    """Listening time, s."""
     frames: int = 0
     load: float = 0.0
     """Bus load as a fraction: in the busiest second of the capture or, without scans, in the last second."""
@@ -124,20 +125,20 @@ class BusFacts:
     dropped: int = 0
     outages: int = 0
     foreign: Mapping[int, int] = field(default_factory=dict)
-    """Number of unexplained frames by COB-ID."""
+    """Number of unexplained frames, keyed by COB-ID."""
     unconfigured: tuple[LssAddress, ...] = ()
     strangers: tuple[FoundNode, ...] = ()
     """Nodes that are not in the hand file."""
     period_s: float | None = None
-    """SYNC period, from the hand file."""
+    """SYNC period from the hand file, s."""
     sync_s: Float = field(default_factory=lambda: np.empty(0))
     """Times of the SYNCs received, s; empty if the doctor sends SYNC."""
     sync_counters: tuple[int, ...] = ()
     """Counters of the SYNCs received; 0 for a SYNC without a counter."""
     sync_ours: bool = False
     own_period_s: float = 0.0
-    """Period of the doctor's own SYNC; 0 if another node sends it. Longer than ``period_s`` if a node that no
-    host has configured needs more time for a scan."""
+    """Period of the SYNC that the doctor sends, s; 0 if another node sends SYNC. Exceeds ``period_s`` if a
+    node that no host has configured needs more time for a scan."""
     active: bool = False
     """Whether the doctor was allowed to start nodes that were not running."""
     role: str = "master"
@@ -149,7 +150,7 @@ class BusFacts:
     master_beats_s: Float | None = None
     """Times at which the host's heartbeat was received, s."""
     heartbeat_ms: int | None = None
-    """Heartbeat period, from the hand file."""
+    """Heartbeat period from the hand file, ms."""
     patches: tuple[PatchFacts, ...] = ()
 
     @property

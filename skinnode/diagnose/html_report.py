@@ -139,7 +139,7 @@ def _timeline(scans: ScanFacts) -> str:
         axes.plot(scans.t_s[1:], 1e3 * np.diff(scans.t_s), ".-", color="#2b6cb0", lw=0.8)
         axes.set_ylabel("ms since the previous scan")
     for number, t_s in enumerate(scans.t_s[~scans.complete]):
-        axes.axvline(t_s, color="#b3261e", lw=1, label=None if number else "scan with holes")
+        axes.axvline(t_s, color="#b3261e", lw=1, label=None if number else "incomplete scan")
     axes.set(xlabel="s", title="scans")
     axes.margins(y=0.1)
     axes.set_ylim(bottom=0.0)

@@ -17,7 +17,7 @@ from skinnode.errors import ConfigError
 from skinnode.host.lss_master import LssFailed
 
 BOOT_S: Final = 5.0
-"""Maximum time to boot with the new node-ID."""
+"""Maximum time for a node to boot with its new node-ID, s."""
 
 _ASKED_S: Final = 0.15
 _ASK_DEVICE_TYPE: Final = upload_request(od.DEVICE_TYPE, 0)
@@ -25,7 +25,7 @@ _ASK_DEVICE_TYPE: Final = upload_request(od.DEVICE_TYPE, 0)
 
 @dataclass(frozen=True, slots=True)
 class Commissioned:
-    """Result of a commissioning."""
+    """Result of setting a node's node-ID or bit rate by LSS."""
 
     address: LssAddress
     node_id_before: int | None
@@ -54,7 +54,7 @@ def only_unconfigured(connection: BusConnection) -> LssAddress:
 
 @dataclass(frozen=True, slots=True)
 class Commissioning:
-    """Values to set in a node."""
+    """Node-ID and bit rate to set in a node by LSS."""
 
     node_id: int | None
     """New node-ID; None to keep it."""
@@ -70,7 +70,7 @@ def commission(
     wanted: Commissioning,
     agreed: Callable[[int | None], bool],
 ) -> Commissioned | None:
-    """Set the node-ID, the bit rate or both.
+    """Set the node-ID of a node, its bit rate or both.
 
     Args:
         connection: The bus.
@@ -103,7 +103,7 @@ def commission(
     booted = True
     if node_id is not None and node_id != before:
         if before is not None:
-            time.sleep(0.01)  # the node switches to waiting mode first
+            time.sleep(0.01)  # the node must first switch to LSS waiting mode
             connection.link.send(od.NMT_COB_ID, nmt.encode(nmt.NmtCommand.RESET_COMMUNICATION, before))
         booted = connection.wait_until(lambda: connection.listener.node(node_id).boot_ups > boot_ups, BOOT_S)
         if not booted:
@@ -113,7 +113,7 @@ def commission(
 
 
 def _configure(connection: BusConnection, wanted: Commissioning) -> str:
-    """Set the values and store them; return why storing failed, or an empty string."""
+    """Set the values in the selected node and store them; return why storing failed, or an empty string."""
     if wanted.bitrate_bps is not None:
         connection.lss.set_bit_rate(wanted.bitrate_bps)
     if wanted.node_id is not None:
@@ -122,5 +122,5 @@ def _configure(connection: BusConnection, wanted: Commissioning) -> str:
         try:
             connection.lss.store()
         except LssFailed as error:
-            return f"not stored, so lost at power-off: {error}"
+            return f"the settings were not stored and will be lost at power-off: {error}"
     return ""

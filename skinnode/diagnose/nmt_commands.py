@@ -13,10 +13,10 @@ from skinnode.canopen.nmt import AFTER_COMMAND, ALL_NODES, NmtCommand, encode, s
 from skinnode.diagnose.bus_connection import BusConnection, State
 
 FOLLOW_S: Final = 1.5
-"""Maximum time, in addition to two heartbeat periods, for a node to report its new state."""
+"""Maximum time for a node to report its new state, s, in addition to two heartbeat periods."""
 
 BOOT_S: Final = 5.0
-"""Maximum boot time of a node."""
+"""Maximum boot time of a node, s."""
 
 _GUARD_EACH_S: Final = 0.1
 
@@ -47,7 +47,7 @@ _SPECIFIERS: Final = {
 
 @dataclass(frozen=True, slots=True)
 class Change:
-    """Effect of a command on one node."""
+    """Effect of an NMT command on one node."""
 
     node_id: int
     before: str
@@ -59,7 +59,7 @@ class Change:
 
 @dataclass(frozen=True, slots=True)
 class _Watch:
-    """State of a node before a command."""
+    """State of a node before an NMT command."""
 
     node_id: int
     heartbeat_s: float | None
@@ -71,7 +71,7 @@ class _Watch:
 def command_nodes(
     connection: BusConnection, node_ids: Sequence[int], command: Command, *, at_once: bool
 ) -> list[Change]:
-    """Send a command to nodes and observe its effect.
+    """Send an NMT command to nodes and observe its effect.
 
     Args:
         connection: The bus.
@@ -92,7 +92,7 @@ def command_nodes(
 
 
 def _watch(connection: BusConnection, node_id: int) -> _Watch:
-    """Read the values that the node can no longer return once it is stopped."""
+    """Read the values that a stopped node would not return."""
     heartbeat_s = connection.heartbeat_s(node_id)
     guarding = not connection.guarded(node_id)
     before = connection.state(node_id, heartbeat_s, guarding=guarding)
@@ -100,7 +100,7 @@ def _watch(connection: BusConnection, node_id: int) -> _Watch:
 
 
 def _followed(connection: BusConnection, watch: _Watch, command: Command, sent_ns: int) -> Change:
-    """Wait until the node reports the commanded state, or until time is up."""
+    """Wait until the node reports the commanded state, or until the time limit is reached."""
     wanted, since_ns = AFTER_COMMAND[_SPECIFIERS[command]], sent_ns
     end_s = time.monotonic() + FOLLOW_S + 2 * (watch.heartbeat_s or 0.0)
     while True:
@@ -115,7 +115,7 @@ def _followed(connection: BusConnection, watch: _Watch, command: Command, sent_n
 
 
 def _booted(connection: BusConnection, watch: _Watch, sent_ns: int) -> Change:
-    """Wait until the node has booted, and read its state."""
+    """Wait until the node has booted, and read its NMT state."""
     node_id = watch.node_id
     if not connection.wait_until(lambda: connection.listener.node(node_id).boot_ups > watch.boot_ups, BOOT_S):
         why = f"no boot-up message within {BOOT_S:g} s"

@@ -1,4 +1,4 @@
-"""Reads all information about one node. Nothing is written."""
+"""Reads all information about one node without writing to the node."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ class PatchInfo:
     shorted_upper: tuple[int, ...]
     open_lower: tuple[int, ...]
     shorted_lower: tuple[int, ...]
-    """Wires, counted from 0."""
+    """Numbers of the open and the shorted wires, counted from 0."""
     self_test: str
     rejected: dict[str, int]
     """Number of frames that the node ignored, by reason; reasons with a count of 0 are omitted."""
@@ -61,7 +61,7 @@ class PatchInfo:
 
 @dataclass(frozen=True, slots=True)
 class NodeInfo:
-    """Information about a node; None for whatever the node does not provide."""
+    """Information about a node; a value is None if the node does not provide it."""
 
     node_id: int
     state: str
@@ -106,7 +106,7 @@ class NodeInfo:
 
 
 class _Reader:
-    """Reads a node's optional objects."""
+    """Reads the optional objects of a node."""
 
     def __init__(self, remote: RemoteOd) -> None:
         self.remote = remote
@@ -273,7 +273,10 @@ def _spread(values: Float) -> tuple[float, float, float]:
 
 
 def read_baseline(remote: RemoteOd, profile: PatchProfile) -> Float:
-    """Return the (U, K) baseline R0 in ohm; 0 for a crossing without a baseline. Raises NodeError."""
+    """Read the (U, K) baseline R0 in ohm; 0 for a crossing without a baseline.
+
+    Raises NodeError if the upload fails or has the wrong size.
+    """
     data = remote.read_large(od.BASELINE_DOMAIN)
     if len(data) != 4 * profile.n_codes:
         raise NodeError(
@@ -284,7 +287,7 @@ def read_baseline(remote: RemoteOd, profile: PatchProfile) -> Float:
 
 
 def _masks(read: _Reader, index: int) -> tuple[tuple[int, ...], tuple[int, ...]]:
-    """Return the open and the shorted wires that 0x2030 or 0x2031 reports."""
+    """Return the numbers of the open and of the shorted wires from the fault masks in 0x2030 or 0x2031."""
     wires: tuple[list[int], list[int]] = ([], [])
     for sub in range(1, (read.number(index) or 0) + 1):
         word, first = read.number(index, sub) or 0, (sub - 1) // 2 * 32

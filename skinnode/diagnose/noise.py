@@ -1,12 +1,12 @@
-"""Estimates the noise at each crossing and on each wire, even while the skin is touched. Pure functions.
+"""Estimates the noise at each crossing and on each wire, even while the skin is touched.
 
-There are two estimates. Second differences of successive scans (variance 6 σ²) are insensitive to slow
-touches. The part of a crossing's signal that the other wires do not explain is insensitive to quick touches:
-the effects of a touch on the crossings of many wires are combinations of a few functions of time, whereas the
-noise of each crossing is independent. Both estimates are upper bounds on the noise, so the smaller of the two
-is used. A quick, deep and small touch affects both estimates. On touched skin a wire is therefore judged by
-comparing its smallest singular values, which a touch hardly affects, with those of its neighbours; the patch
-is judged by its own singular values.
+The functions are pure. There are two noise estimates. Second differences of successive scans (variance 6 σ²)
+are insensitive to slow touches. The part of a crossing's signal that the other wires do not explain is
+insensitive to quick touches. A touch affects the crossings of many wires by combinations of a few functions
+of time, whereas the noise of each crossing is independent. Both estimates are upper bounds on the noise, so
+the smaller of the two is used. A quick, deep and small touch affects both estimates. On touched skin, the
+smallest singular values of a wire, which a touch hardly affects, are therefore compared with those of its
+neighbours. The patch as a whole is judged by its own smallest singular values.
 """
 
 from __future__ import annotations
@@ -22,13 +22,15 @@ from skinnode.diagnose.facts import Counts, ScanFacts
 from skinnode.model.layout import Float
 
 LEAST_SCANS: Final = 20
-"""Minimum number of scans; with fewer, the estimated standard deviation is off by more than 25 %."""
+"""Minimum number of scans for a noise analysis; with fewer scans, the estimated standard deviation is off by
+more than 25 %."""
 
 _MOST_SCANS: Final = 64
 """Maximum number of scans used (the newest); computing time grows with the square of this number."""
 
 _FLOOR: Final = 8
-"""Number of singular values that form a patch's noise floor; they give the noise level to within 20 %."""
+"""Number of singular values that form a patch's noise floor; they determine the noise level to within 20
+%."""
 
 _MOVED: Final = 6.0
 """Minimum motion of a touched crossing, in units of the stated noise."""
@@ -42,10 +44,10 @@ _STEP: Final = 20.0
 _STAYS: Final = 0.3
 """Maximum difference between a jump and the change of the median, as a fraction of the jump."""
 _STILL: Final = 0.1
-"""Maximum standard deviation of a crossing once its jump is removed, as a fraction of the jump."""
+"""Maximum standard deviation of a crossing after its jump is removed, as a fraction of the jump."""
 _EVEN: Final = 0.2
-"""Maximum noise of a crossing once the common noise is removed, as a fraction of the common noise, for the
-supply to count as noisy."""
+"""Maximum noise of a crossing without the common noise, as a fraction of the common noise, if the supply
+counts as noisy."""
 
 Mask = NDArray[np.bool_]
 
@@ -63,7 +65,7 @@ class NoiseAnalysis:
     touched: Mask
     """Whether the crossing moved together with other crossings."""
     steps: Mask
-    """Whether the crossing was constant except for one jump of its own."""
+    """Whether the crossing was constant except for a single jump."""
     step_at: Counts
     step_by: Float
     upper: Float
@@ -79,7 +81,7 @@ class NoiseAnalysis:
 
     @property
     def is_touched(self) -> bool:
-        """Whether something touched the skin."""
+        """Whether something touched the skin during the scans."""
         return int(self.touched.sum()) >= _TOUCHED
 
 
@@ -124,7 +126,8 @@ def _unexplained(moved: Float) -> Float:
     """Return the (U, K) standard deviations of the part of the motion that other wires do not explain.
 
     For each upper wire, the leading half of the temporal components of all other upper wires is projected
-    out; likewise for each lower wire; at each crossing the larger residual is used. ``moved`` has mean 0.
+    out. The same is done for each lower wire. At each crossing, the larger of the two residuals is used.
+    ``moved`` has mean 0.
     """
     count = len(moved)
     flat = moved.reshape(count, -1)
@@ -168,7 +171,7 @@ def _of_noise(shape: tuple[int, int], values: int) -> float:
 
 
 def _steps(safe: Float) -> tuple[Counts, Float, Mask]:
-    """Return the scan and height of each crossing's largest jump, and whether it is otherwise constant.
+    """Return scan and height of each crossing's largest jump, and whether the crossing is otherwise constant.
 
     A crossing is otherwise constant if its medians before and after the jump differ by the jump's height, and
     there is little other variation.

@@ -1,6 +1,6 @@
 """Reads, writes, dumps and compares a node's object dictionary, with names and types from its EDS (CiA 306).
 
-Without an EDS, objects have their CiA 301 names (``standard_objects``).
+Without an EDS, objects are named as in CiA 301 (``standard_objects``).
 """
 
 from __future__ import annotations
@@ -39,7 +39,8 @@ _BOOLEAN, _TEXT = 0x01, 0x09
 _REALS: Final = {0x08: "<f", 0x11: "<d"}
 _STRINGS: Final = ("VISIBLE_STRING", "OCTET_STRING", "UNICODE_STRING", "DOMAIN")
 NOT_CONFIGURATION: Final = (od.ERROR_REGISTER, od.ERROR_FIELD, od.STORE, od.RESTORE)
-"""Objects that hold the state of a node rather than its configuration, even if its EDS gives a default."""
+"""Objects that hold the state of a node rather than its configuration, even if its EDS specifies a
+default."""
 _LONGEST_SHOWN: Final = 16
 _ADDRESS: Final = re.compile(r"(?:0[xX])?([0-9A-Fa-f]{1,4})(?::(0[xX][0-9A-Fa-f]{1,2}|[0-9]{1,3}))?")
 
@@ -89,7 +90,7 @@ class Reading:
 
 @dataclass(frozen=True, slots=True)
 class Difference:
-    """An object whose value on the node differs from that in a file."""
+    """Object whose value on the node differs from its value in a file."""
 
     index: int
     subindex: int
@@ -132,7 +133,7 @@ def decode(entry: EdsEntry, data: bytes) -> Value | None:
 
 
 def encode(entry: EdsEntry, text: str, node_id: int) -> bytes:
-    """Return the bytes of a value that the user typed.
+    """Return the bytes of a value that the user entered.
 
     Args:
         entry: The object.
@@ -158,13 +159,13 @@ def encode(entry: EdsEntry, text: str, node_id: int) -> bytes:
     where = (
         f"{entry} is {kind}"
         if entry.data_type
-        else f"the type of {entry} is given only in its EDS (--eds FILE)"
+        else f"the type of {entry} is specified only in the EDS of the node (--eds FILE)"
     )
     raise ConfigError("--write", text, f"--hex and bytes in hexadecimal: {where}")
 
 
 def read_entry(remote: RemoteOd, entry: EdsEntry) -> Reading:
-    """Read a value; an abort is also returned as a reading. Raises NodeError if the node does not answer."""
+    """Read a value, or the reason for an SDO abort. Raises NodeError if the node does not answer."""
     named = entry.index, entry.subindex, entry.name, type_name(entry), entry.access
     try:
         data = remote.read_bytes(entry.index, entry.subindex, MAX_UPLOAD_BYTES)
@@ -180,7 +181,7 @@ def type_name(entry: EdsEntry) -> str:
 
 
 def abort_text(abort: SdoAbort) -> str:
-    """Return the code and reason of an abort."""
+    """Return the code and reason of an SDO abort as text."""
     return f"0x{abort.code:08X} {str(abort).rpartition(': ')[2]}"
 
 
@@ -194,10 +195,10 @@ def entries_at(eds: Eds, index: int, subindex: int | None, count: Callable[[], i
     """Return the entries at an address.
 
     Args:
-        eds: Names of the objects; an object missing there has its CiA 301 name, or no name.
+        eds: Names of the objects; an object missing from the EDS has its CiA 301 name, if any.
         index: Index.
-        subindex: One value; None for all values of the object.
-        count: Reads sub-index 0 of the object.
+        subindex: Sub-index of one value; None for all values of the object.
+        count: Callback that reads sub-index 0 of the object.
     """
     if subindex is None:
         listed = list(eds.between(index, index))
@@ -251,7 +252,7 @@ def compare(
 
     Args:
         remote: The node.
-        eds: The file; each readable value given there is compared, except the node's state.
+        eds: The file. Its readable values are compared, except objects that hold the node's state.
         node_id: Replaces $NODEID.
         progress: Called from time to time with a description of the progress.
 
@@ -283,17 +284,17 @@ def compare(
 
 
 def _same(entry: EdsEntry, data: bytes, wanted: bytes) -> bool:
-    """Return whether the node's value equals the file's.
+    """Return whether the node's value equals the value in the file.
 
-    Trailing zeros of a string count only if the file gives the bytes, because an EDS default cannot express
-    them.
+    Ignores trailing zeros of a string unless the file specifies its bytes, because an EDS default cannot
+    express trailing zeros.
     """
     spelt_out = entry.data_type != _TEXT or entry.given is not None
     return data == wanted or (not spelt_out and data.rstrip(b"\0") == wanted)
 
 
 def _distinct(got: Reading, expected: Reading) -> tuple[str, str]:
-    """Return two different values as texts that differ.
+    """Return two different values as different texts.
 
     If the plain texts are equal, the bytes from the first difference onwards are appended.
     """

@@ -15,7 +15,7 @@ Direction = Literal["TPDO", "RPDO"]
 
 _CAN_ID: Final = 0x1FFF_FFFF
 _KINDS: Final = {
-    0: "at SYNC, if there was an event",
+    0: "at SYNC, if an event occurred",
     252: "sampled at SYNC, sent on request",
     253: "on request",
     254: "on event",
@@ -25,11 +25,11 @@ _KINDS: Final = {
 
 @dataclass(frozen=True, slots=True)
 class Pdo:
-    """One PDO. Times are in CiA 301 units; a value is None if the node lacks the sub-index."""
+    """Parameters of one PDO. Times are in CiA 301 units; a value is None if the node lacks the sub-index."""
 
     direction: Direction
     number: int
-    """Number, from 1."""
+    """PDO number, counted from 1."""
     cob_id: int
     enabled: bool
     kind: int
@@ -52,7 +52,7 @@ def read_pdos(remote: RemoteOd) -> tuple[Pdo, ...]:
 
 
 def read_pdo(remote: RemoteOd, direction: Direction, number: int) -> Pdo | None:
-    """Read one PDO; None if the node lacks it."""
+    """Read the parameters of one PDO; None if the node does not have the PDO."""
     first = od.TPDO1_PARAMETER if direction == "TPDO" else od.RPDO1_PARAMETER
     index = first + number - 1
     cob_id = _optional(remote, index, od.PDO_COB_ID, "u32")
@@ -120,7 +120,7 @@ def pdo_text(pdo: Pdo, name_of: Callable[[int, int], str]) -> str:
 
 
 def _shortened(names: list[str]) -> str:
-    """Merge runs of names that differ only in their number."""
+    """Merge consecutive names that differ only in their number."""
     shown: list[str] = []
     for name in names:
         stem, _, number = name.rpartition(" ")

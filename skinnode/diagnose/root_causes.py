@@ -1,7 +1,7 @@
 """Groups findings by root cause: a finding that follows from another is listed below it.
 
 For example, an overloaded bus causes torn scans, skipped scans and emergencies at every patch on it. All
-these findings are true, but none of them is the fault to be repaired. A rule names a cause and its possible
+these findings are true, but only the overload needs to be corrected. A rule names a cause and its possible
 consequences, at the same patch or at every patch on a bus. If the text of a finding is ambiguous, its
 evidence decides: emergencies follow from an overload only if each of their texts reports an overrun.
 """
@@ -43,8 +43,8 @@ class Rule:
     of its evidence matches."""
 
 
-_HOLES: Final = ("scans with holes", "whole scans are missing")
-_LATE: Final = (*_HOLES, "scans end after the next has begun")
+_HOLES: Final = ("incomplete scans", "whole scans are missing")
+_LATE: Final = (*_HOLES, "scans end after the next scan has begun")
 _OF_SYNC: Final = ("SYNCs are missing", "SYNC is irregular")
 _ERRORS: Final = ("emergency messages during the examination", "the node reports an error")
 _CONFIGURED_BY_OTHERS: Final = (
@@ -68,7 +68,7 @@ _ANYTHING: Final[Mapping[str, str]] = {}
 # precedes any rule whose cause may be a consequence of its own cause.
 RULES: Final = (
     Rule(
-        "two nodes have its node-ID",
+        "two nodes have the patch's node-ID",
         (
             "two different chunks with the same number",
             "frames that are not chunks of this patch",
@@ -83,9 +83,9 @@ RULES: Final = (
         (
             *_LATE,
             *_CONFIGURED_BY_OTHERS,
-            "the node is .* while others run",
+            "the node is .* while other nodes are operational",
             "the node is .* and does not answer",
-            "some of its objects could not be read",
+            "some objects of the node could not be read",
             *_ERRORS,
         ),
         _RESTARTED,
@@ -99,11 +99,16 @@ RULES: Final = (
     ),
     Rule(
         "the interface failed during the examination",
-        (*_LATE, *_OF_SYNC, "the node is .* and does not answer", "some of its objects could not be read"),
+        (
+            *_LATE,
+            *_OF_SYNC,
+            "the node is .* and does not answer",
+            "some objects of the node could not be read",
+        ),
         _ANYTHING,
     ),
     Rule(
-        "two producers of SYNC",
+        "two SYNC producers",
         (
             "two masters send the same heartbeat",
             "another device sends NMT commands",
@@ -118,7 +123,13 @@ RULES: Final = (
     Rule("two masters send the same heartbeat", ("another device sends NMT commands", *_OF_SYNC), _ANYTHING),
     Rule(
         "the bus load exceeds the planning limit",
-        (*_LATE, *_OF_SYNC, "this machine dropped frames", "some of its objects could not be read", *_ERRORS),
+        (
+            *_LATE,
+            *_OF_SYNC,
+            "this machine dropped frames",
+            "some objects of the node could not be read",
+            *_ERRORS,
+        ),
         _OVERRUN,
     ),
     Rule("this machine dropped frames", (*_HOLES, *_OF_SYNC), _ANYTHING),
@@ -133,14 +144,14 @@ RULES: Final = (
         ".*crossings? have no baseline|.*crossing has no baseline", (".*crossings? out of range",), _ANYTHING
     ),
     Rule(
-        "its layout differs",
+        "the layout differs",
         ("the code width differs from the hand file", "the EDS in the hand file"),
         _ANYTHING,
     ),
     Rule("SYNCs are missing", ("whole scans are missing", "SYNC is irregular"), _ANYTHING),
     Rule(
         "the node reports an error",
-        ("emergency messages during the examination", "the node is .* while others run"),
+        ("emergency messages during the examination", "the node is .* while other nodes are operational"),
         _ANYTHING,
     ),
 )
@@ -156,7 +167,10 @@ def grouped(buses: Sequence[BusFacts]) -> list[Group]:
 
 
 def merged(findings: Sequence[Finding]) -> list[tuple[Finding, tuple[str, ...]]]:
-    """Return each distinct finding once, with its places; an overload, for example, affects every patch."""
+    """Return each distinct finding once, with all places where it occurred.
+
+    For example, an overload affects every patch on a bus.
+    """
     places: dict[str, list[Finding]] = {}
     for finding in findings:
         places.setdefault(finding.what, []).append(finding)
@@ -164,7 +178,7 @@ def merged(findings: Sequence[Finding]) -> list[tuple[Finding, tuple[str, ...]]]
 
 
 def _of_bus(bus: str, findings: list[Finding]) -> list[Group]:
-    """Assign each finding to the first rule that matches; a chain of causes ends at its root."""
+    """Assign each finding to its cause by the first matching rule, and group all findings by root cause."""
     cause_of: dict[int, int] = {}
     for rule in RULES:
         for at, cause in enumerate(findings):

@@ -44,7 +44,7 @@ class ScanCapture:
             node_id: The node.
             profile: Sizes of the patch.
             overflow: Overflow value of the SYNC counter.
-            period_s: SYNC period.
+            period_s: SYNC period, s.
         """
         assembler = ScanAssembler(
             profile, counter_overflow=overflow, period_ns=round(period_s * 1e9), node_id=node_id
@@ -58,7 +58,7 @@ class ScanCapture:
         return len(self._patches[node_id].scans)
 
     def on_frames(self, frames: Sequence[Frame]) -> None:
-        """Process a batch of frames."""
+        """Process a batch of received frames."""
         for frame in frames:
             if frame.error or frame.remote or frame.extended:
                 continue
@@ -66,7 +66,7 @@ class ScanCapture:
                 self.note_sync(frame.t_ns, frame.data[0] if frame.data else 0)
             elif (taker := self._takers.get(frame.can_id)) is not None:
                 patch, chunk = taker
-                if not patch.begun:  # its first scan began before the capture
+                if not patch.begun:  # the first scan began before the capture
                     patch.begun = not chunk
                     continue
                 take = patch.assembler.on_chunk if chunk else patch.assembler.on_summary
@@ -83,8 +83,8 @@ class ScanCapture:
 
         Args:
             node_id: The node.
-            scale: Scale of its codes.
-            stated_noise: Relative noise of its converter, from the hand file.
+            scale: Scale of the patch's codes.
+            stated_noise: Relative noise of the patch's converter, from the hand file.
         """
         patch = self._patches[node_id]
         patch.keep(patch.assembler.poll(time.monotonic_ns()), self._sync_ns)
@@ -124,7 +124,10 @@ class ScanCapture:
 
 
 def _conversions(scans: Sequence[Scan]) -> tuple[int | None, int]:
-    """Return the numbers of scans with a new and with a repeated conversion; None, 0 without a phase."""
+    """Return the numbers of scans with a new and with a repeated conversion.
+
+    Returns None and 0 if the scans carry no conversion phase.
+    """
     pairs = [
         (before.phase, scan.phase)
         for before, scan in itertools.pairwise(scans)

@@ -1,4 +1,4 @@
-"""Objects whose names and types CiA 301 v4.2 (7.5.2) defines, for describing a device without an EDS.
+"""Defines the names and types of CiA 301 v4.2 objects (7.5.2), used to describe a device without an EDS.
 
 Sub-index 0 of an array or record is the number of entries, which is read from the device.
 """

@@ -27,14 +27,14 @@ from skinnode.model.layout import Float
 from skinnode.protocol.profile import PatchProfile
 
 QUIET_S: Final = 0.3
-"""Duration of silence on a node's SDO channel that rules out an ongoing transfer by another client."""
+"""Duration of silence on a node's SDO channel, s, that rules out an ongoing transfer by another client."""
 
 HOST_BEGINS_S: Final = 1.0
-"""Maximum time, in addition to a SYNC period, from the tare to the host's first SDO request; an idle host
+"""Maximum time from the tare to the host's first SDO request, s, in addition to a SYNC period; an idle host
 takes 0.3 s."""
 
 OTHERS_S: Final = 4.0
-"""Maximum wait for other SDO clients to finish."""
+"""Maximum wait for other SDO clients to finish, s."""
 
 _ATTEMPTS: Final = 3
 _POLL_S: Final = 0.02
@@ -49,7 +49,7 @@ class Tared:
     node_id: int
     bus: str
     problem: str
-    """Why the patch was not tared; empty if it was."""
+    """Why the patch was not tared; empty if it was tared."""
     crossings: int = 0
     """Number of crossings with a new R0."""
     median_ohm: float | None = None
@@ -86,7 +86,7 @@ def tare(
         connection: The bus.
         node_id: The node.
         patch: Name of the patch; empty if no hand file names it.
-        sync_period_s: SYNC period of a host that may be running.
+        sync_period_s: SYNC period of a host that may be running, s.
         progress: Called with a description of each step.
 
     Returns:
@@ -120,7 +120,9 @@ def _tare(
     except SdoAbort as abort:
         if abort.code != AbortCode.HARDWARE:
             raise
-        raise NodeError(node_id, f"its converter gave no reading (SDO abort 0x{abort.code:08X})") from None
+        raise NodeError(
+            node_id, f"its converter returned no reading (SDO abort 0x{abort.code:08X})"
+        ) from None
     runs = _runs(connection, node_id)
     progress(f"{who}: reading its baseline")
     _let_others_finish(connection, node_id, at_least_s=HOST_BEGINS_S + sync_period_s if runs else 0.0)

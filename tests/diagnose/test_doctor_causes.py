@@ -78,12 +78,12 @@ def test_an_overload_and_five_faults_are_in_order() -> None:
     assert groups[-1].cause.sure is Sure.POSSIBLE
     overload = named["can0: the bus load exceeds the planning limit"]
     below = {(finding.where, finding.what) for finding in overload.consequences}
-    assert ("ring", "scans with holes") in below
-    assert ("ring", "scans end after the next has begun") in below
+    assert ("ring", "incomplete scans") in below
+    assert ("ring", "scans end after the next scan has begun") in below
     assert ("ring", "emergency messages during the examination") in below
     assert not any(where == "thumb" for where, _ in below)  # that it restarts is nearer
     restarts = named["thumb: the node restarts by itself"]
-    assert {finding.what for finding in restarts.consequences} >= {"scans with holes"}
+    assert {finding.what for finding in restarts.consequences} >= {"incomplete scans"}
     wire = named["index: upper wires open: 2"]
     assert {finding.what for finding in wire.consequences} == {"emergency messages during the examination"}
     places = {finding.what: where for finding, where in merged(overload.consequences)}

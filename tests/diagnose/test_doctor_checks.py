@@ -54,8 +54,8 @@ def test_a_healthy_hand_has_no_finding(seed: int) -> None:
             Sure.CERTAIN,
         ),
         ({"dropped": 12}, "this machine dropped frames", Sure.CERTAIN),
-        ({"sync_s": np.empty(0)}, "nobody sends SYNC", Sure.CERTAIN),
-        ({"sync_counters": (1, 200, 2, 201, 3, 202) * 4}, "two producers of SYNC", Sure.CERTAIN),
+        ({"sync_s": np.empty(0)}, "no node sends SYNC", Sure.CERTAIN),
+        ({"sync_counters": (1, 200, 2, 201, 3, 202) * 4}, "two SYNC producers", Sure.CERTAIN),
         (
             {"master_node_id": 1, "master_beats_s": 0.125 * np.arange(9)},
             "two masters send the same heartbeat",
@@ -96,8 +96,8 @@ def test_one_master_is_as_it_should_be(changes: dict[str, Any]) -> None:
     ("changes", "what"),
     [
         ({"found": node(state="stopped", answers=False)}, "is stopped and does not answer"),
-        ({"found": node(duplicate="one request got 2 responses")}, "two nodes have its node-ID"),
-        ({"found": node(product_code=1)}, "another device has its node-ID"),
+        ({"found": node(duplicate="one request got 2 responses")}, "two nodes have the patch's node-ID"),
+        ({"found": node(product_code=1)}, "another device has the patch's node-ID"),
         ({"found": node(boot_ups=3)}, "restarts by itself"),
         ({"boot_ups": 2}, "restarts by itself"),
         (
@@ -118,7 +118,7 @@ def test_a_guest_whose_master_sends_no_sync() -> None:
     """Also where that master has started no node."""
     idle = replace(WELL, found=node(state="pre-operational"), scans=None)
     finding = one(bus_of(idle, role="guest", sync_s=np.empty(0)))
-    assert (finding.what, finding.sure) == ("nobody sends SYNC", Sure.CERTAIN)
+    assert (finding.what, finding.sure) == ("no node sends SYNC", Sure.CERTAIN)
     assert finding.evidence == "none in 6.0 s, and the host is a guest here"
     assert run_checks(bus_of(idle, sync_s=np.empty(0))) == []  # its host does not run
 
@@ -203,7 +203,7 @@ def test_faults_are_found_while_somebody_touches_the_skin(
     lower[..., seed] *= 1.0 + 3e-3 * random.standard_normal(lower[..., seed].shape)
     assert told_of(lower) == {f"noise on lower wire {seed}"}
     whole = stroked(layout, seed, depth=depth, converter_noise=1e-4)
-    assert told_of(whole) == {"the whole patch is noisier than the hand file says"}
+    assert told_of(whole) == {"the whole patch is noisier than the hand file states"}
     loose[10:20:3, seed, 5] = np.nan
     n_open = np.zeros(layout.shape, dtype=np.int64)
     n_open[seed, 5] = 4
@@ -216,7 +216,7 @@ def test_faults_are_found_while_somebody_touches_the_skin(
 def test_noise_of_the_supply_is_alike_in_all_crossings() -> None:
     hum = 1.0 + 20 * NOISE * np.random.default_rng(3).standard_normal((50, 1, 1))
     finding = skin(quiet_ratio() * hum)
-    assert finding.what == "the whole patch is noisier than the hand file says"
+    assert finding.what == "the whole patch is noisier than the hand file states"
     assert finding.evidence.startswith("all crossings together: ")
 
 
@@ -224,7 +224,7 @@ def test_a_jump_that_stays() -> None:
     ratio = quiet_ratio()
     ratio[25:, 1, 4] += 0.03
     finding = skin(ratio)
-    assert finding.what == "1 crossing jumped and stayed"
+    assert finding.what == "1 crossing jumped and kept the new value"
     assert "1/4 by 3.0" in finding.evidence
     assert finding.sure is Sure.POSSIBLE
 
@@ -253,7 +253,7 @@ def test_drift_of_the_baseline() -> None:
     assert "+1.20 %" in finding.evidence.replace("%", " %")
     part = quiet_ratio()
     part[:, 0, :4] *= 0.97
-    assert skin(part).what == "part of the skin is not at its baseline"
+    assert skin(part).what == "part of the skin differs from its baseline"
     assert skin(part).sure is Sure.POSSIBLE
 
 
@@ -275,7 +275,7 @@ def test_crossings_open_always_and_now_and_then() -> None:
 @pytest.mark.parametrize(
     ("counts", "what"),
     [
-        ({"scans_torn": 2, "chunks_lost": 5}, "scans with holes"),
+        ({"scans_torn": 2, "chunks_lost": 5}, "incomplete scans"),
         ({"scans_corrupt": 2}, "codes differ from those that the node packed"),
         ({"bad_form": 3}, "frames that are not chunks of this patch"),
         ({"scans_missed": 3}, "whole scans are missing"),

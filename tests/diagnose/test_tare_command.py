@@ -59,7 +59,7 @@ def test_what_was_not_tared_is_said(bus: BusConfig, powered: Powered) -> None:
     done = run(["tare", "5", "9", "--json"], bus)
     assert done.status == 1
     assert [(row["node_id"], row["tared"], row["problem"]) for row in done.json] == [
-        (5, False, "its converter gave no reading (SDO abort 0x06060000)"),
+        (5, False, "its converter returned no reading (SDO abort 0x06060000)"),
         (9, False, "does not answer SDO requests"),
     ]
     assert run(["tare"], bus).stderr.startswith("error: PATCH: got nothing, allowed: names of patches")

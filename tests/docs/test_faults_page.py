@@ -78,7 +78,7 @@ def test_every_finding_of_the_doctor_is_on_the_page() -> None:
     assert {
         "the interface does not work",
         "the controller is …",
-        "scans with holes",
+        "incomplete scans",
         "… crossings …",
     } <= named
     assert len(named) > 35

@@ -1,4 +1,4 @@
-"""Case EDS-01: the EDS is consistent with itself, with CiA 301 and with the device's identity."""
+"""Conformance case EDS-01: the EDS is consistent with itself, with CiA 301 and with the device's identity."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ def _entry(entry: EdsEntry, node_id: int) -> Iterator[str]:
 
 
 def _doubtful(entry: EdsEntry, node_id: int) -> Iterator[str]:
-    """Yield each property that the standard permits but some tools cannot handle."""
+    """Yield each property of an EDS entry that the standard permits but some tools cannot handle."""
     if entry.mappable and not entry.size and entry.data_type in _TEXTS and entry.data_type != _DOMAIN:
         yield f"{entry}: mappable, but of variable length"
     if entry.low is not None and entry.high is not None and entry.low > entry.high:
@@ -101,7 +101,7 @@ def _doubtful(entry: EdsEntry, node_id: int) -> Iterator[str]:
     try:
         value = _default(entry, node_id)
     except ValueError:
-        return  # a fault
+        return  # _entry reports this fault
     if value is None:
         return
     if (entry.low is not None and value < entry.low) or (entry.high is not None and value > entry.high):
@@ -109,7 +109,10 @@ def _doubtful(entry: EdsEntry, node_id: int) -> Iterator[str]:
 
 
 def _default(entry: EdsEntry, node_id: int) -> int | None:
-    """Return the default as a number, or None if there is none. Raises ValueError if it is not a number."""
+    """Return the default of a numeric entry; None if the entry has no default or is not numeric.
+
+    Raises ValueError if the default is not a number.
+    """
     if not entry.default or entry.data_type in (*_TEXTS, *_REALS):
         return None
     return number(entry.default, node_id)

@@ -1,4 +1,4 @@
-"""EMCY 1 to 6: emergency messages, error register and error history."""
+"""Conformance cases EMCY-01 to EMCY-06: emergency messages, error register and error history."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _NO_DATA = 0x0800_0024
 _GENERIC = 1
 
 
-@case("EMCY-01", "0x1014 is 0x80 + node-ID", "7.5.2.17; 7.3.3")
+@case("EMCY-01", "0x1014, the COB-ID of emergency messages, is 0x80 + node-ID", "7.5.2.17; 7.3.3")
 def cob_id(dut: Dut) -> None:
     dut.need(_COB_ID)
     got = dut.sdo.integer(_COB_ID)
@@ -73,4 +73,6 @@ def history_after(dut: Dut) -> None:
     request = expedited(_HISTORY, 0, b"\x01")
     dut.sdo.aborts(request, _HISTORY, 0, (0x0609_0030, 0x0609_0031), "write of 1 to 0x1003:00")
     dut.sdo.write_integer(_HISTORY, 0, 0, 1)
-    dut.sdo.aborts(b"\x40" + mux(_HISTORY, 1), _HISTORY, 1, (_NO_DATA,), "read of 0x1003:01 after clearing")
+    dut.sdo.aborts(
+        b"\x40" + mux(_HISTORY, 1), _HISTORY, 1, (_NO_DATA,), "read of 0x1003:01 after clearing it"
+    )

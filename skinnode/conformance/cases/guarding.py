@@ -1,4 +1,4 @@
-"""GUARD 1 to 6: node guarding and life guarding."""
+"""Conformance cases GUARD-01 to GUARD-06: node guarding and life guarding."""
 
 from __future__ import annotations
 
@@ -12,7 +12,10 @@ _GUARD_MS, _FACTOR = 100, 3
 
 
 def guarded(dut: Dut, state: int, toggle: int | None, what: str) -> None:
-    """Raise Failed unless the node answers a remote frame with this state and toggle bit (None: either)."""
+    """Raise Failed unless the node answers a remote frame with ``state`` and ``toggle``.
+
+    ``toggle`` is the expected toggle bit; None accepts either value.
+    """
     got = dut.guard(what)
     toggle_text = "any toggle bit" if toggle is None else f"toggle bit {toggle}"
     if got is None:
@@ -23,7 +26,7 @@ def guarded(dut: Dut, state: int, toggle: int | None, what: str) -> None:
         )
 
 
-@case("GUARD-01", "0x100C and 0x100D are 0 by default: no life guarding", "7.5.2.11, 7.5.2.12")
+@case("GUARD-01", "0x100C and 0x100D are 0 by default, which disables life guarding", "7.5.2.11, 7.5.2.12")
 def defaults(dut: Dut) -> None:
     for index in (GUARD_TIME, LIFE_TIME_FACTOR):
         default = dut.need(index).default_bytes(dut.node_id)
@@ -48,7 +51,7 @@ def toggle(dut: Dut) -> None:
     for number in range(5):
         guarded(dut, 127, number % 2, f"answer {number + 1}")
     dut.reset(RESET_COMMUNICATION)
-    guarded(dut, 127, 0, "first after a communication reset")
+    guarded(dut, 127, 0, "the first after a communication reset")
 
 
 @case("GUARD-04", "Remote frames for other node-IDs are not answered", "7.2.8.3.2.1; 7.3.3")

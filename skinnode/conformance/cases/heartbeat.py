@@ -1,4 +1,4 @@
-"""HB 1 to 7: heartbeat producer (0x1017) and consumer (0x1016)."""
+"""Conformance cases HB-01 to HB-07: heartbeat producer (0x1017) and consumer (0x1016)."""
 
 from __future__ import annotations
 
@@ -60,11 +60,15 @@ def twice(dut: Dut) -> None:
     partner = foreign_id(dut)
     consume(dut, partner, 1000)
     request = expedited(CONSUMER, 2, (partner << 16 | 2000).to_bytes(4, "little"))
-    dut.sdo.aborts(request, CONSUMER, 2, (0x0604_0043,), f"node {partner} written to 0x1016:02 as well")
+    dut.sdo.aborts(
+        request, CONSUMER, 2, (0x0604_0043,), f"write of a second entry for node {partner} to 0x1016:02"
+    )
 
 
 @case(
-    "HB-05", "Heartbeats that arrive in time cause no emergency message and no change of state", "7.2.8.2.2.2"
+    "HB-05",
+    "Heartbeats that arrive in time cause neither an emergency message nor a change of state",
+    "7.2.8.2.2.2",
 )
 def in_time(dut: Dut) -> None:
     partner = foreign_id(dut)
@@ -83,7 +87,7 @@ def too_late(dut: Dut) -> None:
     partner = foreign_id(dut)
     consume(dut, partner, 100)
     dut.operational()
-    for _ in range(2):  # monitoring resumes with the next heartbeat
+    for _ in range(2):  # after a late heartbeat, monitoring resumes with the next heartbeat
         sent_ns = beat(dut, partner)
         frame = expect_emcy(dut, COMMUNICATION_LOST, "when a heartbeat is late")
         not_before(frame, sent_ns, 100, "EMCY 0x8130")

@@ -1,4 +1,7 @@
-"""HBVG 1 to 7: a device uses either heartbeat or guarding, and heartbeat has priority (7.2.8.2.2)."""
+"""Conformance cases HBVG-01 to HBVG-07: a device uses either heartbeat or guarding (7.2.8.2.2).
+
+If both are enabled, heartbeat has priority.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +17,10 @@ _CLAUSE = "7.2.8.2.2"
 
 
 def _both(dut: Dut, heartbeat_ms: int, guard_ms: int) -> None:
-    """Set heartbeat and guarding. Raises NotApplicable if the device supports only one of the two."""
+    """Set the heartbeat period and the guard time.
+
+    Raises NotApplicable if the device supports only one of the two.
+    """
     dut.need(HEARTBEAT)
     dut.need(GUARD_TIME)
     dut.need(LIFE_TIME_FACTOR)
@@ -24,7 +30,7 @@ def _both(dut: Dut, heartbeat_ms: int, guard_ms: int) -> None:
 
 
 def _heartbeats(dut: Dut, *, remote: bool) -> None:
-    """Check that only heartbeats arrive, at the set period, even if remote frames are sent in between."""
+    """Check that only heartbeats arrive, at the set period; ``remote`` sends a remote frame after each."""
     frames = []
     for _ in range(8):
         frames.append(dut.bus.expect(dut.error_control_id, "a heartbeat"))
@@ -38,7 +44,7 @@ def _heartbeats(dut: Dut, *, remote: bool) -> None:
 
 @case(
     "HBVG-01",
-    "The device has heartbeat or guarding; after a reset at most one is active",
+    "The device supports heartbeat or guarding; after a reset, at most one of them is active",
     _CLAUSE,
 )
 def supported(dut: Dut) -> None:
@@ -54,7 +60,7 @@ def supported(dut: Dut) -> None:
 @case("HBVG-02", "Heartbeat off, guarding off: the device sends nothing unsolicited", _CLAUSE)
 def both_off(dut: Dut) -> None:
     _both(dut, 0, 0)
-    dut.bus.expect_silence(dut.error_control_id, "frame of error control", 3 * _PERIOD_MS * 1e-3)
+    dut.bus.expect_silence(dut.error_control_id, "error-control frame", 3 * _PERIOD_MS * 1e-3)
 
 
 @case("HBVG-03", "Heartbeat off, guarding on: remote frames are answered, and nothing else is sent", _CLAUSE)
@@ -62,7 +68,7 @@ def guarding_on(dut: Dut) -> None:
     _both(dut, 0, 1000)
     for number in range(4):
         guarded(dut, 127, number % 2, "heartbeat off")
-    dut.bus.expect_silence(dut.error_control_id, "frame of error control")
+    dut.bus.expect_silence(dut.error_control_id, "error-control frame")
 
 
 @case("HBVG-04", "Heartbeat on, guarding off: heartbeats are sent", _CLAUSE)

@@ -1,4 +1,8 @@
-"""OD 1 to 9: the objects in the EDS; 1 to 6 cover indices up to 0x1FFF, 7 to 9 higher indices."""
+"""Conformance cases OD-01 to OD-09: access to the objects described in the EDS.
+
+OD-01, OD-02 and OD-05 cover 0x1000 to 0x1FFF, OD-07 to OD-09 cover 0x2000 to 0x9FFF, and the other cases
+cover all objects.
+"""
 
 from __future__ import annotations
 
@@ -34,8 +38,8 @@ def _read_all(dut: Dut, entries: Iterable[EdsEntry]) -> None:
                 faults.append(f"{entry}: {abort}")
             continue
         if entry.size and len(value) != entry.size:
-            faults.append(f"{entry}: {counted(len(value), 'byte')}, but its type needs {entry.size}")
-    _none("every object readable, with the length of its type", faults)
+            faults.append(f"{entry}: {counted(len(value), 'byte')}, but its data type has {entry.size}")
+    _none("every object to be readable and to have the length of its data type", faults)
 
 
 def _none(expected: str, faults: list[str]) -> None:
@@ -62,12 +66,14 @@ def _compare_defaults(dut: Dut, entries: Iterable[EdsEntry]) -> None:
             (doubts if entry.index in (STORE, RESTORE) and entry.subindex else faults).append(text)
     _none("the default values given in the EDS", faults)
     if doubts:
-        raise Warned(f"its store or restore capabilities differ from those in the EDS: {'; '.join(doubts)}")
+        raise Warned(
+            f"the device's store or restore capabilities differ from those in the EDS: {'; '.join(doubts)}"
+        )
 
 
 @case(
     "OD-01",
-    "Every readable object from 0x1000 to 0x1FFF can be read and has the length of its type",
+    "Every readable object from 0x1000 to 0x1FFF can be read and has the length of its data type",
     "7.4, 7.5.2",
 )
 def read_communication(dut: Dut) -> None:
@@ -85,7 +91,7 @@ def read_only(dut: Dut) -> None:
     for entry in dut.eds.entries.values():
         if entry.access in ("ro", "const"):
             request = expedited(entry.index, entry.subindex, bytes(entry.size if 0 < entry.size <= 4 else 4))
-            if entry.size > 4:  # too long for an expedited request
+            if entry.size > 4:  # an expedited request holds at most four bytes
                 request = b"\x21" + mux(entry.index, entry.subindex) + bytes((entry.size, 0, 0, 0))
             dut.sdo.aborts(request, entry.index, entry.subindex, READ_ONLY, f"write to {entry}")
 
@@ -114,7 +120,7 @@ def structure(dut: Dut) -> None:
         word = int.from_bytes(answer[4:8], "little")
         data_type, object_code = word >> 8, word & 0xFF
         if object_code not in (0x2, 0x7, 0x8, 0x9):
-            raise Failed(f"an object code in 0x{index:04X}:FF", f"0x{word:08X}")
+            raise Failed(f"a valid object code in 0x{index:04X}:FF", f"0x{word:08X}")
         if object_code == 0x8 and known.get(entry.data_type, data_type) != data_type:
             raise Failed(f"data type 0x{entry.data_type:04X} in 0x{index:04X}:FF", f"0x{word:08X}")
     if not found:
@@ -125,7 +131,7 @@ def structure(dut: Dut) -> None:
 def limits(dut: Dut) -> None:
     found = False
     for entry in dut.eds.entries.values():
-        # Mappings (PDO-25), the error field (which accepts only 0) and signatures follow other rules.
+        # Other rules apply to mappings (PDO-25), the error field (accepts only 0) and signatures.
         if (entry.index in _PDOS and entry.subindex == 0) or entry.index in (*_COMMANDS, _ERROR_FIELD):
             continue
         for limit, beyond, codes in ((entry.high, 1, TOO_HIGH), (entry.low, -1, TOO_LOW)):
@@ -135,11 +141,13 @@ def limits(dut: Dut) -> None:
                 request = expedited(entry.index, entry.subindex, value)
                 dut.sdo.aborts(request, entry.index, entry.subindex, codes, f"{entry} beyond {limit}")
     if not found:
-        raise NotApplicable("no writable object in the EDS has a limit within the range of its type")
+        raise NotApplicable("no writable object in the EDS has a limit within the range of its data type")
 
 
 @case(
-    "OD-07", "Every readable object from 0x2000 to 0x9FFF can be read and has the length of its type", "7.4"
+    "OD-07",
+    "Every readable object from 0x2000 to 0x9FFF can be read and has the length of its data type",
+    "7.4",
 )
 def read_rest(dut: Dut) -> None:
     entries = [entry for entry in dut.eds.between(*_REST) if not entry.flags & _REFUSE_READ]
@@ -163,7 +171,7 @@ def rest_defaults(dut: Dut) -> None:
 
 @case(
     "OD-09",
-    "rw objects from 0x2000 to 0x9FFF accept the value read from them (ObjFlags bit 0 clear)",
+    "Objects from 0x2000 to 0x9FFF with access rw accept the value read from them (ObjFlags bit 0 clear)",
     "CiA 306-1",
 )
 def write_back(dut: Dut) -> None:
@@ -176,6 +184,8 @@ def write_back(dut: Dut) -> None:
         dut.sdo.write(entry.index, entry.subindex, value)
         again = dut.sdo.read(entry.index, entry.subindex)
         if again != value:
-            raise Failed(f"{entry} = {value.hex(' ').upper()} after writing it", again.hex(" ").upper())
+            raise Failed(
+                f"{entry} = {value.hex(' ').upper()} after that value was written", again.hex(" ").upper()
+            )
     if not found:
         raise NotApplicable("the EDS has no rw object from 0x2000 to 0x9FFF that may be scanned")

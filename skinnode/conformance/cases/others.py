@@ -1,4 +1,4 @@
-"""OTHER 1 to 10: storing and restoring (0x1010, 0x1011), 0x1020, and restricted CAN-IDs."""
+"""Conformance cases OTHER-01 to OTHER-10: parameter storage, 0x1020 and restricted CAN-IDs."""
 
 from __future__ import annotations
 
@@ -66,11 +66,11 @@ def _store(dut: Dut, subindex: int) -> None:
     _, after = _change(dut)
     dut.store(subindex)
     dut.reset()
-    _compare(dut, after, "stored, after a node reset")
+    _compare(dut, after, "after it was stored and the node was reset")
 
 
 def _restore(dut: Dut, subindex: int) -> None:
-    """Check that defaults take effect at the next reset, but not earlier."""
+    """Check that restored defaults take effect at the next reset and not earlier."""
     dut.need_storage(RESTORE, subindex)
     if dut.eds.find(STORE, subindex) is not None:
         _store(dut, subindex)
@@ -89,7 +89,11 @@ def store_all_wrong(dut: Dut) -> None:
     _wrong_signature(dut, STORE, 1)
 
 
-@case("OTHER-02", "0x1010:01 stores if the signature is 'save': values survive a node reset", "7.5.2.13")
+@case(
+    "OTHER-02",
+    "0x1010:01 stores parameters if the signature is 'save': values survive a node reset",
+    "7.5.2.13",
+)
 def store_all(dut: Dut) -> None:
     _store(dut, 1)
 
@@ -100,7 +104,9 @@ def restore_all_wrong(dut: Dut) -> None:
 
 
 @case(
-    "OTHER-04", "0x1011:01 restores if the signature is 'load': defaults apply after a node reset", "7.5.2.14"
+    "OTHER-04",
+    "0x1011:01 restores defaults if the signature is 'load': they apply after a node reset",
+    "7.5.2.14",
 )
 def restore_all(dut: Dut) -> None:
     _restore(dut, 1)
@@ -113,7 +119,7 @@ def store_communication_wrong(dut: Dut) -> None:
 
 @case(
     "OTHER-06",
-    "0x1010:02 (communication) stores if the signature is 'save': values survive a node reset",
+    "0x1010:02 (communication) stores parameters if the signature is 'save': values survive a node reset",
     "7.5.2.13",
 )
 def store_communication(dut: Dut) -> None:
@@ -127,7 +133,7 @@ def restore_communication_wrong(dut: Dut) -> None:
 
 @case(
     "OTHER-08",
-    "0x1011:02 (communication) restores if the signature is 'load': defaults apply after a node reset",
+    "0x1011:02 (communication) restores defaults if the signature is 'load': they apply after a node reset",
     "7.5.2.14",
 )
 def restore_communication(dut: Dut) -> None:
@@ -140,7 +146,7 @@ def verify(dut: Dut) -> None:
     dut.need(_VERIFY, 1)
     dut.need(_VERIFY, 2)
     dut.need_storage(STORE, 1)
-    date, time = 15_000, 43_200_000  # days since 1984, ms since midnight
+    date, time = 15_000, 43_200_000  # days since 1984-01-01; milliseconds since midnight
     dut.sdo.write_integer(_VERIFY, 1, date, 4)
     dut.sdo.write_integer(_VERIFY, 2, time, 4)
     dut.store(1)
@@ -159,7 +165,7 @@ def restricted(dut: Dut) -> None:
     found = False
     for index, subindex in _cob_ids(dut):
         found = True
-        if index == _EMCY or index >= 0x1280:  # a valid COB-ID must not be changed
+        if index == _EMCY or index >= 0x1280:  # CiA 301 forbids changing a valid COB-ID
             current = dut.sdo.integer(index, subindex)
             dut.sdo.write_integer(index, subindex, current | INVALID, 4)
         for block in RESTRICTED:
@@ -172,7 +178,7 @@ def restricted(dut: Dut) -> None:
 
 
 def _cob_ids(dut: Dut) -> Iterator[tuple[int, int]]:
-    """Yield the writable COB-IDs: SYNC, TIME, EMCY, and the first PDO of each kind."""
+    """Yield index and sub-index of each writable COB-ID: SYNC, TIME, EMCY, first RPDO and first TPDO."""
     pdos = [indices[0] for first in (0x1400, 0x1800) if (indices := dut.eds.indices(first, first + 0x1FF))]
     for index, subindex in ((0x1005, 0), (0x1012, 0), (_EMCY, 0), *((index, COB_ID) for index in pdos)):
         entry = dut.eds.find(index, subindex)

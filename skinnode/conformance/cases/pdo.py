@@ -1,4 +1,4 @@
-"""PDO 1 to 20: communication parameters, and transmission of TPDOs in each NMT state."""
+"""Conformance cases PDO-01 to PDO-20: communication parameters and TPDO transmission."""
 
 from __future__ import annotations
 
@@ -30,13 +30,17 @@ from skinnode.conformance.tester import ANSWER_S, QUIET_S, Failed
 
 _EVENT_MS = 50
 _FIRST_S = 0.4
-"""Maximum wait after a SYNC for the first TPDO of a cycle, which a later SYNC may trigger instead."""
+"""Maximum wait after a SYNC for the first TPDO of a cycle, s; a later SYNC may trigger that TPDO instead."""
 _SYNC_COUNTER = 0x1019
 _RESERVED_KINDS = range(241, 252)
 
 
 def _scan(dut: Dut, pdos: list[Pdo], base: int) -> None:
-    """Check transmission types and COB-IDs: as in the EDS, unique if valid, the first four pre-defined."""
+    """Check the COB-IDs and transmission types of PDOs.
+
+    COB-IDs must equal those in the EDS. Those of valid PDOs must be unique, and the first four must match
+    the pre-defined connection set.
+    """
     valid: dict[int, Pdo] = {}
     for pdo in pdos:
         cob_id = dut.sdo.integer(pdo.parameter, 1)
@@ -83,7 +87,9 @@ def scan_tpdos(dut: Dut) -> None:
 # --- OPERATIONAL
 
 
-@case("PDO-03", "OPERATIONAL: a remote frame is answered with the TPDO, once", "7.2.2.5.2, 7.5.2.37")
+@case(
+    "PDO-03", "OPERATIONAL: the device answers a remote frame by sending the TPDO once", "7.2.2.5.2, 7.5.2.37"
+)
 def remote(dut: Dut) -> None:
     def trial(dut: Dut, pdo: Pdo) -> None:
         can_id, length = _for_remote(dut, pdo)
@@ -98,7 +104,7 @@ def remote(dut: Dut) -> None:
 
 
 def _for_remote(dut: Dut, pdo: Pdo) -> tuple[int, int]:
-    """Set a PDO up to answer remote frames; return its CAN-ID and length.
+    """Configure a PDO to answer remote frames; return its CAN-ID and length in bytes.
 
     Raises Unsupported if bit 30 of the COB-ID forbids remote frames.
     """
@@ -124,7 +130,7 @@ def event_driven(dut: Dut) -> None:
         dut.operational()
         frames = [expect_pdo(dut, can_id, length, f"{pdo} when its event timer elapses") for _ in range(8)]
         gaps = gaps_ms(frames)
-        # A delayed frame shortens the next interval; the mean hardly changes.
+        # A delayed frame shortens the next interval, so the mean interval hardly changes.
         if statistics.mean(gaps) < 40 * 0.95 or min(gaps) < 20:
             shown = ", ".join(f"{gap:.1f}" for gap in gaps)
             raise Failed(f"{pdo} at intervals of at least its inhibit time of 40 ms", f"gaps of {shown} ms")
@@ -142,7 +148,8 @@ def event_timer(dut: Dut) -> None:
         length = payload_bytes(mapped(dut, pdo))
         can_id = set_up(dut, pdo, PdoSetup(254))
         dut.operational()
-        busy = bool(dut.bus.listen(can_id, 3 * _EVENT_MS * 1e-3))  # events of the application
+        # Application events may also trigger the PDO.
+        busy = bool(dut.bus.listen(can_id, 3 * _EVENT_MS * 1e-3))
         dut.nmt(PRE_OPERATIONAL)
         set_up(dut, pdo, PdoSetup(254, event_ms=_EVENT_MS))
         dut.operational()
@@ -156,7 +163,7 @@ def event_timer(dut: Dut) -> None:
     each_tpdo(dut, trial)
 
 
-@case("PDO-06", "OPERATIONAL: a TPDO of type 1 is sent after every SYNC, one of type 3 after every third",
+@case("PDO-06", "OPERATIONAL: a TPDO is sent after every SYNC if of type 1, after every third if of type 3",
       "7.2.2.2, 7.5.2.37")  # fmt: skip
 def cyclic(dut: Dut) -> None:
     def trial(dut: Dut, pdo: Pdo) -> None:
@@ -198,7 +205,7 @@ def _after_sync(  # noqa: PLR0913 - one PDO, one SYNC
 
 @case(
     "PDO-07",
-    "OPERATIONAL: a TPDO of type 0 is sent only after a SYNC, at the latest after the third",
+    "OPERATIONAL: a TPDO of type 0 is sent only after a SYNC, and no later than after the third SYNC",
     "7.2.2.2, 7.5.2.37",
 )
 def acyclic(dut: Dut) -> None:
@@ -217,7 +224,9 @@ def acyclic(dut: Dut) -> None:
 
 
 @case(
-    "PDO-08", "OPERATIONAL: the SYNC start value begins the cycle of a synchronous TPDO", "7.5.2.37, 7.5.2.22"
+    "PDO-08",
+    "OPERATIONAL: the cycle of a synchronous TPDO begins at the SYNC start value",
+    "7.5.2.37, 7.5.2.22",
 )
 def sync_start(dut: Dut) -> None:
     def trial(dut: Dut, pdo: Pdo) -> None:
@@ -237,11 +246,11 @@ def _for_start(dut: Dut, pdo: Pdo) -> int:
     return set_up(dut, pdo, PdoSetup(2, start=3))
 
 
-# --- STOPPED, and PRE-OPERATIONAL after OPERATIONAL: the same triggers send nothing
+# --- STOPPED, and PRE-OPERATIONAL entered from OPERATIONAL: no trigger may send a TPDO
 
 
 def _silent(command: int, kind: int, state: str, *, event_ms: int = 0, start: bool = False) -> Trial:
-    """Return a trial that sets up a PDO, starts the node, enters ``state`` and triggers the PDO."""
+    """Return a trial that checks that a triggered PDO is not sent in ``state``, entered from OPERATIONAL."""
 
     def trial(dut: Dut, pdo: Pdo) -> None:
         if kind == 253:

@@ -1,4 +1,7 @@
-"""PDO 21 to 33: default mapping; remapping by the standard procedure, without it, and to invalid entries."""
+"""Conformance cases PDO-21 to PDO-33: default mapping, and remapping.
+
+PDOs are remapped by the standard procedure, without it, and to invalid entries.
+"""
 
 from __future__ import annotations
 
@@ -71,7 +74,7 @@ def _most_bytes(dut: Dut) -> int:
 
 
 def _slots(dut: Dut, pdo: Pdo) -> int:
-    """Return the maximum number of mapping entries."""
+    """Return the maximum number of mapping entries of a PDO."""
     return max(entry.subindex for entry in dut.eds.between(pdo.mapping, pdo.mapping))
 
 
@@ -98,7 +101,8 @@ def _check_mapped(dut: Dut, pdo: Pdo, subindex: int, word: int) -> None:
             raise Failed(f"{where} to name an object or an allowed dummy", f"0x{word:08X}")
         return
     entry = dut.eds.find(word >> 16, word >> 8 & 0xFF)
-    if entry is None or (entry.size and word & 0xFF != 8 * entry.size):  # a string may have any length
+    # A mapped string may have any length.
+    if entry is None or (entry.size and word & 0xFF != 8 * entry.size):
         raise Failed(f"{where} to name an object in the EDS and its length", f"0x{word:08X}")
     if not (entry.into_tpdo if pdo.transmits else entry.into_rpdo):
         raise Failed(f"{where} to name an object that may be mapped into {pdo}", str(entry))
@@ -152,7 +156,7 @@ def mapping_of_valid(dut: Dut) -> None:
         tried = True
         words = mapped(dut, pdo)
         request = expedited(pdo.mapping, 0, b"\0")
-        dut.sdo.aborts(request, pdo.mapping, 0, OUT_OF_ORDER, f"{pdo}: number of entries written while valid")
+        dut.sdo.aborts(request, pdo.mapping, 0, OUT_OF_ORDER, f"{pdo}: write to sub-index 0 while valid")
         _still(dut, pdo, words)
     if not tried:
         raise NotApplicable("no PDO is valid by default")
@@ -173,7 +177,7 @@ def too_many(dut: Dut) -> None:
             dut.sdo.write_integer(pdo.mapping, subindex, entry.mapping, 4)
         request = expedited(pdo.mapping, 0, bytes((slots + 1,)))
         dut.sdo.aborts(
-            request, pdo.mapping, 0, TOO_MUCH, f"{pdo}: {slots + 1} entries, but only room for {slots}"
+            request, pdo.mapping, 0, TOO_MUCH, f"{pdo}: {slots + 1} mapping entries, where {slots} fit,"
         )
         if dut.sdo.integer(pdo.mapping, 0):
             raise Failed(f"{pdo} still without entries", str(dut.sdo.integer(pdo.mapping, 0)))
@@ -195,7 +199,7 @@ def too_long(dut: Dut) -> None:
                 dut.sdo.write_integer(pdo.mapping, subindex, entry.mapping, 4)
         except Aborted as abort:
             if abort.code in TOO_MUCH:
-                continue  # a device may refuse the excess entry
+                continue  # a device may refuse the entry that exceeds the frame
             raise
         request = expedited(pdo.mapping, 0, bytes((count,)))
         what = f"{pdo}: {count} × {8 * entry.size} bits"

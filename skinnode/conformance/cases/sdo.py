@@ -1,4 +1,4 @@
-"""SDO 1 to 18: expedited and segmented transfer, and requests that a server must refuse."""
+"""Conformance cases SDO-01 to SDO-18: expedited and segmented transfer, and refused requests."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _STRINGS = (0x1008, 0x1009, 0x100A)
 
 
 def first(entries: Iterable[EdsEntry], fits: Callable[[EdsEntry], bool], lack: str) -> EdsEntry:
-    """Return the first entry that meets ``fits``. Raises NotApplicable, naming ``lack``, if none does."""
+    """Return the first entry that ``fits`` accepts. Raises NotApplicable, naming ``lack``, if none fits."""
     for entry in entries:
         if fits(entry) and entry.index not in _SPECIAL:
             return entry
@@ -97,7 +97,7 @@ def read_write_only(dut: Dut) -> None:
     dut.sdo.aborts(request, entry.index, entry.subindex, WRITE_ONLY, f"read of {entry}")
 
 
-@case("SDO-05", "A sub-index that does not exist, 0x1000:01, is refused", "7.2.4.3.17")
+@case("SDO-05", "A read of 0x1000:01, a sub-index that does not exist, is refused", "7.2.4.3.17")
 def no_subindex(dut: Dut) -> None:
     dut.sdo.aborts(b"\x40" + mux(_DEVICE_TYPE, 1), _DEVICE_TYPE, 1, NO_SUBINDEX, "read of 0x1000:01")
 
@@ -163,7 +163,7 @@ def _unchanged(dut: Dut, entry: EdsEntry, before: bytes) -> None:
 
 
 def limited(entry: EdsEntry, limit: int | None, beyond: int) -> bytes | None:
-    """Return the value just beyond a limit; None if there is no limit or the type cannot hold that value."""
+    """Return the value just beyond a limit; None if there is no limit or the type cannot hold the value."""
     if limit is None or not entry.writable or entry.data_type not in (*SIGNED, *UNSIGNED):
         return None
     try:
@@ -215,7 +215,7 @@ def default_sdo(dut: Dut) -> None:
 
 @case(
     "SDO-13",
-    "0x1000 can be read by whichever transfer the server chooses, with the announced length",
+    "0x1000 can be read by the transfer that the server chooses and has the announced length",
     "7.2.4.3.5",
 )
 def read_short(dut: Dut) -> None:

@@ -1,4 +1,4 @@
-"""SDO 19 to 30: block transfer, and SDOs other than the default SDO."""
+"""Conformance cases SDO-19 to SDO-30: block transfer, and SDOs other than the default SDO."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ def block_write_heartbeat_crc(dut: Dut) -> None:
     start = dut.sdo.served(b"\xc6" + mux(HEARTBEAT, 0) + struct.pack("<I", 2), "a block write to 0x1017:00")
     dut.sdo.abort(HEARTBEAT, 0)
     if not start[0] & 4:
-        return  # the server announces that it does not check a CRC
+        return  # the server does not support CRC checks
     try:
         dut.sdo.write_block(HEARTBEAT, 0, b"\x34\x12", crc=True, wrong_crc=True)
     except Aborted as abort:
@@ -117,7 +117,7 @@ def wrong_sequence(dut: Dut) -> None:
     dut.sdo.aborts(b"\xa2\x80\x14", 0x1000, 0, codes, "an acknowledgement of segment 128")
 
 
-@case("SDO-28", "0x1201 to 0x127F: objects in the EDS can be read, and no others exist", "7.5.2.33")
+@case("SDO-28", "SDO servers in the EDS (0x1201 to 0x127F) can be read, and no others exist", "7.5.2.33")
 def further_servers(dut: Dut) -> None:
     for index in range(0x1201, 0x1280):
         if dut.eds.has(index):
@@ -127,7 +127,7 @@ def further_servers(dut: Dut) -> None:
             dut.sdo.aborts(b"\x40" + mux(index, 1), index, 1, NO_OBJECT, f"read of 0x{index:04X}:01")
 
 
-@case("SDO-29", "Further SDO servers are unchanged after a communication reset", "7.5.2.33; 7.3.2.2")
+@case("SDO-29", "A communication reset restores the COB-IDs of additional SDO servers", "7.5.2.33; 7.3.2.2")
 def servers_after_reset(dut: Dut) -> None:
     servers = dut.eds.indices(0x1201, 0x127F)
     if not servers:

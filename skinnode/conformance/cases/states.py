@@ -1,4 +1,4 @@
-"""STATE 1 to 4: the boot-up message, and the services of a node in each state."""
+"""Conformance cases STATE-01 to STATE-04: the boot-up message, and the services served in each NMT state."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ _EVENT_MS = 20
 
 @case(
     "STATE-01",
-    "Reset node: one boot-up message, and every parameter as before",
+    "Reset node causes one boot-up message and restores every parameter",
     "7.3.2.2.1, 7.2.8.3.3",
 )
 def boot_up(dut: Dut) -> None:
@@ -62,7 +62,7 @@ def boot_up(dut: Dut) -> None:
 
 
 def _check_state(dut: Dut, state: int, what: str) -> None:
-    """Check the state by heartbeat and by guarding, as far as the device supports them."""
+    """Check the NMT state by heartbeat and by guarding, if the device supports them."""
     dut.start_heartbeat()
     dut.expect_state(state, what)
     if dut.eds.find(HEARTBEAT) is not None:
@@ -80,7 +80,7 @@ def pre_operational(dut: Dut) -> None:
     dut.sdo.read(0x1000)
     with contextlib.suppress(NotApplicable):  # a producer is optional
         produce(dut)
-        dut.bus.expect(SYNC_ID, "SYNC of the producer in PRE-OPERATIONAL")
+        dut.bus.expect(SYNC_ID, "SYNC from the producer in PRE-OPERATIONAL")
         consume_only(dut)
     _no_pdos(dut, "PRE-OPERATIONAL")
     _emcy(dut, "in PRE-OPERATIONAL")
@@ -157,7 +157,7 @@ def stopped(dut: Dut) -> None:
         drain(dut, can_id)
     dut.sdo.send(b"\x40\x00\x10\x00")
     dut.bus.expect_silence(dut.sdo.answer_id, "SDO response in STOPPED")
-    dut.bus.expect_silence(SYNC_ID, "SYNC of the producer in STOPPED")
+    dut.bus.expect_silence(SYNC_ID, "SYNC from the producer in STOPPED")
     sync(dut)
     for can_id in can_ids:
         dut.bus.expect_silence(can_id, "TPDO in STOPPED")

@@ -1,4 +1,4 @@
-"""SYNC 1 to 10: producer, consumer and counter."""
+"""Conformance cases SYNC-01 to SYNC-10: SYNC producer, consumer and counter."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def producer(dut: Dut) -> None:
     check_period(frames, PERIOD_MS, "SYNC")
     consume_only(dut)
     dut.bus.pending(SYNC_ID)
-    dut.bus.expect_silence(SYNC_ID, "SYNC once the producer is off", 3 * PERIOD_MS * 1e-3)
+    dut.bus.expect_silence(SYNC_ID, "SYNC after the producer was stopped", 3 * PERIOD_MS * 1e-3)
 
 
 @case("SYNC-03", "A TPDO of type 10 is sent 3 times in 30 SYNCs", "7.2.2.2, 7.5.2.37")
@@ -156,7 +156,7 @@ def overflow_in_use(dut: Dut) -> None:
     consume_only(dut)
     dut.sdo.write_integer(PERIOD, 0, 1000, 4)
     request = expedited(OVERFLOW, 0, b"\x05")
-    dut.sdo.aborts(request, OVERFLOW, 0, _BUSY, "write to 0x1019:00 with a period in 0x1006")
+    dut.sdo.aborts(request, OVERFLOW, 0, _BUSY, "write to 0x1019:00 while the period in 0x1006 is not 0")
 
 
 @case("SYNC-10", "The overflow value stored through 0x1010:01 survives a node reset", "7.5.2.13, 7.5.2.22")

@@ -1,4 +1,4 @@
-"""TRANS 1 to 4: reset node and reset communication, pre-operational, start, stop."""
+"""Conformance cases TRANS-01 to TRANS-04: NMT commands reset, enter pre-operational, start and stop."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def _application_object(dut: Dut) -> tuple[EdsEntry, bytes] | None:
 
 @case(
     "TRANS-01",
-    "Reset node and reset communication from every state; the latter keeps application objects",
+    "Reset node and reset communication work in every state; the latter keeps application objects",
     "7.3.2.2.1",
 )
 def resets(dut: Dut) -> None:
@@ -52,7 +52,7 @@ def resets(dut: Dut) -> None:
             dut.reset(reset)
             period_ms = dut.sdo.integer(HEARTBEAT) if dut.eds.find(HEARTBEAT) is not None else 0
             if period_ms == 20:
-                raise Failed("0x1017 as before it was written", "20")
+                raise Failed("0x1017 to be restored by the reset", "20")
             dut.start_heartbeat()
             dut.expect_state(127, f"reset after {_NAMES[command]}")
     changed = _application_object(dut)
@@ -71,7 +71,7 @@ def resets(dut: Dut) -> None:
 
 
 def _transition(dut: Dut, command: int, *others: int) -> None:
-    """Check that ``command`` works after each of ``others``, sent to the node-ID and to 0 (all nodes)."""
+    """Check that ``command`` works after each of ``others``, addressed to the node or to all nodes (0)."""
     state, name = _COMMANDS[command], _NAMES[command]
     dut.start_heartbeat()
     for other in others:
@@ -81,7 +81,9 @@ def _transition(dut: Dut, command: int, *others: int) -> None:
             dut.bus.send(0x000, bytes((command, dut.node_id % 127 + 1)))
             dut.bus.send(0x000, bytes((command,)))
             dut.bus.send(0x000, bytes((0x7F, dut.node_id)))
-            dut.expect_state(_COMMANDS[other], "after commands not addressed to it")
+            dut.expect_state(
+                _COMMANDS[other], "after NMT commands that are invalid or addressed to another node"
+            )
             dut.bus.send(0x000, bytes((command, node_id)))
             dut.expect_state(state, f"{name} (node-ID {node_id}) after {_NAMES[other]}")
     dut.nmt(command)
@@ -90,7 +92,7 @@ def _transition(dut: Dut, command: int, *others: int) -> None:
 
 @case(
     "TRANS-02",
-    "Enter pre-operational from OPERATIONAL and STOPPED, sent to the node-ID and to all nodes",
+    "Enter pre-operational works in OPERATIONAL and STOPPED, sent to the node-ID or to all nodes",
     "7.2.8.2.1, 7.3.2.2",
 )
 def enter_pre_operational(dut: Dut) -> None:
@@ -99,7 +101,7 @@ def enter_pre_operational(dut: Dut) -> None:
 
 @case(
     "TRANS-03",
-    "Start from PRE-OPERATIONAL and STOPPED, sent to the node-ID and to all nodes",
+    "Start works in PRE-OPERATIONAL and STOPPED, sent to the node-ID or to all nodes",
     "7.2.8.2.1, 7.3.2.2",
 )
 def start(dut: Dut) -> None:
@@ -108,7 +110,7 @@ def start(dut: Dut) -> None:
 
 @case(
     "TRANS-04",
-    "Stop from PRE-OPERATIONAL and OPERATIONAL, sent to the node-ID and to all nodes",
+    "Stop works in PRE-OPERATIONAL and OPERATIONAL, sent to the node-ID or to all nodes",
     "7.2.8.2.1, 7.3.2.2",
 )
 def stop(dut: Dut) -> None:

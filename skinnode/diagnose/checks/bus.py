@@ -1,4 +1,4 @@
-"""Checks of a bus: interface, controller, load, unknown frames, and masters."""
+"""Doctor checks of a bus: interface, controller, load, unknown frames, and masters."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from skinnode.text.words import counted
 
 _SYNCS: Final = 10
 _ASTRAY: Final = 0.25
-"""Maximum fraction of SYNC counters that do not follow their predecessor. With two producers the fraction is
-a half; with lost SYNCs it is much smaller."""
+"""Maximum fraction of SYNC counters that do not follow their predecessor. With two SYNC producers, the
+fraction is one half; with lost SYNCs, it is much smaller."""
 
 _BEATS: Final = 4
 _TOO_OFTEN: Final = 0.7
@@ -49,14 +49,14 @@ def check_bus(bus: BusFacts) -> Iterator[Finding]:
             "the bit rate of the interface differs from the hand file",
             Sure.CERTAIN,
             f"{bus.link_bitrate_bps} bit/s, hand file: {bus.bitrate_bps}",
-            "set both to the same bit rate",
+            "set the interface and the hand file to the same bit rate",
         )
     if bus.error_frames:
         yield found(
             "error frames on the bus",
             Sure.CERTAIN,
             f"{bus.error_frames} in {bus.seconds:.1f} s",
-            "check termination, bit rate of each node, length of stubs, power of each node",
+            "check the termination, the length of the stubs, and the bit rate and power of each node",
         )
     if bus.load > MAX_BUS_LOAD:
         yield found(
@@ -78,7 +78,7 @@ def check_bus(bus: BusFacts) -> Iterator[Finding]:
             "frames of unknown origin",
             Sure.POSSIBLE,
             f"{shown} in {bus.seconds:.1f} s",
-            "normal if drives or another master share the bus; otherwise find their sender",
+            "normal if drives or another master share the bus; otherwise find the sender of these frames",
         )
     for address in bus.unconfigured:
         yield found(
@@ -95,13 +95,13 @@ def check_masters(bus: BusFacts) -> Iterator[Finding]:
     def found(what: str, sure: Sure, evidence: str, advice: str) -> Finding:
         return Finding("bus", bus.name, what, sure, evidence, advice)
 
-    stop_one = "use one host per hand: stop the other, or give this host the role guest (buses.role)"
+    stop_one = "run one host per hand: stop the other host, or give this host the role guest (buses.role)"
     counters = [counter for counter in bus.sync_counters if counter]
     steps = list(pairwise(counters))
     astray = sum(after not in (before + 1, 1) for before, after in steps)
     if len(steps) >= _SYNCS and astray > _ASTRAY * len(steps):
         yield found(
-            "two producers of SYNC",
+            "two SYNC producers",
             Sure.CERTAIN,
             f"{astray} of {len(steps)} SYNC counters do not follow their predecessor",
             stop_one,

@@ -1,4 +1,4 @@
-"""Checks of the nodes' configuration: sizes, layout, EDS, PDOs, times."""
+"""Doctor checks of the nodes' configuration: sizes, layout, EDS, PDOs, inhibit time and heartbeat."""
 
 from __future__ import annotations
 
@@ -39,11 +39,11 @@ def _check_layout(patch: PatchFacts) -> Iterator[Finding]:
         yield Finding(
             "configuration",
             patch.name,
-            "its layout differs from the hand file",
+            "the layout differs from the hand file",
             Sure.CERTAIN,
             f"layout hash 0x{own.layout_hash:08X} ({own.layout}, {own.upper_wires} × {own.lower_wires} "
             f"wires), wanted 0x{patch.layout_hash:08X}",
-            "correct [patches.layout], or mount the right patch: until then its fields are wrong",
+            "correct [patches.layout] or mount the right patch; until then, the fields are wrong",
         )
     if own.code_bits != wanted.code_bits:
         yield Finding(
@@ -66,7 +66,7 @@ def _check_pdos(bus: BusFacts, patch: PatchFacts) -> Iterator[Finding]:
     def found(what: str, sure: Sure, evidence: str, advice: str) -> Finding:
         return Finding("configuration", patch.name, what, sure, evidence, advice)
 
-    again = "skinnode host sets it at bring-up: find what else writes to the node"
+    again = "skinnode host sets this value at bring-up: find the other program that writes to the node"
     pdos = {(pdo.direction, pdo.number): pdo for pdo in info.pdos}
     chunk, summary = pdos.get(("TPDO", 1)), pdos.get(("TPDO", 2))
     running = patch.found.state == "operational"
@@ -88,7 +88,7 @@ def _check_pdos(bus: BusFacts, patch: PatchFacts) -> Iterator[Finding]:
             "the patch scans on its own timer, not on SYNC",
             Sure.LIKELY,
             f"period {info.patch.period_ms} ms (0x2021:1)",
-            f"write 0: skinnode od {patch.node_id} 2021:1 --write 0; all patches then scan together",
+            f"run skinnode od {patch.node_id} 2021:1 --write 0, so that all patches scan at the same time",
         )
     if running and info.heartbeat_ms == 0:
         yield found("no heartbeat: a loss of the node goes unnoticed", Sure.CERTAIN, "0x1017 is 0", again)
@@ -106,7 +106,7 @@ def _check_inhibit(
     profile = PatchProfile(*sizes, bus="classic" if own.pdo_bytes == 8 else "fd")
     at_default = chunk.inhibit_100us == profile.default_inhibit_100us
     if at_default and not running and patch.inhibit_100us is not None:
-        return  # not configured by a host since power-up; bring-up replaces the default
+        return  # a host replaces this default at bring-up
     chunks, inhibit_s = profile.n_chunks, (chunk.inhibit_100us or 0) * 1e-4
     if chunks * inhibit_s > period_s:
         yield found(

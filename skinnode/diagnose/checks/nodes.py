@@ -1,4 +1,4 @@
-"""Checks of the nodes: presence, identity, state, errors."""
+"""Doctor checks of the nodes: presence, identity, NMT state and errors."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def check_nodes(bus: BusFacts) -> Iterator[Finding]:
                 f"two nodes have node-ID {node.node_id}",
                 Sure.CERTAIN if "responses" in node.duplicate else Sure.LIKELY,
                 node.duplicate,
-                "unplug one and give it another node-ID",
+                "unplug one node and change the node-ID of the other",
             )
         if node.is_patch:
             yield Finding(
@@ -46,7 +46,7 @@ def check_nodes(bus: BusFacts) -> Iterator[Finding]:
                 f"patch at node {node.node_id} is not in the hand file",
                 Sure.CERTAIN,
                 f"serial {known(node.serial)}, {node.state}",
-                "add it, or give it the node-ID that it should have (skinnode lss set)",
+                "add the patch to the hand file, or assign the intended node-ID (skinnode lss set)",
             )
 
 
@@ -61,31 +61,32 @@ def _check_node(bus: BusFacts, patch: PatchFacts) -> Iterator[Finding]:
             Sure.CERTAIN,
             f"node {patch.node_id} neither answers SDO requests nor sends heartbeats; "
             f"other nodes on {bus.name} do",
-            "check its supply and connector; skinnode scan shows whether it has another node-ID",
+            "check supply and connector of the node; skinnode scan shows whether it has another node-ID",
         )
         return
     if node.duplicate:
         yield found(
-            "two nodes have its node-ID",
+            "two nodes have the patch's node-ID",
             Sure.CERTAIN if "responses" in node.duplicate else Sure.LIKELY,
             node.duplicate,
-            "unplug one and give it another node-ID: skinnode lss set --serial …",
+            "unplug one node and change the node-ID of the other: skinnode lss set --serial …",
         )
     if not node.answers:
         standard = " as CiA 301 requires" if node.wrong_answer else ""
         yield found(
             f"the node is {node.state} and does not answer{standard}",
             Sure.CERTAIN,
-            "it sends heartbeats" + (f" but {no_answer(node.wrong_answer)}" if node.wrong_answer else ""),
+            "the node sends heartbeats"
+            + (f" but {no_answer(node.wrong_answer)}" if node.wrong_answer else ""),
             f"skinnode nmt {patch.node_id} reset-communication",
         )
         return
     if wanted is not None and not node.is_patch:
         yield found(
-            "another device has its node-ID",
+            "another device has the patch's node-ID",
             Sure.CERTAIN,
             ", ".join([f"'{node.name}'" if node.name else "unnamed", *node.identity]),
-            "give one of them another node-ID",
+            "change the node-ID of one of the two devices",
         )
         return
     if wanted is not None and wanted.serial not in (None, node.serial):
@@ -93,7 +94,7 @@ def _check_node(bus: BusFacts, patch: PatchFacts) -> Iterator[Finding]:
             "the serial number differs from the hand file",
             Sure.CERTAIN,
             f"serial {known(node.serial)}, hand file: {wanted.serial}",
-            "if two patches were swapped, swap them back, or correct the hand file and its calibration",
+            "if two patches were swapped, swap them back or correct the hand file and its calibration",
         )
     yield from _check_state(bus, patch, node)
 
@@ -104,20 +105,22 @@ def _check_state(bus: BusFacts, patch: PatchFacts, node: FoundNode) -> Iterator[
 
     info = patch.info
     if patch.failure:
-        yield found("some of its objects could not be read", Sure.CERTAIN, patch.failure, "see skinnode info")
+        yield found(
+            "some objects of the node could not be read", Sure.CERTAIN, patch.failure, "see skinnode info"
+        )
     if patch.boot_ups or node.boot_ups:
         yield found(
             "the node restarts by itself",
             Sure.CERTAIN,
             f"{counted(max(patch.boot_ups, node.boot_ups), 'boot-up message')} in {bus.seconds:.1f} s",
-            "check supply voltage under load, connector, watchdog of the board",
+            "check the supply voltage under load, the connector, and the watchdog of the board",
         )
     if bus.running and node.state != "operational":
         yield found(
-            f"the node is {node.state} while others run",
+            f"the node is {node.state} while other nodes are operational",
             Sure.LIKELY,
             f"NMT state by {node.state_known_by}",
-            "see its errors below; a running host restarts it once they are cleared",
+            "see the errors of the node below; a running host restarts the node after they are cleared",
         )
     if info is not None and info.error_register:
         yield found(

@@ -1,4 +1,4 @@
-"""Runs all checks on the facts about a bus."""
+"""Runs all checks of the doctor on the facts about a bus."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def run_checks(facts: BusFacts) -> list[Finding]:
 
 
 def others(facts: BusFacts) -> list[str]:
-    """Describe, in one line each, the devices that are neither patches nor in the hand file.
+    """Return one line for each device that is neither a patch nor in the hand file.
 
     The lines identify the devices; they do not report faults.
     """
@@ -60,7 +60,7 @@ def others(facts: BusFacts) -> list[str]:
 def not_judged(facts: BusFacts) -> list[str]:
     """Return one line for each check that could not be made, with the reason."""
     if facts.failure:
-        return [f"{facts.name}: everything except the interface"]
+        return [f"{facts.name}: all checks except that of the interface"]
     lines = []
     for patch in facts.patches:
         scans = 0 if patch.scans is None else patch.scans.scans
@@ -72,8 +72,8 @@ def not_judged(facts: BusFacts) -> list[str]:
             )
         elif patch.scans is not None and skin.is_touched(patch.scans):
             lines.append(
-                f"{patch.name}: noise of single crossings, and drift from the baseline: something moves "
-                "on the skin; do not touch it while the doctor listens"
+                f"{patch.name}: noise of single crossings, and drift from the baseline: something "
+                "touched the skin; do not touch it while the doctor listens"
             )
         elif patch.scans is not None and skin.may_be_frozen(patch.scans):
             lines.append(

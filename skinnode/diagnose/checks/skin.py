@@ -1,4 +1,4 @@
-"""Checks of the skin, made on captured scans: wires, noise, frozen values, jumps, baseline.
+"""Doctor checks of the skin, based on captured scans: wires, noise, frozen values, jumps, baseline.
 
 A touch is not a defect: a finding that a touch can explain is not reported.
 """
@@ -36,7 +36,7 @@ def _judged(bus: BusFacts) -> Iterator[tuple[PatchFacts, ScanFacts, NoiseAnalysi
 
 
 def check_wires(bus: BusFacts) -> Iterator[Finding]:
-    """Check the node's masks and the codes for open, shorted and out-of-range wires and crossings."""
+    """Check fault masks and codes of each node for open, shorted and out-of-range wires and crossings."""
     for patch in bus.patches:
         own = patch.info.patch if patch.info is not None else None
         upper: set[int] = set()
@@ -60,13 +60,17 @@ def _check_crossings(
     patch: PatchFacts, scans: ScanFacts, upper: set[int], lower: set[int]
 ) -> Iterator[Finding]:
     """Check the crossings that are not on an entirely faulty wire."""
-    whole = max(1, int(scans.complete.sum()))  # crossings missing from a torn scan are unknown
+    whole = max(1, int(scans.complete.sum()))  # a torn scan lacks the values of some crossings
     rest = np.ones(scans.n_open.shape, dtype=np.bool_)
     rest[sorted(upper), :] = False
     rest[:, sorted(lower)] = False
     for what, counts, advice in (
-        ("open", scans.n_open, "look for a broken electrode or wire; its values are left out"),
-        ("shorted", scans.n_short, "the rubber is pressed through, or there is moisture"),
+        (
+            "open",
+            scans.n_open,
+            "look for a broken electrode or wire; the values of these crossings are left out",
+        ),
+        ("shorted", scans.n_short, "look for rubber that is pressed through, or for moisture"),
         (
             "out of range",
             scans.n_over,
@@ -75,7 +79,7 @@ def _check_crossings(
     ):
         always, sometimes = rest & (counts >= whole), rest & (counts > 0) & (counts < whole)
         for side, wires in (("upper", always.all(axis=1)), ("lower", always.all(axis=0))):
-            if wires.any():  # the masks are older than these scans
+            if wires.any():  # the masks may be older than the scans
                 yield Finding(
                     "wires",
                     patch.name,
@@ -115,7 +119,7 @@ def check_noise(bus: BusFacts) -> Iterator[Finding]:
             yield Finding(
                 "wires",
                 patch.name,
-                f"{_crossings(analysis.steps)} jumped and stayed",
+                f"{_crossings(analysis.steps)} jumped and kept the new value",
                 Sure.POSSIBLE,
                 f"{_places(analysis.steps)}; at {row}/{column} by {analysis.step_by[row, column]:.2%} of R0, "
                 f"scan {int(analysis.step_at[row, column]) + 1}",
@@ -141,7 +145,7 @@ def _check_noise(patch: PatchFacts, scans: ScanFacts, analysis: NoiseAnalysis) -
         all_alike &= bool(min(levels) > NOISY)
     if all_alike or analysis.supply > NOISY:
         yield found(
-            "the whole patch is noisier than the hand file says",
+            "the whole patch is noisier than the hand file states",
             Sure.LIKELY,
             f"{int(noisy.sum())} of {_crossings(judged)}; {figures}"
             if all_alike
@@ -168,7 +172,7 @@ def _check_noise(patch: PatchFacts, scans: ScanFacts, analysis: NoiseAnalysis) -
 
 
 def _stands_out(levels: Float, wire: int) -> bool:
-    """Return whether a wire is noisy but its neighbours are not; a touch affects adjacent wires too."""
+    """Return whether a wire is noisier than its neighbours; a touch affects adjacent wires alike."""
     neighbours = [levels[i] for i in (wire - 1, wire + 1) if 0 <= i < len(levels)]
     return bool(neighbours) and bool(levels[wire] > NOISY * max(1.0, *neighbours))
 
@@ -181,8 +185,8 @@ def _check_frozen(patch: PatchFacts, scans: ScanFacts) -> Iterator[Finding]:
             patch.name,
             "the node repeats the same scan",
             Sure.CERTAIN,
-            f"its clock did not change over {len(device)} scans",
-            "its sampling has stopped: reset the node",
+            f"the clock of the node did not change over {len(device)} scans",
+            "sampling has stopped: reset the node",
         )
     known, still = _still(scans)
     if scans.repeated >= LEAST_SCANS and not scans.conversions:
@@ -191,7 +195,7 @@ def _check_frozen(patch: PatchFacts, scans: ScanFacts) -> Iterator[Finding]:
             patch.name,
             "the values are frozen",
             Sure.CERTAIN,
-            f"its converter completed no conversion in {scans.repeated} successive scans",
+            f"the converter completed no conversion in {scans.repeated} successive scans",
             "the converter has stopped: switch the patch off and on",
         )
     elif _shows(scans) and known.any() and still.sum() > _MANY * known.sum():
@@ -207,9 +211,9 @@ def _check_frozen(patch: PatchFacts, scans: ScanFacts) -> Iterator[Finding]:
 
 
 def may_be_frozen(scans: ScanFacts) -> bool:
-    """Return whether all codes are constant but the stated noise is too small for this to prove a defect.
+    """Return whether all codes are constant but the stated noise is too small to prove a defect.
 
-    A patch that counts its conversions leaves no doubt.
+    Returns False for a patch that counts its conversions, because the count is conclusive.
     """
     if scans.conversions is not None:
         return False
@@ -223,7 +227,7 @@ def _shows(scans: ScanFacts) -> bool:
 
 
 def _still(scans: ScanFacts) -> tuple[Mask, Mask]:
-    """Return two masks: crossings measured in every scan, and those among them that never changed."""
+    """Return two masks: crossings measured in every scan, and the subset whose values never changed."""
     known = np.asarray(np.isfinite(scans.ratio).all(axis=0))
     return known, known & (np.ptp(np.where(known, scans.ratio, 0.0), axis=0) == 0.0)
 
@@ -257,16 +261,16 @@ def check_baseline(bus: BusFacts) -> Iterator[Finding]:
                 "the baseline no longer matches the skin at rest",
                 Sure.LIKELY,
                 figures,
-                "temperature or age changed it: run skinnode tare with nothing touching the skin",
+                "temperature or age changed the resistances: run skinnode tare with the skin untouched",
             )
         elif share > 0.02 and not analysis.is_touched:
             yield Finding(
                 "baseline",
                 patch.name,
-                "part of the skin is not at its baseline",
+                "part of the skin differs from its baseline",
                 Sure.POSSIBLE,
                 figures,
-                "if nothing presses there, run skinnode tare",
+                "if nothing presses on the skin, run skinnode tare",
             )
 
 

@@ -1,4 +1,4 @@
-"""Checks of timing and losses: SYNC, scans after SYNC, lost frames."""
+"""Doctor checks of timing and losses: SYNC, delay of scans after SYNC, lost frames."""
 
 from __future__ import annotations
 
@@ -24,17 +24,17 @@ def check_timing(bus: BusFacts) -> Iterator[Finding]:
     def found(where: str, what: str, sure: Sure, evidence: str, advice: str) -> Finding:
         return Finding("timing", where, what, sure, evidence, advice)
 
-    awaited = (bus.running and not bus.sync_ours) or bus.role == "guest"  # another master must send SYNC
+    awaited = (bus.running and not bus.sync_ours) or bus.role == "guest"  # SYNC must come from another master
     if awaited and len(bus.sync_s) == 0 and bus.seconds > 0 and not bus.failure:
         timers = any(p.info and p.info.patch and p.info.patch.period_ms for p in bus.patches)
         if not timers:
             yield found(
                 bus.name,
-                "nobody sends SYNC",
+                "no node sends SYNC",
                 Sure.CERTAIN,
                 f"none in {bus.seconds:.1f} s, and "
                 + ("nodes are operational" if bus.running else "the host is a guest here"),
-                "start the host, or the robot's master: patches scan only at SYNC",
+                "start the host or the robot's master, because patches scan only at SYNC",
             )
     yield from _check_sync(bus)
     for patch in bus.patches:
@@ -45,10 +45,10 @@ def check_timing(bus: BusFacts) -> Iterator[Finding]:
         if len(latency_s) and float(np.median(latency_s)) > _LATE * period_s:
             yield found(
                 patch.name,
-                "scans end after the next has begun",
+                "scans end after the next scan has begun",
                 Sure.CERTAIN,
                 f"median {np.median(latency_s) * 1e3:.1f} ms after SYNC, period {period_s * 1e3:g} ms",
-                "set a shorter inhibit time or a longer period, or reduce the load on the bus",
+                "set a shorter inhibit time or a longer SYNC period, or reduce the bus load",
             )
 
 
@@ -67,7 +67,7 @@ def _check_sync(bus: BusFacts) -> Iterator[Finding]:
                 "the SYNC period differs from the hand file",
                 Sure.CERTAIN,
                 f"{period_s * 1e3:.2f} ms, hand file: {bus.period_s * 1e3:g} ms",
-                "look for a second master, or another hand file in use",
+                "look for a second master, or for a host that uses another hand file",
             )
         missing = int(np.sum(np.rint(intervals / period_s) - 1))
         if missing > 0:
@@ -102,7 +102,7 @@ def check_losses(bus: BusFacts) -> Iterator[Finding]:
             "this machine dropped frames",
             Sure.CERTAIN,
             f"{bus.dropped} of {bus.frames + bus.dropped}, by the kernel or the receive queue",
-            "raise net.core.rmem_max or reduce the load; the findings about scans may result from this",
+            "raise net.core.rmem_max or reduce the load; the dropped frames may explain findings about scans",
         )
     for patch in bus.patches:
         if patch.scans is None:
@@ -111,7 +111,7 @@ def check_losses(bus: BusFacts) -> Iterator[Finding]:
         if stats.chunks_lost or stats.scans_torn or stats.summaries_lost:
             yield found(
                 patch.name,
-                "scans with holes",
+                "incomplete scans",
                 Sure.LIKELY if bus.dropped else Sure.CERTAIN,
                 f"{stats.scans_torn} of {scans} torn, {counted(stats.chunks_lost, 'chunk')} and "
                 f"{counted(stats.summaries_lost, 'summary', 'summaries')} lost",
@@ -123,7 +123,7 @@ def check_losses(bus: BusFacts) -> Iterator[Finding]:
                 "whole scans are missing",
                 Sure.CERTAIN,
                 f"{stats.scans_missed} of {scans + stats.scans_missed}",
-                "the node skips scans (EMCY 0x8110) that take longer than the period",
+                "look for EMCY 0x8110: the node skips scans that take longer than the period",
             )
         if stats.conflicts:
             yield found(
@@ -150,5 +150,5 @@ def check_losses(bus: BusFacts) -> Iterator[Finding]:
                 Sure.CERTAIN,
                 f"{stats.bad_length} with wrong length, {stats.bad_index} with wrong index, "
                 f"{stats.bad_counter} with wrong counter, {stats.bad_form} summaries without a check",
-                "look for a node that uses its COB-IDs, and check its PDO mapping",
+                "look for another node that uses the COB-IDs of this patch, and check its PDO mapping",
             )

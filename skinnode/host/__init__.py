@@ -1,27 +1,28 @@
-"""The host: configure, start and supervise nodes; receive, assemble, solve and publish their scans.
+"""Host: configures, starts and supervises nodes; receives, assembles, solves and publishes their scans.
 
-**Data flow.** ``host`` owns all parts; ``lifecycle`` starts and stops them. Each bus has a ``link`` (port,
-receive thread, reopening) and a ``served_bus``; each patch has a ``patch_stream`` and a ``node_monitor``::
+**Data flow.** The module ``lifecycle`` starts and stops the parts of a host; ``host`` is their public
+interface. Each bus has a ``link`` (port, receive queue, reopening) and a ``served_bus``. Each patch has a
+``patch_stream`` and a ``node_monitor``::
 
-    link (receive thread) -> drop_oldest_queue -> mainline -> dispatcher (frame to its handler, set up in
-        reception) -> patch_stream (scan assembly; accounting of losses) -> code_watch (which data to use)
-        -> workers, scan_solver -> publish (subscriptions), callback, hand_frame, trust_report
-    code_watch  =  code_runs -> converter_liveness (is the patch frozen?), frozen_parts (is a wire or crossing
-        frozen?), wire_windows and wire_faults (noisy, drifting, open, shorted wires)
+    receive thread -> link (receive queue) -> mainline -> dispatcher (calls the handlers set up in reception)
+        -> patch_stream (assembles scans) -> code_watch (selects usable codes) -> workers, scan_solver
+        -> publish (subscriptions, drop_oldest_queue) -> callback, hand_frame
+    code_watch: code_runs -> converter_liveness (frozen patches), frozen_parts (frozen wires and crossings),
+        wire_windows and wire_faults (noisy, drifting, open and shorted wires)
 
-    start (bring-up of all nodes) -> configurator (one node: write, verify, store), node_facts, lss_master
-    supervisor -> node_supervision -> supervised (what is due for a node) -> remote_node, sdo_client (by SDO)
+    start (brings up all nodes) -> remote_node -> configurator (configures one node), sdo_client, lss_master
+    supervisor -> node_supervision (actions for each supervised node) -> remote_node, baseline_watch
     node_monitor (evidence about a node) -> health (condition) -> health_watch -> events
 
-Producers: ``sync`` (SYNC), ``nmt_master`` (NMT commands). ``containment`` catches exceptions; ``retry_pause``
-spaces repeated attempts; ``tap`` hands frames and fields to recorders.
+The module ``sync`` sends SYNC, and ``nmt_master`` sends NMT commands. ``containment`` contains exceptions,
+and ``retry_pause`` determines the pauses between attempts. ``tap`` passes frames to recorders.
 
 **Containment.** Exceptions do not end the host's threads. An exception raised while serving a patch makes
-that patch faulty and is recorded as the reason: the scans of the patch are withheld, and the patch is brought
-up again after a pause of 0.1 s, which doubles with each defect, up to 1 s; a boot-up of the node ends the
-pause. An exception raised while serving a bus pauses the bus, or causes its interface to be closed and
-reopened, with pauses of the same length. If an exception is raised while serving a subscriber, a callback or
-a tap, only the item meant for that recipient is lost. All exceptions are counted by subject
+that patch faulty and is recorded as the reason. The scans of a faulty patch are withheld, and the patch is
+brought up again after a pause. The pause is 0.1 s and doubles with each defect, up to 1 s; a boot-up of the
+node ends the pause. After an exception raised while serving a bus, the bus pauses, or its interface is closed
+and reopened, with pauses of the same length. If an exception is raised while serving a subscriber, a callback
+or a tap, only the item for that recipient is lost. All exceptions are counted by subject
 (``Host.stats().defects``), published as events, and logged once for each distinct message; see
 :mod:`skinnode.host.containment`.
 

@@ -1,4 +1,4 @@
-"""Watch the health of a running host and publish changes as events."""
+"""Monitor the health of a running host and publish changes as events."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from skinnode.process import clock
 from skinnode.text.words import counted
 
 _CHECK_S: Final = 0.05
-"""Interval between checks, s; a change that does not last this long may be visible only in the counters."""
+"""Interval between health checks, s. A shorter change may be visible only in the counters."""
 
 _QUIET_NS: Final = 1_000_000_000
-"""Minimum interval between events for a counter that keeps growing."""
+"""Minimum interval between events for the same counter, ns."""
 
 
 _PATCH_COUNTERS: Final = {
@@ -27,7 +27,7 @@ _PATCH_COUNTERS: Final = {
     "baselines": ("new baseline in use", "new baselines in use"),
     "conflicts": ("conflict", ""),
 }
-"""Counters of :class:`PatchHealth`, each with the singular noun for what it counts, and the plural if it is
+"""Counters of :class:`PatchHealth`, each with the singular of the counted noun, and the plural if it is
 irregular."""
 _BUS_COUNTERS: Final = {
     "bus_offs": ("bus-off", ""),
@@ -40,7 +40,8 @@ _BUS_COUNTERS: Final = {
     "other_syncs": ("SYNC of another producer", "SYNCs of another producer"),
     "other_masters": ("command of another master", "commands of another master"),
 }
-"""Counters of :class:`BusHealth`, likewise."""
+"""Counters of :class:`BusHealth`, each with the singular of the counted noun, and the plural if it is
+irregular."""
 
 
 def _is_frozen_part(fault: DataFault) -> bool:
@@ -48,9 +49,9 @@ def _is_frozen_part(fault: DataFault) -> bool:
 
 
 class HealthWatch:
-    """Watcher that publishes changes in the health of all patches and buses since the previous check.
+    """Monitor that publishes changes in the health of all patches and buses between two checks.
 
-    Threads: a dedicated thread runs the checks, from construction to :meth:`close`.
+    Threads: a dedicated thread runs the health checks, from construction until :meth:`close`.
     """
 
     def __init__(
@@ -66,13 +67,14 @@ class HealthWatch:
         self._all_defects = all_defects
         self._ended = False
         self._patch_before, self._bus_before = dict(patches()), dict(buses())
-        self._reported: dict[tuple[str, str], tuple[int, int]] = {}  # when, and how many
+        # time and count of the last event, by subject and counter
+        self._reported: dict[tuple[str, str], tuple[int, int]] = {}
         self._stop = clock.event()
         self._thread = clock.thread(target=self._run, name="health")
         self._thread.start()
 
     def close(self) -> None:
-        """Make a final check, then end and join the thread."""
+        """Run a final health check, then end and join the thread."""
         self._stop.set()
         self._thread.join()
 
@@ -88,9 +90,9 @@ class HealthWatch:
         keep_on(self._turn, self._defects, "watching the health")
 
     def _turn(self) -> bool:
-        """Wait, then check. Returns False after the last check.
+        """Wait, then check the health. Returns False after the last check.
 
-        A check that raised an exception is repeated, so an event may be published twice, but none is missed.
+        A check that raised an exception is repeated, so an event may be published twice but is never missed.
         """
         if self._ended:
             return False
@@ -143,7 +145,7 @@ class HealthWatch:
         self._compare_counters(name, before, now, _PATCH_COUNTERS)
 
     def _compare_frozen_parts(self, name: str, before: PatchHealth, now: PatchHealth) -> None:
-        """Publish which wires and crossings are left out because they are frozen, and which no longer are."""
+        """Publish changes in which frozen wires and crossings are left out of the fields."""
         was, are = (
             {each.place: each for each in health.faults if _is_frozen_part(each)} for health in (before, now)
         )

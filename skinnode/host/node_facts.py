@@ -1,4 +1,4 @@
-"""Facts about a patch that are available once its node has been configured."""
+"""Parameters of a patch that are available after its node has been configured."""
 
 from __future__ import annotations
 
@@ -12,21 +12,21 @@ from skinnode.protocol.profile import PatchProfile
 
 @dataclass(frozen=True, slots=True, eq=False)
 class NodeFacts:
-    """Facts about a patch, collected while its node was configured."""
+    """Parameters of a patch, collected during the configuration of its node."""
 
     config: PatchConfig
     layout: PatchLayout
     profile: PatchProfile
     scale: CodeScale
     baseline_ohm: Float
-    """(U, K) resistances at rest with which the node encodes its scans, ohm."""
+    """(U, K) ohm: resistances at rest with which the node encodes its scans."""
     serial: int | None
-    """Serial number; None if the host is not allowed to read it."""
+    """Serial number of the node; None if the host is not allowed to read the serial number."""
     heartbeat_s: float
     """Heartbeat period of the node, s."""
     checked: bool = False
     """Whether the node is known to send a check with every scan; False if its revision could not be read."""
 
     def with_baseline(self, baseline_ohm: Float) -> NodeFacts:
-        """Return a copy with another baseline, for example after a tare."""
+        """Return a copy with a different baseline, for example after a tare."""
         return replace(self, baseline_ohm=baseline_ohm)

@@ -1,8 +1,8 @@
-"""Turn chunks on the bus into fields: assemble on the mainline, decode and solve on the worker pool.
+"""Turn a patch's chunks into fields: assemble scans on the mainline, decode and solve them on workers.
 
-The mainline assembles scans and puts the newest in a box that holds one scan; a worker takes the scan from
-the box and solves it. A scan overtaken while the worker is busy is skipped and counted. The stream's
-token ensures that at most one worker processes the stream at a time.
+The mainline assembles scans and puts the newest scan into a box that holds a single scan. A worker thread
+takes the scan from the box and solves it. If a newer scan replaces the scan in the box, the older scan is
+skipped and counted. A token ensures that at most one worker processes the stream at a time.
 """
 
 from __future__ import annotations
@@ -35,8 +35,8 @@ _BASELINE_CHANGED: Final = int(SummaryFlag.BASELINE_CHANGED)
 
 _EVER_NS: Final = 2**63
 WATCH_AFTER_NS: Final = 5_000_000
-"""Delay after the last frame of a scan before its codes are evaluated for faults. Fields have priority
-because programs wait for them, and the fields of all patches for one SYNC are due at the same time."""
+"""Delay from the last frame of a scan to the search for noisy and drifting wires, ns. Solving has priority,
+because programs wait for the fields, and all patches' fields for one SYNC are due at the same time."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,30 +48,30 @@ class StreamStats:
     """
 
     frames: int
-    """Chunks and summaries passed to the stream."""
+    """Number of chunks and summaries passed to the stream."""
     offered: int
     withheld: int
-    """Scans that could not be decoded because the patch was being brought up or its baseline was being
-    read."""
+    """Number of scans that could not be decoded because the patch was being brought up or its baseline was
+    being read."""
     partial: int
-    """Incomplete scans withheld because of ``stream.partial`` in the hand file."""
+    """Number of incomplete scans withheld because of ``stream.partial`` in the hand file."""
     solved: int
     skipped: int
-    """Scans replaced by newer scans before a worker was free."""
+    """Number of scans replaced by newer scans before a worker was free."""
     untrusted: int
-    """Fields in which a wire did not converge."""
+    """Number of fields that are not trusted."""
     invalid_codes: int
-    """Codes over range, short, open or missing, in all solved scans."""
+    """Number of codes in all solved scans that are over range, short, open or missing."""
     assembler: AssemblerStats
     failed: int = 0
-    """Scans whose decoding or solving raised an exception."""
+    """Number of scans whose decoding or solving raised an exception."""
 
 
 class StreamTap(Protocol):
-    """Recorder of events (other than frames) that decide which scans a stream passes on. Mainline only."""
+    """Recorder of the events, other than frames, that determine which scans are solved. Mainline only."""
 
     def resumed(self, patch: str, solver: ScanSolver, *, anew: bool) -> None:
-        """Record that :meth:`PatchStream.resume` began to pass scans on."""
+        """Record that :meth:`PatchStream.resume` started passing scans to a solver."""
 
     def withheld(self, patch: str) -> None:
         """Record that :meth:`PatchStream.withhold` was called."""
@@ -80,15 +80,15 @@ class StreamTap(Protocol):
         """Record that :meth:`PatchStream.poll` ended an incomplete scan."""
 
     def overtaken(self, patch: str, scan: int, t_receive_ns: int) -> None:
-        """Record that a newer scan replaced this scan, whose last frame arrived at ``t_receive_ns``."""
+        """Record that a newer scan replaced ``scan``, whose last frame arrived at ``t_receive_ns``."""
 
 
 def _ignore(scan: Scan) -> None:
-    """Ignore a scan."""
+    """Ignore a scan; default for unused callbacks."""
 
 
 def _find_nothing(scan: Scan, number: int) -> Verdict:
-    """Find no fault in a scan."""
+    """Return a verdict without faults; default for :attr:`StreamOptions.judge`."""
     return FAULTLESS
 
 
@@ -99,63 +99,66 @@ class StreamOutput:
     workers: Workers | Inline
     publisher: Publisher
     defects: Defects | None = None
-    """Collects exceptions raised by decoding and solving; if None, the first exception ends the publisher."""
+    """Collector of exceptions raised by decoding and solving; if None, the first exception ends the
+    publisher."""
 
 
 @dataclass(frozen=True, slots=True)
 class StreamOptions:
-    """Settings of a stream."""
+    """Settings of a patch stream."""
 
     tick: Callable[[int], Tick | None]
-    """Returns the newest SYNC with the given counter."""
+    """Function that returns the newest SYNC with the given counter value."""
     on_scan: Callable[[Scan], None] = _ignore
-    """Called immediately with each assembled scan."""
+    """Function called immediately with each assembled scan."""
     judge: Callable[[Scan, int], Verdict] = _find_nothing
-    """Called with each assembled scan and its number before the scan is solved. All earlier scans have been
-    passed to ``watch`` by then, so a replay comes to the same verdicts as the host."""
+    """Function called with each assembled scan and its number before the scan is solved. All earlier scans
+    have been passed to ``watch`` by then, so a replay produces the same verdicts as the host."""
     watch: Callable[[Scan], None] = _ignore
-    """Called with each assembled scan after a delay of :data:`WATCH_AFTER_NS`."""
+    """Function called with each assembled scan after a delay of :data:`WATCH_AFTER_NS`."""
     partial: Partial = "pass"
-    """``pass`` or ``withhold``: what to do with incomplete scans."""
+    """Handling of incomplete scans: ``pass`` or ``withhold``."""
     under_way: bool = False
-    """Whether another master starts the node, so that the node may already be sending when scans are first
-    passed on."""
+    """Whether another master starts the node, so that the node may already be sending when the stream starts
+    passing scans to a solver."""
 
 
 class PatchStream:
-    """Path of one patch's scans from frames to fields.
+    """Stream of one patch's scans, from received frames to published fields.
 
-    Scans are withheld until :meth:`resume` passes a solver. A scan whose decoding or solving raises an
-    exception is lost.
+    Scans are withheld until :meth:`resume` is called with a solver. A scan whose decoding or solving raises
+    an exception is lost.
 
-    Threads: the mainline calls all methods; any thread may also call :meth:`settled` and :meth:`stats`.
+    Threads: only the mainline may call the methods, except :meth:`settled` and :meth:`stats` (any thread).
     """
 
     def __init__(
         self, patch: str, assembler: ScanAssembler, output: StreamOutput, options: StreamOptions
     ) -> None:
         self._patch, self._options = patch, options
-        self._solver: ScanSolver | None = None  # None: withhold
+        self._solver: ScanSolver | None = None  # None while scans are withheld
         self._assembler = assembler
         self._workers, self._publisher, self._defects = output.workers, output.publisher, output.defects
         assembler.on_discarded = self._doubt
         self._unwatched: deque[tuple[int, Scan]] = deque()
-        self._box: deque[tuple[Scan, ScanStamp, ScanSolver, Verdict]] = deque()  # holds one scan; thread-safe
+        # at most one scan; thread-safe
+        self._box: deque[tuple[Scan, ScanStamp, ScanSolver, Verdict]] = deque()
         self._token: deque[None] = deque([None])
         self.tap: StreamTap | None = None
         self._left_out: list[int] = []
         self._left_out_within_ns = 0
         self.withholdings = 0
-        """Number of times that withholding has begun."""
+        """Number of times that :meth:`withhold` has been called."""
         self.doubtful = False
         """Whether a summary that may have announced a new baseline was lost or discarded with its scan."""
         self._frames = self._withheld = self._partial = 0
         self._offered = self._taken = self._solved = self._failed = self._untrusted = self._invalid = 0
         self._newest = 0
         self._solving = 0
-        """Number of the scan that a worker is solving."""
+        """Number of the scan that a worker is currently solving."""
         self.t_passed_ns = 0
-        """Monotonic time at which the newest scan that was not withheld was received; 0 before the first."""
+        """Monotonic arrival time of the newest scan that was not withheld, ns; 0 before the first such
+        scan."""
 
     # --- mainline
 
@@ -174,7 +177,7 @@ class PatchStream:
             self._offer(scan)
 
     def poll(self, t_ns: int) -> None:
-        """End a scan that has waited long enough for missing frames; evaluate earlier scans for faults."""
+        """End an incomplete scan after its deadline, and check earlier scans for faulty wires."""
         self._watch_until(t_ns)
         deadline_ns = self._assembler.next_deadline_ns()
         if deadline_ns is None or t_ns < deadline_ns:
@@ -182,16 +185,16 @@ class PatchStream:
         if self.tap is not None:
             self.tap.polled(self._patch, t_ns)
         scan = self._assembler.poll(t_ns)
-        if scan is not None:  # None if the scan was discarded
+        if scan is not None:  # None if the assembler discarded the scan
             self._offer(scan)
 
     def _watch_until(self, t_ns: int) -> None:
-        """Evaluate the scans that are due at ``t_ns`` for faults."""
+        """Check the scans that are due at ``t_ns`` for faulty wires."""
         while self._unwatched and t_ns >= self._unwatched[0][0]:
             self._options.watch(self._unwatched.popleft()[1])
 
     def withhold(self) -> int:
-        """Stop passing scans on, including the scan being assembled. Returns ``withholdings``."""
+        """Withhold all further scans, including the scan being assembled. Returns ``withholdings``."""
         self._solver = None
         self.withholdings += 1
         if self.tap is not None:
@@ -204,13 +207,13 @@ class PatchStream:
         return self._solver is None
 
     def resume(self, solver: ScanSolver, withholdings: int, *, anew: bool) -> None:
-        """Start passing scans on, decoded and solved by ``solver``.
+        """Start passing scans to ``solver``, which decodes and solves them.
 
         Args:
-            solver: Decodes and solves the scans.
-            withholdings: Number of withholdings known to the caller; if there have been more since, the call
-                has no effect.
-            anew: Whether the node has been started anew, so that frames received earlier belong to another
+            solver: Solver for the scans.
+            withholdings: Value of ``withholdings`` known to the caller. If scans have been withheld again
+                since then, the call has no effect.
+            anew: Whether the node has been restarted, so that frames received earlier belong to a previous
                 stream.
         """
         if withholdings != self.withholdings:
@@ -226,16 +229,16 @@ class PatchStream:
             self.tap.resumed(self._patch, solver, anew=anew)
 
     def inform_tap(self) -> None:
-        """Notify a new tap if scans are being passed on."""
+        """Inform a new tap about the solver if scans are not being withheld."""
         if self.tap is not None and self._solver is not None:
             self.tap.resumed(self._patch, self._solver, anew=False)
 
     def close(self) -> None:
-        """Discard the scan that waits for a worker. Called once the mainline has ended."""
+        """Discard the scan that waits for a worker. Called after the mainline has ended."""
         self._box.clear()
         while self._unwatched:
             scan = self._unwatched.popleft()[1]
-            with contextlib.suppress(Exception):  # no caller is left
+            with contextlib.suppress(Exception):  # no caller remains that could handle it
                 self._options.watch(scan)
 
     def _doubt(self) -> None:
@@ -248,7 +251,7 @@ class PatchStream:
         self._watch_until(_EVER_NS)
         verdict = self._options.judge(scan, number)
         self._unwatched.append((scan.t_last_ns + WATCH_AFTER_NS, scan))
-        if scan.flags & _BASELINE_CHANGED:  # this scan is the first with the new baseline
+        if scan.flags & _BASELINE_CHANGED:  # the first scan encoded with the new baseline
             self.withhold()
         elif scan.device_time_us is None:
             self.doubtful = True
@@ -283,12 +286,12 @@ class PatchStream:
     def leave_out(self, times_ns: Sequence[int], within_ns: int) -> None:
         """Skip the scans that newer scans overtook when the recording was made.
 
-        Scan numbers cannot identify these scans: after a pause, the two halves of one scan may count as two
-        scans with the same number.
+        Scan numbers cannot identify the overtaken scans: after a pause, the two halves of one scan may count
+        as two scans with the same number.
 
         Args:
-            times_ns: Monotonic times at which the last frames of these scans arrived.
-            within_ns: Tolerance for these times.
+            times_ns: Monotonic arrival times of the last frames of the overtaken scans, ns.
+            within_ns: Tolerance for the arrival times, ns.
         """
         self._left_out, self._left_out_within_ns = sorted(times_ns), within_ns
 
@@ -299,7 +302,7 @@ class PatchStream:
         return i < len(self._left_out) and self._left_out[i] <= t_ns + self._left_out_within_ns
 
     def settled(self, scan: int) -> bool:
-        """Return whether no scan is left to solve, and ``scan`` has arrived or scans are withheld."""
+        """Return whether no scan remains to be solved, and ``scan`` has arrived or scans are withheld."""
         return (self._newest >= scan or self._solver is None) and not self._box and bool(self._token)
 
     # --- worker
@@ -308,7 +311,7 @@ class PatchStream:
         try:
             self._token.pop()
         except IndexError:
-            return  # a worker is busy, and checks the box when it is done
+            return  # the busy worker checks the box when it has finished
         try:
             self._workers.submit(self._work, self._work_failed)
         except Exception:
@@ -323,7 +326,7 @@ class PatchStream:
         self._leave()
 
     def _solve_next(self) -> None:
-        self._taken += 1  # before the scan leaves the box, so that the counters always include it
+        self._taken += 1  # counted before the scan leaves the box, so that the counters always include it
         try:
             scan, stamp, solver, verdict = self._box.popleft()
         except IndexError:  # the stream was closed
@@ -342,20 +345,20 @@ class PatchStream:
         self._publisher.publish(field, stamp.patch)
 
     def _work_failed(self, error: Exception) -> None:
-        """Handle the exception raised when a job could not start."""
+        """Handle an exception raised outside the solving itself."""
         self._report(error)
         self._leave()
 
     def _leave(self) -> None:
-        """Release the stream to the next worker, at once if a scan is waiting.
+        """Return the token, and call another worker immediately if a scan is waiting.
 
-        Never raises, because the holder must return the token exactly once.
+        Never raises an exception, because the token must be returned exactly once.
         """
         self._token.append(None)
         try:
             if self._box:
                 self._call_worker()
-        except Exception as error:  # the scan waits for the next call
+        except Exception as error:  # the waiting scan is solved after the next call
             self._report(error)
 
     def _report(self, error: Exception) -> None:
@@ -368,10 +371,10 @@ class PatchStream:
         self._publisher.fail(failure)
 
     def stats(self) -> StreamStats:
-        """Return all counters.
+        """Return all counters of the stream.
 
-        The counters are read in such an order that a scan that may still be solved is never counted as
-        skipped.
+        The order in which the counters are read ensures that a scan that may still be solved is never counted
+        as skipped.
         """
         offered, waiting = self._offered, len(self._box)
         return StreamStats(

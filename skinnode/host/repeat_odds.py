@@ -1,10 +1,11 @@
-"""Probability that a live converter repeats its codes, given its noise and the width of a code.
+"""Compute the probability that a live converter repeats its codes, given the noise in codes.
 
-A reading falls into the same code again with a probability of at most 2Φ(1/2σ) − 1, where σ is the noise in
-codes; a true value in the middle of a step attains it. Skin at rest after a tare is exactly there. Under a
-press, each crossing has its own value, and where it lies within a step is as good as random. The probability
-that n + 1 readings of one crossing all fall into the same code is then E max(0, 1 − σ R), where R is the
-range of n + 1 standard normal variables: much less than the bound, even for a quiet converter.
+The probability that a reading falls into the same code again is at most 2Φ(1/2σ) − 1, where σ is the standard
+deviation of the noise in codes. This bound is reached if the true value is in the middle of a quantization
+step, as for skin at rest after a tare. Under a press, each crossing has a different value, whose position
+within its quantization step is practically random. The probability that n + 1 readings of one crossing all
+fall into the same code is then E max(0, 1 − σ R), where R is the range of n + 1 standard normal variables.
+Even for a converter with little noise, this probability is much lower than the bound.
 """
 
 from __future__ import annotations
@@ -14,12 +15,12 @@ import math
 from typing import Final
 
 _EDGES: Final = 0.1
-"""Largest σ for which σ R stays below 1 for every run that matters, so that E max(0, 1 − σ R) = 1 − σ E R;
-larger noise is treated as this."""
+"""Maximum σ for which σ R is less than 1 for all relevant runs, so that E max(0, 1 − σ R) = 1 − σ E R. A
+larger σ is replaced by this value."""
 
 
 def log_stay(sigma: float) -> float:
-    """Return the logarithm of the largest probability that a code repeats.
+    """Return the logarithm of the maximum probability that a code repeats once.
 
     Args:
         sigma: Standard deviation of the noise, codes.
@@ -31,7 +32,7 @@ def log_stay(sigma: float) -> float:
 
 
 def log_stay_anywhere(sigma: float, run: int) -> float:
-    """Return the logarithm of the probability that a code repeats ``run`` times, at a random place in a step.
+    """Return the log probability that a code repeats ``run`` times, for a random position within its step.
 
     Args:
         sigma: Standard deviation of the noise, codes.
@@ -52,7 +53,7 @@ def _mean_range(count: int) -> float:
 
 
 def deviations_of(log_p: float) -> float:
-    """Return the number of standard deviations that a normal variable exceeds with probability exp(log_p)."""
+    """Return the z-score that a standard normal variable exceeds with probability exp(log_p)."""
     if log_p > -1.0:
         return 0.0
     z = math.sqrt(-2.0 * log_p)

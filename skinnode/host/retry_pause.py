@@ -1,4 +1,4 @@
-"""Pauses between retries of an operation that fails: bring-up of a node, opening a bus, a failing thread."""
+"""Determine the pauses between attempts at a failing operation, such as bringing up a node."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from skinnode.process import clock
 
 FIRST_PAUSE_S: Final = 0.1
 LONGEST_PAUSE_S: Final = 1.0
-"""First and longest pause before a failed operation is retried, in s; each pause is twice the previous
-pause."""
+"""First and longest pause before a failed operation is retried, s. Each pause is twice as long as the
+previous pause."""
 
 
 class Pause:
-    """Sequence of increasing pauses between retries of an operation, s.
+    """Sequence of increasing pauses between attempts at an operation.
 
-    Once the operation has worked for as long as the longest pause, the sequence starts again.
+    If the operation has worked for longer than the longest pause, the sequence starts again.
     """
 
     def __init__(self, first_s: float = FIRST_PAUSE_S, longest_s: float = LONGEST_PAUSE_S) -> None:
@@ -25,7 +25,7 @@ class Pause:
         self._end_s = -math.inf
 
     def next_s(self) -> float:
-        """Return the length of the pause that starts now, before the next attempt."""
+        """Return the duration of the pause before the next attempt, s."""
         now_s = clock.monotonic()
         again = now_s <= self._end_s + self._longest_s
         self._pause_s = min(2 * self._pause_s, self._longest_s) if again else self._first_s

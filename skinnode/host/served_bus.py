@@ -1,4 +1,4 @@
-"""A bus of the hand, and the host's tasks on it other than serving patches."""
+"""Serve a bus of the hand: SYNC, LSS, detection of other masters, and bus health."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from skinnode.host.sync import SyncFollower, Ticks
 
 @dataclass(frozen=True, slots=True)
 class ServedBus:
-    """A bus with its SYNC counters, its listeners for other masters and SYNC, and its LSS master."""
+    """Bus with its SYNC times, SYNC follower, LSS master and detector of other masters."""
 
     link: BusLink
     ticks: Ticks
@@ -25,7 +25,7 @@ class ServedBus:
     lss: LssMaster
 
     def health(self, *, no_sync: bool) -> BusHealth:
-        """Return the health of the bus; ``no_sync`` is copied into the result."""
+        """Return the health of the bus; ``no_sync`` is copied to the result."""
         masters, stats, failure = self.other_masters.stats(), self.link.stats(), self.link.failure
         return BusHealth(
             bus=self.link.config.name,
@@ -48,12 +48,12 @@ class ServedBus:
     def sync_is_late(self, t_up_ns: int, period_ns: int) -> bool:
         """Return whether another master's SYNC has been absent for :data:`SYNCS_MISSED` periods.
 
-        The time of the newest dispatched frame counts as now, so that a delay in the host does not count as
-        missing SYNC.
+        Times are compared with the time of the newest dispatched frame instead of the current time, so that a
+        delay in the host does not count as missing SYNC.
 
         Args:
-            t_up_ns: Monotonic time at which bring-up of the host was complete.
-            period_ns: SYNC period.
+            t_up_ns: Monotonic time at which bring-up was complete, ns.
+            period_ns: SYNC period, ns.
         """
         if self.link.config.role == "master" or self.link.failure is not None:
             return False

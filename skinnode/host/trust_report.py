@@ -1,4 +1,4 @@
-"""What a field says about itself, for reports and JSON: trust, precision, share of the data, faults."""
+"""Summarise a field's trust, precision, data share and faults for reports and JSON."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from skinnode.text.json_values import plain
 
 
 def trust_table(field: FieldFrame | None) -> dict[str, Any]:
-    """Return what a field says about itself; every value is None if there is no field.
+    """Return a field's trust, precision, data share and faults; every value is None if there is no field.
 
-    ``deepest_data_share`` is the share of the data in the depth of the deepest electrode; it is 1 if the
-    field does not depend on a prior.
+    ``deepest_data_share`` is the data share of the deepest electrode's depth, which is 1 if the field does
+    not depend on a prior.
     """
     if field is None:
         return dict.fromkeys(("trusted", "distrust", "precise", "deepest_data_share", "data_faults"))
@@ -33,14 +33,14 @@ def trust_table(field: FieldFrame | None) -> dict[str, Any]:
 
 
 def deepest_data_share(field: FieldFrame) -> float:
-    """Return how much of the depth of the deepest electrode comes from the data; 1 means all of it."""
+    """Return the data share of the deepest electrode's depth; 1 if the depth comes from the data alone."""
     if field.data_share is None:
         return 1.0
     return float(field.data_share[..., 2].flat[int(np.argmin(field.displacement_m[..., 2]))])
 
 
 def fault_table(fault: DataFault) -> dict[str, Any]:
-    """Return a fault for JSON; infinite deviations are None."""
+    """Return a fault as a table for JSON, with infinite deviations replaced by None."""
     table: dict[str, Any] = plain(
         {
             "part": str(fault.part),

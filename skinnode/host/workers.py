@@ -1,8 +1,8 @@
-"""A pool of worker threads that run submitted jobs in order.
+"""Run submitted jobs in order on a pool of worker threads.
 
-Submitting a job costs the mainline only half a microsecond, because, unlike ThreadPoolExecutor, this pool has
-no result objects and no lock except the queue's. An exception in a job is passed to the function submitted
-with the job, and the thread continues with the next job.
+Submitting a job takes the mainline only half a microsecond, because the pool needs neither result objects nor
+a lock in addition to the queue's, unlike ThreadPoolExecutor. If a job raises an exception, the exception is
+passed to the function submitted with the job, and the thread continues with the next job.
 """
 
 from __future__ import annotations
@@ -17,28 +17,28 @@ from skinnode.process import clock
 
 Job = Callable[[], None]
 OnError = Callable[[Exception], object]
-"""Called with the exception raised by a job, on the thread that ran the job; must not raise."""
+"""Function called with the exception raised by a job, on the thread that ran the job; must not raise."""
 
 
 class Workers:
-    """A pool of ``count`` threads, from construction to :meth:`close`.
+    """Pool of ``count`` worker threads, which run from construction until :meth:`close`.
 
-    Threads: any thread may submit. Exceptions raised outside jobs are reported to ``defects``.
+    Threads: any thread may submit jobs. Exceptions raised outside jobs are reported to ``defects``.
     """
 
     def __init__(self, count: int, name: str, defects: Defects | None = None) -> None:
-        self._jobs: queue.SimpleQueue[tuple[Job, OnError] | None] = clock.simple_queue()  # None: end
+        self._jobs: queue.SimpleQueue[tuple[Job, OnError] | None] = clock.simple_queue()  # None ends a thread
         self._defects = Defects(name) if defects is None else defects
         self._threads = [clock.thread(target=self._run, name=f"{name} {i}") for i in range(count)]
         for thread in self._threads:
             thread.start()
 
     def submit(self, job: Job, on_error: OnError) -> None:
-        """Run ``job`` on the next free thread; ``on_error`` receives its exception."""
+        """Run ``job`` on the next free thread; if the job raises an exception, pass it to ``on_error``."""
         self._jobs.put((job, on_error))
 
     def close(self) -> None:
-        """Run the jobs already submitted, then end and join the threads."""
+        """Wait until the submitted jobs have run, then end and join the threads."""
         for _ in self._threads:
             self._jobs.put(None)
         for thread in self._threads:
@@ -56,7 +56,7 @@ class Workers:
         keep_on(self._turn, self._defects, "taking a job")
 
     def _turn(self) -> bool:
-        """Wait for the next job and run it. Returns False when the thread must end."""
+        """Wait for the next job and run it. Returns False if the thread must end."""
         task = self._jobs.get()
         if task is None:
             return False
@@ -69,10 +69,10 @@ class Workers:
 
 
 class Inline:
-    """Stand-in for :class:`Workers` that runs each job at once, on the submitting thread."""
+    """Replacement for :class:`Workers` that runs each job immediately on the submitting thread."""
 
     def submit(self, job: Job, on_error: OnError) -> None:
-        """Run ``job``; ``on_error`` receives its exception."""
+        """Run ``job``; if the job raises an exception, pass it to ``on_error``."""
         try:
             job()
         except Exception as error:

@@ -1,15 +1,15 @@
-"""Scenes as data: bodies that press, slide, roll, shear, turn, tap and walk on the patches of a hand.
+"""Scenes as data: rigid bodies that press, slide, roll, shear, turn, tap and walk on a hand's patches.
 
 ::
 
     scene file -> tables (keys, checks) -> bind (touch_checks: is the touch possible on its patch?)
         -> PatchScene of each patch
-    shapes, motions (body at a time) -> window (cells under the body) -> history (contact at each step)
+    shapes, motions (body pose at a time) -> window (cells under the body) -> history (contact at each step)
         -> response (displacement of the electrodes) -> patch (state at any time) -> truth
 
-The contact mechanics is that of :mod:`vcan_sim.contact`, which shares no code with the solvers. A scene is a
-function of scene time: each touch starts and ends with an untouched skin and is computed at fixed steps in
-order, so that the state at a time does not depend on the order in which times are asked for.
+The contact mechanics comes from :mod:`vcan_sim.contact`, which shares no code with the solvers. A scene is a
+function of scene time. Each touch starts and ends with an undeformed skin and is computed at fixed time steps
+in order. The state at a given time therefore does not depend on the order in which times are requested.
 """
 
 from vcan_sim.scenes.bind import bind_scene, load_scene

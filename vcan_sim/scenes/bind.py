@@ -1,4 +1,4 @@
-"""Binds a scene to a hand: checks every touch on its patch, and returns one :class:`PatchScene` per patch."""
+"""Bind a scene to a hand: check every touch on its patch, and return one :class:`PatchScene` per patch."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ from vcan_sim.scenes.touch_checks import check_apart, check_on_patch, error_at, 
 
 
 def load_scene(path: Path | str, hand: HandConfig) -> SceneConfig:
-    """Read a scene file and check it with the hand whose patches it touches.
+    """Read a scene file and check its touches on the patches of a hand.
 
     Args:
-        path: The file.
-        hand: The hand.
+        path: Scene file.
+        hand: Hand whose patches the scene touches.
 
     Raises:
-        ConfigError: The file cannot be read, is not a scene, or has a touch that is impossible on its patch.
-            The message is one line with file, line and column.
+        ConfigError: If the file cannot be read, is not a scene, or contains a touch that is impossible on its
+            patch. The message is one line with file, line and column.
     """
     scene = read_scene(path)
     bind_scene(scene, hand)
@@ -33,15 +33,15 @@ def load_scene(path: Path | str, hand: HandConfig) -> SceneConfig:
 
 
 def bind_scene(scene: SceneConfig, hand: HandConfig) -> dict[str, PatchScene]:
-    """Return the scene of each patch of a hand, also of patches that nothing touches.
+    """Return the scene of each patch of a hand by patch name, including patches that no body touches.
 
     Args:
-        scene: The scene.
-        hand: The hand.
+        scene: Scene to bind.
+        hand: Hand whose patches the scene touches.
 
     Raises:
-        ConfigError: A touch names an unknown patch, is deeper than the layer, leaves the patch, or comes too
-            close to another touch.
+        ConfigError: If a touch names an unknown patch, is too deep for the elastic layer, leaves the patch,
+            or comes too close to another touch.
     """
     names = [patch.name for patch in hand.patches]
     for i, touch in enumerate(scene.touches):
@@ -53,12 +53,12 @@ def bind_scene(scene: SceneConfig, hand: HandConfig) -> dict[str, PatchScene]:
 
 
 def layer_of(skin: SkinConfig, patch: PatchConfig, layout: PatchLayout) -> Layer:
-    """Return the elastic layer of a patch: the values of the scene, else those of the hand file.
+    """Return the elastic layer of a patch, from the scene file or, where it has no value, from the hand file.
 
     Args:
-        skin: Values of the scene.
+        skin: The scene file's ``[skin]`` table.
         patch: The patch in the hand file.
-        layout: Its layout, whose height is the default thickness.
+        layout: Layout of the patch; its height is the default thickness.
     """
     calibration = patch.calibration
     return Layer(

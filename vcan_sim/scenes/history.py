@@ -1,7 +1,7 @@
-"""History of one touch: its contact at fixed time steps, each from the step before.
+"""History of one touch: the contact at fixed time steps, each computed from the preceding step.
 
-Friction depends on the past, so the steps are computed in order and kept. The window of cells moves with the
-body by whole cells of a lattice that is fixed to the patch; the tractions stay with the skin.
+Friction depends on the past, so the time steps are computed in order and stored. The window of cells follows
+the body in whole cells of a lattice that is fixed to the patch; the tractions stay with the skin.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ from vcan_sim.scenes.tables import TouchConfig
 from vcan_sim.scenes.window import CLOSE, Window, centred_m, overlap_m, solve_depth
 
 _LEAST: Final = 1e-5
-"""Level of a touch, relative to its largest, below which the body counts as lifted."""
+"""Fraction of a touch's maximum depth or force below which the body counts as lifted."""
 _LOOSER: Final = (1.0, 10.0, 100.0)
-"""Factors of the tolerance, tried in turn until the contact converges."""
+"""Factors on the contact solver's tolerance, tried in this order until the contact converges."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,7 +32,7 @@ class Step:
     """State of a touch at one time step.
 
     Attributes:
-        first: (2,) lattice indices of the first cell of the window.
+        first: (2,) lattice indices of the window's first cell.
         traction_pa: (3, X, Y) tractions on the skin, Pa.
         electrodes_m: (E, 3) displacement of the electrodes, metres.
         force_n: (3,) force on the skin, N.
@@ -51,18 +51,18 @@ class Step:
 
 
 class History:
-    """Steps of one touch, computed when they are needed, in order. Can be used from several threads.
+    """Time steps of one touch, computed in order on first use. Safe to use from several threads.
 
     Args:
-        touch: The touch.
-        shape: Shape of its body.
+        touch: Touch to compute.
+        shape: Shape of the body that touches.
         friction: Coefficient of friction.
         window: Cells under the body.
         step_s: Time step, s.
-        electrodes: Places at which the displacement of the surface is computed.
+        electrodes: Electrodes at which the displacement of the surface is computed.
     """
 
-    def __init__(  # noqa: PLR0913 - what a touch depends on
+    def __init__(  # noqa: PLR0913 - all inputs of a touch
         self,
         touch: TouchConfig,
         shape: Shape,
@@ -73,9 +73,9 @@ class History:
     ) -> None:
         self.touch, self.window, self.step_s = touch, window, step_s
         self.first = math.floor(touch.from_s / step_s)
-        """Number of the first step; the body does not touch before."""
+        """Number of the first time step; the body does not touch the skin before this step."""
         self.last = math.ceil(touch.to_s / step_s)
-        """Number of the last step; the body does not touch after."""
+        """Number of the last time step; the body does not touch the skin after this step."""
         self._shape, self._friction, self._electrodes = shape, friction, electrodes
         self._steps: list[Step | None] = []
         self._contact = untouched(window.grid)
@@ -86,7 +86,7 @@ class History:
 
     @property
     def size_m(self) -> float:
-        """Side of a cell, metres."""
+        """Side length of a cell, metres."""
         return self.window.grid.size_m
 
     def step(self, number: int) -> Step | None:
@@ -100,19 +100,19 @@ class History:
             return self._steps[index]
 
     def cell_m(self, first: tuple[int, int]) -> Float:
-        """Return the centre (2,) of a cell of the lattice in the frame of the patch, metres."""
+        """Return the centre (2,) of a lattice cell in the patch frame, metres."""
         return np.asarray(self.touch.at_m) + centred_m(self.window.grid) + self.size_m * np.array(first)
 
     def _following(self, number: int) -> Step | None:
         pose, last = pose_at(self.touch, number * self.step_s), self._pose
         if self._steps and last is not None and self._steps[-1] is not None and pose == last:
-            return self._steps[-1]  # at rest
+            return self._steps[-1]  # the body has not moved
         largest = self.window.force_n if self.touch.by_force else self.window.deepest_m
         if pose.level < _LEAST * largest:
             self._contact, self._pose = untouched(self.window.grid), pose
             self._depth_and_force = None
             return None
-        start = self._contact  # what slides takes its tractions along
+        start = self._contact  # a sliding contact keeps its tractions relative to the body
         self._follow(pose)
         offset = self.cell_m(self._first_cell) - np.asarray(pose.place_m)
         slide = np.zeros(2) if last is None else np.subtract(pose.slid_m, last.slid_m)
@@ -125,7 +125,7 @@ class History:
         return self._summary(depth)
 
     def _solve(self, pose: Pose, offset_m: Float, slide_m: Float, start: Contact) -> tuple[float, Contact]:
-        """Return the depth, metres, and the contact after the move to a pose, searched from ``start``."""
+        """Return depth, metres, and contact after a move to a pose; ``start`` is the initial guess."""
         grid = self.window.grid
 
         def at(depth_m: float) -> Contact:
@@ -150,7 +150,7 @@ class History:
         return depth, newest
 
     def _follow(self, pose: Pose) -> None:
-        """Move the window by whole cells to the body; the tractions stay with the skin."""
+        """Move the window by whole cells to the body's pose; the tractions stay with the skin."""
         grid = self.window.grid
         way = (np.asarray(pose.place_m) - np.asarray(self.touch.at_m)) / grid.size_m
         first = (round(float(way[0])), round(float(way[1])))
@@ -186,12 +186,13 @@ class History:
         )
 
 
-def _advance(  # noqa: PLR0913 - what a step depends on
+def _advance(  # noqa: PLR0913 - all inputs of a time step
     grid: Grid, last: Contact, start: Contact, overlap_m: Float, slide_m: Float, friction: float
 ) -> Contact:
-    """Return the contact after a move; with a looser tolerance if it does not converge otherwise.
+    """Return the contact after a move; if it does not converge, try looser tolerances.
 
-    If friction does not converge at all, the step has none: its state is still an equilibrium of the layer.
+    If no tolerance in ``_LOOSER`` leads to convergence, compute the time step without friction. The state is
+    then still an equilibrium of the elastic layer.
 
     Raises:
         NoSolution: If the pressure without friction does not converge either.
@@ -205,7 +206,7 @@ def _advance(  # noqa: PLR0913 - what a step depends on
 
 
 def _shifted(traction_pa: Float, shift: tuple[int, int]) -> Float:
-    """Return tractions (3, X, Y) of a window that has moved by a number of cells; those outside are lost."""
+    """Return the tractions (3, X, Y) in a window shifted by whole cells; tractions outside are dropped."""
     moved = np.zeros_like(traction_pa)
     size = traction_pa.shape[1:]
     if abs(shift[0]) >= size[0] or abs(shift[1]) >= size[1]:

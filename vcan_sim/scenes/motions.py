@@ -1,4 +1,4 @@
-"""Motion of a body in a touch, as a pure function of scene time."""
+"""Motion of a body during a touch, as a pure function of scene time."""
 
 from __future__ import annotations
 
@@ -12,19 +12,20 @@ from vcan_sim.scenes.tables import MotionConfig, TouchConfig
 from vcan_sim.smooth import ease, glide
 
 _EVERY_S = 0.5
-"""Default time between two targets of a walk, s."""
+"""Default time between two consecutive targets of a random walk, s."""
 
 
 @dataclass(frozen=True, slots=True)
 class Pose:
-    """Pose of a body at one time.
+    """Pose of a body at one instant.
 
     Attributes:
-        place_m: Lowest point of the body, metres: (x, y) in the frame of the patch.
-        slid_m: Way of the body's surface along the skin since the touch began, metres: (x, y). A rolling body
-            moves without a way of its surface.
+        place_m: Position (x, y) of the body's lowest point in the patch frame, metres.
+        slid_m: Distance (x, y) by which the body's surface has slid along the skin since the touch began,
+            metres. Rolling does not change it.
         yaw_rad: Rotation about z, rad.
-        level: Depth in metres or normal force in N, as the touch is controlled; 0 without contact.
+        level: Depth, metres, of a touch controlled by depth, or normal force, N, of a touch controlled by
+            force; 0 without contact.
     """
 
     place_m: tuple[float, float]
@@ -34,10 +35,10 @@ class Pose:
 
 
 def pose_at(touch: TouchConfig, t_s: float) -> Pose:
-    """Return the pose of a touch's body.
+    """Return the pose of a touch's body at a given scene time.
 
     Args:
-        touch: The touch.
+        touch: Touch whose body moves.
         t_s: Scene time, s.
     """
     x, y = touch.at_m
@@ -62,14 +63,14 @@ def pose_at(touch: TouchConfig, t_s: float) -> Pose:
 
 
 def highest_level(touch: TouchConfig) -> float:
-    """Return the largest depth in metres or the largest normal force in N of a touch, as it is controlled."""
+    """Return a touch's maximum normal force, N, if it is force-controlled, else its maximum depth, metres."""
     levels = [touch.force_n if touch.by_force else touch.depth_m]
     levels += [motion.force_n if touch.by_force else motion.depth_m for motion in touch.motions]
     return max(level for level in levels if level is not None)
 
 
 def yaws_rad(touch: TouchConfig) -> tuple[float, ...]:
-    """Return yaw angles that a touch passes through, rad, in steps of at most a quarter radian."""
+    """Return yaw angles, rad, that cover a touch's rotation in steps of at most a quarter radian."""
     turned = sum(abs(motion.by_rad or 0.0) for motion in touch.motions)
     if not turned:
         return (touch.yaw_rad,)
@@ -77,7 +78,7 @@ def yaws_rad(touch: TouchConfig) -> tuple[float, ...]:
 
 
 def _way_m(motion: MotionConfig, share: float, t_s: float) -> tuple[float, float]:
-    """Return the way (x, y) of a motion along the skin so far, metres."""
+    """Return the displacement (x, y) of a body along the skin since a motion began, metres."""
     if motion.kind == "walk":
         return _walked_m(motion, t_s)
     way_x, way_y = motion.by_m or (0.0, 0.0)
@@ -87,7 +88,7 @@ def _way_m(motion: MotionConfig, share: float, t_s: float) -> tuple[float, float
 
 
 def _walked_m(motion: MotionConfig, t_s: float) -> tuple[float, float]:
-    """Return the way (x, y) of a random walk so far, metres: minimum jerk from target to target."""
+    """Return the displacement (x, y), metres, of a random walk with minimum jerk between targets."""
     targets = _targets_m(motion)
     elapsed = min(max(t_s, motion.from_s), motion.to_s) - motion.from_s
     step_s = (motion.to_s - motion.from_s) / (len(targets) - 1)
@@ -99,7 +100,7 @@ def _walked_m(motion: MotionConfig, t_s: float) -> tuple[float, float]:
 
 @functools.lru_cache(maxsize=256)
 def _targets_m(motion: MotionConfig) -> tuple[tuple[float, float], ...]:
-    """Return the targets of a walk, metres, uniform in a disc of radius ``reach_m`` about the first."""
+    """Return a random walk's targets, metres, uniform in a disc of radius ``reach_m`` about the start."""
     count = max(1, round((motion.to_s - motion.from_s) / (motion.every_s or _EVERY_S)))
     random = np.random.default_rng(1 if motion.seed is None else motion.seed)
     r = (motion.reach_m or 0.0) * np.sqrt(random.uniform(0.0, 1.0, count))

@@ -1,10 +1,11 @@
-"""Scene of one patch: state of its skin at any time, interpolated between the steps of its touches.
+"""Scene of one patch: state of the skin at any time, interpolated between the time steps of the touches.
 
-The state at a time is the mean of the four nearest steps, weighted by the uniform cubic B-spline (de Boor, A
-Practical Guide to Splines, 1978, chapter IX). The weights are positive and sum to 1, so that the mean keeps
-what every step has: pressure is not negative, shear is at most friction times pressure, the force is the
-integral of the tractions, and the displacement is the layer's response to them. All are twice continuously
-differentiable in time. A motion shorter than four steps is blurred.
+The state at a given time is the mean of the four nearest time steps, weighted by the uniform cubic B-spline
+(de Boor, A Practical Guide to Splines, 1978, chapter IX). The weights are positive and sum to 1, so the mean
+has the properties that every time step has: pressure is not negative, shear is at most friction times
+pressure, the force is the integral of the tractions, and the displacement is the layer's response to the
+tractions. All these quantities are twice continuously differentiable in time. A motion shorter than four time
+steps is smoothed.
 """
 
 from __future__ import annotations
@@ -26,16 +27,16 @@ Weighted = list[tuple[float, Step]]
 
 @dataclass(frozen=True, eq=False)
 class PatchScene:
-    """Skin of one patch in a scene. Made by :func:`vcan_sim.scenes.bind_scene`.
+    """Skin of one patch in a scene, as returned by :func:`vcan_sim.scenes.bind_scene`.
 
     Attributes:
-        layout: The patch at rest. Its electrodes lie on the surface of the layer; a curved skin is treated as
-            its projection onto the x-y plane.
-        simulation: Seed and noise of the converter.
+        layout: Layout of the patch at rest. The upper electrodes are on the surface of the elastic layer; a
+            curved skin is treated as its projection onto the x-y plane.
+        simulation: Simulation settings, with the seed and noise of the converter.
         number: Number of the patch in the hand.
-        step_s: Step of the contact mechanics, s.
+        step_s: Time step of the contact mechanics, s.
         repeat_s: Period of the scene, s; None if the scene plays once.
-        histories: Touches of the patch.
+        histories: Computed touches of the patch.
     """
 
     layout: PatchLayout
@@ -47,11 +48,11 @@ class PatchScene:
 
     @property
     def end_s(self) -> float:
-        """Scene time at which the last touch of this patch ends, s; 0 if nothing touches the patch."""
+        """Scene time at which the last touch on this patch ends, s; 0 if no body touches the patch."""
         return max((history.touch.to_s for history in self.histories), default=0.0)
 
     def upper_m(self, t_s: float) -> Float:
-        """Return the electrodes (U, N, 3), metres, at scene time ``t_s``; ``layout.upper_m`` while at rest.
+        """Return the upper electrodes' positions (U, N, 3), metres; ``layout.upper_m`` itself while at rest.
 
         Args:
             t_s: Scene time, s.
@@ -66,7 +67,7 @@ class PatchScene:
         return np.asarray(self.layout.upper_m + moved.reshape(self.layout.upper_m.shape))
 
     def truth(self, t_s: float) -> PatchTruth:
-        """Return the ground truth at scene time ``t_s``.
+        """Return the patch's ground truth at scene time ``t_s``.
 
         Args:
             t_s: Scene time, s.
@@ -80,17 +81,17 @@ class PatchScene:
         return PatchTruth(t_s, moved.reshape(self.layout.upper_m.shape), tuple(contacts), wrench)
 
     def prepare(self, until_s: float = math.inf) -> None:
-        """Compute the steps of all touches now, instead of when they are needed.
+        """Compute the time steps of all touches in advance, instead of when they are first needed.
 
         Args:
-            until_s: Scene time up to which the steps are computed, s.
+            until_s: Scene time up to which time steps are computed, s.
         """
         for history in self.histories:
             if history.touch.from_s < until_s:
                 history.step(min(history.last, math.ceil(min(until_s / self.step_s, history.last))))
 
     def _touching(self, t_s: float) -> Iterator[tuple[History, Weighted]]:
-        """Yield each touch that contributes at a time, with its steps and their weights."""
+        """Yield each touch that contributes to the state at ``t_s``, with its weighted time steps."""
         t_s = t_s if self.repeat_s is None or t_s < 0.0 else math.fmod(t_s, self.repeat_s)
         low = math.floor(t_s / self.step_s)
         weights = _spline(t_s / self.step_s - low)
@@ -104,7 +105,7 @@ class PatchScene:
 
 
 def _spline(share: float) -> tuple[float, float, float, float]:
-    """Return the weights of four steps for a time between the second and the third: the cubic B-spline."""
+    """Return the cubic B-spline weights of four time steps, for a time between the second and the third."""
     s, rest = share, 1.0 - share
     cube, other = s * s * s / 6.0, rest * rest * rest / 6.0
     second = 2.0 / 3.0 - s * s * (1.0 - 0.5 * s)
@@ -112,7 +113,7 @@ def _spline(share: float) -> tuple[float, float, float, float]:
 
 
 def _contact(history: History, steps: Weighted) -> BodyContact:
-    """Return the weighted mean of some steps, on the smallest window that holds those of all steps."""
+    """Return the weighted mean of a touch's time steps, on the smallest window that covers them all."""
     firsts = np.array([step.first for _, step in steps])
     low = firsts.min(axis=0)
     size = (firsts - low).max(axis=0) + np.array(steps[0][1].traction_pa.shape[1:])

@@ -1,4 +1,4 @@
-"""Preview of a scene: force over time per body, and pressure at the deepest instant. Needs matplotlib."""
+"""Preview plot of a scene: force of each body over time, pressure at maximum depth. Needs matplotlib."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ _COLOURS: Final = ("tab:blue", "tab:orange", "tab:green", "tab:red", "tab:purple
 
 
 def write_plot(scene: SceneConfig, hand: HandConfig, file: Path) -> None:
-    """Draw a scene to a file, one column per patch that a body touches.
+    """Plot a scene to an image file, with one column per patch that a body touches.
 
     Args:
-        scene: The scene.
-        hand: The hand.
-        file: File to write; its suffix determines the format.
+        scene: Scene to plot.
+        hand: Hand whose patches the scene touches.
+        file: Image file to write; its suffix determines the format.
 
     Raises:
-        ConfigError: A touch is impossible on its patch, or the file cannot be written.
+        ConfigError: If a touch is impossible on its patch, or the file cannot be written.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -52,12 +52,12 @@ def write_plot(scene: SceneConfig, hand: HandConfig, file: Path) -> None:
 
 
 def _depth_m(truth: PatchTruth) -> float:
-    """Return the largest depth of a body, metres; 0 if nothing touches."""
+    """Return the depth of the deepest contact on a patch, metres; 0 without contact."""
     return max((contact.depth_m for contact in truth.contacts), default=0.0)
 
 
 def _forces(axes: Any, times_s: Any, truths: list[PatchTruth], colours: dict[str, str]) -> None:
-    """Draw normal force and shear force over time."""
+    """Plot each body's normal force and shear force over time."""
     present = {contact.body for truth in truths for contact in truth.contacts}
     for body, colour in colours.items():
         if body not in present:
@@ -73,7 +73,7 @@ def _forces(axes: Any, times_s: Any, truths: list[PatchTruth], colours: dict[str
 
 
 def _pressures(axes: Any, patch: PatchScene, truth: PatchTruth, colours: dict[str, str]) -> Any:
-    """Draw the pressure of all contacts at one time, and the electrodes; return the image."""
+    """Plot the pressure of all contacts at one instant, and the electrodes. Return the pressure image."""
     highest_kpa = 1e-3 * max(float(contact.pressure_pa.max()) for contact in truth.contacts)
     image = None
     for contact in truth.contacts:

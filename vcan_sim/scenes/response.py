@@ -1,4 +1,4 @@
-"""Displacement of the electrodes, which lie on the surface, under the tractions of a window."""
+"""Displacement of the electrodes on the skin's surface due to the tractions in a window of cells."""
 
 from __future__ import annotations
 
@@ -15,41 +15,42 @@ from vcan_sim.contact.solve import Contact
 from vcan_sim.scenes.shapes import Float
 
 BEYOND: Final = 20.0
-"""Distance from a point force, in thicknesses of the layer, beyond which the response is below ``FAR``."""
+"""Distance from a point force, in layer thicknesses, beyond which the displacement is below ``FAR``."""
 CLUSTER_CELLS: Final = 6.0
-"""Distance from the window, in cells, beyond which 2 × 2 cells act as one force."""
+"""Distance from the window, in cells, beyond which each group of 2 × 2 cells acts as one point force."""
 FAR: Final = 1e-5
-"""Response to a point force, relative to that next to the force, below which it counts as zero. The response
-of a layer falls exponentially with the distance."""
+"""Displacement due to a point force, relative to its maximum, below which it is treated as zero. The
+displacement of an elastic layer decays exponentially with the distance from the force."""
 POINTS: Final = 4096
-"""Points of the table of the response over the distance."""
+"""Number of points in the table of displacement versus distance from a point force."""
 
 
 @dataclass(frozen=True, eq=False)
 class Electrodes:
-    """Places at which the displacement of the surface is computed. Make one with :meth:`of`.
+    """Electrodes at which the surface displacement is computed. Use :meth:`of` to create an instance.
 
     Attributes:
-        places_m: (E, 2) places in the frame of the patch, metres.
-        surface_m: Height of the undeformed surface in the frame of the patch, metres.
+        places_m: (E, 2) electrode positions in the patch frame, metres.
+        surface_m: Height of the undeformed surface in the patch frame, metres.
     """
 
     places_m: Float
     surface_m: float
     _table: Float
-    """(POINTS, 4) r Z, r A, r B and r K over the distance r, m²/N."""
+    """(POINTS, 4) table of r Z, r A, r B and r K over the distance r, m²/N; see
+    :class:`vcan_sim.contact.layer.PointResponse` for Z, A, B and K."""
     _step_m: float
     _far_m: float
-    """Distance from which the response is negligible, metres."""
+    """Distance from a point force beyond which the displacement is negligible, metres."""
 
     @classmethod
     def of(cls, layer: Layer, places_m: Float, surface_m: float) -> Electrodes:
-        """Tabulate the response of a layer.
+        """Tabulate an elastic layer's displacement due to a point force.
 
         Args:
-            layer: The layer.
-            places_m: (E, 2) places in the frame of the patch, metres.
-            surface_m: Height of the undeformed surface in the frame of the patch, metres.
+            layer: Elastic layer.
+            places_m: (E, 2) electrode positions in the patch frame, metres.
+            surface_m: Height of the undeformed surface in the patch frame, metres.
         """
         reach = min(3.0 * float(np.linalg.norm(np.ptp(places_m, axis=0))) + 0.01, BEYOND * layer.thickness_m)
         table, step = _radial(layer, reach)
@@ -57,16 +58,17 @@ class Electrodes:
         return cls(places_m, surface_m, table, step, step * float(noticed[-1] + 1))
 
     def displacement_m(self, grid: Grid, origin_m: Float, contact: Contact) -> Float:
-        """Return the displacement of the electrodes.
+        """Return the displacement of the electrodes due to a contact.
 
-        Electrodes inside the window take the displacement of its cells, interpolated by cubics. All others
-        are at least two cells from a loaded cell, whose traction then acts as a force at its centre. At a
-        distance of ``CLUSTER_CELLS`` from the window, the force of 2 × 2 cells acts at their centre.
+        For electrodes inside the window, the displacement of the cells is interpolated by cubics. All other
+        electrodes are at least two cells away from any loaded cell, so each cell's traction acts as a point
+        force at the cell's centre. Beyond ``CLUSTER_CELLS`` from the window, the forces of each group of
+        2 × 2 cells act at the centre of the group.
 
         Args:
             grid: Cells of the window.
-            origin_m: (2,) centre of the first cell in the frame of the patch, metres.
-            contact: Contact in the window.
+            origin_m: (2,) centre of the first cell in the patch frame, metres.
+            contact: State of the contact in the window.
 
         Returns:
             (E, 3) displacement, metres.
@@ -90,7 +92,7 @@ class Electrodes:
         return moved
 
     def _under_forces(self, places_m: Float, at_m: Float, force_n: Float) -> Float:
-        """Return the displacement (P, 3) of places (P, 2) under forces (3, F) at places (F, 2)."""
+        """Return the displacement (P, 3) of places (P, 2) due to point forces (3, F) at ``at_m`` (F, 2)."""
         x = places_m[:, None, 0] - at_m[:, 0]
         y = places_m[:, None, 1] - at_m[:, 1]
         r = np.sqrt(x * x + y * y)
@@ -110,10 +112,11 @@ class Electrodes:
 
 @functools.lru_cache(maxsize=64)
 def _radial(layer: Layer, reach_m: float) -> tuple[Float, float]:
-    """Return the table of the response to a point force, and the distance between its points, metres.
+    """Return the table of displacement versus distance from a point force, and the table's step, metres.
 
-    On a half-space it is the solution of Boussinesq and Cerruti (Johnson, Contact Mechanics, 1985, sections
-    3.2 and 3.6); :class:`vcan_sim.contact.layer.PointResponse` is the difference of a layer.
+    For a half-space, the table holds the solution of Boussinesq and Cerruti (Johnson, Contact Mechanics,
+    1985, sections 3.2 and 3.6). For a layer, :class:`vcan_sim.contact.layer.PointResponse` adds the
+    difference between layer and half-space.
     """
     r = np.linspace(0.0, reach_m, POINTS)
     nu = layer.poisson
@@ -126,20 +129,20 @@ def _radial(layer: Layer, reach_m: float) -> tuple[Float, float]:
 
 
 def _forces(force_n: Float, origin_m: Float, size_m: float) -> tuple[Float, Float]:
-    """Return the places (F, 2), metres, and the forces (3, F), N, that are not zero of cells (3, X, Y)."""
+    """Return the positions (F, 2), metres, and forces (3, F), N, of the loaded cells in a window."""
     loaded = np.argwhere(force_n.any(axis=0))
     return origin_m + size_m * loaded, force_n[:, loaded[:, 0], loaded[:, 1]]
 
 
 def _clustered(force_n: Float) -> Float:
-    """Return the sums (3, X/2, Y/2) of 2 × 2 cells each of forces (3, X, Y), N."""
+    """Sum the forces (3, X, Y) of cells over groups of 2 × 2 cells: (3, X/2, Y/2), N."""
     x, y = force_n.shape[1:]
     even = np.pad(force_n, ((0, 0), (0, x % 2), (0, y % 2)))
     return np.asarray(even.reshape(3, (x + 1) // 2, 2, (y + 1) // 2, 2).sum(axis=(2, 4)))
 
 
 def _cubic(field: Float, index: Float) -> Float:
-    """Return a field (3, X, Y) at fractional indices (P, 2), interpolated by cubics through 4 × 4 cells."""
+    """Interpolate a vector field (3, X, Y) at fractional indices (P, 2), with cubics through 4 × 4 cells."""
     low = np.clip(np.floor(index).astype(np.intp) - 1, 0, np.array(field.shape[1:]) - 4)
     weights = _lagrange(index - low)
     found = np.zeros((len(index), 3))
@@ -151,7 +154,7 @@ def _cubic(field: Float, index: Float) -> Float:
 
 
 def _lagrange(position: Float) -> Float:
-    """Return the weights (…, 4) of the points 0, 1, 2, 3 for a cubic through them at ``position`` (…)."""
+    """Return the cubic Lagrange weights (…, 4) at ``position`` (…) of the points 0, 1, 2 and 3."""
     points = np.arange(4.0)
     weights = np.ones((*position.shape, 4))
     for i in range(4):

@@ -1,7 +1,7 @@
-"""Shapes of rigid bodies: height of the surface above the body's lowest point.
+"""Shapes of rigid bodies, as the height of the body's surface above its lowest point.
 
-A shape is a function of places (…, 2) in the frame of the body, metres, to heights (…,), metres. The lowest
-point has height 0; where there is no body above the skin, the height is inf.
+A shape is a function from positions (…, 2) in the body frame, metres, to heights (…,), metres. The body's
+lowest point has height 0; where no part of the body is above the skin, the height is inf.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ Height = Callable[[Float], Float]
 
 @dataclass(frozen=True, slots=True)
 class Shape:
-    """A rigid body as a height over the skin.
+    """Shape of a rigid body, as a height above its lowest point.
 
     Attributes:
-        height: Function of places (…, 2), metres, in the frame of the body, to heights (…,), metres.
-        round: Whether the height depends only on the distance from the lowest point.
+        height: Function from positions (…, 2) in the body frame, metres, to heights (…,), metres.
+        round: Whether the height depends only on the horizontal distance from the lowest point.
         key: Values that determine the height; shapes with equal keys are equal.
     """
 
@@ -32,14 +32,14 @@ class Shape:
     key: tuple[object, ...]
 
     def over(self, places_m: Float, yaw_rad: float) -> Float:
-        """Return the height over places relative to the body's lowest point, in the frame of the patch.
+        """Return the height of a rotated body's surface at positions in the axes of the patch.
 
         Args:
-            places_m: (…, 2) places relative to the lowest point, metres.
+            places_m: (…, 2) positions relative to the body's lowest point, metres.
             yaw_rad: Rotation of the body about z, rad.
 
         Returns:
-            (…,) heights above the lowest point, metres; inf where there is no body.
+            (…,) heights above the lowest point, metres; inf outside the body.
         """
         if self.round or yaw_rad == 0.0:
             return self.height(places_m)
@@ -49,11 +49,11 @@ class Shape:
 
 
 def ellipsoid(radii_m: tuple[float, float, float], name: str = "ellipsoid") -> Shape:
-    """Return an ellipsoid with semi-axes (x, y, z), metres; its lowest point is a pole of the z axis.
+    """Return the shape of an ellipsoid whose lowest point is on its z axis.
 
     Args:
         radii_m: Semi-axes along x, y and z, metres, each positive.
-        name: Name of the shape, part of its key.
+        name: Name of the shape, which is part of its key.
     """
     rx, ry, rz = radii_m
 
@@ -65,7 +65,7 @@ def ellipsoid(radii_m: tuple[float, float, float], name: str = "ellipsoid") -> S
 
 
 def sphere(radius_m: float) -> Shape:
-    """Return a sphere.
+    """Return the shape of a sphere.
 
     Args:
         radius_m: Radius, metres.
@@ -74,11 +74,11 @@ def sphere(radius_m: float) -> Shape:
 
 
 def punch(radius_m: float, edge_radius_m: float) -> Shape:
-    """Return a flat circular punch with a rounded rim.
+    """Return the shape of a flat circular punch with a rounded rim.
 
     Args:
-        radius_m: Radius of the punch, rim included, metres.
-        edge_radius_m: Radius of the rounding of the rim, metres; at most ``radius_m``, 0 for a sharp rim.
+        radius_m: Radius of the punch including its rim, metres.
+        edge_radius_m: Rounding radius of the rim, metres; at most ``radius_m``, 0 for a sharp rim.
     """
     flat = radius_m - edge_radius_m
 
@@ -90,14 +90,16 @@ def punch(radius_m: float, edge_radius_m: float) -> Shape:
 
 
 def box_edge(length_m: float, slope_rad: float, edge_radius_m: float) -> Shape:
-    """Return the edge of a box, along x, which points down: two flanks that rise to both sides.
+    """Return the shape of a box edge that runs along x and points down: two flanks that rise on both sides.
 
     Args:
         length_m: Length of the edge along x, metres.
-        slope_rad: Angle of both flanks to the skin, rad.
-        edge_radius_m: Radius of the rounding of the edge, metres.
+        slope_rad: Angle between each flank and the skin, rad.
+        edge_radius_m: Rounding radius of the edge, metres.
     """
-    tangent_m = edge_radius_m * math.sin(slope_rad)  # where the rounding meets the flank
+    tangent_m = edge_radius_m * math.sin(
+        slope_rad
+    )  # distance from the edge at which the rounding meets the flank
     tangent_height_m = edge_radius_m * (1.0 - math.cos(slope_rad))
 
     def height(places_m: Float) -> Float:
@@ -110,11 +112,11 @@ def box_edge(length_m: float, slope_rad: float, edge_radius_m: float) -> Shape:
 
 
 def ridge(radius_m: float, length_m: float) -> Shape:
-    """Return a cylinder that lies along x and ends in half-spheres.
+    """Return the shape of a cylinder along x with hemispherical ends.
 
     Args:
         radius_m: Radius of the cylinder, metres.
-        length_m: Length of the cylinder without its ends, metres.
+        length_m: Length of the cylinder without its hemispherical ends, metres.
     """
 
     def height(places_m: Float) -> Float:
@@ -126,5 +128,5 @@ def ridge(radius_m: float, length_m: float) -> Shape:
 
 
 def _rounded(distance_m: Float, radius_m: float) -> Float:
-    """Return the height of a circle of ``radius_m`` at a distance from its lowest point."""
+    """Return the height of a circle of ``radius_m`` at a horizontal distance from its lowest point."""
     return np.asarray(radius_m - np.sqrt(np.maximum(radius_m**2 - distance_m**2, 0.0)))

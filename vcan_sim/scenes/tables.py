@@ -1,4 +1,4 @@
-"""Keys of a scene file: ``[skin]``, ``[[bodies]]``, ``[[touches]]`` and ``[[touches.motions]]``."""
+"""Tables and keys of a scene file: ``[skin]``, ``[[bodies]]``, ``[[touches]]``, ``[[touches.motions]]``."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ _REQUIRED_OF_MOTION: Final[dict[str, tuple[str, ...]]] = {
     "press": (),
 }
 KEY_OF_TRAVEL: Final[dict[str, str]] = {"slide": "by_m", "shear": "by_m", "roll": "by_m", "walk": "reach_m"}
-"""Key that states how far a motion moves the body along the skin, for the motions that do."""
+"""Key that sets the distance along the skin, for each kind of motion that moves the body along the skin."""
 
 _Coordinate = Annotated[float, Field(ge=-1, le=1, allow_inf_nan=False), Allowed("a number from -1 to 1")]
 _Place = Annotated[
@@ -82,10 +82,11 @@ _Poisson = Annotated[float, Field(ge=0, le=0.5, allow_inf_nan=False), Allowed("a
 
 
 class SkinConfig(Table):
-    """Elastic layer of every patch of the scene, bonded to a rigid base."""
+    """Elastic layer of every patch in the scene, bonded to a rigid base."""
 
     thickness_m: Length | None = None
-    """Thickness of the layer, metres; None: the height of the patch's upper electrodes above the lower."""
+    """Thickness of the elastic layer, metres; None: the height of the patch's upper electrodes above the
+    lower."""
     young_pa: _Modulus | None = None
     """Young's modulus, Pa; None: ``calibration.young_pa`` of the patch in the hand file."""
     poisson: _Poisson | None = None
@@ -100,7 +101,7 @@ class BodyConfig(Table):
     shape: Annotated[BodyShape, one_of(BodyShape)]
     """Shape of the part of the body that faces the skin."""
     radius_m: Length | None = None
-    """Radius of the sphere, the punch or the ridge, metres."""
+    """Radius of the sphere, punch or ridge, metres."""
     edge_radius_m: Length | None = None
     """Radius of the rounded rim of the punch (default: a tenth of its radius) or of the edge of the box
     (default: 1 mm), metres."""
@@ -137,27 +138,27 @@ class BodyConfig(Table):
 
 
 class MotionConfig(Table):
-    """Motion of a body while it touches the skin. Motions add up; several may run at once."""
+    """Motion of a body while it touches the skin. Simultaneous motions add up."""
 
     kind: Annotated[MotionKind, one_of(MotionKind)]
-    """``slide``: move along the skin. ``shear``: move along the skin and back. ``roll``: move without slip.
-    ``turn``: turn about z. ``walk``: slide at random. ``press``: change the depth or the force."""
+    """``slide``: slide along the skin. ``shear``: slide along the skin and back. ``roll``: roll without slip.
+    ``turn``: rotate about z. ``walk``: slide at random. ``press``: change the depth or the force."""
     from_s: _Time
     """Scene time at which the motion starts, s."""
     to_s: _Time
     """Scene time at which the motion ends, s."""
     by_m: _Place | None = None
-    """Way of ``slide`` and ``roll``, and of the outward half of ``shear``, metres: [x, y]."""
+    """Displacement [x, y] of ``slide`` and ``roll``, and of the outward half of ``shear``, metres."""
     by_rad: _Angle | None = None
-    """Angle of ``turn``, rad, counterclockwise as seen from above the skin."""
+    """Angle of the rotation ``turn``, rad, counterclockwise as seen from above the skin."""
     depth_m: Length | None = None
-    """Depth after ``press``, metres, if the touch is by depth."""
+    """Depth at the end of ``press``, metres, for a touch with ``depth_m``."""
     force_n: _Force | None = None
-    """Force after ``press``, N, if the touch is by force."""
+    """Force at the end of ``press``, N, for a touch with ``force_n``."""
     reach_m: Length | None = None
-    """Largest distance of ``walk`` from its start, metres."""
+    """Maximum distance of ``walk`` from its start, metres."""
     every_s: _Duration | None = None
-    """Time between two targets of ``walk``, s; default: 0.5."""
+    """Time between consecutive targets of ``walk``, s; default: 0.5."""
     seed: Annotated[int, Field(ge=0), Allowed("an integer of at least 0")] | None = None
     """Random seed of ``walk``; default: 1."""
 
@@ -173,11 +174,11 @@ class TouchConfig(Table):
     """One touch: a body comes down, moves, and lifts off."""
 
     body: Name
-    """Name of the body."""
+    """Name of the body that touches."""
     patch: Name
-    """Name of the patch in the hand file."""
+    """Name of the touched patch, as in the hand file."""
     at_m: _Place
-    """Place where the body comes down, metres: [x, y] in the frame of the patch."""
+    """Position [x, y] in the patch frame at which the body comes down, metres."""
     from_s: _Time
     """Scene time of the first contact, s."""
     to_s: _Time
@@ -185,32 +186,33 @@ class TouchConfig(Table):
     ramp_s: _Duration = 0.3
     """Duration of the press at the start and of the lift at the end, s (minimum jerk)."""
     depth_m: Length | None = None
-    """Depth of the body's lowest point below the undeformed surface, metres. Give this or ``force_n``."""
+    """Depth of the body's lowest point below the undeformed surface, metres. Set either ``depth_m`` or
+    ``force_n``."""
     force_n: _Force | None = None
-    """Normal force, N. Give this or ``depth_m``."""
+    """Normal force of the touch, N. Set either ``force_n`` or ``depth_m``."""
     yaw_rad: _Angle = 0.0
     """Rotation of the body about z, rad."""
     times: Annotated[int, Field(ge=1, le=1000), Allowed("an integer from 1 to 1000")] = 1
-    """Number of times that the touch is made, as for taps."""
+    """Number of times to repeat the touch, for example for a series of taps."""
     every_s: _Duration | None = None
     """Time from the start of one touch to the start of the next, s, if ``times`` is more than 1."""
     motions: Annotated[tuple[MotionConfig, ...], Field(strict=False)] = ()
-    """Motions between the press and the lift."""
+    """Motions of the body during the touch."""
 
     @property
     def by_force(self) -> bool:
-        """Whether the touch is controlled by force."""
+        """Whether the touch is controlled by force rather than by depth."""
         return self.force_n is not None
 
     @property
     def each(self) -> tuple[TouchConfig, ...]:
-        """One touch for each of the ``times``."""
+        """Repetitions of the touch, each as a touch with ``times`` = 1."""
         if self.times == 1:
             return (self,)
         return tuple(self._after(number * (self.every_s or 0.0)) for number in range(self.times))
 
     def _after(self, delay_s: float) -> TouchConfig:
-        """Return the touch made once, ``delay_s`` later."""
+        """Return a single touch, ``delay_s`` later."""
 
         def later(table: Any, **changes: Any) -> Any:
             times = {"from_s": table.from_s + delay_s, "to_s": table.to_s + delay_s}
@@ -238,14 +240,16 @@ class TouchConfig(Table):
         return self
 
     def _check_motions(self) -> None:
-        """Check that motions lie in the touch and that presses follow each other."""
+        """Check that all motions are within the touch's duration and that presses do not overlap in time."""
         pressed_s = 0.0
         for i, motion in enumerate(self.motions):
             key = f"motions[{i}]"
             if motion.from_s < self.from_s:
-                raise ConfigError(f"{key}.from_s", motion.from_s, f"at least {self.from_s} s, in the touch")
+                raise ConfigError(
+                    f"{key}.from_s", motion.from_s, f"at least {self.from_s} s, the start of the touch"
+                )
             if motion.to_s > self.to_s:
-                raise ConfigError(f"{key}.to_s", motion.to_s, f"at most {self.to_s} s, in the touch")
+                raise ConfigError(f"{key}.to_s", motion.to_s, f"at most {self.to_s} s, the end of the touch")
             if motion.kind != "press":
                 continue
             own, other = ("force_n", "depth_m") if self.by_force else ("depth_m", "force_n")
@@ -255,7 +259,7 @@ class TouchConfig(Table):
                 raise ConfigError(f"{key}.{own}", None, f"a {own}, as in the touch")
             if motion.from_s < pressed_s:
                 raise ConfigError(
-                    f"{key}.from_s", motion.from_s, f"at least {pressed_s} s, the end of the press before"
+                    f"{key}.from_s", motion.from_s, f"at least {pressed_s} s, the end of the preceding press"
                 )
             pressed_s = motion.to_s
 
@@ -266,29 +270,29 @@ class SceneConfig(Table):
     name: Name = "scene"
     """Name of the scene."""
     step_s: _Step = 0.03
-    """Step of the contact mechanics, s. The state between steps is interpolated smoothly, so that motions
-    shorter than four steps are blurred."""
+    """Time step of the contact mechanics, s. The state between time steps is interpolated smoothly, which
+    blurs motions shorter than four steps."""
     cells: Annotated[int, Field(ge=8, le=128), Allowed("an integer from 8 to 128")] = 20
-    """Number of cells across a contact's window. With 20, forces are within 1 % and areas within 3 %; the
-    duration of a computation grows with the square."""
+    """Number of cells across a contact. With 20 cells, errors are below 1 % for forces and below 3 % for
+    areas. The computing time grows with the square of this number."""
     repeat_s: _Duration | None = None
     """Period after which the scene repeats, s; None: the scene plays once."""
     skin: SkinConfig = SkinConfig()
     bodies: Annotated[
         tuple[BodyConfig, ...], Field(min_length=1, strict=False), Allowed("at least one [[bodies]]")
     ]
-    """Rigid bodies."""
+    """Rigid bodies of the scene."""
     touches: Annotated[
         tuple[TouchConfig, ...], Field(min_length=1, strict=False), Allowed("at least one [[touches]]")
     ]
-    """Touches, in any order."""
+    """Touches of the scene, in any order."""
     _read_of: Document = PrivateAttr(Document("", {}, {}))
 
     def body(self, name: str) -> BodyConfig:
         """Return the body called ``name``.
 
         Raises:
-            KeyError: The scene has no such body.
+            KeyError: If the scene has no such body.
         """
         return {body.name: body for body in self.bodies}[name]
 
@@ -319,7 +323,7 @@ class SceneConfig(Table):
         return self
 
     def _check_motions(self, number: int, touch: TouchConfig) -> None:
-        """Check that a body rolls only if its shape can: a sphere, or a ridge across its axis."""
+        """Check that only bodies that can roll do so: spheres, and ridges across their axis."""
         body, key = self.body(touch.body), f"touches[{number}].motions"
         turns = any(motion.kind == "turn" for motion in touch.motions)
         for j, motion in enumerate(touch.motions):
@@ -336,32 +340,33 @@ class SceneConfig(Table):
 
 
 def _meet(one: TouchConfig, two: TouchConfig) -> bool:
-    """Return whether two touches are made at the same time."""
+    """Return whether two touches, including their repetitions, overlap in time."""
     return any(a.from_s < b.to_s and b.from_s < a.to_s for a in one.each for b in two.each)
 
 
 def read_scene(path: Path | str) -> SceneConfig:
-    """Read a scene file without a hand. :func:`vcan_sim.scenes.load_scene` also checks it with the hand.
+    """Read a scene file. :func:`vcan_sim.scenes.load_scene` also checks its touches on the patches of a hand.
 
     Args:
-        path: The file.
+        path: Scene file.
 
     Raises:
-        ConfigError: The file cannot be read or is not a scene. The message is one line with line and column.
+        ConfigError: If the file cannot be read or is not a scene. The message is one line with line and
+            column.
     """
     path = Path(path)
     return _parse(read_toml(path, "scene file"))
 
 
 def parse_scene(table: Mapping[str, Any], *, where: str = "") -> SceneConfig:
-    """Validate a table with the keys of a scene file.
+    """Make a scene from a table with the keys of a scene file.
 
     Args:
-        table: The table, as returned by tomllib.
+        table: Scene as a table, as returned by tomllib.
         where: File name for error messages.
 
     Raises:
-        ConfigError: The table is not a scene.
+        ConfigError: If the table is not a valid scene.
     """
     return _parse(Document(where, dict(table), {}))
 
@@ -382,7 +387,7 @@ def _require_keys(
     allowed: Mapping[str, tuple[str, ...]],
     required: Mapping[str, tuple[str, ...]],
 ) -> None:
-    """Raise ConfigError if a key does not belong to the shape or kind, or if one is missing."""
+    """Raise ConfigError if a given key is not allowed for a shape or kind, or a required key is missing."""
     for name in sorted({each for keys in allowed.values() for each in keys}):
         given = getattr(table, name)
         if given is not None and name not in allowed[value]:

@@ -1,6 +1,6 @@
-"""Checks of a touch with the patch that it touches: depth or force, place, distance from other touches.
+"""Checks of a touch on its patch: depth or force, position, and distance from other touches.
 
-Checks that need no patch (keys, times, bodies) are in :mod:`vcan_sim.scenes.tables`.
+Checks that do not depend on the patch (keys, times, bodies) are in :mod:`vcan_sim.scenes.tables`.
 """
 
 from __future__ import annotations
@@ -18,17 +18,17 @@ from vcan_sim.scenes.tables import KEY_OF_TRAVEL, SceneConfig, TouchConfig
 from vcan_sim.scenes.window import FRICTION_MARGIN, MARGIN, BodyKey, TooMuch, Window, window_of
 
 DEEPEST: Final = 0.9
-"""Maximum depth of a body, relative to the thickness of the layer and to the height of the electrodes."""
+"""Maximum depth of a body, as a fraction of the layer thickness or electrode height, whichever is smaller."""
 APART: Final = 3.0
-"""Minimum distance between the contacts of two bodies on a patch, in layer thicknesses or, if that is less,
-in half widths of the larger contact. The simulator neglects the displacement that one contact causes at the
+"""Minimum distance between the contacts of two bodies on a patch, as a multiple of the layer thickness
+or of the larger contact's half width, whichever is smaller. The simulator neglects the displacement that one contact causes at the
 other, which is at most 3 % of the depth there (incompressible layer 2 mm thick, sphere of radius 40 mm)."""
 
 
 def window_of_touch(
     scene: SceneConfig, number: int, touch: TouchConfig, layer: Layer, layout: PatchLayout
 ) -> Window:
-    """Return the window of a touch. Raises ConfigError if the touch is deeper than the layer."""
+    """Return a touch's window of cells. Raises ConfigError if the touch is too deep for the layer."""
     most = DEEPEST * min(layer.thickness_m, layout.height_m)
     level, key = highest_level(touch), "force_n" if touch.by_force else "depth_m"
     path = f"touches[{number}].{key}"
@@ -36,7 +36,7 @@ def window_of_touch(
         if motion.kind == "press" and getattr(motion, key) == level != getattr(touch, key):
             path = f"touches[{number}].motions[{j}].{key}"
     if not touch.by_force and level > most:
-        allowed = f"at most {most:.3g} m, nine tenths of the layer of {touch.patch!r}"
+        allowed = f"at most {most:.3g} m, nine tenths of the thickness of the layer on {touch.patch!r}"
         raise error_at(scene, path, level, allowed)
     body = scene.body(touch.body)
     shape, margin = BodyKey(body.build()), MARGIN + FRICTION_MARGIN * body.friction
@@ -48,7 +48,7 @@ def window_of_touch(
 
 
 def path_of(touch: TouchConfig, step_s: float) -> dict[int, Pose]:
-    """Return the pose at each time step of a touch, each time that it is made."""
+    """Return the body's pose at each time step of a touch and its repetitions, by step number."""
     return {
         number: pose_at(each, number * step_s)
         for each in touch.each
@@ -56,7 +56,7 @@ def path_of(touch: TouchConfig, step_s: float) -> dict[int, Pose]:
     }
 
 
-def check_on_patch(  # noqa: PLR0913 - what a touch is checked with
+def check_on_patch(  # noqa: PLR0913 - all inputs of the check
     scene: SceneConfig,
     number: int,
     touch: TouchConfig,
@@ -65,13 +65,13 @@ def check_on_patch(  # noqa: PLR0913 - what a touch is checked with
     places_m: Float,
     pitch_m: float,
 ) -> None:
-    """Raise ConfigError if the deepest contact of a touch would extend half a pitch over the electrodes."""
+    """Raise ConfigError if a contact would extend more than half a pitch beyond the outermost electrodes."""
     half = np.array(window.half_m)
     low = places_m.min(axis=0) - 0.5 * pitch_m + half
     high = places_m.max(axis=0) + 0.5 * pitch_m - half
     if (low > high).any():
         size = 2e3 * half
-        allowed = f"a contact that fits on {touch.patch!r}; this one is {size[0]:.3g} × {size[1]:.3g} mm"
+        allowed = f"a contact that fits on {touch.patch!r}; this contact is {size[0]:.3g} × {size[1]:.3g} mm"
         raise error_at(scene, f"touches[{number}].body", touch.body, allowed)
     room = (
         f"x from {low[0]:.4g} to {high[0]:.4g}, y from {low[1]:.4g} to {high[1]:.4g} m on {touch.patch!r}, "
@@ -100,7 +100,7 @@ def check_apart(
     early: tuple[int, TouchConfig, Window, dict[int, Pose]],
     layer: Layer,
 ) -> None:
-    """Raise ConfigError if two touches come so close at some time that one would move the other's skin."""
+    """Raise ConfigError if two simultaneous contacts on a patch ever come closer than ``APART`` allows."""
     (i, touch, window, path), (j, _, other_window, other_path) = late, early
     both = np.array(window.half_m) + np.array(other_window.half_m)
     gap = APART * min(layer.thickness_m, max(*window.half_m, *other_window.half_m))
@@ -113,11 +113,11 @@ def check_apart(
             continue
         allowed = (
             f"a place or time at which its contact stays {1e3 * gap:.3g} mm away from that of touches[{j}]; "
-            f"at {number * scene.step_s:.3g} s it is {1e3 * float(np.hypot(*beyond)):.3g} mm away"
+            f"at {number * scene.step_s:.3g} s the distance is {1e3 * float(np.hypot(*beyond)):.3g} mm"
         )
         raise error_at(scene, f"touches[{i}].at_m", list(touch.at_m), allowed)
 
 
 def error_at(scene: SceneConfig, key: str, got: object, allowed: str) -> ConfigError:
-    """Return the error for a value of a scene file, with the file, line and column of its key."""
+    """Return a ConfigError for a value in a scene file, with the file, line and column of its key."""
     return ConfigError(key, got, allowed, where=scene.where(key))

@@ -1,4 +1,4 @@
-"""Ground truth of a patch at one time."""
+"""Ground truth of a simulated patch at one instant."""
 
 from __future__ import annotations
 
@@ -12,18 +12,19 @@ from vcan_sim.scenes.shapes import Float
 
 @dataclass(frozen=True, eq=False)
 class BodyContact:
-    """Contact of one body with the skin.
+    """Contact between one body and the skin.
 
     Attributes:
         body: Name of the body.
-        centre_m: (2,) centre of pressure in the frame of the patch, metres.
+        centre_m: (2,) centre of pressure in the patch frame, metres.
         area_m2: Area of contact, m².
         depth_m: Depth of the body's lowest point below the undeformed surface, metres.
-        force_n: (3,) force on the skin in the frame of the patch, N; z is negative, into the skin.
+        force_n: (3,) force on the skin in the patch frame, N; its z component points into the skin and is
+            negative.
         origin_m: (2,) centre of the first cell, metres.
-        cell_m: Side of a cell, metres.
-        traction_pa: (3, X, Y) tractions on the skin, Pa: force per area in the frame of the patch. The first
-            index of a cell counts along x.
+        cell_m: Side length of a cell, metres.
+        traction_pa: (3, X, Y) tractions on the skin in the patch frame (force per area), Pa. Cells are
+            indexed along x first, then along y.
     """
 
     body: str
@@ -37,7 +38,7 @@ class BodyContact:
 
     @property
     def radius_m(self) -> float:
-        """Radius of a circle with the area of the contact, metres."""
+        """Radius of a circle whose area is that of the contact, metres."""
         return math.sqrt(self.area_m2 / math.pi)
 
     @property
@@ -47,20 +48,20 @@ class BodyContact:
 
     @property
     def cells_m(self) -> Float:
-        """Centres (X, Y, 2) of the cells in the frame of the patch, metres."""
+        """Centres (X, Y, 2) of the cells in the patch frame, metres."""
         x, y = (np.arange(n) * self.cell_m for n in self.traction_pa.shape[1:])
         return np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1) + self.origin_m
 
 
 @dataclass(frozen=True, eq=False)
 class PatchTruth:
-    """What touches a patch at one time, and how the skin has moved.
+    """Contacts on a patch at one instant, and the displacement of its skin.
 
     Attributes:
         t_s: Scene time, s.
         displacement_m: (U, N, 3) displacement of the upper electrodes, metres.
         contacts: Contacts, in the order of the touches in the scene.
-        wrench: (6,) force, N, and moment, N m, on the patch about the origin of its frame.
+        wrench: (6,) force, N, on the patch, and moment, N m, about the origin of the patch frame.
     """
 
     t_s: float

@@ -1,4 +1,4 @@
-"""Window of cells that moves with a body, sized for the deepest contact of a touch."""
+"""Window of grid cells that moves with a body, sized for the deepest contact of a touch."""
 
 from __future__ import annotations
 
@@ -16,27 +16,29 @@ from vcan_sim.contact.solve import press
 from vcan_sim.scenes.shapes import Float, Shape
 
 MOST_CELLS: Final = 1.4
-"""Cells of a window relative to the square of the number across, above which the cells get larger instead,
-up to twice as large."""
+"""Maximum number of cells in a window, relative to the square of the number across its narrow side. A longer
+window has larger cells, up to twice as large, instead of more cells."""
 MARGIN: Final = 0.1
-"""Margin around the deepest contact, relative to its half width; at least ``MARGIN_CELLS``."""
+"""Margin of the window around the deepest contact, relative to the contact's half width; at least
+``MARGIN_CELLS`` cells."""
 FRICTION_MARGIN: Final = 0.15
-"""Additional margin per coefficient of friction: what slides piles up the skin in front of it."""
+"""Additional margin per unit of the friction coefficient, because a sliding body piles up the skin in front
+of it."""
 MARGIN_CELLS: Final = 2
 CLOSE: Final = 3e-4
 """Tolerance of the contact mechanics (:func:`vcan_sim.contact.solve.press`), relative to the depth."""
 FORCE_CLOSE: Final = 2e-3
-"""Tolerance of a touch by force, relative to the force."""
+"""Tolerance of the normal force of a force-controlled touch, relative to the force."""
 _TURNS: Final = 12
-"""Maximum number of sizes that are tried for a window."""
+"""Maximum number of window sizes to try."""
 _SEARCHES: Final = 40
-"""Maximum number of depths that are tried for a force."""
+"""Maximum number of depths to try when searching for a force."""
 _NOWHERE_M: Final = -1.0
-"""Overlap where there is no body, metres; any large negative length."""
+"""Overlap of body and skin where there is no body, metres: any large negative length."""
 
 
 class TooMuch(ValueError):
-    """No depth within the layer reaches the force; ``most_n`` is the force at the largest depth, N."""
+    """Requested force exceeds the force at the maximum allowed depth, which is ``most_n``, N."""
 
     def __init__(self, most_n: float) -> None:
         self.most_n = most_n
@@ -45,10 +47,10 @@ class TooMuch(ValueError):
 
 @dataclass(frozen=True, eq=False)
 class Window:
-    """Cells under a body.
+    """Window of grid cells under a body.
 
     Attributes:
-        grid: Response of the cells.
+        grid: Grid of the cells, with their elastic response.
         half_m: Half of the deepest contact's bounding box along x and y, metres.
         deepest_m: Depth of the deepest contact without friction, metres.
         force_n: Normal force of the deepest contact without friction, N.
@@ -61,13 +63,13 @@ class Window:
 
 
 def overlap_m(grid: Grid, shape: Shape, offset_m: Float, yaw_rad: float, depth_m: float) -> Float:
-    """Return the overlap of the undeformed body and the undeformed layer.
+    """Return the overlap of a rigid body and the undeformed elastic layer.
 
     Args:
-        grid: The cells.
-        shape: The body.
+        grid: Cells at which the overlap is computed.
+        shape: Shape of the body.
         offset_m: (2,) centre of the first cell relative to the lowest point of the body, metres.
-        yaw_rad: Rotation of the body, rad.
+        yaw_rad: Rotation of the body about z, rad.
         depth_m: Depth of the body's lowest point below the surface, metres.
 
     Returns:
@@ -77,12 +79,12 @@ def overlap_m(grid: Grid, shape: Shape, offset_m: Float, yaw_rad: float, depth_m
 
 
 def centred_m(grid: Grid) -> Float:
-    """Return the centre (2,) of the first cell of a grid relative to the middle of the grid, metres."""
+    """Return the centre (2,) of a grid's first cell relative to the middle of the grid, metres."""
     return -0.5 * grid.size_m * (np.array(grid.shape, float) - 1.0)
 
 
 @functools.lru_cache(maxsize=512)
-def window_of(  # noqa: PLR0913 - what a contact depends on
+def window_of(  # noqa: PLR0913 - all inputs of a contact
     layer: Layer,
     body: BodyKey,
     yaws_rad: tuple[float, ...],
@@ -92,20 +94,20 @@ def window_of(  # noqa: PLR0913 - what a contact depends on
     cells: int,
     margin: float = MARGIN,
 ) -> Window:
-    """Return the window for a touch.
+    """Return a window of cells that covers the deepest contact of a touch.
 
     Args:
-        layer: The layer.
-        body: The body.
-        yaws_rad: Rotations of the body in the touch, rad.
-        level: Largest depth, metres, or largest normal force, N, of the touch.
+        layer: Elastic layer.
+        body: Shape of the body.
+        yaws_rad: Rotations of the body during the touch, rad.
+        level: Maximum depth, metres, or maximum normal force, N, of the touch.
         by_force: Whether ``level`` is a force.
-        most_m: Largest depth allowed, metres.
+        most_m: Maximum allowed depth, metres.
         cells: Number of cells across the narrow side of the window.
-        margin: Margin around the contact without friction, relative to its half width.
+        margin: Margin around the frictionless contact, relative to the contact's half width.
 
     Raises:
-        TooMuch: The force needs a larger depth than ``most_m``.
+        TooMuch: If the force requires a depth larger than ``most_m``.
     """
     if not by_force:
         return _fit(layer, body.shape, yaws_rad, level, cells, margin)
@@ -123,7 +125,7 @@ def window_of(  # noqa: PLR0913 - what a contact depends on
 
 @dataclass(frozen=True, eq=False)
 class BodyKey:
-    """A shape that is equal to another if its key is."""
+    """Shape of a body with equality and hash by the shape's key, so that it can index a cache."""
 
     shape: Shape
 
@@ -140,15 +142,16 @@ def solve_depth(
     known: tuple[float, float],
     close: float = FORCE_CLOSE,
 ) -> float:
-    """Return the depth at which a force that rises with depth reaches a target.
+    """Find the depth at which a force that increases with depth equals a target.
 
-    Bracketed secant steps on the logarithms, because a force is nearly a power of the depth.
+    The search takes bracketed secant steps on logarithms, because the contact force is nearly a power of
+    depth.
 
     Args:
-        force_n: Function from depth, metres, to force, N; its last call is at the result.
-        target_n: Force to reach, N, positive.
-        known: A depth, metres, and its force, N, from which the first trial follows by F ∝ δ^1.5.
-        close: Tolerance relative to the target.
+        force_n: Function from depth, metres, to force, N. The last call is at the returned depth.
+        target_n: Target force, N, positive.
+        known: A depth, metres, and the force there, N; the first trial depth assumes F ∝ δ^1.5.
+        close: Tolerance of the force, relative to the target.
 
     Raises:
         ArithmeticError: If the search does not converge.
@@ -164,7 +167,7 @@ def solve_depth(
             low = max(low, depth)
         else:
             high = min(high, depth)
-        if high - low < 0.1 * close * high:  # the rest is the tolerance of the contact mechanics
+        if high - low < 0.1 * close * high:  # the remaining error is the contact solver's tolerance
             return depth
         power = 1.5
         if force > 0.0 and last[1] > 0.0 and last[0] != depth and last[1] != force:
@@ -174,10 +177,12 @@ def solve_depth(
         if not low < following < high:
             following = 0.5 * (low + high) if math.isfinite(high) else 1.5 * low
         depth = following
-    raise ArithmeticError(f"no depth for {target_n:g} N within {_SEARCHES} trials, last {depth:g} m")
+    raise ArithmeticError(
+        f"no depth found for a force of {target_n:g} N in {_SEARCHES} trials; last trial: {depth:g} m"
+    )
 
 
-def _fit(  # noqa: PLR0913 - what a contact depends on
+def _fit(  # noqa: PLR0913 - all inputs of a contact
     layer: Layer,
     shape: Shape,
     yaws_rad: tuple[float, ...],
@@ -185,7 +190,7 @@ def _fit(  # noqa: PLR0913 - what a contact depends on
     cells: int,
     margin: float,
 ) -> Window:
-    """Return a window that holds the contact at a depth, whichever the rotation."""
+    """Return a window that covers the contact at a given depth for every rotation in ``yaws_rad``."""
     half = 1.5 * np.max([_extent_m(shape, yaw, depth_m) for yaw in yaws_rad], axis=0)
     for _ in range(_TURNS):
         grid = _grid(layer, half, cells)
@@ -212,19 +217,19 @@ def _grid_of(layer: Layer, shape: tuple[int, int], size_m: float) -> Grid:
 
 
 def _grid(layer: Layer, half_m: Float, across: int) -> Grid:
-    """Return a grid that is at least twice ``half_m`` (2,) large, metres."""
+    """Return a grid whose sides along x and y are at least twice ``half_m`` (2,), metres."""
     wide = 2.0 * half_m
     narrow = float(wide.min())
     size = max(narrow / across, math.sqrt(float(wide.prod()) / MOST_CELLS) / across)
     size = min(size, 2.0 * narrow / across)
-    size = min(size, layer.thickness_m)  # a larger cell does not resolve the response of the layer
-    size = float(f"{size:.2g}")  # equal sizes share the response
+    size = min(size, layer.thickness_m)  # larger cells do not resolve the layer's response
+    size = float(f"{size:.2g}")  # rounded, so that more windows share a cached response
     cells = np.maximum(np.ceil(wide / size - 1e-9), 4).astype(int)
     return _grid_of(layer, (int(cells[0]), int(cells[1])), size)
 
 
 def _extent_m(shape: Shape, yaw_rad: float, depth_m: float) -> Float:
-    """Return half of the bounding box (2,) of the body's section at a depth, metres, roughly from above."""
+    """Return a rough upper bound of a body section's half width (2,) along x and y, metres, at a depth."""
     reach = 1e-5
     for _ in range(20):
         line = np.linspace(-reach, reach, 65)
@@ -234,7 +239,7 @@ def _extent_m(shape: Shape, yaw_rad: float, depth_m: float) -> Float:
         if extent.max() < reach * (1.0 - 1e-9):
             break
         reach *= 2.0
-    for axis in (0, 1):  # a narrow body lies between the samples
+    for axis in (0, 1):  # the samples above may miss a narrow body
         line = np.linspace(0.0, extent[axis] + 2.0 * reach / 64, 257)
         places = np.stack([line, 0.0 * line] if axis == 0 else [0.0 * line, line], axis=-1)
         inside = shape.over(places, yaw_rad) <= depth_m

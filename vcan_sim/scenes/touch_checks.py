@@ -20,9 +20,10 @@ from vcan_sim.scenes.window import FRICTION_MARGIN, MARGIN, BodyKey, TooMuch, Wi
 DEEPEST: Final = 0.9
 """Maximum depth of a body, as a fraction of the layer thickness or electrode height, whichever is smaller."""
 APART: Final = 3.0
-"""Minimum distance between the contacts of two bodies on a patch, as a multiple of the layer thickness
-or of the larger contact's half width, whichever is smaller. The simulator neglects the displacement that one contact causes at the
-other, which is at most 3 % of the depth there (incompressible layer 2 mm thick, sphere of radius 40 mm)."""
+"""Minimum distance between the contacts of two bodies on a patch, as a multiple of the layer thickness or of
+the larger contact's half width, whichever is smaller. The simulator neglects the displacement that each
+contact causes at the other. At this distance, the neglected displacement is at most 3 % of the depth
+(incompressible layer 2 mm thick, sphere of radius 40 mm)."""
 
 
 def window_of_touch(

@@ -1,4 +1,4 @@
-"""Call a user's function with each field, on a separate thread, so that the calls cannot delay other work."""
+"""Call a user's function with each field, on a separate thread, so that the calls delay no other work."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from skinnode.process import clock
 _log = logging.getLogger(__name__)
 
 LAST_CALL_S: Final = 1.0
-"""Maximum wait for a running call when a callback or the host ends, s."""
+"""Maximum wait for a running call while a callback or the host ends, s."""
 
 
 class FieldCallback:
-    """Callback that receives each field until :meth:`close` or until the host closes.
+    """Callback that passes each field to a user's function, until :meth:`close` or until the host closes.
 
-    Exceptions raised by the function are counted, and the first is logged with its traceback; the next field
-    is delivered nevertheless. Threads: a dedicated thread calls the function; any thread may call the
+    If the function raises exceptions, they are counted, the first exception is logged with its traceback, and
+    later fields are still delivered. Threads: a dedicated thread calls the function; any thread may call the
     methods.
     """
 
@@ -42,7 +42,7 @@ class FieldCallback:
 
     @property
     def dropped(self) -> int:
-        """Fields lost because the function was too slow."""
+        """Number of fields lost because the function was too slow."""
         return self._fields.dropped
 
     @property
@@ -51,12 +51,12 @@ class FieldCallback:
         return self._failed
 
     def close(self) -> None:
-        """End the calls and wait up to a second for a running call; the function may call this method."""
+        """Stop the calls, and wait up to a second for a running call. The function may call this method."""
         self._fields.end()
         self.join()
 
     def join(self) -> None:
-        """Wait up to a second for the last call to return, and log a warning if it does not."""
+        """Wait up to a second for the last call to return, and log a warning if the call does not return."""
         if self._thread is threading.current_thread():
             return
         self._thread.join(LAST_CALL_S)
@@ -72,10 +72,10 @@ class FieldCallback:
         keep_on(self._turn, self._defects, "waiting for a field")
 
     def _turn(self) -> bool:
-        """Wait for the next field and process it. Returns False when there are no more fields."""
+        """Wait for the next field and pass it to the function. Returns False if no further fields follow."""
         try:
             field = self._fields.take(None)
-        except SkinError as error:  # this error stopped the host; every subscriber receives it
+        except SkinError as error:  # every subscriber receives the error that stopped the host
             _log.debug("callback %s: %s", _name(self._function), error)
             return False
         if field is None:
@@ -90,14 +90,14 @@ class FieldCallback:
 
 
 class Callbacks:
-    """All callbacks of a host. Exceptions raised outside the user's functions are reported to ``defects``."""
+    """Callbacks of a host. Exceptions raised outside users' functions are reported to ``defects``."""
 
     def __init__(self, defects: Defects | None = None) -> None:
         self._defects = defects
         self._all: list[FieldCallback] = []
 
     def add(self, function: Callable[[FieldFrame], object], fields: Subscription) -> FieldCallback:
-        """Start a callback.
+        """Start calling ``function`` with the fields of a subscription.
 
         Raises:
             TypeError: if ``function`` is not callable, or is async.
@@ -112,7 +112,7 @@ class Callbacks:
         return callback
 
     def join(self) -> None:
-        """Wait for all callbacks to end; their subscriptions must already have ended."""
+        """Wait for all callbacks to end. The callbacks' subscriptions must have ended before the call."""
         for callback in self._all:
             callback.join()
 

@@ -1,7 +1,7 @@
-"""Containment of exceptions in the host's threads.
+"""Contain exceptions in the host's threads.
 
-An exception raised while serving one subject (a patch, a bus, a subscriber) is reported to the
-:class:`Defects` of that subject and affects no other subject; the operation is then retried. The table in
+An exception raised while serving one subject (a patch, a bus or a subscriber) is reported to that subject's
+:class:`Defects`, and does not affect other subjects. The operation is then retried. The table in
 :mod:`skinnode.host` lists every thread.
 """
 
@@ -21,34 +21,34 @@ _log = logging.getLogger(__name__)
 
 _BRIEF_S: Final = 0.001
 _LONGEST_BRIEF_S: Final = 0.02
-"""First and longest pause, in s, in a loop that serves several subjects: the failure of one must not delay
-the others."""
+"""First and longest pause after an exception in a loop that serves several subjects, s. The pauses are short,
+because the failure of one subject must not delay the others."""
 
 _COMPLAINTS: Final = 64
-"""Maximum number of logged messages remembered per subject; when this number is reached, messages may be
-logged again."""
+"""Maximum number of logged messages remembered per subject. After this number of distinct messages, messages
+may be logged again."""
 
 
 def one_line(error: BaseException | None) -> str:
-    """Return the type and text of an exception as one line."""
+    """Return the type and the message of an exception as one line."""
     text = " ".join(str(error).split())
     return f"{type(error).__name__}: {text}" if text else type(error).__name__
 
 
 @dataclass(frozen=True, slots=True)
 class DefectStats:
-    """Statistics on the exceptions raised while serving one subject."""
+    """Statistics of the exceptions raised while serving one subject."""
 
     count: int
     newest: str | None
-    """Newest failed operation and its exception, in one line; None before the first exception."""
+    """Most recently failed operation and its exception, in one line; None before the first exception."""
 
 
 class Defects:
     """Collector of the exceptions raised while serving ``subject``; thread-safe.
 
-    The first occurrence of each distinct message is passed to ``on_new`` and logged: one line at level
-    warning, and the traceback at level debug.
+    The first occurrence of each distinct message is passed to ``on_new`` and logged, as one line at level
+    WARNING and with the traceback at level DEBUG.
     """
 
     def __init__(self, subject: str, on_new: Callable[[SkinError], object] = lambda error: None) -> None:
@@ -60,16 +60,16 @@ class Defects:
 
     @property
     def count(self) -> int:
-        """Number of exceptions so far."""
+        """Number of exceptions reported so far."""
         return self._count
 
     @property
     def newest(self) -> str | None:
-        """Newest exception, in one line."""
+        """Most recently failed operation and its exception, in one line; None before the first exception."""
         return self._newest
 
     def stats(self) -> DefectStats:
-        """Return the statistics so far."""
+        """Return the statistics of the exceptions reported so far."""
         return DefectStats(self._count, self._newest)
 
     def report(self, doing: str, error: Exception) -> None:
@@ -96,7 +96,7 @@ class Defects:
 def keep_on(turn: Callable[[], bool], defects: Defects, doing: str) -> None:
     """Call ``turn`` until it returns False.
 
-    An exception ends only the current call; a pause of 1 to 20 ms follows.
+    An exception ends only the current call and is followed by a pause of 1 to 20 ms.
     """
     pause = Pause(_BRIEF_S, _LONGEST_BRIEF_S)
     while True:

@@ -1,20 +1,24 @@
-"""Name the frozen wires and crossings of a live patch, so that its fields are solved without them.
+"""Detect the frozen wires and crossings of a live patch, so that its fields are solved without them.
 
-**Movement.** A crossing is frozen if its code repeats exactly while all four neighbours move the same way by
-at least ``CROSSING_LEAD`` codes. A wire is frozen if all its codes repeat while the neighbours of at least
-``LEADS`` of its crossings, on the wires next to it, move by ``WIRE_LEAD`` codes. This holds for the quietest
-converter. In 696 simulated presses of live patches (two layouts, layers of 0.3 to 1 pitch, depths of 2 to
-50 %, friction of 0 to 0.8, noise of 0 to 3e-6, 16-bit codes), a crossing that happened to stay within one
-code for five scans reached a lead of 75 codes; in 1,800 presses without noise (depths from 0.2 %), a wire
-that stayed so for one scan or more reached 25. An indentation by 10 % moves codes by thousands.
+**Movement.** A crossing is frozen if its code repeats exactly while the codes of all four neighbours change
+in the same direction by at least ``CROSSING_LEAD`` codes. A wire is frozen if all its codes repeat while, for
+at least ``LEADS`` of its crossings, the codes of the neighbours on the adjacent wires change by at least
+``WIRE_LEAD`` codes. These criteria do not depend on the converter's noise.
 
-**Noise.** A part is also frozen if a live converter would repeat its codes so often with a probability of
-:data:`~skinnode.host.converter_liveness.FALSE_ALARM` or less, at a tenth of the stated noise or at half of
-the noise in recent windows, while three quarters of the other crossings have not repeated for a quarter as
-long. The last condition excludes converters that are quieter than assumed, because all their crossings
-repeat.
+The limits were verified with simulated presses on live patches; :mod:`skinnode.host.code_runs` defines a
+lead. In 696 presses (two layouts, layers of 0.3 to 1 pitch, depths of 2 to 50 %, friction of 0 to 0.8, noise
+of 0 to 3e-6, 16-bit codes), the maximum lead of a crossing whose code stayed constant for five scans was 75
+codes. In 1,800 presses without noise (depths from 0.2 %), the maximum lead of a wire whose codes stayed
+constant for at least one scan was 25 codes. An indentation by 10 % changes codes by thousands.
 
-A part is readmitted as soon as one of its codes changes.
+**Noise.** A wire or crossing is also frozen if the probability that a live converter would repeat its codes
+as often as observed is :data:`~skinnode.host.converter_liveness.FALSE_ALARM` or less. This probability is
+computed for a tenth of the stated noise, or for half of the recently measured noise if that is larger. In
+addition, at least three quarters of the other crossings must have repeated their codes for less than a
+quarter as long. This condition prevents false alarms for converters with less noise than assumed, whose
+crossings all repeat.
+
+A wire or crossing is used again as soon as one of its codes changes.
 """
 
 from __future__ import annotations
@@ -47,22 +51,24 @@ from skinnode.model.data_fault import DataFault, FaultKind, FaultyPart
 from skinnode.protocol.codes import CodeScale
 
 CROSSING_LEAD: Final = 512
-"""Minimum lead of a frozen crossing, codes: seven times the largest of a live crossing in 696 presses."""
+"""Minimum lead of a frozen crossing, codes: seven times the maximum of live crossings in 696 simulated
+presses."""
 WIRE_LEAD: Final = 64
-"""Minimum lead of ``LEADS`` crossings of a frozen wire, codes: 2.5 times the largest of a live wire."""
+"""Minimum lead of ``LEADS`` crossings of a frozen wire, codes: 2.5 times the maximum of live wires in 1,800
+simulated presses."""
 _NEVER: Final = 2**62
 _OTHERS: Final = 0.75
-"""Minimum fraction of the other crossings that must not have repeated for a quarter as long."""
+"""Minimum fraction of the other crossings that must have repeated for less than a quarter as long."""
 
 
 class FrozenParts:
-    """Wires and crossings of one patch that are frozen. Owned by the mainline.
+    """Detector of the frozen wires and crossings of one patch. Owned by the mainline.
 
     Args:
         scale: Scale of the codes.
         relative_noise: Converter noise stated in the hand file, as a fraction of the resistance.
-        state: State of the runs (:mod:`skinnode.host.code_runs`); this object writes the plane of named
-            crossings.
+        state: State of the runs (:mod:`skinnode.host.code_runs`). The detector writes the plane that marks
+            crossings as frozen.
     """
 
     def __init__(self, scale: CodeScale, relative_noise: float, state: NDArray[np.int64]) -> None:
@@ -70,18 +76,19 @@ class FrozenParts:
         self._log_stay = 0.0
         self.faults: tuple[DataFault, ...] = ()
         self.left_out: NDArray[np.bool_] | None = None
-        """(U, K) crossings to leave out; None if there are none."""
+        """(U, K) bool: crossings to leave out of the solve; None if no crossing is frozen."""
         self.limits = np.zeros(7, np.int64)
         self.limits[STEPS] = scale.steps
         self.limits[_WIRE_LEAD], self.limits[_CROSSING_LEAD] = WIRE_LEAD, CROSSING_LEAD
         self.assume_noise(0.0, 0)
 
     def assume_noise(self, measured: float, least: int) -> None:
-        """Set the limits of the runs.
+        """Set the limits for runs from the assumed noise.
 
         Args:
-            measured: Noise that recent windows have shown, codes; 0 if none.
-            least: Smallest code, which has the least noise because noise is proportional to the resistance.
+            measured: Noise measured over recent windows, codes; 0 if no noise was measurable.
+            least: Smallest code of a scan. Its noise is the smallest, because noise is proportional to the
+                resistance.
         """
         ratio = max(self._scale.lo + least * self._scale.step, self._scale.step)
         self._log_stay = log_stay(ratio * max(self._stated / QUIETER, 0.5 * measured))
@@ -92,15 +99,15 @@ class FrozenParts:
             self.limits[limit] = max(LEAST_RUN, math.ceil(needed)) if needed < _NEVER else _NEVER
 
     def release(self) -> None:
-        """Readmit the parts of which a code has changed."""
+        """Remove the faults of wires and crossings with a changed code."""
         alive = (self._state[NAMED] != 0) & (self._state[RUN] == 0)
         self._set([fault for fault in self.faults if not alive[_place(fault)].any()])
 
     def name(self, scan: int) -> None:
-        """Name the parts that are frozen now.
+        """Add faults for wires and crossings that are now frozen.
 
         Args:
-            scan: Number of the scan.
+            scan: Number of the newest scan, at which the new faults begin.
         """
         last, run, named = self._state[LAST], self._state[RUN], self._state[NAMED] != 0
         known = (last >= 0) & (last <= self._scale.steps) & ~named
@@ -121,7 +128,7 @@ class FrozenParts:
     def _wire(
         self, known: NDArray[np.bool_], run: NDArray[np.int64], lead: NDArray[np.int64], at: Any, limit: int
     ) -> float | None:
-        """Return the logarithm of the probability that a wire is live; None if it is not frozen."""
+        """Return the log probability that a live wire repeats these codes; None if the wire is not frozen."""
         here = known[at]
         if not here.any() or (least := int(run[at][here].min())) < 1:
             return None
@@ -162,7 +169,7 @@ class FrozenParts:
 
 
 def _place(fault: DataFault) -> Any:
-    """Return the index of a fault's crossings."""
+    """Return the index of a fault's crossings in a (U, K) array."""
     return (
         slice(None) if fault.upper is None else fault.upper,
         slice(None) if fault.lower is None else fault.lower,
@@ -170,7 +177,7 @@ def _place(fault: DataFault) -> Any:
 
 
 def _lies_on(fault: DataFault, part: FaultyPart, number: int) -> bool:
-    """Return whether a fault is a crossing of this wire."""
+    """Return whether a fault concerns a single crossing of the given wire."""
     wire = fault.upper if part is FaultyPart.UPPER else fault.lower
     return fault.part is FaultyPart.CROSSING and wire == number
 

@@ -1,4 +1,4 @@
-"""A running host: fields, health, events, statistics and taring for a hand."""
+"""Run the host of a hand: deliver fields, health, events and statistics, and tare patches."""
 
 from __future__ import annotations
 
@@ -35,23 +35,24 @@ from skinnode.transport import CanPort
 
 @dataclass(frozen=True, slots=True)
 class HostStats:
-    """Counters of a running host at one instant."""
+    """Counters of a running host."""
 
     buses: Mapping[str, BusStats]
     patches: Mapping[str, StreamStats]
     nodes: Mapping[str, NodeStats]
-    """By patch."""
+    """Bring-up statistics of each node, by patch name."""
     other_masters: Mapping[str, OtherMasterStats]
-    """Frames from other masters, by bus."""
+    """Counters of frames from other masters, by bus name."""
     sync: SyncStats
     malformed: tuple[CodecError, ...]
-    """First malformed frame on each bus; buses without malformed frames are omitted."""
+    """First malformed frame received on each bus; buses without malformed frames are omitted."""
     defects: Mapping[str, DefectStats]
-    """Exceptions contained by the host, by patch and by bus; ``host`` holds the remaining exceptions."""
+    """Statistics of contained exceptions by patch or bus name; ``host`` for exceptions that concern
+    neither."""
 
     @property
     def rivals(self) -> Mapping[str, OtherMasterStats]:
-        """Old name of :attr:`other_masters`; it will be removed in version 0.2."""
+        """Old name of :attr:`other_masters`, which will be removed in version 0.2."""
         warnings.warn(
             "HostStats.rivals is now HostStats.other_masters; the old name will be removed in version 0.2",
             DeprecationWarning,
@@ -61,7 +62,7 @@ class HostStats:
 
 
 class Host:
-    """A running hand. Created and shut down by :meth:`from_toml` or :meth:`from_config`.
+    """Host of a running hand, created and shut down by :meth:`from_toml` or :meth:`from_config`.
 
     Example::
 
@@ -69,12 +70,12 @@ class Host:
             for field in host.fields():
                 ...
 
-    Inside the block, all nodes are operational, SYNC is sent, and a node that restarts or comes back is
-    brought up again. After the block, and also if bring-up fails, the nodes are pre-operational, every
+    Inside the ``with`` block, all nodes are operational, SYNC is sent, and a node that restarts or comes back
+    is brought up again. After the block, and also if bring-up fails, the nodes are pre-operational, every
     thread has ended and every interface is closed. On a bus that another master runs (``role = "guest"``),
-    NMT and SYNC are left to that master.
+    the host sends neither NMT commands nor SYNC.
 
-    Threads: every method may be called from any thread.
+    Threads: any thread may call any method.
     """
 
     def __init__(self, parts: HostParts) -> None:
@@ -96,19 +97,19 @@ class Host:
         cancelled: Callable[[], bool] = never,
         tap: HostTap | None = None,
     ) -> Iterator[Host]:
-        """Bring up the hand described in a hand file; shut it down at the end of the ``with`` block.
+        """Bring up the hand described in a hand file, and shut it down at the end of the ``with`` block.
 
         Args:
-            path: The hand file.
-            interface: As in :meth:`from_config`, like all arguments below.
-            channel: As in :meth:`from_config`.
-            boot_deadline_s: As in :meth:`from_config`.
-            cancelled: As in :meth:`from_config`.
-            tap: As in :meth:`from_config`.
+            path: Path of the hand file.
+            interface: See :meth:`from_config`.
+            channel: See :meth:`from_config`.
+            boot_deadline_s: See :meth:`from_config`.
+            cancelled: See :meth:`from_config`.
+            tap: See :meth:`from_config`.
 
         Raises:
-            ConfigError: if the file cannot be used.
-            SkinError: as raised by :meth:`from_config`.
+            ConfigError: if the hand file is missing or invalid.
+            SkinError: if :meth:`from_config` raises it.
         """
         hand = load_hand(path)
         running = cls.from_config(
@@ -135,27 +136,27 @@ class Host:
         tap: HostTap | None = None,
         open_port: Callable[[BusConfig], CanPort] = CanPort,
     ) -> Iterator[Host]:
-        """Bring a hand up; shut it down at the end of the ``with`` block.
+        """Bring up a hand, and shut it down at the end of the ``with`` block.
 
-        Once the hand is up, the host survives all errors: see :meth:`health` and :meth:`stats`.
+        After a successful bring-up, no error ends the host: see :meth:`health` and :meth:`stats`.
 
         Args:
-            hand: The hand.
-            interface: python-can interface to use in place of the hand's.
-            channel: Channel to use in place of the hand's; only for a hand with one bus.
+            hand: Configuration of the hand.
+            interface: python-can interface that replaces the hand's interfaces.
+            channel: Channel that replaces the hand's channel; only for a hand with one bus.
             boot_deadline_s: Maximum time until the first response from a node, s.
-            cancelled: Called repeatedly during bring-up; once it returns True, bring-up ends with
+            cancelled: Called repeatedly during bring-up. If it returns True, bring-up raises
                 BringUpCancelled.
-            tap: Records the traffic, including bring-up; see :class:`skinnode.record.Recorder`.
-            open_port: Opens a bus whose interface is not one of python-can's.
+            tap: Recorder of the traffic, including bring-up; see :class:`skinnode.record.Recorder`.
+            open_port: Function that opens a bus, for interfaces that python-can does not provide.
 
         Raises:
             ConfigError: if an option, EDS file or baseline file does not match the hand, or a layout cannot
                 be solved.
-            BusLoadError: if the planned traffic is too much for a bus.
-            BusError: if an interface cannot be opened, or no node on a bus answers and ``bring_up.missing``
+            BusLoadError: if the planned traffic exceeds the load limit of a bus.
+            BusError: if an interface cannot be opened, or no node on a bus responds and ``bring_up.missing``
                 is not ``wait``.
-            NodeTimeout: if a node does not answer and ``bring_up.missing`` is not ``wait``.
+            NodeTimeout: if a node does not respond and ``bring_up.missing`` is not ``wait``.
             NodeError: if a node is not the patch described in ``hand``, or does not keep its configuration.
             BringUpCancelled: if ``cancelled`` returned True.
             ValueError: if ``boot_deadline_s`` is negative, infinite or not a number.
@@ -172,11 +173,11 @@ class Host:
     def fields(
         self, *, timeout_s: float | None = None, capacity: int | None = None, patch: str | None = None
     ) -> Subscription:
-        """Subscribe to fields from now until the host closes; iterate with ``for`` or ``async for``.
+        """Subscribe to all further fields. Iterate over the subscription with ``for`` or ``async for``.
 
         Args:
-            timeout_s: Time without a field after which the loop raises TimeoutError, s; None: no limit.
-            capacity: Number of fields by which the loop may lag before it loses the oldest; the hand
+            timeout_s: Time without a field after which the loop raises TimeoutError, s; None for no limit.
+            capacity: Maximum number of waiting fields, beyond which the oldest field is dropped; the hand
                 file's capacity by default.
             patch: Patch whose fields are delivered; all patches by default.
 
@@ -189,12 +190,13 @@ class Host:
     def hands(self, *, timeout_s: float | None = None, capacity: int | None = None) -> HandSubscription:
         """Subscribe to hand frames, each with all patches' fields for one SYNC.
 
-        Iterate with ``for`` or ``async for``. A frame waits at most two SYNC periods for a patch's field, and
-        does not wait for a patch that is absent.
+        Iterate over the subscription with ``for`` or ``async for``. A hand frame waits at most two SYNC
+        periods for a patch's field, and does not wait for an absent patch.
 
         Args:
-            timeout_s: Time without a hand frame after which the loop raises TimeoutError, s; None: no limit.
-            capacity: Number of hand frames by which the loop may lag; the hand file's capacity by default.
+            timeout_s: Time without a hand frame after which the loop raises TimeoutError, s; None for no
+                limit.
+            capacity: Maximum number of waiting hand frames; the hand file's capacity by default.
 
         Raises:
             ValueError: if the patches of the hand do not all follow the same SYNC with a counter.
@@ -215,15 +217,15 @@ class Host:
         patch: str | None = None,
         capacity: int | None = None,
     ) -> FieldCallback:
-        """Call ``function`` with each field from now on, on a separate thread.
+        """Call ``function`` with each further field, on a separate thread.
 
-        The calls end with the host or with the callback's ``close()``. A function that blocks or raises an
-        exception loses only its own fields, which the callback counts.
+        The calls end when the host closes or the callback's ``close()`` is called. If the function blocks or
+        raises an exception, only its own fields are lost, and the callback counts them.
 
         Args:
-            function: Called with each field.
+            function: Function to call with each field.
             patch: Patch whose fields are delivered; all patches by default.
-            capacity: Number of fields by which the function may lag; the hand file's capacity by default.
+            capacity: Maximum number of waiting fields; the hand file's capacity by default.
 
         Raises:
             TypeError: if ``function`` is not callable, or is async.
@@ -232,7 +234,7 @@ class Host:
         return self._callbacks.add(function, self.fields(capacity=capacity, patch=patch))
 
     def latest(self, patch: str) -> FieldFrame | None:
-        """Return the newest field of a patch, or None before the first. Never waits.
+        """Return the newest field of a patch, or None before the patch's first field. Never waits.
 
         Raises:
             ValueError: if there is no such patch.
@@ -259,23 +261,23 @@ class Host:
         """Return the health of a bus.
 
         Raises:
-            KeyError: if there is no such bus, or it has no patches.
+            KeyError: if there is no such bus, or the bus has no patches.
         """
         served = self._buses[bus]
         return served.health(no_sync=self._lacks_sync(served))
 
     def _lacks_sync(self, bus: ServedBus) -> bool:
-        """Return whether SYNC is missing. Patches that scan on their own clocks do not need SYNC."""
+        """Return whether a bus lacks SYNC, unless its patches scan on their own clocks and need no SYNC."""
         if not bus.sync_is_late(self._t_up_ns, self.hand.sync.period_ms * 1_000_000):
             return False
         streams = [node.stream for node in self._nodes.values() if node.link is bus.link]
         return bool(self.hand.sync.counter_overflow) or not any(each.stats().offered for each in streams)
 
     def events(self, *, capacity: int = CAPACITY_EVENTS) -> EventSubscription:
-        """Subscribe to changes in the health of patches, wires and buses from now until the host closes.
+        """Subscribe to all further changes in the health of patches, wires and buses.
 
         Args:
-            capacity: Number of events by which the subscriber may lag before losing the oldest.
+            capacity: Maximum number of waiting events, beyond which the oldest event is dropped.
 
         Raises:
             ValueError: if ``capacity`` is below 1.
@@ -302,7 +304,7 @@ class Host:
         return {each.subject: each.stats() for each in (self._defects, *of_buses, *of_patches)}
 
     def tap(self, tap: HostTap) -> Callable[[], None]:
-        """Record the traffic with ``tap`` from now until the host closes. Only one tap may be active.
+        """Record all further traffic with ``tap``. Only one tap may be active at a time.
 
         Returns:
             A function that ends the recording.
@@ -321,13 +323,13 @@ class Host:
     def tare(self, patch: str, *, deadline_s: float | None = None) -> None:
         """Tare a patch: its current resistances become the baseline.
 
-        Returns once the host has read the new baseline and uses it to solve scans. The event ``baselines``
-        confirms the new baseline to all subscribers. The command is RPDO1. The node loses the baseline at
-        power-off unless it is stored (0x1010).
+        The call returns when the host has read the new baseline and solves scans with it. The event
+        ``baselines`` announces the new baseline to all subscribers. The tare is commanded by RPDO1. The node
+        loses the new baseline at power-off unless the baseline is stored (0x1010).
 
         Args:
             patch: Name of the patch.
-            deadline_s: Maximum wait, s; 5 s plus three SYNC periods by default.
+            deadline_s: Maximum wait for the new baseline, s; 5 s plus three SYNC periods by default.
 
         Raises:
             KeyError: if there is no such patch.
@@ -347,7 +349,7 @@ class Host:
         )
 
     def stats(self) -> HostStats:
-        """Return all counters."""
+        """Return all counters of the host."""
         buses = self._buses
         sync = SyncStats(0, 0, 0, 0) if self._sync is None else self._sync.stats()
         followers = [bus.follower for bus in buses.values()]

@@ -1,4 +1,4 @@
-"""Start-up and shutdown of a host: its parts start in order and end in reverse order."""
+"""Start a host's parts in order, and end them in reverse order."""
 
 from __future__ import annotations
 
@@ -39,28 +39,28 @@ from skinnode.transport import CanPort
 _log = logging.getLogger(__name__)
 
 LAST_SCAN_S: Final = 0.5
-"""Maximum wait for the last scans when a host closes, s."""
+"""Maximum wait for the last scans while a host closes, s."""
 
 _POLL_S: Final = 0.005
 
 
 def never() -> bool:
-    """Return False: nothing was cancelled."""
+    """Return False; default for :attr:`StartOptions.cancelled`."""
     return False
 
 
 @dataclass(frozen=True, slots=True)
 class StartOptions:
-    """Start options. Raises ValueError if the deadline is negative, infinite or not a number."""
+    """Start options of a host. Raises ValueError if the deadline is negative, infinite or not a number."""
 
     boot_deadline_s: float = BOOT_DEADLINE_S
     """Maximum time until the first response from a node, s."""
     cancelled: Callable[[], bool] = never
-    """Called repeatedly during bring-up; once it returns True, bring-up raises BringUpCancelled."""
+    """Function called repeatedly during bring-up. If it returns True, bring-up raises BringUpCancelled."""
     tap: HostTap | None = None
-    """Records the traffic, including bring-up."""
+    """Recorder of the traffic, including bring-up; None for no recording."""
     open_port: Callable[[BusConfig], CanPort] = CanPort
-    """Opens the interface of a bus."""
+    """Function that opens the interface of a bus."""
 
     def __post_init__(self) -> None:
         if not 0 <= self.boot_deadline_s < math.inf:
@@ -71,35 +71,35 @@ class StartOptions:
 
 @dataclass(frozen=True, slots=True)
 class HostParts:
-    """The parts of a running host. Created and ended by :func:`running_parts`."""
+    """Parts of a running host, created and ended by :func:`running_parts`."""
 
     hand: HandConfig
     buses: Mapping[str, ServedBus]
     nodes: Mapping[str, RemoteNode]
     sync: SyncProducer | None
-    """None if other masters run all buses."""
+    """SYNC producer; None if other masters run all buses."""
     supervisor: Supervisor
     publisher: Publisher
     callbacks: Callbacks
     events: Events
     defects: Defects
-    """Exceptions that do not concern a particular bus or patch."""
+    """Collector of exceptions that do not concern a particular bus or patch."""
 
 
 @contextlib.contextmanager
 def running_parts(hand: HandConfig, options: StartOptions) -> Iterator[HostParts]:
     """Start the parts of a host, and end them at the end of the ``with`` block.
 
-    At the end, in this order: SYNC stops, scans in progress end, configuration stops, nodes become
-    pre-operational, the mainline ends, waiting scans are discarded, workers end, interfaces close, and the
-    loops of subscribers end.
+    The shutdown has this order: SYNC stops, scans in progress end, configuration stops, nodes become
+    pre-operational, the mainline ends, waiting scans are discarded, workers end, interfaces close, and
+    subscribers' loops end.
 
     Raises:
-        SkinError: as listed under :meth:`skinnode.host.Host.from_config`.
+        SkinError: see :meth:`skinnode.host.Host.from_config`.
     """
     check_plan(hand)
     check_files(hand)
-    load_kernels()  # the kernels compute the bus load; compiling them later would delay the mainline
+    load_kernels()  # compiling the bus load's kernels later would delay the mainline
     defects = Defects("host")
     publisher = Publisher(tuple(patch.name for patch in hand.patches), defects)
     callbacks = Callbacks(defects)
@@ -119,7 +119,7 @@ def running_parts(hand: HandConfig, options: StartOptions) -> Iterator[HostParts
             _tap_all(ContainedTap(options.tap, defects), buses.values(), nodes)
         for node in nodes:
             stack.callback(node.stream.close)
-        # All handlers are set: frames may be dispatched.
+        # Frames may be dispatched from here on, because all handlers are set.
         stack.enter_context(Mainline([bus.link for bus in buses.values()], defects))
         ready = _brought_up(hand, nodes, options, stack)
         supervisor = Supervisor(nodes, list(ready), hand.bring_up.heartbeat_s, defects)
@@ -158,7 +158,7 @@ def _tap_all(tap: ContainedTap, buses: Iterable[ServedBus], nodes: Iterable[Remo
 def _brought_up(
     hand: HandConfig, nodes: Sequence[RemoteNode], options: StartOptions, stack: contextlib.ExitStack
 ) -> dict[RemoteNode, ScanSolver]:
-    """Configure and start the nodes; closing ``stack`` makes them pre-operational again."""
+    """Configure and start the nodes, which become pre-operational again when ``stack`` is closed."""
     for patch in hand.patches:
         go_on_unless(options.cancelled)
         check_solvable(patch, hand.solver)
@@ -169,7 +169,7 @@ def _brought_up(
         start_all(ready)
     except BusError:
         for node in nodes:
-            if node.link.failure is not None:  # the nodes are silent because their bus failed
+            if node.link.failure is not None:  # the nodes are silent because the bus failed
                 raise node.link.failure from node.link.failure.__cause__
         raise
     return ready
@@ -181,7 +181,7 @@ def _sync(
     nodes: Sequence[RemoteNode],
     stack: contextlib.ExitStack,
 ) -> SyncProducer | None:
-    """Send SYNC on the buses where the host is the master, until ``stack`` is closed."""
+    """Send SYNC on the buses whose master is the host, until ``stack`` is closed."""
     own = [bus for bus in buses.values() if bus.link.config.role == "master"]
     if not own:
         return None
@@ -195,11 +195,11 @@ def _sync(
 
 
 def _logged_already(error: Exception) -> None:
-    """Ignore a bus defect: the health watch publishes it."""
+    """Ignore a bus defect, because the health watch publishes it."""
 
 
 def _let_scans_end(streams: Sequence[tuple[PatchStream, Ticks]], period_s: float) -> None:
-    """Wait for the scans started by the last SYNC, so that the shutdown does not interrupt them."""
+    """Wait for the scans started by the last SYNC, so that the shutdown does not interrupt these scans."""
     end_s = clock.monotonic() + min(1.5 * period_s, LAST_SCAN_S)
     while not all(stream.settled(ticks.newest) for stream, ticks in streams):
         if clock.monotonic() > end_s:
@@ -213,5 +213,5 @@ def _stand_by(node: RemoteNode) -> None:
     node.monitor.running = False
     try:
         nmt_master.stand_by(node.link.send, node.patch.node_id)
-    except Exception as error:  # the bus is gone; the shutdown must continue
+    except Exception as error:  # the bus may have failed, but the shutdown must continue
         _log.warning("node %d could not be made pre-operational: %s", node.patch.node_id, error)

@@ -1,4 +1,4 @@
-"""NMT commands that the host sends as NMT master (CiA 301 v4.2, 7.2.8.3.1)."""
+"""Send NMT commands as the NMT master of a bus (CiA 301 v4.2, 7.2.8.3.1)."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from skinnode.canopen.nmt import NmtCommand, encode
 
 
 def start(send: Callable[[int, bytes], None], node_id: int) -> None:
-    """Command a node to become operational."""
+    """Command a node to enter the NMT state operational."""
     send(NMT_COB_ID, encode(NmtCommand.START, node_id))
 
 
 def stand_by(send: Callable[[int, bytes], None], node_id: int) -> None:
-    """Command a node to become pre-operational: it then sends only heartbeats, EMCY and SDO responses."""
+    """Command a node to become pre-operational, and so to send only heartbeats, EMCY and SDO responses."""
     send(NMT_COB_ID, encode(NmtCommand.ENTER_PRE_OPERATIONAL, node_id))

@@ -1,6 +1,6 @@
-"""Connect the handlers of a host to the frames on a bus, by COB-ID.
+"""Register a host's handlers for the frames on a bus, by COB-ID.
 
-Nothing in this module sends, waits or starts a thread, so a replay can use the module with recorded frames.
+The functions neither send nor wait nor start threads, so a replay can use them with recorded frames.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ from skinnode.protocol.profile import PatchProfile
 from skinnode.protocol.scan import Scan
 
 LEAST_GRACE_NS: Final = 5_000_000
-"""Minimum time to wait for a summary once all chunks have arrived; half a period if that is longer. On a full
-bus, the summary loses arbitration to the chunks of all other patches."""
+"""Minimum time to wait for a scan's summary after its last chunk, ns; half a SYNC period if that is longer.
+On a fully loaded bus, the summary loses arbitration to the chunks of all other patches."""
 
 
 @dataclass(frozen=True, slots=True)
 class PatchReception:
-    """Receivers of a patch's frames."""
+    """Stream and monitor that receive a patch's frames."""
 
     stream: PatchStream
     monitor: NodeMonitor
@@ -38,14 +38,14 @@ class PatchReception:
 
 @dataclass(frozen=True, slots=True)
 class BusReception:
-    """Receivers of frames from other masters on a bus, and of their SYNC."""
+    """Detector of other masters on a bus, and follower of their SYNC."""
 
     other_masters: OtherMasters
     follower: SyncFollower
 
 
 def receive_bus(hand: HandConfig, dispatcher: Dispatcher, ticks: Ticks) -> BusReception:
-    """Start listening for other masters on a bus, and for their SYNC."""
+    """Register the handlers that detect other masters on a bus and follow their SYNC."""
     config = dispatcher.config
     other_masters, follower = OtherMasters(config), SyncFollower(ticks)
     for cob_id, handler in other_masters.handlers(
@@ -65,25 +65,25 @@ def receive_patch(
     ticks: Ticks,
     output: StreamOutput,
 ) -> PatchReception:
-    """Start passing the frames of a patch to its monitor and its stream.
+    """Register the handlers that pass a patch's frames to its monitor and its stream.
 
-    The stream withholds scans until it has a solver, because a node that an earlier host left operational may
-    be sending already.
+    The stream withholds scans until a solver is available, because a node that an earlier host left
+    operational may already be sending.
 
     Args:
-        patch: The patch.
-        hand: The hand to which the patch belongs.
-        dispatcher: Dispatches the frames of its bus.
-        ticks: The SYNC counters of its bus.
-        output: Where scans are solved. Exceptions are reported to its ``defects``; if ``defects`` is None,
-            they are raised, and the publisher fails.
+        patch: Configuration of the patch.
+        hand: Configuration of the hand to which the patch belongs.
+        dispatcher: Dispatcher of the frames on the patch's bus.
+        ticks: SYNC times of the patch's bus.
+        output: Workers and publisher for the patch's scans. Exceptions are reported to ``output.defects``; if
+            that is None, exceptions are raised, and the publisher fails.
     """
     period_ns = hand.sync.period_ms * 1_000_000
     watch = CodeWatch(CodeScale(patch.code_bits), patch.relative_noise)
     monitor = NodeMonitor(patch.name, patch.node_id, dispatcher.reject, watch)
 
     arrivals = ArrivalPredictor(period_ns)
-    dispatcher.expect(patch.name, ())  # until its first scan
+    dispatcher.expect(patch.name, ())  # no prediction before the patch's first scan
 
     def on_scan(scan: Scan) -> None:
         if not scan.empty:
@@ -112,7 +112,7 @@ def receive_patch(
     def on_heartbeat(data: bytes, t_ns: int) -> None:
         monitor.on_heartbeat(data, t_ns)
         if len(data) == 1 and data[0] & STATE_MASK == NmtState.INITIALISING:
-            stream.withhold()  # its configuration is lost
+            stream.withhold()  # a node that boots has lost its configuration
 
     dispatcher.handle(od.heartbeat_cob_id(patch.node_id), on_heartbeat, output.defects)
     dispatcher.handle(od.emcy_cob_id(patch.node_id), monitor.on_emergency, output.defects)
@@ -123,4 +123,4 @@ def receive_patch(
 
 
 def _ignore(data: bytes, t_ns: int) -> None:
-    """Ignore NMT commands that another master sends to its own nodes."""
+    """Ignore an NMT command from the master of the bus."""

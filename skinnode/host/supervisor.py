@@ -1,24 +1,25 @@
-"""Keep the nodes of a running hand in operation.
+"""Keep the nodes of a running hand operational.
 
-A node that comes back, or appears late, is configured and started; a changed baseline is read again. Nodes do
-not affect each other. One thread decides fifty times a second what to do, based on the facts that the
-mainline collected. Operations that wait for a node (configuration, reading a baseline) run on a pool, one job
-per node at a time; the thread takes the result when the job is done, so all state has one owner.
+A node that comes back or appears late is configured and started, and a changed baseline is read again. The
+state of one node does not affect the others. A single thread decides fifty times a second what to do, based
+on the data collected by the mainline. Operations that wait for a node (configuration, reading a baseline) run
+on a thread pool, with one job per node at a time. The deciding thread fetches the result of a finished job,
+so all state is owned by this thread.
 
 =========  ========================================  =========================================
-phase      means                                     left when
+phase      meaning                                   next phase
 =========  ========================================  =========================================
-AWAITED    absent, or not configured                 it is heard, or answers: JOINING
-JOINING    a job configures it                       done: STARTING; failed: AWAITED
-STARTING   it got the start command                  it is operational: RUNNING; too late: AWAITED
-RUNNING    its scans are passed on                   it booted, or left operational: JOINING;
-                                                     no heartbeat: AWAITED
+AWAITED    node is absent or not configured          JOINING when a frame from the node arrives
+JOINING    a job configures the node                 STARTING if successful, otherwise AWAITED
+STARTING   the start command has been sent           RUNNING when operational; AWAITED if too late
+RUNNING    the node's scans are solved               JOINING if it boots or leaves operational;
+                                                     AWAITED if heartbeats are missing
 =========  ========================================  =========================================
 
-A defect is an exception raised while serving a patch that is STARTING or RUNNING, or while configuring it. It
-makes the patch faulty: its scans are withheld, and its node is AWAITED for a pause of 0.1 s to 1 s that grows
-with each defect. A node that could not be configured is likewise AWAITED. A boot-up ends the pause; after
-silence or a refusal, so does any frame from the node.
+A defect is an exception raised while serving a patch in phase STARTING or RUNNING, or while configuring its
+node. A defect makes the patch faulty: its scans are withheld, and its node is in phase AWAITED for a pause of
+0.1 s to 1 s that doubles with each defect. The same pause follows a failed configuration. A boot-up message
+from the node ends the pause. After silence or a refusal, any frame from the node ends the pause.
 """
 
 from __future__ import annotations
@@ -40,23 +41,24 @@ from skinnode.process import clock
 _log = logging.getLogger(__name__)
 
 THREADS: Final = 8
-"""Maximum number of nodes configured in parallel after the start; more would only wait for the bus."""
+"""Maximum number of nodes configured in parallel after the start; additional nodes would only wait for the
+bus."""
 
 _TURN_S: Final = 0.02
-"""Interval between two decisions, s."""
+"""Interval between two checks of all nodes, s."""
 
 
 class Supervisor:
-    """Supervisor of ``nodes`` from construction until :meth:`close`.
+    """Supervisor of all nodes, from construction until :meth:`close`. Also sends the host's heartbeats.
 
-    It also sends the host's heartbeats. Threads: one thread decides; a pool runs jobs that wait for nodes;
-    any thread may call :meth:`stats`.
+    Threads: one thread makes all decisions; a pool runs the jobs that wait for nodes; any thread may call
+    :meth:`stats`.
 
     Args:
         nodes: All nodes of the hand.
         running: Nodes that are already running.
         heartbeat_s: Period of the host's heartbeat, s.
-        defects: Collects exceptions that do not concern a particular patch.
+        defects: Collector of exceptions that do not concern a particular patch.
     """
 
     def __init__(
@@ -92,7 +94,7 @@ class Supervisor:
         self._thread.start()
 
     def stats(self) -> dict[str, NodeStats]:
-        """Return the statistics of each node, by patch."""
+        """Return the statistics of each node, by patch name."""
         return {
             node.remote.patch.name: NodeStats(
                 node.phase, node.rejoins, node.failures, node.baselines, node.complaint
@@ -101,7 +103,7 @@ class Supervisor:
         }
 
     def close(self) -> None:
-        """Stop starting jobs; end and join all threads."""
+        """Abort running jobs, then end and join all threads."""
         self._stop.set()
         self._thread.join()
         for node in self._nodes:
@@ -116,7 +118,7 @@ class Supervisor:
     ) -> None:
         self.close()
 
-    # --- its thread
+    # --- supervisor's thread
 
     def _run(self) -> None:
         keep_on(self._turn, self._defects, "supervision")
@@ -127,7 +129,7 @@ class Supervisor:
         for node in self._nodes:
             try:
                 self._supervision.look(node, clock.monotonic_ns())
-            except Exception as error:  # the next iteration marks the patch as faulty
+            except Exception as error:  # the next iteration makes the patch faulty
                 node.upset = True
                 node.remote.defects.report("supervision", error)
         self._beat(clock.monotonic_ns())
@@ -140,10 +142,10 @@ class Supervisor:
         self._beat_ns = max(self._beat_ns + self._heartbeat_ns, now_ns)
         for link in self._links.values():
             node_id = link.config.heartbeat_node_id
-            assert node_id is not None  # only buses with such a node-ID are kept
+            assert node_id is not None  # only buses with a node-ID for the host are kept
             try:
                 link.send(od.heartbeat_cob_id(node_id), bytes([NmtState.OPERATIONAL]))
-            except BusError:  # nodes that miss the heartbeat report it themselves
+            except BusError:  # nodes that miss the heartbeat report the error themselves
                 continue
             except Exception as error:
                 link.defects.report("sending a heartbeat", error)

@@ -21,7 +21,7 @@ class CodeMap:
     baseline_ohm: Float
     """(U, K) R0, ohm; a code is invalid if its R0 is not positive and finite."""
     lo: float
-    """R / R0 at code 0."""
+    """Ratio R / R0 at code 0."""
     step: float
     """Change in R / R0 per code."""
     steps: int
@@ -83,7 +83,7 @@ def checked_mask(valid: Any, layout: PatchLayout) -> NDArray[np.bool_]:
 
 
 def checked_codes(codes: Any, layout: PatchLayout) -> NDArray[np.uint32]:
-    """Return the codes unchanged.
+    """Return the codes unchanged if their type and shape are correct.
 
     Raises:
         ValueError: If the codes are not uint32 or not of shape (U, K).

@@ -1,16 +1,17 @@
 """Bound on the force of a contact whose layer is not calibrated.
 
-Forces follow from the displacement of an elastic half-space. Real skin is a layer on a support. A layer of
-incompressible rubber bonded to a rigid support is the stiffest support there is: for the same displacement it
-carries more force, the more so the wider the contact is relative to the layer's thickness. Under Hertz's
-pressure over a circle of radius a, a layer of thickness t sinks by
+The solver computes forces from the displacement of an elastic half-space, but real skin is a layer on a
+support. The stiffest case is a layer of incompressible rubber bonded to a rigid support. For the same
+displacement, such a layer carries more force than the half-space, and the ratio grows with the width of the
+contact relative to the layer's thickness. Under Hertz's pressure over a circle of radius a, a layer of
+thickness t is indented by
 
     δ = (1/2πG) ∫ p̂(k) f(k t) dk,   f(x) = (sinh 2x − 2x) / (cosh 2x + 1 + 2x²),   p̂(k) = ∫ p e^(ikx) d²x
 
-where f = 1 is the half-space (Johnson, Contact Mechanics, 1985, 5.8; the thin-layer limit F ∝ G a⁴ δ / t³ is
-that of Barber, Int. J. Mech. Sci. 32, 129, 1990). The ratio of the two forces at the same δ is a function of
-a/t. Layers between the two need a force between the two. The sum of the pressing loads of the half-space is a
-second bound: on thicker layers the pulling loads cancel part of it.
+where f = 1 for the half-space (Johnson, Contact Mechanics, 1985, 5.8; the thin-layer limit F ∝ G a⁴ δ / t³ is
+from Barber, Int. J. Mech. Sci. 32, 129, 1990). At the same δ, the ratio of the bonded layer's force to the
+half-space's force is a function of a/t. The force on any real layer lies between these two forces. The sum of
+the half-space's pressing loads is a second bound: on thicker layers, pulling loads cancel part of this sum.
 """
 
 from __future__ import annotations
@@ -21,18 +22,19 @@ from typing import Final
 from skinnode.model.elastic import Rubber
 
 LINEAR: Final = 1.05
-"""Coefficient of a/t in the ratio of the forces; fitted, with :data:`CUBIC`, to the integral above at a/t
-from 0.05 to 20: within 12 %."""
+"""Coefficient of a/t in the ratio of the bonded layer's force to the half-space's force. Fitted together with
+:data:`CUBIC` to the exact integral for a/t from 0.05 to 20, with errors of at most 12 %."""
 CUBIC: Final = 0.51
-"""Coefficient of (a/t)³ in the ratio of the forces."""
+"""Coefficient of (a/t)³ in the ratio of the bonded layer's force to the half-space's force."""
 SPAN: Final = 2.5
-"""Number of standard deviations from the half-space's force to the bonded layer's; a bound on the model, no
-noise. With 3, the forces of layers of 2, 4, 8 and 16 mm, pressed over radii from 1.6 to 10 mm on a patch with
-a clearance of 2 mm, were up to 4.3 standard deviations off; 2.5 keeps them within 5 with some margin."""
+"""Number of standard deviations between the half-space's force and the bonded layer's force; these express a
+bound on the model error, not noise. With a value of 3, force errors reached 4.3 standard deviations on layers
+of 2, 4, 8 and 16 mm, pressed over radii from 1.6 to 10 mm on a patch with a clearance of 2 mm. A value of 2.5
+keeps force errors below 5 standard deviations with some margin."""
 
 
 def stiffening(radius_m: float, thickness_m: float) -> float:
-    """Return the ratio of the force of a bonded layer to that of a half-space at the same depth.
+    """Return the ratio of a bonded layer's force to a half-space's force at the same indentation depth.
 
     Args:
         radius_m: Radius of the contact, metres.
@@ -43,7 +45,7 @@ def stiffening(radius_m: float, thickness_m: float) -> float:
 
 
 def bonded_force_n(rubber: Rubber, depth_m: float, radius_m: float, thickness_m: float) -> float:
-    """Return the force in N that presses a bonded layer in by ``depth_m`` over a circle.
+    """Return the force in N that indents a bonded layer by ``depth_m`` over a circular contact.
 
     Args:
         rubber: The material.
@@ -56,5 +58,5 @@ def bonded_force_n(rubber: Rubber, depth_m: float, radius_m: float, thickness_m:
 
 
 def layer_std_n(bonded_n: float, force_n: float) -> float:
-    """Return the standard deviation that reaches from the half-space's force to the bonded layer's, N."""
+    """Return the force difference between bonded layer and half-space as a standard deviation, N."""
     return math.fabs(max(bonded_n - force_n, 0.0)) / SPAN

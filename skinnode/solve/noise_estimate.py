@@ -1,21 +1,23 @@
-"""Estimate of the actual noise of a stream, relative to the stated noise, without solving anything.
+"""Estimate of a stream's actual noise relative to the stated noise, computed without a solve.
 
-Frames are taken in blocks of four. Four values of a reading give two contrasts that do not depend on its
-level and slope, and that independent noise makes independent and equally strong:
+The estimator groups frames into blocks of four. The four values of a reading yield two contrasts that do not
+depend on the reading's level or slope. If the noise of the four frames is independent, the contrasts are
+independent and have the same variance:
 
 quadratic  (r₀ − r₁ − r₂ + r₃) / 2
 cubic      (r₀ − 3 r₁ + 3 r₂ − r₃) / √20
 
-A block counts only if it contains noise and nothing else. Motion of the skin is slow, so its quadratic
-contrast is stronger than its cubic one; a step or a lost scan has unequal contrasts too. Motion also moves
-neighbouring readings together, whereas their noise has independent signs. A robust mean over the readings
-(Huber, Robust Statistics, 1981, proposal 2) keeps a few bad readings or a touch of a few wires out of the
-level of a block, and the median over the last blocks keeps a bad block out of the estimate.
+A block is used only if it contains nothing but noise. Motion of the skin is slow, so its quadratic contrast
+is larger than its cubic contrast; a step or a lost scan also makes the two contrasts unequal. Motion also
+shifts neighbouring readings in the same direction, whereas the signs of their noise are independent. A robust
+mean over the readings (Huber, Robust Statistics, 1981, proposal 2) prevents a few bad readings, or a touch on
+a few wires, from raising a block's noise level. The median over the last blocks prevents a bad block from
+distorting the estimate.
 
-Readings that repeat exactly say nothing: the converter may be quiet, or it may be frozen. If the rounding to
-codes is known, the estimate concerns the noise before the converter, and the rounding error stays as it is.
-Where most codes repeat, and the others change by a single code, the noise is at most half a code, and half a
-code is taken.
+Readings that repeat exactly carry no information about the noise: the converter may be quiet or frozen. If
+the rounding to codes is known, the estimate applies only to the noise before the converter, not to the
+rounding error. If most codes repeat and the others change by a single code, the noise is at most half a code,
+and the estimator assumes half a code.
 """
 
 from __future__ import annotations
@@ -30,59 +32,62 @@ from skinnode.compiled.jit import njit, njit_part
 from skinnode.model.layout import Float
 
 BLOCK: Final = 4
-"""Number of frames in a block: the smallest number that gives two contrasts."""
+"""Number of frames in a block, the minimum for two contrasts."""
 WINDOW: Final = 11
-"""Number of blocks in the estimate, 44 frames; odd, so that a median never lies between old and new noise."""
+"""Maximum number of blocks in the estimate (44 frames). The number is odd, so that the median of a full
+window is the level of one block, never a mean of an old and a new noise level."""
 LEAST_BLOCKS: Final = 5
-"""Minimum number of blocks in the estimate: 20 frames."""
+"""Minimum number of blocks in the estimate (20 frames)."""
 PAUSE: Final = 12
-"""Number of frames between two blocks once the window is full and the last block agrees with it, or after
-several blocks that do not count; a look at every frame would cost 8 % of the time of a patch at rest."""
+"""Number of frames skipped after a block if the window is full and the block agrees with it, or after several
+rejected blocks. Evaluating every frame would take 8 % of the computing time of a patch at rest."""
 REPEATED: Final = 0.15
-"""Maximum share of repeated readings in a block that counts. With noise of half a code, a tenth of the
-readings repeat in all four frames; with less noise, the variance of the codes no longer is the sum of the
-variances of noise and rounding."""
+"""Maximum share of repeated readings in a block whose contrasts are used. With noise of half a code, a tenth
+of the readings repeat in all four frames. With less noise, the variance of the codes is no longer the sum of
+the variances of noise and rounding."""
 ALIVE: Final = 4
-"""Minimum number of readings that change by a single code where most repeat; a frozen converter has none."""
+"""Minimum number of readings that change by one code in a block in which most readings repeat; with a frozen
+converter, no reading changes."""
 SAME: Final = 1e-14
-"""Contrast, as a fraction of the reading, up to which a reading counts as repeated: rounding of float64."""
+"""Maximum contrast of a repeated reading, as a fraction of the reading; allows for the rounding of
+float64."""
 DEVIATIONS: Final = 4.0
-"""Number of standard deviations that chance may contribute to a decision: one block in 16,000."""
+"""Number of standard deviations of random scatter added to each threshold; chance exceeds the threshold in
+one block in 16,000."""
 DEPARTED: Final = math.log(1.5)
-"""Logarithm of the ratio between estimated and stated noise above which the estimate is used. Below it,
-results stay those of the stated noise to the last bit."""
+"""Logarithm of the ratio of estimated to stated noise above which the estimate replaces the stated noise.
+Below this ratio, the results are bit-identical to those with the stated noise."""
 RETURNED: Final = math.log(1.25)
-"""Logarithm of the same ratio below which the stated noise is used again."""
+"""Logarithm of the ratio of estimated to stated noise below which the stated noise is used again."""
 STEP: Final = math.log(1.05)
-"""Logarithm of the change in an estimate in use, besides what chance contributes, that triggers an update;
-every update solves the frame again."""
+"""Logarithm of the relative change, in addition to random scatter, at which an estimate in use is updated.
+Smaller changes are ignored because every update requires another solve of the frame."""
 UNEQUAL: Final = 0.3
-"""Largest mean logarithm of the ratio between the powers of the two contrasts. Motion that makes up this much
-raises the estimate by 8 %; noise of half a code, whose contrasts take few values, stays below 0.15."""
+"""Maximum mean logarithm of the power ratio of the two contrasts. Motion that reaches this limit raises the
+estimate by 8 %. Noise of half a code, whose contrasts have few possible values, stays below 0.15."""
 LEAST: Final = 1.0 / 30.0
-"""Smallest estimated ratio."""
+"""Minimum ratio of estimated to stated noise."""
 
 _CLIP: Final = 1.0
-"""Square, in units of the variance, at which Huber's proposal 2 clips; with it, a noisy lower and a noisy
-upper wire, 13 % of the readings, raise the estimate by 20 %."""
+"""Square, in units of the variance, at which Huber's proposal 2 clips. With this limit, one noisy lower wire
+and one noisy upper wire (13 % of the readings) raise the estimate by 20 %."""
 _CLIPPED_MEAN: Final = 0.5160585
 """Mean of min(z², 1) for a normal z: 1 − 2 φ(1)."""
 _STD: Final = 2.03
-"""Standard deviation of ln(variance) found in one value, by the influence function of the estimate; 1.41 for
-the mean square."""
+"""Standard deviation of ln(variance) estimated from one value, from the influence function of the robust
+mean. For the mean square, this standard deviation would be 1.41."""
 _ITERATIONS: Final = 30
-"""Maximum number of Newton steps; 4 to 8 are needed."""
+"""Maximum number of Newton steps; convergence takes 4 to 8 steps."""
 _ONE_CODE: Final = 12.5
-"""Square of a contrast of readings that differ by one code, in units of the variance of rounding, and a
-margin."""
+"""Squared contrast of readings that differ by one code, in units of the rounding variance, plus a margin."""
 _HALF_A_CODE: Final = 4.0
-"""Variance of the sum of a noise of half a code and of rounding, in units of the latter."""
+"""Total variance of half a code of noise plus rounding, in units of the rounding variance."""
 _CUBIC: Final = 1.0 / math.sqrt(20.0)
 
 
 @njit_part
 def _variance(squares: Float, count: int) -> float:
-    """Return the robust mean of ``count`` squares of normal values: mean(min(x, v)) = E[min(z², 1)] v."""
+    """Return the robust mean v of ``count`` squared normal values, with mean(min(x, v)) = E[min(z², 1)] v."""
     total = 0.0
     for i in range(count):
         total += squares[i]
@@ -111,9 +116,10 @@ def _contrasts(
 ) -> tuple[int, int, int, float, float, float]:
     """Write the squared contrasts of the readings that changed, relative to their stated variances.
 
-    The arguments are those of :func:`assess_block`. Returns the number of readings that changed and of those
-    that repeated; the sum of the products of neighbouring signs and their number; the share of the stated
-    variance that is not due to rounding; and the largest square in units of the variance of rounding.
+    The arguments are those of :func:`assess_block`. Returns six values: the number of changed readings, the
+    number of repeated readings, the number of pairs of neighbouring readings, the sum of the products of
+    their signs, the share of the stated variance that is not due to rounding, and the largest squared
+    contrast in units of the rounding variance.
     """
     count, silent, pairs, signs, share, largest = 0, 0, 0, 0.0, 0.0, 0.0
     for u in range(frames.shape[1]):
@@ -143,7 +149,7 @@ def _contrasts(
 def assess_block(
     frames: Float, noise: Float, rounding_ohm: Float, quadratic: Float, cubic: Float
 ) -> tuple[int, float, float, float]:
-    """Return what a block shows of its noise.
+    """Return the noise variances of a block of four frames.
 
     Args:
         frames: (4, U, K) resistances, ohm; NaN if not valid.
@@ -153,9 +159,9 @@ def assess_block(
         cubic: (U K,) workspace.
 
     Returns:
-        The number of readings, or 0 if the block does not count; the variances of the quadratic and of the
-        cubic contrast, relative to the stated variance; and the share of the stated variance that is not due
-        to rounding.
+        The number of readings, or 0 if the block is rejected; the variances of the quadratic and the cubic
+        contrast, relative to the stated variance; and the share of the stated variance that is not due to
+        rounding.
     """
     none = 0, 0.0, 0.0, 0.0
     count, silent, pairs, signs, share, largest = _contrasts(frames, noise, rounding_ohm, quadratic, cubic)
@@ -177,14 +183,14 @@ def assess_block(
 
 
 class NoiseEstimate:
-    """Ratio of actual to stated noise of one stream. Do not share an instance between owners.
+    """Estimator of the ratio of actual to stated noise; each stream needs its own instance.
 
     Args:
         shape: (U, K) of the frames.
 
     Attributes:
-        factor: Factor to apply to the stated noise; exactly 1 while the stream does not contradict it. If the
-            rounding to codes is known, the factor applies to the noise before the converter.
+        factor: Factor to apply to the stated noise; exactly 1 while the stream agrees with the stated noise.
+            If the rounding to codes is known, the factor applies to the noise before the converter.
         relative_std: Relative standard deviation of the estimated ratio; inf before the first estimate.
     """
 
@@ -193,7 +199,7 @@ class NoiseEstimate:
         self._noise, self._rounding_ohm = np.ones(shape), np.zeros(shape)
         self._work = np.empty((2, shape[0] * shape[1]))
         self.reset()
-        self._assess()  # compile now, not in the stream
+        self._assess()  # compiles the kernel before a stream starts
 
     def reset(self) -> None:
         """Discard the state of the stream."""
@@ -208,7 +214,7 @@ class NoiseEstimate:
         rounding_ohm: Float | None = None,
         valid: NDArray[np.bool_] | None = None,
     ) -> bool:
-        """Take the next frame; return whether :attr:`factor` changed.
+        """Process the next frame; return whether :attr:`factor` changed.
 
         Args:
             ohm: (U, K) resistances, ohm.
@@ -234,7 +240,7 @@ class NoiseEstimate:
         return self.factor != before
 
     def _assess(self) -> None:
-        """Take the block into the window, and decide."""
+        """Add the current block to the window, then update :attr:`factor`."""
         count, slow, fast, share = assess_block(
             self._frames, self._noise, self._rounding_ohm, self._work[0], self._work[1]
         )
@@ -250,14 +256,15 @@ class NoiseEstimate:
             self._decide()
 
     def _decide(self) -> None:
-        """Set :attr:`factor` from the last blocks."""
+        """Set :attr:`factor` from the blocks in the window."""
         blocks = self._blocks
         values = sum(block[0] for block in blocks)
         levels = sorted(block[1] for block in blocks)
         level = 0.5 * (levels[(len(levels) - 1) // 2] + levels[len(levels) // 2])
         agrees = abs(blocks[-1][1] - level) < RETURNED + DEVIATIONS * _STD / math.sqrt(8.0 * blocks[-1][0])
         self._pause = PAUSE if agrees and len(blocks) == WINDOW else 0
-        # of a mean of logarithms of standard deviations, with the efficiency of a median of blocks
+        # standard deviation of the mean log standard deviation; the factor 1.25 accounts for the median of
+        # blocks
         std = 1.25 * 0.5 * _STD / math.sqrt(2.0 * values)
         self.relative_std = std
         unequal = math.fsum(block[2] for block in blocks) / len(blocks)

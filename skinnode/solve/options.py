@@ -31,22 +31,23 @@ class EstimateOptions:
         rubber: Material of the skin. Forces are proportional to its modulus; the displacement does not depend
             on it.
         estimate_noise: Whether to estimate a scale factor for ``relative_noise`` from the data.
-        follow_noise: Whether to scale ``relative_noise`` once the stream shows that it is wrong by more than
-            half (:mod:`skinnode.solve.noise_estimate`); not in effect together with ``estimate_noise``.
+        follow_noise: Whether to scale ``relative_noise`` if the stream shows that it is wrong by a factor of
+            more than 1.5 (:mod:`skinnode.solve.noise_estimate`); ignored if ``estimate_noise`` is set.
         drift: Gain errors to estimate: ``patch`` for one gain common to all resistances, ``wire`` for one
             gain per upper wire, or ``none``.
         drift_std: Prior standard deviation of a gain error, as a fraction.
         model_error: Standard error of the forward model, as a fraction of the change in each resistance
             (from thickness, electrode size and conductivity under strain): the full value for an error common
             to all resistances, and 0.7 times this value for an independent error in each resistance.
-        tolerances: Tolerances to which the patch was made, which the standard deviations then include; the
-            default None means exact. The resistances at rest count as measured on the patch.
+        tolerances: Manufacturing tolerances of the patch, which the standard deviations then include; the
+            default None means an exact patch. The resistances at rest are assumed to be measured on the patch
+            itself.
         contacts: Whether to estimate contacts and forces.
         force_calibrated: Whether ``rubber`` reproduces known forces on this patch, for instance from presses
-            with a load cell. A modulus from a data sheet does not count: the skin is a layer on a support,
-            which may carry fifty times the force of the half-space that the forces are computed for. If
-            False, the standard deviation of each normal force covers that.
-        normal_only: Whether only z is unknown, which leaves a third of the unknowns.
+            with a load cell. A modulus from a data sheet is not a calibration: forces are computed for a
+            half-space, but the skin is a layer on a support, which may carry fifty times as much force. If
+            False, the standard deviation of each normal force covers this difference.
+        normal_only: Whether only z is unknown, which reduces the number of unknowns to a third.
         hold: Whether to keep the last solution of wires whose resistances changed no more than their noise.
         deadline_us: Time limit of an update, µs; the update may exceed it by one step. Wires not solved by
             the deadline have the status DEADLINE.
@@ -83,13 +84,13 @@ class EstimateOptions:
 
     @property
     def deadline_s(self) -> float:
-        """``deadline_us`` in seconds; inf without a deadline."""
+        """Time limit ``deadline_us`` in seconds; inf if there is no deadline."""
         return math.inf if self.deadline_us is None else self.deadline_us * 1e-6
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PosteriorOptions(EstimateOptions):
-    """Options of :class:`skinnode.Posterior`: those of :class:`EstimateOptions` and one more.
+    """Options of :class:`skinnode.Posterior`: all options of :class:`EstimateOptions`, and ``scale_m``.
 
     Args:
         scale_m: RMS normal displacement that the prior expects, metres; by default set from the data.
@@ -108,7 +109,7 @@ class PosteriorOptions(EstimateOptions):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class TrackerOptions(EstimateOptions):
-    """Options of :class:`skinnode.Tracker`: those of :class:`EstimateOptions` and seven more.
+    """Options of :class:`skinnode.Tracker`: all options of :class:`EstimateOptions`, and seven others.
 
     The method ``auto`` chooses the posterior if ``drift``, ``model_error``, ``tolerances`` or
     ``estimate_noise`` is set, since only the posterior supports them.
@@ -116,8 +117,8 @@ class TrackerOptions(EstimateOptions):
     Args:
         method: ``exact``, ``posterior`` or ``auto``.
         operator: ``levenberg_marquardt``, ``dogleg`` or ``gauss_newton``; exact inverse only.
-        stiffness_n_per_m: Stiffness k of the paper's law F = k Δs, N/m, which then gives ``force_n`` of exact
-            fields. All other forces, and those of contacts, are computed from ``rubber``.
+        stiffness_n_per_m: Stiffness k of the paper's law F = k Δs, N/m, from which ``force_n`` of exact
+            fields is then computed. All other forces, including contact forces, are computed from ``rubber``.
         active_only: Whether to solve only for electrodes that contacts move; exact inverse only.
         codes: Mapping from the codes passed to :meth:`skinnode.Tracker.update_codes` to resistances.
         max_std_m: Largest standard deviation of a coordinate of a precise field, metres; by default set from

@@ -1,9 +1,9 @@
 """Precision of a field: whether its standard deviations are within the limits that the user set.
 
-The default limit of the displacement follows from the layout, the noise and the tolerances: :data:`MULTIPLE`
-times the standard deviation of the exact inverse at rest, a part for the tolerances, and at most :data:`MOST`
-clearances. A healthy patch stays within it. A patch that has lost readings, or that is noisier than stated,
-does not.
+The default limit for the displacement depends on the layout, the noise and the tolerances. The limit is
+:data:`MULTIPLE` times the standard deviation of the exact inverse at rest, plus (in quadrature) a part for
+the tolerances, but at most :data:`MOST` clearances. A healthy patch stays within the default limit. A patch
+that has lost readings, or that is noisier than stated, exceeds the limit.
 """
 
 from __future__ import annotations
@@ -24,19 +24,20 @@ from skinnode.solve.wires.problem import PatchProblem
 
 MULTIPLE: Final = 15.0
 """Limit of a standard deviation, as a multiple of the RMS standard deviation of the exact inverse at rest.
-Measured: the largest standard deviation of a healthy field was up to 8.5 times the latter at rest and 12.2
-times pressed (ten layouts, noise from 3e-6 to 1e-3, presses from 5 to 30 %, 2,640 fields)."""
+In 2,640 healthy fields, the largest standard deviation was up to 8.5 times this RMS at rest and up to 12.2
+times under a press (ten layouts, noise from 3e-6 to 1e-3, presses from 5 to 30 %)."""
 MOST: Final = 0.3
-"""Limit of a standard deviation, clearances, on layouts and at noises that leave the displacement to the
-prior. In the same measurement, only thick patches (h = 1) at a noise of 1e-3 exceeded it: in 5 of 66 fields
-on `staggered`, in 20 of 66 on `aligned`."""
+"""Limit of a standard deviation, clearances, for layouts and noise levels at which mainly the prior
+determines the displacement. In the 2,640 fields measured for :data:`MULTIPLE`, only thick patches (h = 1)
+with a noise of 1e-3 exceeded this limit: 5 of 66 fields on `staggered` and 20 of 66 on `aligned`."""
 TOLERANCE_SHARE: Final = 0.06
 """Part of the limit for a patch made to the ordinary tolerances, clearances; proportional to the largest
-tolerance. In the same presses, these tolerances made standard deviations of up to 0.028 clearances at
-noises of 3e-6 and 1e-5."""
+tolerance. In the presses measured for :data:`MULTIPLE`, the ordinary tolerances caused standard deviations of
+up to 0.028 clearances at noise levels of 3e-6 and 1e-5."""
 FORCE_SHARE: Final = 0.3
 """Limit of a normal force's standard deviation, as a share of the modulus times clearance times pitch. In the
-same measurement it was at most 0.1 of it; presses of 50 % half outside the patch reach 0.26."""
+fields measured for :data:`MULTIPLE`, the share was at most 0.1. Presses of 50 % that lie half outside the
+patch reach a share of 0.26."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,7 +88,7 @@ def is_precise(field: FieldFrame, limits: PrecisionLimits) -> bool:
 
 
 def _at_rest(layout: PatchLayout, options: TrackerOptions) -> float:
-    """Return the standard deviation of the exact inverse at rest, in clearances; inf if it has none."""
+    """Return the standard deviation of the exact inverse at rest, in clearances; inf if undefined."""
     unknowns = layout.unknowns // 3 if options.normal_only else layout.unknowns
     if layout.shape[1] < unknowns:
         return math.inf

@@ -28,8 +28,8 @@ from skinnode.solve.wires.problem import PatchProblem
 from skinnode.solve.wires.root_check import SOME_ROUGH, SOME_SUSPECT, RootCheck, check_roots
 
 PAUSE: Final = 16
-"""Number of frames without a posterior solve after the posterior has missed a deadline; a futile solve in
-each frame would delay the other patches on the thread by 2 ms."""
+"""Number of frames without a posterior solve after the posterior has missed a deadline. A futile solve in
+every frame would delay the other patches on the same thread by 2 ms."""
 APART: Final = 3.0
 """Factor applied to the distance between a root near a fold and the posterior estimate that confirms it. The
 product is added in quadrature to the standard deviation, because two roots may be too close for the posterior
@@ -44,7 +44,7 @@ Mask = NDArray[np.bool_]
 class RootGate:
     """Gate that checks every field of an exact tracker with the posterior of its patch.
 
-    Do not share an instance between owners.
+    Each exact tracker needs its own gate.
 
     Args:
         exact: Tracker whose fields are checked.
@@ -62,9 +62,9 @@ class RootGate:
         self._lost, self._unsure, self._rough = np.zeros((3, layout.shape[0]), np.bool_)
         self._pause = 0  # frames until the next posterior solve
         self.hurried = False
-        """Whether there was no time to check a doubtful wire of the last field."""
+        """Whether a doubtful wire of the last field was not checked for lack of time."""
         self._confirmed: Float | None = None  # displacement at which a rough wire was last confirmed
-        self._apart = np.zeros((len(problem.rest), 1, 1))  # m, uncertainty left by the confirmation
+        self._apart = np.zeros((len(problem.rest), 1, 1))  # m, uncertainty that the confirmation leaves
         self._any_apart = False
         self._blind = roots.blind_wires(layout, options.normal_only)
         self._options = options
@@ -97,7 +97,7 @@ class RootGate:
         return roots.folded_wires(layout, normal_only)
 
     def set_noise(self, factor: float) -> None:
-        """Take the noise for ``factor`` times the stated noise from now on."""
+        """Assume ``factor`` times the stated noise from the next frame on."""
         self._folded[:] = self._folded_with(factor)
         self._root_check.folded[:] = self._folded
 
@@ -114,7 +114,7 @@ class RootGate:
         Args:
             field: Field of the exact tracker.
             start: Value of :func:`skinnode.process.clock.perf_counter` when the update began, s.
-            again: Whether the same frame was checked before, with other readings.
+            again: Whether the same frame was already checked with a different selection of readings.
         """
         doubtful: Mask | None = None
         self.hurried = False
@@ -125,10 +125,10 @@ class RootGate:
                 field, self.hurried = self._give_up(field, doubtful), True
             else:
                 if anew:
-                    self._posterior.reset()  # anneal from rest; tracking a wrong root would confirm it
+                    self._posterior.reset()  # anneal from rest: tracking a wrong root would confirm it
                 its = self._exact.arrays
                 self._posterior.stop_at(until)
-                # noise that is not positive stays so: its resistance is not usable for the posterior either
+                # non-positive noise is kept: it marks a resistance that the posterior cannot use either
                 noise = np.where(its.noise > 0.0, np.maximum(its.noise, roots.REFEREE_NOISE), its.noise)
                 estimate = self._posterior.estimate(its.ohm.copy(), its.valid.copy(), noise)
                 if Status.DEADLINE in estimate.status:
@@ -241,14 +241,14 @@ class RootGate:
 
 
 def _mixed_share(estimate: FieldFrame, replaced: Mask) -> Float | None:
-    """Return the share of the data: that of the posterior for ``replaced`` (U,), 1 for all other wires."""
+    """Return the data share: the posterior's value for ``replaced`` wires (U,), 1 for all other wires."""
     if estimate.data_share is None or not replaced.any():
         return None
     return np.where(replaced[:, None, None], estimate.data_share, 1.0)
 
 
 def _selected(status: tuple[Status, ...], changed: Mask, replaced: Mask) -> tuple[Status, ...]:
-    """Return statuses with CONVERGED for ``replaced`` (U,), ILL_CONDITIONED for other ``changed`` wires."""
+    """Return the statuses, with ``replaced`` wires CONVERGED and other ``changed`` wires not CONVERGED."""
     found = list(status)
     for u in np.flatnonzero(changed).tolist():
         if replaced[u]:

@@ -1,9 +1,10 @@
 """Rules and thresholds that decide which root of F = b is the true position of the skin.
 
-Zero residuals prove nothing, because F = b has several roots. The rules consider four things: the layout at
-rest (does it have folds, and do its resistances depend on the electrodes at all), one root (its branch, its
-distance from rest, its roughness), two roots of one wire (which is likelier), and the posterior of the whole
-patch, which uses the neighbouring wires. The functions are pure; callers keep the state.
+A zero residual does not identify the true position, because F = b has several roots. The rules use four
+criteria: the layout at rest (folds, and sensitivity of the resistances to the electrodes), properties of one
+root (its branch, its distance from rest, its roughness), the relative likelihood of two roots of one wire,
+and the posterior of the whole patch, which uses the neighbouring wires. The functions are pure; callers store
+the state.
 
 =================  =====  ================================================  ================================
 constant           value  meaning                                           measured on
@@ -17,7 +18,7 @@ LARGE              0.03   displacement, clearances, that must be smooth     fold
 ROUGH_IN_STREAM    1.2    roughness / size, checked with the posterior      presses 0.5 to 1.7, wrong 1 to 2
 ROUGH_AT_PATH_END  0.8    roughness / size that triggers a second attempt   presses 0.67, wrong 0.7 to 2
 SMOOTH_PATH        0.2    largest miss of a secant / size on smooth paths   right paths 0.2, wrong from 0.24
-LONG_PATH          20     samples from which only the second half counts    a path that jumped early, returned
+LONG_PATH          20     samples from which only the second half counts    one path that jumped and returned
 ROOT_RESIDUAL      1e-9   RMS of F/b − 1 up to which a path ends at a root  not measured
 STILL_CONFIRMED    0.2    relative change up to which a check stays valid   not measured
 SAME_ROOT          0.001  relative distance up to which roots are equal     not measured
@@ -25,7 +26,7 @@ TWIN_REACH         2      largest relative distance of a twin               stag
 TWIN_ROUGHNESS     1.05   ratio of roughness that decides between twins     82 + 60 + 40 presses, staggered
 UNLIKELY           4      energy margin over other roots                    1530 pairs of roots
 UNLIKELY_BLIND     16     energy margin for nearly blind wires              not measured
-REFEREE_NOISE      1e-5   least noise of a posterior that checks roots      not measured
+REFEREE_NOISE      1e-5   minimum noise for a posterior that checks roots   not measured
 AGREE              6      standard deviations up to which roots agree       not measured
 NEAR               0.25   first correction, clearances, when tracking       not measured
 FAR                0.1    move, clearances, before annealing is compared    folds crossed from 0.3
@@ -55,8 +56,9 @@ Mask = NDArray[np.bool_]
 
 FOLDED: Final = 250.0
 """RMS of ∂x/∂(ln R) at rest, in clearances, above which presses run into folds. The value is 70 for the
-staggered layout at h = 0.5, where none of 6000 wires ran into a fold, and at least 1200 for staggered layouts
-with h ≥ 1 and for aligned and symmetric layouts, where one wire in 30 ends at a wrong root."""
+staggered layout at h = 0.5, where none of 6000 wires ran into a fold. The value is at least 1200 for
+staggered layouts with h ≥ 1 and for aligned and symmetric layouts, where one wire in 30 ends at a wrong
+root."""
 BLIND: Final = 1e7
 """RMS of ∂x/∂(ln R), in clearances, above which a root is meaningless: electrodes can cross the whole layer
 while R changes only in its seventh digit. Wires on a symmetry line of the layout are blind, because each of
@@ -66,8 +68,8 @@ NEARLY_BLIND: Final = 1e5
 """RMS of ∂x/∂(ln R), in clearances, above which a root must be clearly likelier than any other; aligned
 layouts exceed it at h ≥ 1."""
 NONLINEAR: Final = 0.003
-"""Standard deviation of the exact inverse, in clearances, above which F is not linear within the noise; roots
-are then as doubtful as near a fold."""
+"""Standard deviation of the exact inverse, in clearances, above which F is not linear within the noise. All
+roots are then as doubtful as roots near a fold."""
 
 # -- one root -----------------------------------------------------------------------------------------------
 
@@ -84,44 +86,46 @@ ROUGH_AT_PATH_END: Final = 0.8
 smoothest displacement. The ratio is 0.67 on average for presses, below 0.9 for nine presses in ten, up to 1.9
 if they move a single electrode, and 0.7 to 2 for wrong roots."""
 SMOOTH_PATH: Final = 0.2
-"""Largest distance between a sample's solution and the secant through the two solutions before it (for the
-first sample: the rest position), relative to the displacement at the end, up to which a path is smooth. The
-value was measured on 3500 wires of aligned and staggered layouts, h = 0.3 to 1, under presses of 30 to 70 %
-with shears of 0.3 to 0.8. On 59 of them, 5 to 100 samples led across a fold to another root than the accepted
-root. The accepted root was wrong on 37, where the largest distance was at most 0.2 except on 2 (0.27 and
-0.67). It was right on 22, where the largest distance was at least 0.24, because the 5 samples were too far
-apart to be followed."""
+"""Maximum distance, on a smooth path, between a sample's solution and the secant through the two previous
+solutions, relative to the final displacement. For the first sample, the distance is measured from the rest
+position. The value was measured on 3500 wires of aligned and staggered layouts, h = 0.3 to 1, under presses
+of 30 to 70 % with shears of 0.3 to 0.8. On 59 of these wires, paths of 5 to 100 samples led across a fold to
+a root other than the accepted root. On 37 of the 59 wires, the accepted root was wrong; the largest distance
+was at most 0.2 except on 2 wires (0.27 and 0.67). On the other 22 wires, the accepted root was right, because
+the 5 samples of the path were too far apart to follow; the largest distance was at least 0.24."""
 LONG_PATH: Final = 20
 """Number of samples from which only the second half of a path must be smooth. On one of 720 wires, the first
-of 20 samples led to a wrong root, and the third back to the skin with a miss of 0.21. The other 17 samples
-were followed to within 0.06, and the accepted root was wrong by 69 %."""
+of 20 samples led to a wrong root, and the third sample led back to the true root with a deviation of 0.21
+from the secant. The deviation of the other 17 samples was at most 0.06, and the accepted root was wrong by 69
+%."""
 ROOT_RESIDUAL: Final = 1e-9
-"""RMS of F/b − 1 up to which a path ends at a root, even if J is too close to singular for CONVERGED."""
+"""Maximum RMS of F/b − 1 at which the end of a path counts as a root, even if J is too close to singular for
+CONVERGED."""
 STILL_CONFIRMED: Final = 0.2
-"""Relative change in a displacement since its confirmation up to which a rough wire is not checked again."""
+"""Maximum relative change of a rough displacement since its confirmation without a new check."""
 
 # -- two roots of one wire ----------------------------------------------------------------------------------
 
 SAME_ROOT: Final = 1e-3
-"""Distance between two solutions, relative to the displacement, up to which they count as the same root."""
+"""Maximum distance between two solutions that count as the same root, relative to the displacement."""
 TWIN_REACH: Final = 2.0
-"""Largest distance at which a twin root is worth solving for, relative to the wire's largest displacement.
-Twins farther away were at least 1.3 times as rough as the root on the staggered layout, h = 0.3 to 1."""
+"""Maximum distance at which a twin root is solved for, relative to the wire's largest displacement. On the
+staggered layout, h = 0.3 to 1, more distant twins were at least 1.3 times as rough as the root."""
 TWIN_ROUGHNESS: Final = 1.05
-"""Ratio between the roughnesses of two roots at a fold above which the smoother root is accepted. Over 82
+"""Ratio between the roughnesses of two roots at a fold above which the smoother root is accepted. In 82
 random presses of 50 % on the staggered layout, h = 1, the twins of wrong roots were at most 1.044 times as
-rough as those roots. Of 100 correct roots, 4 have a twin within the ratio and lose the status CONVERGED. In
-60 further presses of each depth and height (6710 wires, h = 0.3 to 1), no wrong root was reported as
-CONVERGED; in another 40 (4510 wires), one was."""
+rough as the wrong roots themselves. Of 100 correct roots, 4 have a twin within this ratio and lose the status
+CONVERGED. In 60 further presses of each depth and height (6710 wires, h = 0.3 to 1), no wrong root was
+reported as CONVERGED; in another 40 presses (4510 wires), one wrong root was."""
 UNLIKELY: Final = 4.0
 """Energy margin by which all other roots must be less likely than the accepted root. In 1530 pairs of roots
-from presses of 30 to 70 % on the staggered layout, h = 1, and the aligned layout, h = 0.5, the wrong root was
-likelier in 19 pairs, by at most 1.4; in a second set of the same size, it was likelier by at most 2.6. A root
-at the end of a path is no safer: with paths of 5 samples, the wrong root was likelier by up to 2.5 as
-well."""
+from presses of 30 to 70 % (staggered layout, h = 1; aligned layout, h = 0.5), the wrong root was likelier in
+19 pairs, by an energy of at most 1.4. In a second set of the same size, the wrong root was likelier by at
+most 2.6. A root at the end of a path is not more reliable: with paths of 5 samples, the wrong root was
+likelier by up to 2.5."""
 UNLIKELY_BLIND: Final = 16.0
-"""Energy margin by which all other roots must be less likely on nearly blind wires, which may have
-undiscovered roots."""
+"""Energy margin by which all other roots of a nearly blind wire must be less likely; such a wire may also
+have undiscovered roots."""
 
 # -- the posterior of the patch -----------------------------------------------------------------------------
 
@@ -131,25 +135,27 @@ forced onto a root of F = b."""
 AGREE: Final = 6.0
 """Number of standard deviations within which the posterior confirms a root."""
 NEAR: Final = 0.25
-"""Largest first correction of an electrode, in clearances; after a larger one, annealing is used."""
+"""Maximum first correction of an electrode, in clearances; a larger first correction is followed by
+annealing."""
 FAR: Final = 0.1
 """Movement of an electrode, in clearances, after which the estimate is compared with an estimate annealed
 from rest. Without the comparison, presses of 0.3 or more crossed folds unnoticed, one frame at a time."""
 LIKELIER: Final = 4.0
 """Energy margin by which an estimate from a second annealing must be likelier to replace the first estimate.
-A smaller gain indicates the same maximum, shifted towards the loads found; the wrong maximum observed was
-worse by 23."""
+A smaller margin indicates that both annealings found the same maximum, shifted towards the estimated loads.
+The wrong maximum that was observed was less likely by a margin of 23."""
 SUSPICIOUS: Final = 3.0
 """Value of a nuisance, in prior standard deviations, above which the estimate is compared with an annealed
-estimate and never held. A drift or model error can mimic a displacement, and a stream would not recover."""
+estimate and never held. A wrong drift or model error can mimic a displacement, and the stream would not
+recover from it."""
 BELIEVABLE: Final = 5.0
 """Value of a nuisance, in prior standard deviations, above which the frame is INCONSISTENT."""
 IMPOSSIBLE_CHANCE: Final = 1e-9
 """Probability per frame that the χ² test reports a wire that obeys the model as INCONSISTENT."""
 Z_REFUSE: Final = 5.998
-"""Normal quantile of 1 − 1e-9; its χ² is the limit above which a tall system is INCONSISTENT. At 100
-frames/s, noise alone exceeds the limit once in four months. Wrong roots and wrong values cause a larger
-χ²."""
+"""Normal quantile of 1 − 1e-9; the corresponding χ² is the limit above which the root of a tall system is
+rejected. At 100 frames/s, noise alone exceeds the limit once in four months. Wrong roots and wrong
+resistances cause a larger χ²."""
 
 
 def folded_wires(layout: PatchLayout, normal_only: bool = False) -> Mask:
@@ -216,7 +222,7 @@ def agrees(gap: Float, reach: Float) -> Mask:
 
 
 def still_confirmed(displacement: Float, confirmed: Float) -> Mask:
-    """Return the wires (U,) whose displacement (U, N, 3) has hardly changed since it was confirmed."""
+    """Return the wires (U,) whose displacement (U, N, 3) has changed little since its confirmation."""
     change = np.abs(displacement - confirmed).max(axis=(1, 2))
     return ~np.asarray(change > STILL_CONFIRMED * np.abs(displacement).max(axis=(1, 2)))
 

@@ -18,14 +18,14 @@ from skinnode.solve.wires.problem import PatchProblem
 
 CORRELATION_PITCHES: Final = 1.0
 """Correlation length ℓ, pitches. At 1.0, the guided start finds 3204 of the 3209 wires that are on the branch
-of the rest position in four sets of 82 random presses on the staggered layout: 70 % at h = 0.5, and 10, 30
-and 50 % at h = 1. Values of 0.7 and 1.5 find fewer."""
+of the rest position in four sets of 82 random presses on the staggered layout (presses of 70 % at h = 0.5,
+and of 10, 30 and 50 % at h = 1). With values of 0.7 and 1.5, the guided start finds fewer wires."""
 ROUGH_SHARE: Final = 1e-3
-"""Relative increase in the diagonal of C, so that C⁻¹ exists in floating point."""
+"""Relative increase in the diagonal of C, which makes C invertible in floating point."""
 
 
 class Smoothness:
-    """Smoothness of every upper wire of a patch.
+    """Smoothness model of every upper wire of a patch.
 
     Args:
         problem: The patch.
@@ -54,7 +54,7 @@ class Smoothness:
 
 @functools.lru_cache(maxsize=64)
 def _covariance(layout: PatchLayout, size: float) -> tuple[Float, Float]:
-    """Return C (U, n, n) and its whitening for displacements of about ``size`` pitches (not critical)."""
+    """Return C (U, n, n) and its whitening matrix for displacements of roughly ``size`` pitches."""
     electrodes: Float = layout.upper_m / layout.pitch_m
     wires, most = electrodes.shape[:2]
     gaps = electrodes[:, :, None, :] - electrodes[:, None, :, :]

@@ -22,13 +22,14 @@ from skinnode.solve.linalg.vectors import Index, dot, largest, padded
 from skinnode.solve.wires.problem import PatchProblem
 
 NOISE_LEVELS: Final[Float] = np.power(10.0, -0.5 * np.arange(2.0, 16.0))
-"""Noise levels of r in the guided start, 0.1 to 3e-8, with one step per level. With steps of a whole decade,
-one more wire in a hundred is lost for presses of 50 % at h = 1."""
+"""Noise levels of r in the guided start, from 0.1 to 3e-8, two per decade, with one step per level. With one
+level per decade, the guided start fails on one more wire in a hundred, for presses of 50 % at h = 1."""
 POWER_STEPS: Final = 8
-"""Number of inverse iterations; the second-smallest singular value is about 3 times the smallest."""
+"""Number of inverse iterations; sufficient because the second-smallest singular value is about 3 times the
+smallest."""
 DIFFERENCE: Final = 1e-4
-"""Step of the central difference of Jacobians, pitches: above eps^(1/3) = 6e-6, where rounding and truncation
-errors balance, yet far below any clearance."""
+"""Step of the central difference of Jacobians, pitches. The step exceeds eps^(1/3) = 6e-6, at which rounding
+and truncation errors are equal, and is far below any clearance."""
 
 
 def guided_start(problem: PatchProblem, wire: int, a: Float, covariance: Float) -> tuple[Float, int]:
@@ -38,12 +39,12 @@ def guided_start(problem: PatchProblem, wire: int, a: Float, covariance: Float) 
         problem: The patch.
         wire: Index of the upper wire.
         a: (K,) R · gain of the wire.
-        covariance: (n, n) prior covariance of the displacement, pitches². Any covariance works; that of
-            elastic rubber would also involve the neighbouring wires.
+        covariance: (n, n) prior covariance of the displacement, pitches². Any covariance works; the
+            covariance of elastic rubber would also involve the neighbouring wires.
 
     Returns:
-        (n,) position, pitches, and the number of evaluations of F and J. The position is the rest position
-        if the iteration runs into an electrode.
+        (n,) position, pitches, and the number of evaluations of F and J. If the iteration runs into an
+        electrode, the position is the rest position.
     """
     n, equations = problem.rest.shape[1], a.size
     x = problem.rest[wire].copy()

@@ -4,9 +4,10 @@
 elastic prior. ``auto`` chooses the exact inverse if it is accurate enough at the converter's noise. Wires on
 which the exact inverse is doubtful are checked with the posterior (:mod:`skinnode.solve.root_gate`).
 
-If the stream shows that its noise is not as stated, the stated noise is scaled
-(:mod:`skinnode.solve.noise_estimate`); ``auto`` then changes from the exact inverse to the posterior if the
-noise is too large for it, and back when the noise falls again. Either change starts from rest.
+If the stream shows that its noise differs from the stated noise, the tracker scales the stated noise
+(:mod:`skinnode.solve.noise_estimate`). With ``auto``, the tracker switches to the posterior if the noise is
+too large for the exact inverse, and back when the noise falls again. After a switch, the new method starts
+from the rest position.
 """
 
 from __future__ import annotations
@@ -34,18 +35,19 @@ from skinnode.solve.root_gate import RootGate
 from skinnode.solve.wires.problem import PatchProblem
 
 NO_CODE: Final = np.uint32(0xFFFF_FFFF)
-"""Code wider than any that a converter sends, for readings left out."""
+"""Code that no converter sends; replaces the codes of readings that are left out."""
 EXACT_STD: Final = 0.0025
 """Standard deviation of the exact inverse at rest, in clearances, up to which ``auto`` chooses the exact
-inverse: 2.5 % of the depth of a press that indents the layer by a tenth. With 16-bit codes, the standard
-deviation is 0.0005 on the staggered layout, h = 0.5, and 0.05 on the aligned layout."""
+inverse. The limit is 2.5 % of the depth of a press that indents the layer by a tenth of its thickness. With
+16-bit codes, the standard deviation is 0.0005 on the staggered layout, h = 0.5, and 0.05 on the aligned
+layout."""
 
 
 class Tracker:
     """Tracker that follows one patch through a stream of frames.
 
-    Do not share an instance between owners. Compiled code releases the GIL. The constructor compiles the
-    kernels.
+    Each patch needs its own tracker. The tracker's compiled code runs without the GIL. The constructor
+    compiles the kernels.
 
     Args:
         layout: The patch.
@@ -77,7 +79,8 @@ class Tracker:
         if self.method == "posterior":
             self._posterior = Posterior(layout, options.of_posterior())
             return
-        # the posterior that checks roots sees some frames only, with the noise that the exact tracker found
+        # the posterior that checks roots receives only some of the frames, with the exact tracker's noise
+        # estimate
         self._posterior = Posterior(layout, dataclasses.replace(options.of_posterior(), follow_noise=False))
         self._noise = NoiseEstimate(layout.shape) if options.follow_noise else None
         self._factor = 1.0  # noise factor to which the method and the gate were adapted
@@ -104,10 +107,10 @@ class Tracker:
         self.reset()
 
     def prepare(self) -> None:
-        """Compute tables that the first frames of a touch would otherwise wait for, up to 0.1 s.
+        """Compute tables in advance, for which the first frames of a touch would otherwise wait up to 0.1 s.
 
-        The reference patch takes 0.25 s and 85 MB; trackers of one layout share them. A host does this before
-        it starts the nodes.
+        For the reference patch, the tables take 0.25 s and 85 MB; trackers of the same layout share the
+        tables. A host calls this method before it starts the nodes.
         """
         self._posterior.check.prepare()
 
@@ -156,13 +159,13 @@ class Tracker:
         return self._judged(field)
 
     def update_codes(self, codes: NDArray[np.uint32]) -> tuple[FieldFrame, int]:
-        """Compute the field of a scan of codes, much faster than decoding followed by :meth:`update`.
+        """Compute the field of a scan from its codes, much faster than by decoding and :meth:`update`.
 
         Args:
             codes: (U, K) uint32, converted by the mapping passed to the constructor as ``codes``.
 
         Returns:
-            The field that the decoded resistances and their noise would give, and the number of invalid
+            The field, as computed from the decoded resistances and their noise, and the number of invalid
             codes.
 
         Raises:
@@ -193,7 +196,7 @@ class Tracker:
 
     @property
     def scan(self) -> int | None:
-        """Number by which the user knows the next frame, for ``DataFault.since``; None to count frames."""
+        """Scan number of the next frame, for ``DataFault.since``; None if the tracker counts the frames."""
         return self._posterior.check.scan
 
     @scan.setter
@@ -219,7 +222,7 @@ class Tracker:
         return self._check.check(solved(field), solve_without, until)
 
     def _judged(self, field: FieldFrame) -> FieldFrame:
-        """Return the field with the contacts of an exact field and with its verdict on precision."""
+        """Return the field with its verdict on precision and, if the field is exact, with its contacts."""
         if field.method == "exact" and self._contacts is not None:
             field = self._contacts.add(field)
         return field if is_precise(field, self._limits) else amended(field, precise=False)

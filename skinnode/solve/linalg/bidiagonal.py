@@ -1,7 +1,7 @@
-"""Bidiagonal form of a small matrix, in which damped steps are cheap for any damping parameter.
+"""Bidiagonal form of a small matrix, from which a damped step can be computed in O(n) operations.
 
-Levenberg-Marquardt tries several damping parameters per Jacobian. Each trial costs O(n) operations here, but
-O(n³) with J itself.
+Levenberg-Marquardt tries several damping parameters per Jacobian. Each trial costs O(n) operations with the
+bidiagonal form, but O(n³) with J itself.
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ def bidiagonalise(  # noqa: C901, PLR0913 - four rows at a time; every result of
 ) -> None:
     """Decompose A (n, m), n ≤ m, as P Bᵀ Qᵀ with P and Q orthogonal and B (n, n) upper bidiagonal.
 
-    ``a`` (n + 3, whole lanes of m) is A padded with zeros, so that loops over four rows and whole vectors
-    need no special cases. Writes B to ``diagonal`` (n,) and ``upper`` (n,), whose last element is 0; the
-    reflectors I − β v vᵀ of Q to the rows of ``a`` with β in ``across`` (n,); and those of P to the rows of
-    ``left`` (n, whole lanes of n + 3) with β in ``down`` (n,). ``w`` is scratch with the length of a row
+    ``a`` (n + 3, whole lanes of m) contains A padded with zeros, so that loops over four rows and whole
+    vectors need no special cases. Writes B to ``diagonal`` (n,) and ``upper`` (n,), whose last element is 0;
+    the reflectors I − β v vᵀ of Q to the rows of ``a`` with β in ``across`` (n,); and those of P to the rows
+    of ``left`` (n, whole lanes of n + 3) with β in ``down`` (n,). ``w`` is scratch with the length of a row
     of ``a``. Squares of the elements must not overflow (Golub & Van Loan, 5.4.8, with rows and columns
     swapped).
     """
@@ -48,7 +48,7 @@ def bidiagonalise(  # noqa: C901, PLR0913 - four rows at a time; every result of
         for j in range(0, column.size, LANES):
             store(column, j, LANES, splat(0.0))
         square = 0.0
-        for i in range(k + 1, n, 4):  # reflect the rows and accumulate the column's reflector
+        for i in range(k + 1, n, 4):  # reflects the rows and accumulates the column's reflector
             t0, t1, t2, t3 = a[i], a[i + 1], a[i + 2], a[i + 3]
             s0, s1, s2, s3 = splat(0.0), splat(0.0), splat(0.0), splat(0.0)
             for j in range(first, end, LANES):
@@ -108,9 +108,9 @@ def damped_solve(  # noqa: PLR0913 - every result of the decomposition
     1977).
 
     The factor R in BᵀB + lam I = RᵀR is bidiagonal too. Writes the reciprocal of its diagonal to ``inverse``
-    (n,) and its superdiagonal to ``ru`` (n,). The squares of lam and B must not both underflow.
+    (n,) and its superdiagonal to ``ru`` (n,). The squares of lam and of B must not both underflow.
     """
-    below, rest = lam, 0.0  # row below row i of B: square of its single element, and its right-hand side
+    below, rest = lam, 0.0  # damping row below row i of B: square of its only element, and right-hand side
     for i in range(x.size):
         radius = 1.0 / (diagonal[i] * diagonal[i] + below)
         inverse[i] = math.sqrt(radius)

@@ -1,13 +1,13 @@
 """Dense kernels for a few hundred unknowns: Cholesky factorisation, triangular solves, products.
 
 LAPACK is not used because the last bits of an OpenBLAS result depend on the number of threads, and equal
-frames must give equal fields. Here each element of a result is a single sum in index order, whatever the
-number of threads or the split of the columns.
+frames must give equal fields. These kernels compute each element of a result as a single sum in index order,
+for any number of threads and any split of the columns.
 
 All kernels share one loop: a tile of 6 rows and 2 vectors of the result stays in registers while k runs, so
 that 12 multiply-adds need only 8 loads (Goto & van de Geijn, Anatomy of high-performance matrix
-multiplication, 2008). Arrays are C-ordered float64; buffers may be larger than the problem, in which case the
-leading n rows and columns are used. Nothing is allocated.
+multiplication, 2008). Arrays are C-ordered float64. A buffer may be larger than the problem; the kernels then
+use its leading n rows and columns. No kernel allocates memory.
 """
 
 from __future__ import annotations
@@ -22,9 +22,10 @@ from skinnode.compiled.simd import LANES, fma, load, splat, store, total
 from skinnode.model.layout import Float
 
 ROWS: Final = 6
-"""Rows of a tile; with 2 vectors per row, 12 sums, 2 loads and a factor fit in the 16 registers of AVX2."""
+"""Number of rows in a tile. With 2 vectors per row, the 12 sums, 2 loads and one factor fit into the 16
+registers of AVX2."""
 TILE: Final = 2 * LANES
-"""Columns of a tile."""
+"""Number of columns in a tile."""
 
 
 @njit_part
@@ -92,7 +93,7 @@ def _tile(  # noqa: PLR0913 - the bounds of a tile
 def _forward(  # noqa: PLR0913 - the bounds of a tile
     l: Float, b: Float, r: int, rows: int, low: int, col: int, count: int
 ) -> None:
-    """Replace rows r to r + rows of a tile of ``b`` with those of L⁻¹ B, given rows low to r."""
+    """Replace rows r to r + rows of a tile of ``b`` with the same rows of L⁻¹ B, given rows low to r."""
     _tile(b, r, rows, l, b, low, r, col, count, True)
     right = col + LANES
     more = count - LANES
@@ -156,7 +157,7 @@ def solve_lower(l: Float, b: Float, n: int, cols: int) -> None:
 def _backward(  # noqa: PLR0913 - the bounds of a tile
     l: Float, b: Float, r: int, rows: int, n: int, col: int, count: int
 ) -> None:
-    """Replace rows r to r + rows of a tile of ``b`` with those of L⁻ᵀ B, given rows r + rows to n."""
+    """Replace rows r to r + rows of a tile of ``b`` with these rows of L⁻ᵀ B, given rows r + rows to n."""
     _tile(b, r, rows, l, b, r + rows, n, col, count, True)
     right = col + LANES
     more = count - LANES
@@ -209,7 +210,7 @@ def solve_lower_transposed_vector(l: Float, v: Float, n: int) -> None:
 def solve_positive(a: Float, b: Float, n: int) -> bool:
     """Replace the leading n elements of ``b`` with A⁻¹ b, and the symmetric ``a`` (n, n) with its factor.
 
-    Returns False, and leaves ``b`` as it was, if ``a`` is not positive definite.
+    If ``a`` is not positive definite, returns False and does not change ``b``.
     """
     if not cholesky(a, n):
         return False

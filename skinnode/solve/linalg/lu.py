@@ -1,9 +1,9 @@
 """LU factorisation of a small square matrix, for the Jacobian of one wire.
 
-LAPACK is not used because with 30 unknowns a call costs more than the arithmetic, and ``numpy.linalg`` inside
-compiled code costs seconds of compile time. Kernels store Jᵀ and factor it, so that every inner loop runs
-along a contiguous row and vectorisation reorders no sum (Golub & Van
-Loan, Matrix Computations, 4th ed., 3.4).
+LAPACK is not used: with 30 unknowns, a LAPACK call takes longer than the arithmetic itself, and
+``numpy.linalg`` in compiled code adds seconds of compile time. Kernels store and factor Jᵀ, so that every
+inner loop runs along a contiguous row and vectorisation does not reorder sums (Golub & Van Loan, Matrix
+Computations, 4th ed., 3.4).
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ from skinnode.solve.linalg.vectors import Index
 def lu_factor(a: Float, pivot: Index) -> int:  # noqa: C901 - four rows at a time
     """Factor A (n, n) in place with row exchanges in ``pivot`` (n,); return the sign of det A, 0 if singular.
 
-    ``a`` (n + 3, whole lanes of n) is A padded with zeros, so that four rows at a time can share loads of the
-    pivot row and whole vectors need no special cases at the ends.
+    ``a`` (n + 3, whole lanes of n) contains A padded with zeros. The padding lets four rows at a time share
+    loads of the pivot row, and avoids special cases at the ends of vectors.
     """
     n, end = pivot.size, a.shape[1]
     sign, top, p = 1, 0.0, 0

@@ -17,8 +17,8 @@ from skinnode.solve.linalg.vectors import dot
 def qr_factor(jt: Float, a: Float, diagonal: Float, beta: Float, w: Float) -> int:  # noqa: C901 - loops
     """Factor J = ``jt``ᵀ (m, n), m ≥ n, by reflectors; return 0 if R has a zero on its diagonal, else 1.
 
-    Writes R above the diagonal of ``a`` (m, n), with the diagonal of R in ``diagonal`` (n,), and the
-    vectors v of the reflectors I − β v vᵀ on and below the diagonal, with β in ``beta`` (n,). ``w`` (n,) is
+    Writes R above the diagonal of ``a`` (m, n) and the diagonal of R to ``diagonal`` (n,). Writes the vectors
+    v of the reflectors I − β v vᵀ on and below the diagonal of ``a``, and β to ``beta`` (n,). ``w`` (n,) is
     scratch.
     """
     n, m = jt.shape

@@ -15,7 +15,7 @@ Index = NDArray[np.int64]
 
 
 def padded(rows: int, size: int) -> Float:
-    """Return zeros (rows, ≥ size) with rows padded to whole vector registers and aligned to cache lines."""
+    """Return a zero array (rows, ≥ size), padded to whole vector registers and aligned to cache lines."""
     size = -(-size // LANES) * LANES
     room = np.zeros(rows * size + 8)
     first = (-room.ctypes.data // room.itemsize) % 8
@@ -24,7 +24,7 @@ def padded(rows: int, size: int) -> Float:
 
 @njit_part
 def dot(a: Float, b: Float) -> float:
-    """Return a·b from four partial sums: as accurate as one sum, with a quarter of the latency."""
+    """Return a·b, summed in four partial sums to reduce the latency to a quarter."""
     s0, s1, s2, s3 = 0.0, 0.0, 0.0, 0.0
     whole = a.size - a.size % 4
     for i in range(0, whole, 4):
@@ -50,9 +50,9 @@ def largest(a: Float) -> float:
 
 @njit
 def orthonormalise(rows: Float) -> None:
-    """Make independent ``rows`` (r, n) orthonormal, by modified Gram-Schmidt done twice.
+    """Make linearly independent ``rows`` (r, n) orthonormal, by modified Gram-Schmidt done twice.
 
-    Twice is enough for orthogonality to working accuracy (Giraud et al., 2005).
+    Two passes are enough for orthogonality to working accuracy (Giraud et al., 2005).
     """
     for i in range(len(rows)):
         row = rows[i]

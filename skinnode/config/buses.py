@@ -42,7 +42,7 @@ class BusConfig(Table):
     """CAN bus, identified by the names of its interface and channel in python-can."""
 
     name: Name = "can0"
-    """Name of the bus, to which a patch refers in its key ``bus``."""
+    """Name of the bus. Patches refer to this name in their key ``bus``."""
     interface: Annotated[str, Field(min_length=1), Allowed("the name of a python-can interface")] = "virtual"
     """Name of the interface in python-can: socketcan, pcan, kvaser, udp_multicast, ..."""
     channel: Annotated[str, Field(min_length=1), Allowed("the name of a channel, as a string")] = "skin"
@@ -60,7 +60,7 @@ class BusConfig(Table):
     ] = 5_000_000
     """Bits per second in the data phase of CAN FD frames, from ESI to the CRC delimiter."""
     options: dict[str, bool | int | float | str] = Field(default={})
-    """Additional arguments for the python-can interface, by name."""
+    """Additional keyword arguments for the python-can interface."""
     role: Annotated[Role, one_of(Role)] = "master"
     """``guest`` if the robot's own master sends NMT and SYNC on this bus; the host then sends neither."""
     guest_sends: Annotated[GuestSends, one_of(GuestSends)] = "nothing"
@@ -68,7 +68,7 @@ class BusConfig(Table):
     read their data."""
     heartbeat_node_id: Annotated[NodeId | None, Allowed("an integer from 1 to 127 that no node uses")] = None
     """Node-ID under which the host, as master, sends a heartbeat. The patches monitor this heartbeat and go
-    pre-operational when it stops. None: no heartbeat."""
+    pre-operational when it stops. None: the host sends no heartbeat."""
     max_load: Annotated[
         float, Field(gt=0, le=1, allow_inf_nan=False), Allowed("a number above 0 and up to 1")
     ] = MAX_BUS_LOAD

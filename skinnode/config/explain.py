@@ -27,7 +27,7 @@ def first_error(
     """Return the error to report, selected from pydantic's errors about a table.
 
     Args:
-        error: The errors.
+        error: All validation errors of the table.
         table: Model of the table.
         where: Function that returns the position of a key in its file.
     """
@@ -36,7 +36,7 @@ def first_error(
     first = next((item for item in found if item["type"] == "extra_forbidden"), found[0])
     location, kind = first["loc"], first["type"]
     cause = first.get("ctx", {}).get("error")
-    if isinstance(cause, ConfigError):  # raised by a check here; its key is relative to the location
+    if isinstance(cause, ConfigError):  # a model's own check failed; its key is relative to the location
         path = (*location, *key_path(cause.key))
         return ConfigError(dotted(path), cause.got, cause.allowed, where=where(path))
     keys, allowed = _place(location, table)

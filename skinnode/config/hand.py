@@ -38,13 +38,13 @@ class HandConfig(Table):
     buses: Annotated[
         tuple[BusConfig, ...], Field(min_length=1, strict=False), Allowed("at least one [[buses]]")
     ]
-    """CAN buses of the hand."""
+    """CAN buses to which the patches of the hand are connected."""
     patches: Annotated[
         tuple[PatchConfig, ...], Field(min_length=1, strict=False), Allowed("at least one [[patches]]")
     ]
     """Skin patches of the hand."""
     links: Annotated[tuple[LinkConfig, ...], Field(strict=False)] = ()
-    """Links of the robot that carry patches, with their poses in the hand."""
+    """Robot links that carry patches, with their poses in the frame of the hand."""
     sync: SyncConfig = SyncConfig()
     bring_up: BringUpConfig = BringUpConfig()
     solver: SolverConfig = SolverConfig()
@@ -80,8 +80,8 @@ class HandConfig(Table):
         """Return a copy of the hand that uses another interface or channel.
 
         Args:
-            interface: python-can interface for all buses, in place of the interfaces in the file.
-            channel: Channel, in place of the channel in the file.
+            interface: python-can interface of all buses, which replaces the interfaces in the file.
+            channel: Channel, which replaces the channel in the file.
 
         Raises:
             ConfigError: A channel is given for a hand with several buses, or a name is empty.
@@ -206,7 +206,7 @@ def parse_hand(table: Mapping[str, Any], *, folder: Path | None = None, where: s
         where: File name for error messages.
 
     Raises:
-        ConfigError: As :func:`load_hand`.
+        ConfigError: See :func:`load_hand`.
     """
     return _parse(Document(where, dict(table), {}), folder or Path())
 

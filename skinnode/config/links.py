@@ -19,7 +19,7 @@ _Part = Annotated[float, Field(ge=-1.001, le=1.001, allow_inf_nan=False), Allowe
 
 
 class PoseConfig(Table):
-    """Pose of a frame in its parent.
+    """Pose of a frame relative to its parent frame.
 
     The frame of a patch has x along the upper wires, y across them and z out of the skin.
     """
@@ -53,7 +53,7 @@ class PoseConfig(Table):
         return self
 
     def build(self) -> Pose:
-        """Return the pose."""
+        """Return the pose in the form that the model uses."""
         if self.rpy_rad is not None:
             return Pose.from_rpy(self.position_m, self.rpy_rad)
         return Pose(self.position_m, self.quaternion_xyzw or (0.0, 0.0, 0.0, 1.0))
@@ -63,9 +63,9 @@ class LinkConfig(Table):
     """Link of the robot that carries patches."""
 
     name: Name
-    """Name of the link, as in ``link`` of its patches."""
+    """Name of the link. Patches refer to this name in their key ``link``."""
     pose: PoseConfig = PoseConfig()
-    """Pose of the link's frame in the frame of the hand, until the program gives another
+    """Pose of the link's frame in the frame of the hand, used until the program sets another pose
     (``HandFrame.at``)."""
 
     @field_validator("name")

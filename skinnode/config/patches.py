@@ -66,10 +66,11 @@ class LayoutConfig(Table):
     lower_electrodes: Count | None = None
     """Number of electrodes per lower wire, M; None: U."""
     resistivity_ohm_per_m: _Resistivity = 1e7
-    """Resistance of the rubber per metre between two electrodes."""
+    """Resistance of the rubber per metre of distance between two electrodes, ohm per metre."""
     coordinates: Annotated[Coordinates, one_of(Coordinates)] = "preset"
-    """``node``: the host reads the positions of the electrodes from the patch (0x2300). Plans and simulations
-    still use the preset or file, whose numbers of wires and electrodes must therefore be correct."""
+    """Source of the electrode positions: ``preset`` for this table, or ``node`` if the host reads the
+    positions from the patch (0x2300). Plans and simulations still use the preset or file, whose numbers of
+    wires and electrodes must therefore be correct."""
 
     @field_validator("file")
     @classmethod
@@ -121,43 +122,44 @@ class CalibrationConfig(Table):
     """
 
     stiffness_n_per_m: Stiffness | None = None
-    """Stiffness of the rubber under one electrode; overrides ``solver.stiffness_n_per_m``."""
+    """Stiffness of the rubber under one electrode, N/m; overrides ``solver.stiffness_n_per_m``."""
     young_pa: Annotated[
         float, Field(ge=1e3, le=1e10, allow_inf_nan=False), Allowed("a number of Pa from 1e3 to 1e10")
     ] = _RUBBER.young_pa
-    """Young's modulus of the rubber, from which the forces of contacts are computed."""
+    """Young's modulus of the rubber, Pa, from which the forces of contacts are computed."""
     poisson: Annotated[float, Field(ge=0, le=0.5, allow_inf_nan=False), Allowed("a number from 0 to 0.5")] = (
         _RUBBER.poisson
     )
     """Poisson's ratio of the rubber."""
     force_calibrated: bool = False
-    """Whether ``young_pa`` reproduces known forces on this patch, for instance presses with a load cell by
-    objects like those that will touch it. If not, the deviations of normal forces cover a layer bonded to a
-    rigid support, which can carry fifty times the force. A modulus from a data sheet is no calibration."""
+    """Whether ``young_pa`` reproduces known forces on this patch, for instance when objects similar to those
+    in use press on it and a load cell measures the force. If false, the standard deviations of normal forces
+    also cover a layer bonded to a rigid support, which can carry fifty times the force. A modulus from a data
+    sheet is not a calibration."""
     upper_gain: Annotated[tuple[_Gain, ...] | None, Field(strict=False), Allowed("a list of numbers")] = None
     """Correction factors, one per upper wire, that restore the wire's resistances to their values at the time
     of the baseline."""
 
     @property
     def rubber(self) -> Rubber:
-        """Rubber parameters for the forces."""
+        """Rubber parameters from which forces are computed."""
         return Rubber(self.young_pa, self.poisson)
 
 
 class TolerancesConfig(Table):
-    """Tolerances to which the patch was made, which the reported standard deviations include.
+    """Manufacturing tolerances of a patch, which the reported standard deviations include.
 
     The text `"ordinary"` stands for the defaults below, `"exact"` for a patch that equals its layout, such as
-    a simulated patch. Only the posterior can include tolerances: with them, the method `auto` is the
-    posterior, and the method `exact` reports standard deviations of an exact patch.
+    a simulated patch. Only the posterior can include tolerances. With tolerances, the method `auto` selects
+    the posterior, and the method `exact` reports the standard deviations of a patch that equals its layout.
     """
 
     placement: _Tolerance = ORDINARY.placement
-    """Standard deviation of the position of each upper and lower wire along each axis, pitches."""
+    """Standard deviation of the position of each upper and lower wire along each axis, in pitches."""
     thickness: _Tolerance = ORDINARY.thickness
     """Standard deviation of the thickness between the electrodes, relative to the clearance."""
     electrode_radius: _Tolerance = ORDINARY.electrode_radius
-    """Radius of the electrodes, which the forward model takes for points, pitches."""
+    """Radius of the electrodes, in pitches. The forward model assumes point electrodes."""
     gain: _Tolerance = ORDINARY.gain
     """Standard deviation of the gain of the front end, as a fraction of the change in each resistance."""
 
@@ -171,12 +173,12 @@ class TolerancesConfig(Table):
         return asdict(_NAMED_TOLERANCES[value])
 
     def build(self) -> Tolerances:
-        """Return the tolerances in the form that the solvers take."""
+        """Return the tolerances in the form that the solvers require."""
         return Tolerances(**self.model_dump())
 
 
 def _or_named(schema: dict[str, Any]) -> None:
-    """Let the JSON Schema of the key ``tolerances`` allow the named tolerances."""
+    """Extend the JSON Schema of the key ``tolerances`` by the named tolerances."""
     named = {"type": "string", "enum": list(_NAMED_TOLERANCES)}
     schema["anyOf"] = [named, {"$ref": schema.pop("$ref")}]
 
@@ -193,14 +195,14 @@ class PatchConfig(Table):
     link: Name | None = None
     """Name of the robot link that carries the patch; None: the patch is fixed to the hand itself."""
     pose: PoseConfig = PoseConfig()
-    """Pose of the patch's frame in the frame of its link or, without a link, of the hand. If the link has no
-    pose of its own (``[[links]]``), the two frames are the same."""
+    """Pose of the patch's frame in the frame of its link or, without a link, of the hand. If ``[[links]]``
+    specifies no pose for the link, the frames of the link and the hand are the same."""
     eds: Annotated[Path | None, Field(strict=False), Allowed("the path of an EDS file")] = None
     """Electronic data sheet (EDS) to check against the wire format of this patch; the path is relative to the
     hand file."""
     layout: LayoutConfig = LayoutConfig()
     code_bits: Annotated[Literal[16, 24], Allowed("16 or 24")] = 16
-    """Width of a resistance code on the bus."""
+    """Width of a resistance code on the bus, bits."""
     serial: Annotated[int | None, Field(ge=0, le=0xFFFF_FFFF), Allowed("an integer from 0 to 2^32 - 1")] = (
         None
     )
@@ -213,13 +215,13 @@ class PatchConfig(Table):
         Path | None, Field(strict=False), Allowed("the path of a file of resistances in ohm")
     ] = None
     """File with the resistances at rest, ohm: one line per upper wire, one number per lower wire.
-    None: the host reads them from the node."""
+    None: the host reads these resistances from the node."""
     calibration: CalibrationConfig = CalibrationConfig()
     tolerances: Annotated[TolerancesConfig, Field(json_schema_extra=_or_named), Allowed(_TOLERANCES)] = (
         TolerancesConfig()
     )
-    """Tolerances to which the patch was made: `"ordinary"`, the default, for a patch made in a good workshop,
-    `"exact"` for a simulated patch, or a table of numbers. The values of the calibration do not concern the
+    """Manufacturing tolerances: `"ordinary"`, the default, for a patch made in a good workshop,
+    `"exact"` for a simulated patch, or a table of numbers. Calibration values do not describe the
     geometry, so they do not replace tolerances."""
 
     @field_validator("eds", "baseline")

@@ -21,14 +21,14 @@ class SolverConfig(Table):
     """Method: ``exact`` inverse for each wire, ``posterior`` for the patch, or ``auto`` to choose between
     them according to layout and noise."""
     operator: Annotated[Operator, one_of(Operator)] = "dogleg"
-    """Operator of the exact inverse."""
+    """Operator, that is the kind of solver step, of the exact inverse."""
     stiffness_n_per_m: Stiffness | None = None
-    """Stiffness of the rubber under one electrode, from which the exact inverse computes forces. The
+    """Stiffness of the rubber under one electrode, N/m, from which the exact inverse computes forces. The
     calibration of a patch can override it."""
     deadline_us: Annotated[
         int | None, Field(ge=100, le=10_000_000), Allowed("an integer from 100 to 10000000")
     ] = None
-    """Time limit per frame, microseconds, after which the estimate so far is returned; None: no limit."""
+    """Time limit per frame, microseconds, after which the current estimate is returned; None: no limit."""
     estimate_noise: bool = False
     """Estimate the noise in the measured resistances from the stream; requires the posterior."""
     drift: Annotated[Drift, one_of(Drift)] = "none"
@@ -39,12 +39,13 @@ class SolverConfig(Table):
     max_std_m: Annotated[
         float | None, Field(gt=0, le=1, allow_inf_nan=False), Allowed("a number of metres above 0, up to 1")
     ] = None
-    """Largest standard deviation of a displacement in a precise field; None: from layout and noise."""
+    """Maximum standard deviation of a displacement in a precise field, metres; None: a limit derived from
+    layout and noise."""
     max_force_std_n: Annotated[
         float | None, Field(gt=0, le=1e6, allow_inf_nan=False), Allowed("a number of N above 0, up to 1e6")
     ] = None
-    """Largest standard deviation of a contact's normal force in a precise field; None: from layout and
-    rubber, for calibrated forces only."""
+    """Maximum standard deviation of a contact's normal force in a precise field, newtons; None: a limit
+    derived from layout and rubber, for calibrated forces only."""
     workers: Annotated[int | None, Field(ge=1, le=64), Allowed("an integer from 1 to 64")] = None
     """Number of threads that solve patches in parallel; None: one per core, at most one per patch."""
 
@@ -56,5 +57,5 @@ class StreamConfig(Table):
     """Handling of incomplete scans, which lack chunks or the summary with the scan check: ``pass`` them on
     unchecked with a mask of the valid resistances, or ``withhold`` them. Both are counted."""
     capacity_fields: Annotated[int, Field(ge=1, le=1_000_000), Allowed("an integer from 1 to 1000000")] = 64
-    """Maximum number of fields by which a subscriber may lag before the oldest fields are lost. 64 fields
-    cover more than a second for four patches at 12.5 scans per second."""
+    """Maximum number of fields by which a subscriber may lag before the oldest fields are lost. At the
+    default of 64, four patches at 12.5 scans per second fill more than a second."""

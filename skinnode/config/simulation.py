@@ -22,7 +22,7 @@ class SimulationConfig(Table):
     seed: Annotated[int, Field(ge=0), Allowed("an integer of at least 0")] = 1
     """Random seed for the converter noise and the positions of the indenters."""
     indenter_radius_m: Length = 0.04
-    """Radius of the spherical indenter."""
+    """Radius of the spherical indenter, metres."""
     depth: Ratio = 0.1
     """Maximum indentation as a fraction of the height of the upper layer; 0: nothing touches the hand."""
     shear_ratio: Annotated[float, Field(ge=0, le=2, allow_inf_nan=False), Allowed("a number from 0 to 2")] = (
@@ -30,8 +30,8 @@ class SimulationConfig(Table):
     )
     """Coefficient of friction: ratio of tangential to normal load while sliding."""
     slide_speed_m_per_s: _Speed = 0.008
-    """Sliding speed."""
+    """Sliding speed of the indenter, metres per second."""
     cycle_s: _Cycle = 4.0
-    """Duration of one cycle of press, slide and lift."""
+    """Duration of one cycle of press, slide and lift, seconds."""
     converter_noise: Ratio = 3e-6
     """Standard deviation of the simulated converter's noise, relative to the resistance."""

@@ -1,4 +1,4 @@
-"""Base class and value types for tables of a hand file, with descriptions of the allowed values."""
+"""Defines the base class and value types for tables of a hand file, with descriptions of allowed values."""
 
 from __future__ import annotations
 
@@ -19,13 +19,16 @@ class Allowed:
 
 
 class Table(BaseModel):
-    """Base class of tables of the hand file. The docstring of a key is its description in the JSON Schema."""
+    """Base class for the tables of the hand file.
+
+    The docstring of a key is its description in the JSON Schema.
+    """
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, use_attribute_docstrings=True)
 
 
 def one_of(names: Any) -> Allowed:
-    """Return the annotation that lists the values of a Literal."""
+    """Return an annotation that lists the values of a Literal as the allowed values."""
     return Allowed(" or ".join(map(str, get_args(names))))
 
 

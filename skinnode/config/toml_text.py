@@ -1,4 +1,4 @@
-"""TOML reader that returns the value of each key with its line and column.
+"""Reads TOML files and returns the value of each key with its line and column.
 
 tomllib parses the file and checks its syntax, but does not record positions. Files that tomllib accepts are
 therefore scanned again for the positions of keys. The scanner is hand-written because no maintained TOML
@@ -18,7 +18,7 @@ from skinnode.errors import NOTHING, ConfigError, Shown
 from skinnode.files.input_file import read_input
 
 KeyPath = tuple[int | str, ...]
-"""Path of a key: ``patches[1].node_id`` is ``("patches", 1, "node_id")``."""
+"""Path of a key in a TOML file: ``patches[1].node_id`` is ``("patches", 1, "node_id")``."""
 
 _GAP: Final = re.compile(r"(?:[ \t\r\n]|#[^\n]*)*")
 _SPACE: Final = re.compile(r"[ \t]*")
@@ -66,7 +66,7 @@ def read_toml(path: Path, what: str) -> Document:
 
     Args:
         path: The file.
-        what: Type of file, for error messages.
+        what: Kind of file, for error messages.
 
     Raises:
         ConfigError: The file cannot be read, is not TOML, is nested more deeply than any hand file, or
@@ -78,7 +78,7 @@ def read_toml(path: Path, what: str) -> Document:
         raise ConfigError(
             f"byte {error.start}", error.object[error.start : error.end], "UTF-8", where=str(path)
         ) from None
-    if _LONG_KEY.search(text):  # tomllib would take minutes
+    if _LONG_KEY.search(text):  # tomllib would take minutes to parse such a key
         raise ConfigError(what, Shown("deeper nesting"), _TOO_DEEP, where=str(path))
     try:
         table = tomllib.loads(text)

@@ -26,9 +26,12 @@ from skinnode.monitor.view_model import History, Level, LogLine, View, log_line,
 from skinnode.monitor.widgets import Canvas, Dialog
 
 PERIOD_S: Final = 0.1
-"""Minimum interval between pictures."""
+"""Minimum interval between screen updates, s."""
 SHARE: Final = 0.2
-"""Maximum fraction of one processor's time spent on drawing; slow pictures are drawn less often."""
+"""Maximum fraction of one processor's time spent on drawing.
+
+If drawing is slow, the screen is updated less often.
+"""
 SLOWEST_S: Final = 0.5
 
 _LOG_LINES: Final = 500
@@ -38,28 +41,29 @@ _MESSAGE_S: Final = 5.0
 HELP: Final = """\
  1 … 9, ← →, tab   select a patch
  z, enter          show that patch alone, or all (also esc)
- t, T              tare it, or all patches: the current reading becomes zero
+ t, T              tare that patch, or all patches: the current reading becomes zero
  r                 start or stop a recording
  space             freeze the picture; the host continues
  a                 show or hide shear arrows on the maps
  q, ctrl-c         quit
 
- Bright means deep; the scale beside "touches" shows how deep. Arrows
- show shear: right is along the upper wires, up is across them. A map
- without colours is out of date: its patch sends nothing."""
+ Brighter colours mean a deeper press; the scale next to "touches" shows
+ the depth. Arrows show shear: right is along the upper wires, up is
+ across them. A map without colours is out of date, because its patch
+ sends no data."""
 
 _SHOWN_AS_EVENTS: Final = ("skinnode.host.supervisor", "skinnode.host.health")
-"""Loggers whose warnings already appear in the event log."""
+"""Names of the loggers whose warnings already appear in the event log."""
 
 
 class MonitorApp(App[None]):
-    """The monitor of a source.
+    """Full-screen monitor of a data source.
 
     Args:
         source: Host or recording; the caller closes it.
         folder: Folder for recordings.
         colours: Colours of the terminal.
-        over: Called on each update; the monitor ends when it returns True.
+        over: Callback for each screen update; the monitor ends when it returns True.
         seconds: Maximum duration; None for no limit.
     """
 
@@ -134,7 +138,7 @@ class MonitorApp(App[None]):
 
     @property
     def view(self) -> View:
-        """View on the screen; available after the first update."""
+        """View shown on the screen; available after the first update."""
         assert self._view is not None
         return self._view
 
@@ -165,7 +169,7 @@ class MonitorApp(App[None]):
         self.faults.update(view, time.monotonic_ns(), ending=ending)
         for event in self._source.events():
             begins = event.what == "operational" and time.monotonic() - self._begun_s < _BEGIN_S
-            if not begins:  # omitted at start-up, when all patches become operational
+            if not begins:  # at start-up, all patches become operational
                 self._lines.append(log_line(event, self._wall_minus_mono_ns))
         self._settle_tares()
         if not self._paused:
@@ -173,7 +177,7 @@ class MonitorApp(App[None]):
             self._scale.update(view.t_ns, view.deepest_m)
 
     def _draw(self) -> None:
-        """Draw the view, unless the terminal is still busy with the previous picture."""
+        """Draw the view unless the terminal is still receiving the previous picture."""
         driver = self._driver
         if isinstance(driver, PatientDriver):
             if driver.busy:
@@ -220,7 +224,7 @@ class MonitorApp(App[None]):
         self._draw()
 
     def action_choose_number(self, number: int) -> None:
-        """Select a patch by its number, from 1."""
+        """Select a patch by its number, counted from 1."""
         if number <= len(self._names):
             self._selected = number - 1
             self._draw()
@@ -262,12 +266,12 @@ class MonitorApp(App[None]):
         text = f"Tare {what}?\n\nThe current reading becomes zero: {', '.join(felt)}.\n"
         text += "Do not touch the skin.\n\n"
         self.push_screen(
-            Dialog(text + "y, enter: tare     any other key: no", question=True),
+            Dialog(text + "y, enter: tare     any other key: cancel", question=True),
             lambda sure: self._tare(names) if sure else None,
         )
 
     def _tare(self, names: list[str]) -> None:
-        """Tare on daemon threads, which do not delay the monitor's exit."""
+        """Tare patches on daemon threads, which do not delay the monitor's exit."""
         self._say(f"{', '.join(names)}: tare requested")
 
         def tare(name: str) -> None:
@@ -276,13 +280,13 @@ class MonitorApp(App[None]):
             except SkinError as error:
                 self._tares.put((str(error), "bad"))
             else:
-                self._tares.put((f"{name}: tared, its new baseline is in use", "good"))
+                self._tares.put((f"{name}: tared; the new baseline is in use", "good"))
 
         for name in names:
             threading.Thread(target=tare, args=(name,), name=f"tare {name}", daemon=True).start()
 
     def _settle_tares(self) -> None:
-        """Show the results of tares."""
+        """Show the results of completed tares."""
         while not self._tares.empty():
             self._say(*self._tares.get())
 
@@ -317,7 +321,7 @@ class _Records(logging.Handler):
 
 
 def terminal_colours(environment: Mapping[str, str]) -> Colours:
-    """Return the terminal's colours, which rich derives from environment variables."""
+    """Return the colours of the terminal, which rich derives from environment variables."""
     from rich.console import Console
 
     if environment.get("NO_COLOR"):

@@ -1,4 +1,4 @@
-"""Draws a displacement field as characters: depth as brightness, shear as arrows. Pure functions.
+"""Renders a displacement field as characters: depth as brightness, shear as arrows.
 
 The x axis, along the upper wires, points right; the y axis, across them, points up. Each character shows two
 pixels, one above the other, so a pixel is roughly square. Without colours, each character represents the mean
@@ -28,31 +28,31 @@ Colours = Literal["rgb", "ansi", "none"]
 """Colours of the terminal: 256 or more, the 16 ANSI colours, or none (NO_COLOR)."""
 
 Line = list[Segment]
-"""Line of the screen, or a part of it."""
+"""Styled text of a screen line or of a part of a line."""
 
 # Five points of matplotlib's "magma" (CC0), where equal steps of depth look like equal steps of brightness.
 _MAGMA: Final = np.array([(0, 0, 4), (81, 18, 124), (183, 55, 121), (252, 137, 97), (252, 253, 191)], float)
 LEVELS: Final = 24
 """Number of shades. More shades would be indistinguishable and take longer to draw and to transmit."""
 _UNKNOWN: Final = -1
-"""Level drawn for skin without a measurement."""
+"""Shade level of skin without a measurement."""
 _SIGNS: Final = "·:-=+*#%@"
-"""Characters from untouched to deep, in order of increasing density."""
+"""Characters that represent depth, from untouched to deep, in order of increasing density."""
 _ANSI: Final = ("black", "blue", "magenta", "red", "yellow", "bright_white")
 ARROWS: Final = "→↗↑↖←↙↓↘"
 
 SURE: Final = 4.0
-"""Minimum shear drawn, in standard deviations."""
+"""Minimum shear that is drawn as an arrow, in standard deviations."""
 _SHORT: Final = 0.15
-"""Minimum shear drawn as an arrow, as a fraction of full scale."""
+"""Minimum shear that is drawn as an arrow, as a fraction of full scale."""
 
 _STEPS_M: Final = tuple(
     step * 10.0**power for power in (-5, -4, -3, -2) for step in (1.0, 1.5, 2.0, 3.0, 5.0, 7.0)
 )
 _LEAST_M: Final = 5e-5
-"""Minimum full scale in m, so that noise does not look like a touch."""
+"""Minimum full scale of the depth, m, so that noise does not look like a touch."""
 _MEMORY_NS: Final = 6_000_000_000
-"""Time for which a deep press determines the scale, ns."""
+"""Time for which the depth scale includes a past press, ns."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -60,9 +60,9 @@ class Surface:
     """Quantities of a field that a map shows. Arrays are (U, N), upper wire 0 first, in metres."""
 
     depth_m: Float
-    """Positive where the skin is pressed inwards."""
+    """Depth, positive where the skin is pressed inwards."""
     shear_m: Float
-    """(2, U, N): along the upper wires, across them."""
+    """(2, U, N) shear, along the upper wires and across them."""
     shear_std_m: Float
     unknown: NDArray[np.bool_]
     """Electrodes without a measurement."""
@@ -94,7 +94,7 @@ def surface_of(field: FieldFrame, upper_m: Float) -> Surface:
 
 
 def aspect_of(upper_m: Float) -> float:
-    """Return the ratio of a patch's width to its height; each electrode represents one cell."""
+    """Return the ratio of a patch's width to its height, where each electrode occupies one cell."""
     wires, electrodes = upper_m.shape[:2]
     width, height = np.ptp(upper_m[..., :2].reshape(-1, 2), axis=0)
     width, height = width / max(electrodes - 1, 1) * electrodes, height / max(wires - 1, 1) * wires
@@ -170,7 +170,7 @@ class MapStyle:
 
     @property
     def full_shear_m(self) -> float:
-        """Shear drawn at full brightness, m; rubber moves less along its surface than perpendicular to it."""
+        """Shear drawn at full brightness, m; below ``full_m``, because shear is smaller than depth."""
         return 0.25 * self.full_m
 
 
@@ -193,7 +193,7 @@ def paint_map(
 
 
 def _arrows_on(surface: Surface, style: MapStyle, width: int, height: int) -> dict[tuple[int, int], str]:
-    """Return arrows keyed by column and line, spaced so that a press covers several arrows."""
+    """Return arrows keyed by column and line, spaced so that several arrows fit into a press."""
     down = 1 if height < 7 else 2 if height < 18 else 3
     across = 2 * down
     rows, columns = (
@@ -214,7 +214,7 @@ def _arrows_on(surface: Surface, style: MapStyle, width: int, height: int) -> di
 def paint_shear(surface: Surface, style: MapStyle, width: int, height: int) -> list[Line]:
     """Draw shear as arrows; the stronger the shear, the brighter the arrow.
 
-    Each electrode has an arrow if there is room; if there is more room, arrows are also drawn between
+    Each electrode has an arrow if the map is large enough; on larger maps, arrows are also drawn between
     electrodes.
     """
     colours = style.colours
@@ -242,7 +242,7 @@ def paint_shear(surface: Surface, style: MapStyle, width: int, height: int) -> l
 
 
 def legend(style: MapStyle, width: int, text: Style) -> Line:
-    """Draw the colour scale from untouched to brightest, labelled with the depth of the brightest colour."""
+    """Draw the colour scale from untouched to brightest, labelled with the depth at full brightness."""
     levels = np.rint(np.linspace(0, LEVELS - 1, width)).astype(int).tolist()
     return [*_depth_line(levels, levels, {}, style.colours), Segment(f" {1e6 * style.full_m:.0f} µm", text)]
 
@@ -256,7 +256,7 @@ def _depth_line(above: Sequence[int], below: Sequence[int], arrows: dict[int, st
 
 
 def _grouped(cells: Sequence[tuple[str, Style]]) -> Line:
-    """Merge neighbouring segments of the same style; drawing time grows with the number of segments."""
+    """Merge neighbouring cells of the same style, because drawing time grows with the number of segments."""
     return [
         Segment("".join(sign for sign, _ in run), style)
         for style, run in itertools.groupby(cells, key=lambda cell: cell[1])

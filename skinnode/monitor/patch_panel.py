@@ -1,4 +1,4 @@
-"""Draws a patch, either as a tile among others or alone with all its figures."""
+"""Renders a patch, either as a tile among other patches or alone with all its values."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ GONE: Final = ("lost", "never seen", "stale", "refused", "restarting", "booting"
 _AROUND: Final = 3
 """Number of lines in a tile, excluding its map."""
 _LEAST_OUTLINED: Final = (8, 5)
-"""Minimum size of a box whose map has an outline, in characters and lines."""
+"""Minimum size, in characters and lines, of a box in which the map has an outline."""
 _LABEL: Final = 10
-"""Width of the column of figure names, characters."""
+"""Width of the column with the names of values, characters."""
 
 
 def tiles(patches: Sequence[PatchView], paint: Paint, width: int, height: int) -> list[Line]:
@@ -33,7 +33,7 @@ def tiles(patches: Sequence[PatchView], paint: Paint, width: int, height: int) -
     aspect = max((patch.surface.aspect for patch in patches if patch.surface is not None), default=1.0)
 
     def high_of(columns: int) -> int:
-        """Return the height of a map in lines for this number of columns."""
+        """Return the height of a map in lines if there are this many columns of tiles."""
         box = width // columns - 1, height // -(-count // columns) - _AROUND
         across, down, frame = _fit(*box, aspect) if min(box) > 0 else (0, 0, 0)
         return down + frame if across else 0
@@ -65,8 +65,8 @@ def _map(patch: PatchView, paint: Paint, width: int, height: int, *, arrows: boo
     """Draw the height map centred in its box.
 
     The map has an outline because untouched skin is as dark as the screen. If a patch stops sending data, its
-    last map is drawn without colours and with the condition across it, so that it cannot be mistaken for live
-    data.
+    last map is drawn without colours and with the condition written over it, so that it cannot be mistaken
+    for live data.
     """
     theme = paint.theme
     if patch.surface is None:
@@ -115,7 +115,7 @@ def outlined(lines: Sequence[Line], across: int, theme: Theme) -> list[Line]:
 
 
 def _figures(patch: PatchView, theme: Theme, width: int) -> Line:
-    """Draw depth and shear."""
+    """Draw the depth and shear of a patch as numbers."""
     if patch.depth_m is None or patch.condition in GONE:
         return pad([], width, theme)
     line = [Segment(f" {1e6 * patch.depth_m:.0f}", theme.text)]
@@ -127,7 +127,7 @@ def _figures(patch: PatchView, theme: Theme, width: int) -> Line:
 
 
 def _health(patch: PatchView, theme: Theme, width: int) -> Line:
-    """Draw the condition, followed by the first fault or, if there is none, by the rate."""
+    """Draw the condition of a patch and its first fault; if it has no fault, its field rate."""
     style = theme.of(patch.level)
     if patch.words:
         return pad([Segment(f" {patch.condition}: {patch.words[0]}", style)], width, theme)
@@ -150,7 +150,7 @@ def shear_text(shear_m: tuple[float, float]) -> str:
 
 
 def alone(patch: PatchView, paint: Paint, width: int, height: int) -> list[Line]:
-    """Draw one patch: depth, shear and all figures."""
+    """Draw one patch: depth map, shear map and all values."""
     theme, style = paint.theme, paint.map_style
     high = height - 2
     aspect = 1.0 if patch.surface is None else patch.surface.aspect
@@ -188,7 +188,7 @@ def _caption(text: str, theme: Theme) -> Line:
 
 
 def facts(patch: PatchView, theme: Theme, width: int) -> list[Line]:
-    """Return all figures of a patch, one name and value per line."""
+    """Return all values of a patch as lines that each contain a name and a value."""
     health, stream = patch.health, patch.stream
     counts = stream.assembler
     lines = [
@@ -221,7 +221,7 @@ def facts(patch: PatchView, theme: Theme, width: int) -> list[Line]:
         if patch.distrust:
             fact("because", patch.distrust, theme.note)
         if patch.data_share is not None:
-            fact("data", f"{patch.data_share:.0%} of the depth is from the data")
+            fact("data", f"{patch.data_share:.0%} of the depth comes from the data")
     for fault in patch.data_faults:
         fact("left out", str(fault), theme.note)
     fact("scans", f"{patch.rate_hz:.1f}/s, newest {patch.scan}" if patch.scan is not None else "none yet")
@@ -257,7 +257,7 @@ def _wrapped(text: str, width: int) -> list[str]:
 
 
 def _span(seconds: float) -> str:
-    """Return a duration in a suitable unit."""
+    """Return a duration as text in a suitable unit."""
     if seconds < 1.0:
         return f"{1e3 * seconds:.0f} ms"
     if seconds < 120.0:

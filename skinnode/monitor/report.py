@@ -1,4 +1,4 @@
-"""Reports the faults of a session at its end, and the view as JSON for programs."""
+"""Collects the faults of a monitoring session, and reports the current view as JSON."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ LOOK_S: Final = 0.1
 """Interval at which the source is checked for faults, s."""
 
 LINE_S: Final = 1.0
-"""Interval between JSON lines."""
+"""Interval between JSON lines, s."""
 
 
 class FaultBook:
-    """Faults of a session, each listed once, in order of appearance.
+    """Faults of a monitoring session, each listed once, in order of first occurrence.
 
     Args:
         live: Whether the hand is running, so that its patches must soon be operational. A recording begins
-            before the bring-up: only at its end do patches that have never been operational count as faults.
+            before the bring-up, so patches that have never been operational count as faults only at its end.
     """
 
     def __init__(self, *, live: bool) -> None:
@@ -40,7 +40,7 @@ class FaultBook:
 
     @property
     def lines(self) -> list[str]:
-        """One line per fault."""
+        """One line of text per fault."""
         return list(self._found.values())
 
     def update(self, view: View, real_ns: int, *, ending: bool = False) -> None:
@@ -73,7 +73,7 @@ class FaultBook:
 
 
 def _lasting(health: PatchHealth) -> list[tuple[str, str]]:
-    """Return the faults other than the condition, each with a key that identifies it and its text."""
+    """Return the faults of a patch other than its condition, each as an identifying key and a text."""
     wires = [f"{fault.side} wire {fault.number} {fault.state}" for fault in health.wires]
     found = [(text, text) for text in wires]
     if health.duplicate_id:
@@ -91,9 +91,9 @@ def watch(
 
     Args:
         source: Host or recording.
-        stop: Ends the iteration.
+        stop: Event that ends the iteration.
         seconds: Maximum duration; None for no limit.
-        faults: Receives the faults of the session.
+        faults: Fault book that receives the faults of the session.
 
     Raises:
         SkinError: The source failed.
@@ -116,7 +116,7 @@ def watch(
 
 
 def as_json(view: View) -> dict[str, Any]:
-    """Return the view for programs, without the fields."""
+    """Return the view as JSON-compatible data, without the fields."""
     return {
         "patches": {patch.name: _patch_json(patch) for patch in view.patches},
         "buses": {

@@ -1,4 +1,4 @@
-"""Draws the whole screen at any size: header, buses, patches, touches, event log, keys."""
+"""Renders the whole screen at any size: header, buses, patches, touches, event log, keys."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ LEAST_HEIGHT: Final = 16
 
 
 def screen(view: View, paint: Paint, log: Sequence[LogLine], width: int, height: int) -> list[Line]:
-    """Draw ``height`` lines of ``width`` characters; the last line of ``log`` is the newest."""
+    """Render the screen as ``height`` lines of ``width`` characters; ``log`` ends with the newest line."""
     theme, ui = paint.theme, paint.ui
     if width < LEAST_WIDTH or height < LEAST_HEIGHT:
         text = f"{width} × {height} is too small: at least {LEAST_WIDTH} × {LEAST_HEIGHT}"
@@ -77,7 +77,7 @@ def _header(view: View, ui: UiState, theme: Theme, width: int) -> Line:
 
 
 def _losses(view: View, bus: BusView) -> str:
-    """Describe the first kind of loss found among the patches on a bus; empty if nothing was lost."""
+    """Describe the losses of the patches on a bus by their first kind; empty if nothing was lost."""
     counts = [patch.stream.assembler for patch in view.patches if patch.bus == bus.name]
     for name, one, several in (
         ("chunks_lost", "chunk lost", "chunks lost"),
@@ -131,7 +131,7 @@ def _keys(ui: UiState, theme: Theme, width: int) -> Line:
 
 
 def _lower(view: View, paint: Paint, log: Sequence[LogLine], width: int, height: int) -> list[Line]:
-    """Draw touches above events or, on a wide screen, beside events and the selected patch's figures."""
+    """Draw touches above events; on a wide screen, draw touches and the selected patch left of events."""
     theme, ui = paint.theme, paint.ui
     chosen = view.patch(ui.selected)
     patches = (chosen,) if ui.zoomed else view.patches
@@ -197,7 +197,10 @@ def _touch_line(patch: PatchView, touch: Touch, theme: Theme, name: int) -> Line
 
 
 def _quiet(view: View) -> str:
-    """Return the text shown while the event log is empty; it names faults that are older than the log."""
+    """Return the text shown while the event log is empty.
+
+    The text names faults that are older than the log.
+    """
     wrong = [f"{patch.name} {patch.condition}" for patch in view.patches if patch.level == "bad"]
     wrong += [bus.name for bus in view.buses if bus.level == "bad"]
     if wrong:

@@ -1,6 +1,6 @@
-"""Data sources of the monitor: a running host, or a replayed recording.
+"""Provides the data sources of the monitor: a running host, or a replayed recording.
 
-Sources take only the newest data and never make the host wait.
+Sources take only the newest data and never block the host.
 """
 
 from __future__ import annotations
@@ -27,15 +27,15 @@ from skinnode.record import Recorder, Replay
 
 _CAPACITY: Final = 1
 _EVENTS: Final = 500
-"""Maximum number of events kept until the screen is drawn."""
+"""Maximum number of events kept until the next screen update."""
 
 
 @dataclass(frozen=True, slots=True)
 class Snapshot:
-    """State of a hand at one instant, keyed by patch or bus."""
+    """State of a hand at one instant; mappings are keyed by patch name or bus name."""
 
     t_ns: int
-    """Monotonic time in ns of the host or, for a recording, of the recording host."""
+    """Monotonic time of the host or, for a recording, of the host that made the recording, ns."""
     health: Mapping[str, PatchHealth]
     bus_health: Mapping[str, BusHealth]
     buses: Mapping[str, BusStats]
@@ -54,7 +54,10 @@ class Recording:
 
 
 class Source(Protocol):
-    """Data source of the screen. All methods return immediately, except record and stop_recording."""
+    """Interface of the monitor's data sources.
+
+    All methods return immediately, except record and stop_recording.
+    """
 
     hand: HandConfig
     title: str
@@ -73,14 +76,14 @@ class Source(Protocol):
 
     @property
     def flaws(self) -> list[str]:
-        """Descriptions of missing or unreadable data in a recording, as far as it has been replayed."""
+        """Descriptions of missing or unreadable data in the part of a recording replayed so far."""
 
     def tare(self, patch: str) -> None:
         """Tare a patch, as :meth:`Host.tare` does."""
 
     @property
     def recording(self) -> Recording | None:
-        """Progress of the recording; None if there is none."""
+        """Progress of the recording being written; None if no recording is being written."""
 
     def record(self, folder: Path) -> Path:
         """Start a recording and return its path. Raises ConfigError if the recording cannot be written."""
@@ -101,13 +104,13 @@ class HostSource:
         self.hand, self.title = host.hand, host.hand.name
         self._host = host
         self._events = host.events(capacity=_EVENTS)
-        self._fields = host.fields(capacity=_CAPACITY)  # subscribers receive the cause of a host failure
+        self._fields = host.fields(capacity=_CAPACITY)  # receives the error if the host fails
         self._recorder: Recorder | None = None
         self._untap: Callable[[], None] | None = None
 
     def snapshot(self) -> Snapshot:
-        """Return the hand now."""
-        for _ in range(_CAPACITY + 1):  # a failure may arrive after the fields
+        """Return the current state of the hand."""
+        for _ in range(_CAPACITY + 1):  # a failure is queued after the fields
             self._fields.get(0.0)
         host, stats = self._host, self._host.stats()
         return Snapshot(
@@ -139,7 +142,7 @@ class HostSource:
 
     @property
     def recording(self) -> Recording | None:
-        """Progress of the recording; None if there is none."""
+        """Progress of the recording being written; None if no recording is being written."""
         if self._recorder is None:
             return None
         stats = self._recorder.stats()
@@ -195,7 +198,7 @@ class ReplaySource:
         self._thread.start()
 
     def snapshot(self) -> Snapshot:
-        """Return the hand now."""
+        """Return the current state of the hand."""
         if self._failure is not None:
             raise self._failure
         return Snapshot(
@@ -227,7 +230,7 @@ class ReplaySource:
 
     @property
     def recording(self) -> Recording | None:
-        """Progress of the recording; None if there is none."""
+        """Progress of the recording being written; None if no recording is being written."""
         return None
 
     def record(self, folder: Path) -> Path:
@@ -287,7 +290,7 @@ class ReplaySource:
 
 
 def drain(subscription: EventSubscription) -> list[HealthEvent]:
-    """Return all queued events; a closed host ends its queue with None."""
+    """Return all queued events; None in the queue marks its end."""
     found: list[HealthEvent] = []
     while (event := subscription.get(0.0)) is not None:
         found.append(event)

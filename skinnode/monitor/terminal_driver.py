@@ -1,4 +1,4 @@
-"""Terminal output that never blocks, even if the terminal disappears or stalls."""
+"""Writes to the terminal without blocking, even if the terminal disappears or stalls."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ if TYPE_CHECKING:
 _STDOUT: Final = 1
 
 _MAX_QUEUED: Final = 30
-"""Maximum number of writes queued for the terminal: a few pictures."""
+"""Maximum number of writes queued for the terminal, enough for a few pictures."""
 
 _END_S: Final = 1.0
-"""Maximum time to wait at the end for the terminal to accept queued output, s."""
+"""Maximum time to wait at exit for the terminal to accept queued output, s."""
 
 
 class _Writer(threading.Thread):
@@ -35,7 +35,7 @@ class _Writer(threading.Thread):
         self._descriptor, self._gone = descriptor, gone
 
     def run(self) -> None:
-        """Write until None is queued."""
+        """Write queued text until None is queued."""
         while (text := self.queue.get()) is not None:
             data = text.encode("utf-8", "replace")
             while data and not self._gone.is_set():
@@ -45,7 +45,10 @@ class _Writer(threading.Thread):
                     self._gone.set()
 
     def end(self) -> None:
-        """Stop once the queue is empty. A thread blocked on a stalled terminal ends with the process."""
+        """End the thread after the queue is empty.
+
+        A thread blocked on a stalled terminal ends with the process.
+        """
         with suppress(queue.Full):
             self.queue.put_nowait(None)
         self.join(_END_S)
@@ -77,7 +80,7 @@ class PatientDriver(LinuxDriver):
 
     @property
     def busy(self) -> bool:
-        """Whether output is still queued, so that a new picture would only be queued behind it."""
+        """Whether output is still queued, so that a new picture would have to wait."""
         return self._writer is not None and self._writer.queue.qsize() > 0
 
     @property
@@ -98,7 +101,7 @@ class PatientDriver(LinuxDriver):
             self._gone.set()
 
     def close(self) -> None:
-        """End the writer thread, then Textual's."""
+        """End the writer thread, then close Textual's driver."""
         if self._writer is not None:
             self._writer.end()
         super().close()

@@ -1,4 +1,4 @@
-"""Screen styles, user interface state, and layout of styled text in lines."""
+"""Defines screen styles and user interface state, and lays out lines of styled text."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from skinnode.text.printable import printable
 
 @dataclass(frozen=True, slots=True)
 class Theme:
-    """Styles for a terminal with the given colours."""
+    """Text styles for a terminal with the given colours."""
 
     colours: Colours
     text: Style
@@ -81,7 +81,7 @@ def theme_for(colours: Colours) -> Theme:
 
 @dataclass(frozen=True, slots=True)
 class UiState:
-    """The user's selections, and the message in the key bar."""
+    """State of the user interface: the user's selections and the message in the key bar."""
 
     title: str
     selected: str
@@ -104,7 +104,7 @@ class Paint:
     theme: Theme
     ui: UiState
     full_m: float
-    """Depth drawn brightest, m."""
+    """Depth drawn at full brightness, m."""
 
     @property
     def map_style(self) -> MapStyle:
@@ -140,7 +140,7 @@ def spread(left: Line, right: Line, width: int, theme: Theme, style: Style | Non
 
 
 def beside(blocks: Sequence[tuple[list[Line], int]], height: int, theme: Theme) -> list[Line]:
-    """Put blocks of lines, each with its width, side by side."""
+    """Join blocks of lines, each with its width, side by side."""
     return [
         [
             segment

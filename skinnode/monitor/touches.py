@@ -1,4 +1,4 @@
-"""Finds the contacts on a patch from its field."""
+"""Finds the contacts on a patch in its displacement field."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from skinnode.model.frames import FieldFrame
 from skinnode.model.layout import Float
 
 TOUCH: Final = 0.35
-"""Minimum depth at which skin counts as touched, relative to the maximum, when contacts are found by depth.
-Under Hertzian pressure the rim of a contact is half as deep as its centre."""
+"""Minimum depth of touched skin as a fraction of the maximum depth, if contacts are found by depth. Under
+Hertzian pressure, the rim of a contact is half as deep as its centre."""
 SURE: Final = 6.0
-"""Minimum depth of a touch, in standard deviations; noise on 100 electrodes exceeds it once in 10 million
-fields."""
+"""Minimum depth of a touch, in standard deviations; noise on 100 electrodes exceeds this limit once in
+10 million fields."""
 LEAST_TOUCH_M: Final = 1e-5
 
 
@@ -23,7 +23,7 @@ LEAST_TOUCH_M: Final = 1e-5
 class Touch:
     """One contact on a patch; unknown values are None.
 
-    Without contacts in the field, forces are known only if a stiffness was given.
+    If the field has no contacts, forces are known only if a stiffness was specified.
     """
 
     x_m: float
@@ -40,8 +40,9 @@ class Touch:
 def touches_of(field: FieldFrame, rest_m: Float) -> tuple[Touch, ...]:
     """Return the contacts on a patch, strongest first.
 
-    Returns the contacts of the field. If it has none and is exact, returns connected regions of pressed skin,
-    with forces if a stiffness was given: fields recorded without contacts have only those.
+    Returns the contacts in the field. If a field of the exact inverse has no contacts, for example because it
+    was recorded without them, returns connected regions of pressed skin. Regions have forces if a stiffness
+    was specified.
 
     Args:
         field: Newest field of the patch.

@@ -1,4 +1,4 @@
-"""Computes the content of the screen from snapshots, as immutable data. Pure functions, no terminal."""
+"""Computes the content of the screen from snapshots, as immutable data."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from skinnode.monitor.source import Snapshot
 from skinnode.monitor.touches import Touch, touches_of
 
 Level = Literal["good", "note", "bad"]
-"""Severities: good, worth checking, fault."""
+"""Severity levels: good, worth checking, fault."""
 HISTORY_NS: Final = 2_000_000_000
 """Period over which rates and latencies are computed, ns."""
 
@@ -53,19 +53,19 @@ class PatchView:
     scan: int | None
     trusted: bool
     distrust: str
-    """Why the newest field is not trusted; empty if it is, or if there is no field."""
+    """Why the newest field is not trusted; empty if it is trusted or there is no field."""
     precise: bool
     data_share: float | None
-    """Share of the data in the depth of the deepest electrode; None without a field."""
+    """Data share of the depth of the deepest electrode; None if there is no field."""
     data_faults: tuple[DataFault, ...]
-    """Readings left out of the newest field."""
+    """Faulty readings that were left out of the newest field."""
     method: str
     surface: Surface | None
     depth_m: float | None
     depth_std_m: float | None
-    """Standard deviation of the deepest electrode's depth."""
+    """Standard deviation of the deepest electrode's depth, m."""
     shear_m: tuple[float, float]
-    """Mean shear, weighted by depth."""
+    """Mean shear (x, y), weighted by depth, m."""
     touches: tuple[Touch, ...]
 
 
@@ -101,7 +101,7 @@ class View:
 
     @property
     def deepest_m(self) -> float:
-        """Deepest press on any patch, m."""
+        """Depth of the deepest press on any patch, m."""
         return max((patch.depth_m or 0.0 for patch in self.patches), default=0.0)
 
     def patch(self, name: str) -> PatchView:
@@ -120,7 +120,7 @@ class LogLine:
 
 
 class History:
-    """Snapshots of the last few seconds, condensed into views."""
+    """Snapshots of the last few seconds, from which views are computed."""
 
     def __init__(self, hand: HandConfig, *, live: bool = True) -> None:
         self._hand, self._live = hand, live
@@ -130,7 +130,7 @@ class History:
         """Add the newest snapshot and return its view."""
         kept = self._kept
         if kept and kept[-1].t_ns > snapshot.t_ns:
-            kept.clear()  # a recording's time may jump back
+            kept.clear()  # the time of a recording may jump back
         elif kept and kept[-1].t_ns == snapshot.t_ns:
             kept.pop()
         kept.append(snapshot)
@@ -144,8 +144,8 @@ def view_of(hand: HandConfig, history: Sequence[Snapshot], *, live: bool = True)
 
     Args:
         hand: The hand.
-        history: Snapshots, oldest first; rates are averages since the oldest.
-        live: Whether the source is a running host; a recording has no latencies.
+        history: Snapshots, oldest first; rates are averages since the oldest snapshot.
+        live: Whether the source is a running host; latencies are computed only for a running host.
     """
     now, before = history[-1], history[0]
     elapsed_s = max(1e-3, (now.t_ns - before.t_ns) * 1e-9)
@@ -208,7 +208,7 @@ def _patch_view(patch: PatchConfig, history: Sequence[Snapshot], elapsed_s: floa
 
 
 def _latencies_s(history: Sequence[Snapshot], name: str) -> list[float]:
-    """Return the latency in s of each field of a patch in these snapshots."""
+    """Return the latency of each field of a patch in these snapshots, s."""
     found: dict[int, float] = {}
     since_ns = history[-1].t_ns - HISTORY_NS
     for snapshot in history:
@@ -221,14 +221,17 @@ def _latencies_s(history: Sequence[Snapshot], name: str) -> list[float]:
 
 @functools.lru_cache(maxsize=128)
 def upper_m(layout: LayoutConfig) -> Float:
-    """Return the rest positions (U, N, 3) in m by the hand file; a layout stored in the patch may differ."""
+    """Return the (U, N, 3) electrode positions at rest according to the hand file, m.
+
+    A layout stored in the patch may differ.
+    """
     return layout.build().upper_m
 
 
 def judge_patch(
     health: PatchHealth, stream: StreamStats, before: StreamStats
 ) -> tuple[str, Level, tuple[str, ...]]:
-    """Return the condition, its severity and all other faults."""
+    """Return the condition of a patch, its severity and all other faults."""
     condition = health.condition
     if condition is Condition.STALE and not stream.solved and not stream.withheld:
         return "starting", "note", ()
@@ -237,7 +240,7 @@ def judge_patch(
     missed = stream.assembler.scans_missed - before.assembler.scans_missed
     lossy = [f"{count} {what} lost" for count, what in ((losses, "chunks"), (missed, "scans")) if count > 0]
     if condition is not Condition.OPERATIONAL:
-        lossy = []  # every frame of a missing patch is lost
+        lossy = []  # a missing patch loses every frame
     level: Level = "good"
     if lossy or words:
         level = "note"

@@ -1,4 +1,4 @@
-"""Screen widgets: a canvas that redraws only changed lines, and a dialog."""
+"""Provides screen widgets: a canvas that redraws only changed lines, and a dialog."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ Painter = Callable[[int, int], list[Line]]
 
 
 class Canvas(Widget):
-    """Shows the lines of a painter; only changed lines are sent to the terminal.
+    """Shows the lines of a painter, sending only changed lines to the terminal.
 
-    Textual's own widgets do not compare lines, and would redraw the whole picture each time.
+    Textual's own widgets do not compare lines and would redraw the whole picture on each update.
     """
 
     DEFAULT_CSS = "Canvas { width: 1fr; height: 1fr; }"
@@ -34,13 +34,13 @@ class Canvas(Widget):
         self._strips: list[Strip] = []
 
     def show(self, painter: Painter) -> None:
-        """Show this painter's pictures from now on, at any size."""
+        """Show the pictures of ``painter`` from now on."""
         self._painter = painter
         self._paint()
 
     @property
     def text(self) -> str:
-        """The text on the canvas, without styles."""
+        """Text on the canvas, without styles."""
         return "\n".join(strip.text for strip in self._strips)
 
     def on_resize(self) -> None:
@@ -68,7 +68,7 @@ class Canvas(Widget):
 
 
 class Dialog(ModalScreen[bool]):
-    """Text in a box. ``enter`` or ``y`` answers a question with True; any other key closes the box."""
+    """Text in a box. ``enter`` or ``y`` answers a question with True; any other key answers with False."""
 
     CSS = """
     Dialog { align: center middle; background: $background 40%; }
@@ -88,7 +88,7 @@ class Dialog(ModalScreen[bool]):
 
     @property
     def text(self) -> str:
-        """The text in the box."""
+        """Text in the box."""
         return self._text
 
     def compose(self) -> ComposeResult:
@@ -96,8 +96,8 @@ class Dialog(ModalScreen[bool]):
         yield Static(self._text, markup=False)
 
     def on_key(self, event: Key) -> None:
-        """Close the box with the answer."""
+        """Close the box and return the answer."""
         event.stop()
-        if not self._answered:  # keys typed ahead can arrive while the box closes
+        if not self._answered:  # more keys may arrive while the box closes
             self._answered = True
             self.dismiss(self._question and event.key in ("y", "enter"))

@@ -288,7 +288,7 @@ def test_losses(counts: dict[str, int], what: str) -> None:
 
 
 def test_scans_that_run_into_the_next() -> None:
-    assert "end after the next has begun" in skin(quiet_ratio(), latency_s=np.full(50, 0.079)).what
+    assert "end after the next scan has begun" in skin(quiet_ratio(), latency_s=np.full(50, 0.079)).what
 
 
 def test_few_scans_are_not_judged() -> None:

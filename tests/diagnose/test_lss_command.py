@@ -67,7 +67,7 @@ def test_a_node_without_memory_says_that_it_forgets(bus: BusConfig, powered: Pow
     (node,) = powered(bus, NOT_CONFIGURED, serial=7, memory=None)
     done = run(["lss", "set", "--node-id", "5", "--yes"], bus)
     assert done.status == 1
-    assert "not stored, so lost at power-off" in done.stdout
+    assert "not stored and will be lost at power-off" in done.stdout
     assert node.node_id == 5
 
 

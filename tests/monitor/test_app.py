@@ -125,7 +125,7 @@ def test_tare_asks_and_then_zeroes() -> None:
             assert host.stats().nodes["p1"].baselines == 0
             await press(pilot, "t", "y")
             assert await eventually(
-                pilot, lambda: "p1: tared, its new baseline is in use" in screen_of(pilot)
+                pilot, lambda: "p1: tared; the new baseline is in use" in screen_of(pilot)
             )
             assert await eventually(pilot, lambda: "150 ± " not in screen_of(pilot))
             assert await eventually(pilot, lambda: "nothing touches" in screen_of(pilot))

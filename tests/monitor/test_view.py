@@ -322,7 +322,7 @@ def test_a_field_that_is_not_to_be_trusted_says_why_on_its_tile_and_alone() -> N
     alone = re.sub(r"\s+", " ", shown(doubtful, zoomed=True))
     assert "not trusted, precise" in alone
     assert "half of its readings are lost" in alone
-    assert "25% of the depth is from the data" in alone
+    assert "25% of the depth comes from the data" in alone
     assert "lower wire 7" in alone
     assert "not precise" in shown(dataclasses.replace(sound, precise=False), zoomed=False)
     assert "left out: lower wire 7" in shown(dataclasses.replace(sound, data_faults=(fault,)), zoomed=False)

@@ -22,6 +22,7 @@ from vcan_sim.fleet import Fleet
 from vcan_sim.scenes import PatchScene, bind_scene, load_scene, parse_scene
 from vcan_sim.scenes.motions import pose_at
 from vcan_sim.scenes.tables import TouchConfig
+from vcan_sim.scenes.window import solve_depth
 
 RADIUS_M, DEPTH_M = 20e-3, 50e-6
 CENTRE = [18e-3, 18e-3]
@@ -187,6 +188,29 @@ def test_wrench_is_that_of_the_tractions(slide: PatchScene) -> None:
 def test_a_touch_by_force_reaches_the_force(slide: PatchScene) -> None:
     for t in (0.5, 0.8, 1.1, 1.5, 1.7):
         assert -slide.truth(t).contacts[0].force_n[2] == pytest.approx(2.0, rel=0.005)
+
+
+@settings(max_examples=300, deadline=None)
+@given(
+    gap=st.floats(0.0, 5e-6),
+    power=st.floats(0.8, 4.0),
+    target=st.floats(1e-5, 100.0),
+    stiffness=st.floats(1e2, 1e9),
+)
+def test_the_depth_of_a_force_is_found_however_steeply_the_force_begins(
+    gap: float, power: float, target: float, stiffness: float
+) -> None:
+    def force_n(depth_m: float) -> float:  # a body whose lowest cells touch only below ``gap``
+        return float(1e-4 * stiffness * (max(depth_m - gap, 0.0) / 1e-4) ** power)
+
+    exact = gap + 1e-4 * (target / (1e-4 * stiffness)) ** (1.0 / power)
+    depth = solve_depth(force_n, target, (1e-3, force_n(1e-3)))
+    assert depth == pytest.approx(exact, rel=2e-4) or force_n(depth) == pytest.approx(target, rel=0.01)
+
+
+def test_a_force_ramps_up_from_nothing_on_a_few_cells() -> None:
+    truth = sphere({"force_n": 4.0, "ramp_s": 0.5, "to_s": 2.0}, friction=0.3).truth(1.0)
+    assert truth.wrench[2] == pytest.approx(-4.0, rel=0.01)
 
 
 def test_a_full_slide_has_the_shear_of_friction(slide: PatchScene) -> None:

@@ -145,7 +145,8 @@ def solve_depth(
     """Find the depth at which a force that increases with depth equals a target.
 
     The search takes bracketed secant steps on logarithms, because the contact force is nearly a power of
-    depth.
+    depth. Every second step halves the bracket, because the force rises far more steeply while only a few
+    cells touch.
 
     Args:
         force_n: Function from depth, metres, to force, N. The last call is at the returned depth.
@@ -159,7 +160,7 @@ def solve_depth(
     low, high = 0.0, math.inf
     last = known
     depth = float(known[0] * (target_n / known[1]) ** (2.0 / 3.0))
-    for _ in range(_SEARCHES):
+    for trial in range(_SEARCHES):
         force = force_n(depth)
         if abs(force - target_n) <= close * target_n:
             return depth
@@ -171,10 +172,13 @@ def solve_depth(
             return depth
         power = 1.5
         if force > 0.0 and last[1] > 0.0 and last[0] != depth and last[1] != force:
-            power = min(max(math.log(force / last[1]) / math.log(depth / last[0]), 0.7), 6.0)
+            power = min(max(math.log(force / last[1]) / math.log(depth / last[0]), 0.7), 60.0)
         last = (depth, force)
-        following = depth * (target_n / force) ** (1.0 / power) if force > 0.0 else 1.5 * depth
-        if not low < following < high:
+        following = (
+            depth * (target_n / force) ** (1.0 / power) if force > 0.0 else math.sqrt(depth * known[0])
+        )
+        halve = trial % 2 and low > 0.0 and math.isfinite(high)
+        if halve or not low < following < high:
             following = 0.5 * (low + high) if math.isfinite(high) else 1.5 * low
         depth = following
     raise ArithmeticError(

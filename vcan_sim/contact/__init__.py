@@ -5,8 +5,8 @@
     layer (elastic response of the surface) -> grid (response of cells to each other, by FFT)
         -> contact (pressure and friction under a body) -> surface displacement, force
 
-This room shares no code with a solver or its prior: it is the independent truth that solvers are tested
-against. Displacements are small: the surface moves, but bodies and cells stay on the undeformed plane.
-Coordinates: x and y along the surface, z outwards. A traction is a force per area on the skin, so a pressing
-one has a negative z.
+This package shares no code with the solvers or their prior, so it provides an independent ground truth for
+testing solvers. Displacements are assumed to be small: the contact is computed for bodies and cells on the
+undeformed plane. The x and y axes are along the surface, and z points outwards. A traction is a force per
+area on the skin; its z component is negative under a body that presses on the skin.
 """

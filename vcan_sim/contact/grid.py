@@ -1,7 +1,7 @@
-"""Cells of equal size on the surface, and their displacement under tractions on all of them, by FFT.
+"""Grid of square cells on the surface, and the displacement of the cells under tractions, computed by FFT.
 
-The convolution with the response of one cell is exact: padded with as many zeros as cells, the patch has no
-periodic neighbours (Liu, Wang and Liu, Wear 243, 101, 2000).
+The displacement is the convolution of the tractions with the response of one cell. Zero padding to at least
+twice the number of cells along each axis prevents wrap-around (Liu, Wang and Liu, Wear 243, 101, 2000).
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ from vcan_sim.contact.layer import Float, Layer, cell_response
 
 @dataclass(frozen=True, eq=False)
 class Grid:
-    """Response of a grid of square cells. Make one with :meth:`of`.
+    """Elastic response of a grid of square cells. Use :meth:`of` to create an instance.
 
     Attributes:
-        layer: The layer under the cells.
+        layer: Elastic layer under the cells.
         shape: Numbers of cells along x and y.
-        size_m: Side of a cell, metres.
+        size_m: Side length of a cell, metres.
     """
 
     layer: Layer
@@ -30,16 +30,16 @@ class Grid:
     size_m: float
     _padded: tuple[int, int]
     _response: Float
-    """(3, 3, …) Fourier transform of the response of one cell."""
+    """(3, 3, …) Fourier transform of one cell's displacement response."""
 
     @classmethod
     def of(cls, layer: Layer, shape: tuple[int, int], size_m: float) -> Grid:
-        """Compute the response of a grid.
+        """Compute the elastic response of a grid of square cells.
 
         Args:
-            layer: The layer under the cells.
+            layer: Elastic layer under the cells.
             shape: Numbers of cells along x and y.
-            size_m: Side of a cell, metres.
+            size_m: Side length of a cell, metres.
         """
         padded = (fft.next_fast_len(2 * shape[0], real=True), fft.next_fast_len(2 * shape[1], real=True))
         steps = [(np.arange(n) + m - 1) % n - (m - 1) for n, m in zip(padded, shape, strict=True)]
@@ -49,33 +49,34 @@ class Grid:
         return cls(layer, shape, size_m, padded, fft.rfft2(turned))
 
     def centres_m(self, origin_m: Float) -> Float:
-        """Return the centres (X, Y, 2) of the cells, metres, the first at ``origin_m`` (2,)."""
+        """Return the centres (X, Y, 2) of the cells, metres, with the first cell at ``origin_m`` (2,)."""
         x, y = (np.arange(n) * self.size_m for n in self.shape)
         return np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1) + origin_m
 
     def displacement_m(self, traction_pa: Float) -> Float:
-        """Return the displacement (3, X, Y), metres, under tractions (3, X, Y), Pa."""
+        """Return the cells' displacement (3, X, Y), metres, under tractions (3, X, Y), Pa."""
         waves = fft.rfft2(traction_pa, self._padded)
         moved = fft.irfft2(np.einsum("ijxy,jxy->ixy", self._response, waves), self._padded)
         return np.asarray(moved[:, : self.shape[0], : self.shape[1]])
 
     def normal_m(self, pressure_pa: Float) -> Float:
-        """Return how far the surface sinks (X, Y), metres, under a pressure (X, Y), Pa."""
+        """Return the indentation (X, Y) of the surface, metres, under a pressure (X, Y), Pa."""
         waves = self._response[2, 2] * fft.rfft2(pressure_pa, self._padded)
         return np.asarray(fft.irfft2(waves, self._padded)[: self.shape[0], : self.shape[1]])
 
     def shear_m(self, traction_pa: Float) -> Float:
-        """Return the displacement along the surface (2, X, Y), metres, under a shear (2, X, Y), Pa."""
+        """Return the tangential displacement (2, X, Y), metres, under shear tractions (2, X, Y), Pa."""
         waves = fft.rfft2(traction_pa, self._padded)
         moved = fft.irfft2(np.einsum("ijxy,jxy->ixy", self._response[:2, :2], waves), self._padded)
         return np.asarray(moved[:, : self.shape[0], : self.shape[1]])
 
     @functools.cached_property
     def largest_compliance(self) -> float:
-        """Upper bound of the eigenvalues of the response of any cells to shear, m/Pa.
+        """Upper bound of the eigenvalues of the cells' shear compliance, m/Pa, for any subset of the cells.
 
-        Power iteration on all cells, and a tenth more. The response of fewer cells is a part of this
-        symmetric matrix, so that its eigenvalues are not larger.
+        Power iteration over all cells estimates the largest eigenvalue; a margin of 10 % is added. The
+        compliance of a subset is a principal submatrix of this symmetric matrix, so its eigenvalues are not
+        larger.
         """
         vector = np.ones((2, *self.shape))
         largest = 0.0

@@ -1,6 +1,6 @@
-"""Elastic layer bonded to a rigid base: displacement of its surface under tractions on its surface.
+"""Elastic layer bonded to a rigid base: displacement of its surface under surface tractions.
 
-For a wave number k and x = k h, a surface traction of unit amplitude moves the surface by
+For a wave number k and x = k h, a surface traction of unit amplitude displaces the surface by
 
     normal, from normal        (1 − ν) / (G k) · (2κ sinh 2x − 4x) / D
     along k, from along k      (1 − ν) / (G k) · (2κ sinh 2x + 4x) / D
@@ -8,8 +8,8 @@ For a wave number k and x = k h, a surface traction of unit amplitude moves the 
     across k, from across k    tanh x / (G k)
 
 with κ = 3 − 4ν and D = 2κ cosh 2x + 4x² + 1 + κ²: the plane-strain solution of Navier's equations with a
-surface at z = h and no displacement at z = 0 (Johnson, Contact Mechanics, 1985, section 5.8;
-Bentall and Johnson, Int. J. Mech. Sci. 10, 637, 1968). For h → ∞ it is the half-space.
+surface at z = h and zero displacement at z = 0 (Johnson, Contact Mechanics, 1985, section 5.8;
+Bentall and Johnson, Int. J. Mech. Sci. 10, 637, 1968). In the limit h → ∞, the layer is a half-space.
 """
 
 from __future__ import annotations
@@ -26,19 +26,20 @@ from scipy.special import j0, j1
 Float = NDArray[np.float64]
 
 DEEPEST: Final = 14.0
-"""Largest x at which a layer differs from a half-space: by x² e^(−2x) < 2e-10."""
+"""Value of x = k h above which the responses of layer and half-space are equal; they differ by
+x² e^(−2x) < 2e-10."""
 STEPS: Final = 32
-"""Points of a table per thickness of the layer."""
+"""Number of points per layer thickness in a table of displacement versus distance."""
 NODES: Final = 16
-"""Nodes of Gauss-Legendre quadrature per panel."""
+"""Number of Gauss-Legendre quadrature nodes per panel."""
 
 
 @dataclass(frozen=True, slots=True)
 class Layer:
-    """An isotropic elastic layer on a rigid base.
+    """Isotropic elastic layer on a rigid base.
 
     Args:
-        thickness_m: Thickness, metres; inf for a half-space.
+        thickness_m: Thickness of the layer, metres; inf for a half-space.
         young_pa: Young's modulus, Pa.
         poisson: Poisson's ratio, at most 0.5.
 
@@ -56,30 +57,32 @@ class Layer:
             ("young_pa", self.young_pa, 0.0, 1e13),
         ):
             if not low < value <= high:
-                raise ValueError(f"{name} is {value}, allowed: larger than {low:g}, at most {high:g}")
+                raise ValueError(f"{name} is {value}, allowed: greater than {low:g}, at most {high:g}")
         if not 0.0 <= self.poisson <= 0.5:
             raise ValueError(f"poisson is {self.poisson}, allowed: 0 to 0.5")
 
     @property
     def shear_modulus_pa(self) -> float:
-        """Shear modulus G, Pa."""
+        """Shear modulus G of the layer, Pa."""
         return 0.5 * self.young_pa / (1.0 + self.poisson)
 
     @property
     def contact_modulus_pa(self) -> float:
-        """Contact modulus E* = E / (1 − ν²) of the layer against a rigid body, Pa."""
+        """Contact modulus E* = E / (1 − ν²) of the layer and a rigid body, Pa."""
         return self.young_pa / (1.0 - self.poisson**2)
 
     def response(self, wave_number_per_m: Float) -> tuple[Float, Float, Float, Float]:
-        """Return the four responses of the module's docstring, k times each, in 1/Pa.
+        """Return the layer's four surface responses, as in the module's docstring, multiplied by k, 1/Pa.
+
+        The order is: normal, along from along, along from normal, across.
 
         Args:
-            wave_number_per_m: Wave numbers k > 0, any shape.
+            wave_number_per_m: Wave numbers k > 0, 1/m, of any shape.
         """
         nu, modulus = self.poisson, self.shear_modulus_pa
         kappa = 3.0 - 4.0 * nu
         x = np.minimum(wave_number_per_m * self.thickness_m, 300.0)
-        fall = np.exp(-2.0 * x)  # all terms times 2 e^(−2x), which avoids an overflow
+        fall = np.exp(-2.0 * x)  # scales all terms by 2 e^(−2x), which avoids an overflow
         sinh, cosh = 1.0 - fall**2, 1.0 + fall**2
         below = 2.0 * kappa * cosh + 2.0 * fall * (4.0 * x**2 + 1.0 + kappa**2)
         scale = (1.0 - nu) / modulus
@@ -91,13 +94,13 @@ class Layer:
 
 
 class PointResponse:
-    """Displacement of the surface at a distance from a point force, apart from that of a half-space.
+    """Surface displacement due to a point force: the difference between a layer and a half-space.
 
-    The difference between a layer and a half-space is smooth, so it is tabulated over the distance.
+    The difference is a smooth function of the distance from the force and is therefore tabulated.
 
     Args:
-        layer: The layer, of finite thickness.
-        reach_m: Largest distance, metres.
+        layer: Elastic layer of finite thickness.
+        reach_m: Maximum distance from the force, metres.
     """
 
     def __init__(self, layer: Layer, reach_m: float) -> None:
@@ -115,7 +118,9 @@ class PointResponse:
             for own, other in zip(layer.response(k), half.response(np.full_like(k, np.inf)), strict=True)
         )
         tables = np.empty((4, len(r)))
-        for start in range(0, len(r), 64):  # a part at a time: all waves at all distances may not fit
+        for start in range(
+            0, len(r), 64
+        ):  # in blocks, because a table of all waves at all distances may exceed the memory
             waves = np.outer(r[start : start + 64], k)
             zeroth, first = j0(waves), j1(waves)
             second = np.where(waves > 1e-4, 2.0 * first / np.maximum(waves, 1e-4) - zeroth, 0.0)
@@ -132,20 +137,21 @@ class PointResponse:
 
 
 def cell_response(layer: Layer, offset_m: Float, size_m: float, reach_m: float) -> Float:
-    """Return the displacement at places due to a uniform unit traction on a square cell at the origin.
+    """Return the surface displacement due to a uniform unit traction on a square cell at the origin.
 
-    On a half-space it is the closed form for a rectangle (Love, Phil. Trans. A 228, 377, 1929; Johnson,
-    eq. 3.25, for all directions): the integrals of 1/R, x²/R³, y²/R³, xy/R³, x/R² and y/R². The difference to
-    a layer is smooth and integrated over the cell by Gauss-Legendre quadrature.
+    For a half-space, the displacement has a closed form (Love, Phil. Trans. A 228, 377, 1929; Johnson,
+    eq. 3.25, for all directions), which contains the integrals of 1/R, x²/R³, y²/R³, xy/R³, x/R² and y/R²
+    over a rectangle. The difference between layer and half-space is smooth and is integrated over the cell by
+    Gauss-Legendre quadrature.
 
     Args:
-        layer: The layer.
-        offset_m: (…, 2) places relative to the centre of the cell, metres.
-        size_m: Side of the cell, metres.
-        reach_m: Largest distance of a place, metres.
+        layer: Elastic layer.
+        offset_m: (…, 2) positions relative to the centre of the cell, metres.
+        size_m: Side length of the cell, metres.
+        reach_m: Maximum distance of a position from the centre of the cell, metres.
 
     Returns:
-        (…, 3, 3) displacement (first) per traction (last), m/Pa.
+        (…, 3, 3) displacement (first index) per traction (last index), m/Pa.
     """
     integrals = np.zeros((6, *offset_m.shape[:-1]))
     for sign_x in (-1.0, 1.0):
@@ -195,5 +201,5 @@ def cell_response(layer: Layer, offset_m: Float, size_m: float, reach_m: float) 
 
 
 def _product(length: Float, logarithm: Float) -> Float:
-    """Return the product, with the limit 0 where the length is 0 and the logarithm infinite."""
+    """Return length times logarithm, with the limit 0 where the length is 0 and the logarithm is infinite."""
     return np.where(length == 0.0, 0.0, length * logarithm)

@@ -1,11 +1,11 @@
 """Pressure and friction between a rigid body and the layer.
 
-Pressure: p ≥ 0 where the body touches, and no overlap elsewhere; the complementarity problem is solved by
-conjugate gradients on the cells in contact (Polonsky and Keer, Wear 231, 206, 1999). Friction: each cell in
-contact sticks, or slips with a shear of μ p against its slip (Coulomb). Given p, the shear minimises a convex
-function on discs of radius μ p, which is solved by accelerated projected gradients (Beck and Teboulle, SIAM
-Journal on Imaging Sciences 2, 183, 2009). Pressure and shear affect each other only a little; they are solved
-in turns.
+Pressure: p ≥ 0 where the body touches the surface, and body and surface do not overlap elsewhere. This
+complementarity problem is solved by conjugate gradients on the cells in contact (Polonsky and Keer, Wear 231,
+206, 1999). Friction: each cell in contact either sticks, or slips with a shear μ p that opposes the slip
+(Coulomb). For a given p, the shear minimises a convex function on discs of radius μ p; the minimum is found
+by accelerated projected gradients (Beck and Teboulle, SIAM Journal on Imaging Sciences 2, 183, 2009).
+Pressure and shear are only weakly coupled and are solved alternately.
 """
 
 from __future__ import annotations
@@ -19,28 +19,29 @@ from vcan_sim.contact.grid import Grid
 from vcan_sim.contact.layer import Float
 
 CLOSE: Final = 1e-6
-"""Default tolerance: largest overlap or gap of a cell in contact, relative to the largest overlap of the
-undeformed shapes."""
+"""Default tolerance of a contact: maximum overlap or gap of a cell in contact, relative to the maximum
+overlap of the undeformed shapes."""
 STEPS: Final = 400
-"""Maximum number of iterations."""
+"""Maximum number of iterations for the pressure or the shear."""
 TURNS: Final = 24
-"""Maximum number of turns of pressure and shear."""
+"""Maximum number of alternations between pressure and shear."""
 DAMPED: Final = 5
-"""Turns after which only half of a change is taken, because much friction on a thin layer oscillates."""
+"""Number of alternations after which only half of each change is applied, because the iteration oscillates
+with high friction on a thin layer."""
 
 
 class NoSolution(RuntimeError):
-    """The iteration did not reach its tolerance."""
+    """Contact iteration did not reach its tolerance."""
 
 
 @dataclass(frozen=True, eq=False)
 class Contact:
-    """State of a contact.
+    """State of a contact between a body and the skin.
 
     Attributes:
         traction_pa: (3, X, Y) tractions on the skin, Pa.
         displacement_m: (3, X, Y) displacement of the surface, metres.
-        sticks: (X, Y) cells in contact that do not slip.
+        sticks: (X, Y) whether a cell is in contact and does not slip.
     """
 
     traction_pa: Float
@@ -48,25 +49,26 @@ class Contact:
     sticks: np.ndarray
 
     def force_n(self, grid: Grid) -> Float:
-        """Return the force (3,) on the skin, N."""
+        """Return the contact's force (3,) on the skin, N."""
         return np.asarray(self.traction_pa.sum(axis=(1, 2)) * grid.size_m**2)
 
 
 def untouched(grid: Grid) -> Contact:
-    """Return the state of a skin that nothing touches."""
+    """Return the state of a skin without contact."""
     zero = np.zeros((3, *grid.shape))
     return Contact(zero, zero, np.zeros(grid.shape, bool))
 
 
 def press(grid: Grid, overlap_m: Float, start_pa: Float | None = None, *, close: float = CLOSE) -> Float:
-    """Return the pressure (X, Y), Pa, of a body without friction.
+    """Return the pressure (X, Y), Pa, under a frictionless body.
 
     Args:
-        grid: The cells.
-        overlap_m: (X, Y) how far the undeformed body would lie below the undeformed surface, metres; negative
-            outside.
-        start_pa: (X, Y) a pressure to start from, as of the step before.
-        close: Tolerance: largest overlap or gap of a cell in contact, relative to the largest overlap.
+        grid: Cells on the surface.
+        overlap_m: (X, Y) depth of the undeformed body below the undeformed surface, metres; negative where
+            the body is above the surface.
+        start_pa: (X, Y) initial guess of the pressure, such as that of the preceding time step, Pa.
+        close: Tolerance: maximum overlap or gap of a cell in contact, relative to the maximum of
+            ``overlap_m``.
 
     Raises:
         NoSolution: If the iteration does not converge.
@@ -89,7 +91,7 @@ def press(grid: Grid, overlap_m: Float, start_pa: Float | None = None, *, close:
         active = pressure > 0.0
         if max(float(np.abs(gap[active]).max(initial=0.0)), -float(gap.min())) < close * largest:
             return pressure
-        if not active.any():  # a start far too large has been lifted off everywhere
+        if not active.any():  # a far too large initial guess has left no cell in contact
             pressure, conjugate = _steepest(grid, gap), 0.0
             continue
         square = float((gap[active] ** 2).sum())
@@ -101,24 +103,27 @@ def press(grid: Grid, overlap_m: Float, start_pa: Float | None = None, *, close:
         entered = (pressure == 0.0) & (gap < 0.0)
         pressure[entered] -= step * gap[entered]
         conjugate = 0.0 if entered.any() else 1.0
-    raise NoSolution(f"no pressure within {STEPS} iterations: gap {np.abs(gap[active]).max():.2g} m")
+    raise NoSolution(
+        f"pressure did not converge in {STEPS} iterations: gap {np.abs(gap[active]).max():.2g} m"
+    )
 
 
 def _steepest(grid: Grid, gap_m: Float) -> Float:
-    """Return the pressure (X, Y), Pa, along the overlaps of a free surface that closes them best."""
+    """Return a pressure (X, Y), Pa, proportional to the overlaps and scaled to close them best."""
     direction = np.maximum(-gap_m, 0.0)
     return np.asarray(direction * ((direction**2).sum() / (grid.normal_m(direction) * direction).sum()))
 
 
 def rub(grid: Grid, limit_pa: Float, target_m: Float, start_pa: Float, *, close: float = CLOSE) -> Float:
-    """Return the shear (2, X, Y), Pa, of at most ``limit_pa`` that comes closest to a displacement.
+    """Return the shear (2, X, Y), Pa, limited to ``limit_pa``, that best produces a target displacement.
 
     Args:
-        grid: The cells.
-        limit_pa: (X, Y) μ p.
+        grid: Cells on the surface.
+        limit_pa: (X, Y) maximum shear μ p, Pa.
         target_m: (2, X, Y) displacement at which a cell sticks, metres.
-        start_pa: (2, X, Y) a shear to start from.
-        close: Ten times the largest change of a shear in the last iteration, relative to the largest limit.
+        start_pa: (2, X, Y) initial guess of the shear, Pa.
+        close: Tolerance: ten times the maximum change of shear in the last iteration, relative to the maximum
+            of ``limit_pa``.
 
     Raises:
         NoSolution: If the iteration does not converge.
@@ -140,15 +145,15 @@ def rub(grid: Grid, limit_pa: Float, target_m: Float, start_pa: Float, *, close:
         change = after - shear
         if float(np.abs(after - ahead).max()) < 0.1 * close * scale:
             return after
-        if float((change * (ahead - after)).sum()) > 0.0:  # O'Donoghue and Candès (2015): restart
+        if float((change * (ahead - after)).sum()) > 0.0:  # restart (O'Donoghue and Candès, 2015)
             weight = 1.0
         new = 0.5 * (1.0 + np.sqrt(1.0 + 4.0 * weight * weight))
         ahead = after + (weight - 1.0) / new * change
         shear, weight = after, new
-    raise NoSolution(f"no shear within {STEPS} iterations")
+    raise NoSolution(f"shear did not converge in {STEPS} iterations")
 
 
-def advance(  # noqa: PLR0913 - the last two steer the search
+def advance(  # noqa: PLR0913 - the last two control the search
     grid: Grid,
     last: Contact,
     overlap_m: Float,
@@ -158,16 +163,16 @@ def advance(  # noqa: PLR0913 - the last two steer the search
     start: Contact | None = None,
     close: float = CLOSE,
 ) -> Contact:
-    """Return the contact after a body moved a little.
+    """Return the contact after a small move of the body.
 
     Args:
-        grid: The cells.
-        last: State before.
+        grid: Cells on the surface.
+        last: State of the contact before the move.
         overlap_m: (X, Y) overlap of the undeformed shapes after the move, metres.
-        slide_m: (2,) or (2, X, Y) move of the body's surface along the skin, metres; the latter if the body
-            turns.
+        slide_m: Displacement of the body's surface along the skin, metres: (2,) without rotation, (2, X, Y)
+            with rotation of the body.
         friction: Coefficient of friction μ.
-        start: State to start the search from; default: ``last``. The result does not depend on it.
+        start: Initial guess of the contact; default: ``last``. The result does not depend on the guess.
         close: Tolerance of :func:`press` and :func:`rub`.
 
     Raises:
@@ -194,6 +199,6 @@ def advance(  # noqa: PLR0913 - the last two steer the search
         if turn >= DAMPED:
             by_shear[2] = 0.5 * (by_shear[2] + before)
     else:
-        raise NoSolution(f"pressure and shear did not agree within {TURNS} turns")
+        raise NoSolution(f"pressure and shear did not converge in {TURNS} alternations")
     sticks = (pressure > 0.0) & (np.hypot(*shear) < (1.0 - 1e-6) * friction * pressure)
     return Contact(np.concatenate([shear, -pressure[None]]), by_pressure + by_shear, sticks)

@@ -1,4 +1,4 @@
-"""Electrodes of a patch as they lie in the rubber, drawn from the imperfections."""
+"""Actual electrode positions of a simulated patch, with random deviations set by its imperfections."""
 
 from __future__ import annotations
 
@@ -13,23 +13,23 @@ from skinnode.model.layout import Float, PatchLayout
 from vcan_sim.skin.imperfections import Imperfections
 
 CLIPPED_AT: Final = 3.0
-"""Largest normal draw, standard deviations."""
+"""Maximum magnitude of a normal random draw, in standard deviations."""
 _LEAST_LEFT: Final = 0.1
-"""Least fraction of the gap between an upper electrode and the nearest lower electrode that must be left."""
+"""Minimum fraction of the nominal gap between an upper electrode and its nearest lower electrode."""
 
 
 @dataclass(frozen=True, eq=False)
 class Body:
-    """Positions of the electrodes at rest, as they are."""
+    """Actual positions of a patch's electrodes at rest."""
 
     upper_m: Float
-    """(U, N, 3) float64, m."""
+    """(U, N, 3) float64, m: upper electrodes."""
     lower_m: Float
-    """(K, M, 3) float64, m."""
+    """(K, M, 3) float64, m: lower electrodes."""
 
 
 class Draws:
-    """Random draws of one patch, with a stream for each imperfection.
+    """Random draws of one patch, with an independent stream for each imperfection.
 
     Args:
         seed: Seed of the imperfections.
@@ -40,20 +40,20 @@ class Draws:
         self._seed, self._number = seed, number
 
     def stream(self, name: str, *more: int) -> np.random.Generator:
-        """Return the generator of the imperfection ``name``, or of its occurrence number ``more``."""
+        """Return the random generator of the imperfection ``name``, or of its occurrence number ``more``."""
         return np.random.default_rng([self._seed, self._number, *name.encode(), *more])
 
     def normal(self, name: str, *shape: int) -> Float:
-        """Return standard normal draws of a shape, clipped at :data:`CLIPPED_AT`."""
+        """Return an array of the given shape with standard normal draws, clipped at :data:`CLIPPED_AT`."""
         drawn = self.stream(name).standard_normal(shape)
         return np.asarray(np.clip(drawn, -CLIPPED_AT, CLIPPED_AT))
 
 
 def made(layout: PatchLayout, imperfections: Imperfections, draws: Draws) -> Body:
-    """Return the electrodes of a patch as a workshop makes it.
+    """Return the electrode positions of a patch as manufactured.
 
-    Thickness and tilt move the upper electrodes along z by a fraction of their height over the nearest lower
-    electrode, on a curved patch too.
+    Errors of thickness and tilt move each upper electrode along z by a fraction of its height above the
+    nearest lower electrode, on flat and curved patches alike.
 
     Args:
         layout: Layout of the patch.
@@ -61,10 +61,10 @@ def made(layout: PatchLayout, imperfections: Imperfections, draws: Draws) -> Bod
         draws: Random draws of the patch.
 
     Returns:
-        The electrodes; the arrays of the layout where nothing moves them.
+        Actual electrode positions; the layout's own arrays if no imperfection moves the electrodes.
 
     Raises:
-        ConfigError: The draws leave too small a gap between an upper and a lower electrode.
+        ConfigError: If the draws leave too small a gap between an upper and a lower electrode.
     """
     sizes, upper, lower = imperfections, layout.upper_m, layout.lower_m
     if not (sizes.placement or sizes.along or sizes.thickness or sizes.tilt):
@@ -96,7 +96,7 @@ def made(layout: PatchLayout, imperfections: Imperfections, draws: Draws) -> Bod
 
 
 def _from_middle(points_m: Float) -> Float:
-    """Return x and y (U, N, 2) of points (U, N, 3), from −1 at one edge of the patch to 1 at the other."""
+    """Scale x and y of points (U, N, 3) to range from −1 at one edge of the patch to 1 at the other."""
     plane = points_m[..., :2]
     low, high = plane.min(axis=(0, 1)), plane.max(axis=(0, 1))
     half = 0.5 * (high - low)
@@ -104,7 +104,7 @@ def _from_middle(points_m: Float) -> Float:
 
 
 def _nearest(layout: PatchLayout) -> NDArray[np.intp]:
-    """Return the index (U, N) of the lower electrode, among all K M, that is nearest to each upper one."""
+    """Return the index (U, N), 0 to K M − 1, of the lower electrode nearest to each upper electrode."""
     gap = layout.upper_m[:, :, None] - layout.lower_m.reshape(-1, 3)
     return np.asarray(np.argmin((gap**2).sum(axis=-1), axis=-1))
 

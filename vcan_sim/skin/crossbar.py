@@ -1,16 +1,17 @@
-"""Resistances that a read-out of the crossbar measures, by nodal analysis of the whole network.
+"""Resistances measured by a crossbar read-out, computed by nodal analysis of the whole network.
 
-The nodes are the electrodes of the wires that have a resistance along them, a ladder from the connector at
-their first electrode, and the wires themselves otherwise. Each path between an upper and a lower electrode is
-a conductance C. In series with each wire are its contact, and the multiplexer or the input of the amplifier.
-With the conductances T of the ladders and connectors, the voltages v of the upper and w of the lower nodes
-obey Kirchhoff's current law (Ho, Ruehli and Brennan, IEEE Trans. Circuits Syst. 22, 1975):
+Each electrode of a resistive wire is a node; the wire forms a resistor ladder that starts at the connector. A
+wire without resistance is a single node. Each path between an upper and a lower electrode has a conductance
+C. In series with each wire are its contact and either a multiplexer (upper wires) or an amplifier input
+(lower wires). With the conductances T of the ladders and connectors, the voltages v of the upper nodes and w
+of the lower nodes obey Kirchhoff's current law (Ho, Ruehli and Brennan, IEEE Trans. Circuits Syst. 22, 1975):
 
     ⎡ A_u   −C ⎤ ⎡ v ⎤   ⎡ currents fed ⎤
     ⎢          ⎥ ⎢   ⎥ = ⎢              ⎥,    A_u = diag(C 1) + T_u,    A_l = diag(Cᵀ 1) + T_l
     ⎣ −Cᵀ  A_l ⎦ ⎣ w ⎦   ⎣ into nodes   ⎦
 
-A_l is tridiagonal, so w is eliminated first, and the Schur complement A_u − C A_l⁻¹ Cᵀ is solved for v.
+A_l is tridiagonal, so w is eliminated first; the system with the Schur complement A_u − C A_l⁻¹ Cᵀ is then
+solved for v.
 """
 
 from __future__ import annotations
@@ -25,12 +26,12 @@ from skinnode.model.layout import Float
 
 @dataclass(frozen=True, eq=False)
 class Side:
-    """Wires of one layer of a crossbar.
+    """Upper or lower wires of a crossbar, with their resistances.
 
     Args:
-        series_ohm: (W,) float64, ohm: resistance between the connector's far end and the wire's ladder or,
-            without a ladder, the wire: contact plus multiplexer or amplifier.
-        wire_ohm: Resistance of the wire per pitch, ohm; 0 for a wire that is a single node.
+        series_ohm: (W,) float64, ohm: resistance in series with each wire or its ladder: contact plus
+            multiplexer or amplifier input.
+        wire_ohm: Resistance of a wire per electrode pitch, ohm; 0 for wires that are single nodes.
         electrodes: Number of electrodes per wire.
     """
 
@@ -40,28 +41,28 @@ class Side:
 
     @property
     def nodes(self) -> int:
-        """Number of nodes per wire."""
+        """Number of network nodes per wire."""
         return self.electrodes if self.wire_ohm else 1
 
     @property
     def feed_ohm(self) -> Float:
-        """Resistance (W,) in ohm between the source and the first node."""
+        """Resistance (W,) in ohm between the source or amplifier and each wire's first node."""
         return np.asarray(self.series_ohm + self.wire_ohm)
 
     @property
     def ideal(self) -> bool:
-        """Whether nothing separates the wires from their sources or amplifiers."""
+        """Whether the wires have no resistance to their sources or amplifiers."""
         return not self.feed_ohm.any()
 
     def first(self) -> Float:
-        """Return the incidence (W nodes, W) of wires and their first nodes."""
+        """Return the incidence matrix (W · nodes, W): 1 for each wire's first node, 0 for all other nodes."""
         wires = len(self.series_ohm)
         found = np.zeros((wires * self.nodes, wires))
         found[np.arange(wires) * self.nodes, np.arange(wires)] = 1.0
         return found
 
     def diagonals(self, sums: Float, feed: Float | float) -> tuple[Float, Float]:
-        """Return diag(sums) + T as a diagonal (n,) and its upper neighbour (n,), whose first entry is unused.
+        """Return diag(sums) + T as diagonal (n,) and upper off-diagonal (n,), whose first entry is unused.
 
         Args:
             sums: (n,) float64, S: conductances of the paths at each node.
@@ -79,11 +80,11 @@ class Side:
 
 
 def grounded_ohm(conductance: Float, upper: Side, lower: Side) -> Float:
-    """Return the resistances (U, K) in ohm that amplifiers at the lower wires measure.
+    """Return the resistances (U, K) in ohm measured by amplifiers at the lower wires (read-out ``grounded``).
 
-    One upper wire after another is driven while the others are connected to ground. A reading is the driving
-    voltage divided by the current into the amplifier of the lower wire. Without series and wire resistances,
-    it is the resistance of the crossing.
+    The upper wires are driven one after another while all other upper wires are grounded. A reading is the
+    driving voltage divided by the current into the lower wire's amplifier. Without series and wire
+    resistances, a reading is the resistance of the crossing.
 
     Args:
         conductance: Conductances (upper nodes, lower nodes) of the paths between nodes, S.
@@ -105,11 +106,11 @@ def grounded_ohm(conductance: Float, upper: Side, lower: Side) -> Float:
 
 
 def floating_ohm(conductance: Float, upper: Side, lower: Side) -> Float:
-    """Return the resistances (U, K) in ohm of each pair of wires while all other wires float.
+    """Return the resistances (U, K) in ohm of each pair of wires while all others float (``floating``).
 
-    That is the effective resistance between two nodes of the network, Z_uu + Z_kk − 2 Z_uk, with the inverse
-    Z of the nodes' conductance matrix (Klein and Randić, J. Math. Chem. 12, 1993), plus the resistances in
-    series with the two wires.
+    A reading is the effective resistance between two nodes of the network, Z_uu + Z_kk − 2 Z_uk, with the
+    inverse Z of the nodes' conductance matrix (Klein and Randić, J. Math. Chem. 12, 1993), plus the
+    resistances in series with the two wires.
 
     Args:
         conductance: Conductances (upper nodes, lower nodes) of the paths between nodes, S.
@@ -121,7 +122,7 @@ def floating_ohm(conductance: Float, upper: Side, lower: Side) -> Float:
     solved = _tridiagonal(lower.diagonals(below, 0.0), np.hstack([conductance.T, ends]))
     across, own = np.split(solved, [len(above)], axis=1)
     schur = _dense(upper.diagonals(above, 0.0)) - conductance @ across
-    # the network floats: a constant added to all elements fixes the mean of v, and no difference changes
+    # the network floats: adding a constant to all elements fixes the mean of v but no voltage difference
     schur += above.mean()
     z = np.linalg.inv(schur)
     between = across[:: lower.nodes] @ z  # (K, upper nodes): Z_lu
@@ -132,7 +133,7 @@ def floating_ohm(conductance: Float, upper: Side, lower: Side) -> Float:
 
 
 def _driven(above: Float, upper: Side) -> Float:
-    """Return the voltages (upper nodes, U) per volt of the driven wire, with all lower nodes at ground."""
+    """Return the voltages (upper nodes, U) per volt on the driven wire, with all lower nodes grounded."""
     if upper.ideal:
         return upper.first()
     feed = 1.0 / upper.feed_ohm
@@ -140,7 +141,7 @@ def _driven(above: Float, upper: Side) -> Float:
 
 
 def _tridiagonal(diagonals: tuple[Float, Float], right: Float) -> Float:
-    """Solve a symmetric positive definite system with a tridiagonal matrix for the columns of ``right``."""
+    """Solve a symmetric positive definite tridiagonal system for the columns of ``right``."""
     diagonal, beside = diagonals
     if not beside.any():
         return np.asarray(right / diagonal[:, None])

@@ -1,18 +1,19 @@
 """Conductances between the electrodes of a patch.
 
-The exact patch has point electrodes, and a path between two of them at distance d has the resistance ρ d, so
-its conductance is 1 / (ρ d): the potential of a point. The same direct summation as ever, in
-:class:`ExactForward`, serves the exact patch. :class:`Paths` departs from it in two ways:
+An exact patch has point electrodes. The path between two point electrodes at distance d has the resistance
+ρ d, so its conductance is 1 / (ρ d): the potential of a point charge. :class:`ExactForward` computes the
+exact patch by direct summation. :class:`Paths` adds two effects:
 
 finite electrodes   A conducting disc of radius a has the potential arcsin(2a / (l₁ + l₂)) / a instead of 1/d,
                     where l₁ and l₂ are the distances to the nearest and the farthest point of its rim
-                    (Weber 1873; Jackson, Classical Electrodynamics, 3rd ed., problem 3.3). The potential of a
-                    disc averaged over another parallel disc, with its own charge 1/√(a² − r²), is to order a²
-                    that of one disc of radius √2 a, because each of them adds (a²/6) ∇²(1/d), the Laplacian
-                    taken in the plane. The next order is (a/d)⁴.
-strain              ρ of a path becomes ρ (1 + β ε), with the strain ε = d/d₀ − 1 of the path since rest: the
-                    linear piezoresistive law (Smith, Phys. Rev. 94, 1954) for each path separately. That is
-                    a model; it neglects strain across the path.
+                    (Weber 1873; Jackson, Classical Electrodynamics, 3rd ed., problem 3.3). The conductance
+                    between two discs averages this potential over a parallel disc with the charge density
+                    1/√(a² − r²). To order a², the average is the potential of one disc of radius √2 a,
+                    because each disc adds (a²/6) ∇²(1/d), with the Laplacian in the plane. The next order is
+                    (a/d)⁴.
+strain              ρ of a path becomes ρ (1 + β ε), with the path's strain ε = d/d₀ − 1 relative to rest: the
+                    linear piezoresistive law (Smith, Phys. Rev. 94, 1954) for each path separately. This
+                    simplified model neglects strain across the path.
 """
 
 from __future__ import annotations
@@ -26,10 +27,10 @@ from skinnode.model.layout import Float
 
 
 class ExactForward:
-    """Computes the resistances of a patch of point electrodes by direct summation.
+    """Resistances of a patch with point electrodes, by direct summation.
 
-    It shares no code with the solver's kernels, so truth and solver cannot have a bug in common. It is six
-    times as fast as the reference model because it allocates no (…, 3) temporaries.
+    This class shares no code with the solvers' kernels, so truth and solver cannot share a bug. It is six
+    times as fast as the reference model because it allocates no (…, 3) temporary arrays.
 
     Args:
         shape: (U, N, K, M): upper wires, electrodes per upper wire, lower wires, electrodes per lower wire.
@@ -56,20 +57,20 @@ class ExactForward:
 
 
 class Paths:
-    """Conductances of all paths between an upper and a lower electrode, at unit resistivity.
+    """Conductances of all paths between upper and lower electrodes, at unit resistivity.
 
     Args:
         upper_m: (U, N, 3) float64, m: upper electrodes at rest.
         lower_m: (K, M, 3) float64, m: lower electrodes.
         radius_m: Radius of the electrodes, m; 0 for points.
-        strain: β, relative change in resistivity per strain of a path.
+        strain: β, relative change in resistivity per unit strain of a path.
     """
 
     def __init__(self, upper_m: Float, lower_m: Float, radius_m: float, strain: float) -> None:
         self._lower = np.ascontiguousarray(lower_m.reshape(-1, 3).T)
         self._radius_m = math.sqrt(2.0) * radius_m
         self._strain = strain
-        # new arrays of this size would cost more time than the arithmetic, by mapping their pages
+        # reused work arrays: mapping the pages of new arrays would take longer than the arithmetic
         self._work = np.empty((3, upper_m.size // 3, self._lower.shape[1]))
         self._lock = threading.Lock()
         self._per_m: Float | None = None
@@ -77,12 +78,12 @@ class Paths:
             self._per_m = strain / np.sqrt(self._squares(upper_m)[1])
 
     def sums(self, upper_m: Float, shape: tuple[int, ...], axes: tuple[int, ...]) -> Float:
-        """Return sums of the conductances of paths.
+        """Return the conductances of the paths, summed over electrodes of the same wire.
 
         Args:
             upper_m: (U, N, 3) float64, m: upper electrodes.
             shape: (U, N, K, M).
-            axes: Axes to sum over, among 1 and 3.
+            axes: Axes of ``shape`` to sum over: 1, 3, both or none.
 
         Returns:
             (U, N or 1, K, M or 1) float64, 1/m; siemens when divided by the resistivity in ohm/m.
@@ -91,7 +92,7 @@ class Paths:
             return np.asarray(self._each(upper_m).reshape(shape).sum(axis=axes, keepdims=True))
 
     def _each(self, upper_m: Float) -> Float:
-        """Return the conductances (U N, K M) in 1/m, in an array that the next call overwrites."""
+        """Return the conductance of every path (U N, K M), 1/m, in an array that the next call overwrites."""
         plane, square = self._squares(upper_m)
         found: Float = self._work[2]
         with np.errstate(divide="ignore"):
@@ -107,7 +108,7 @@ class Paths:
         return found
 
     def _squares(self, upper_m: Float) -> tuple[Float, Float]:
-        """Return the squared distances (U N, K M) in m², within the x-y plane and in all, in work arrays."""
+        """Return the squared distances (U N, K M), m², in the x-y plane and in space, in reused arrays."""
         here, there = np.ascontiguousarray(upper_m.reshape(-1, 3).T), self._lower
         plane, square, gap = self._work
         for axis, out in ((0, plane), (1, gap), (2, square)):

@@ -1,4 +1,4 @@
-"""Amplifier and converter of a patch: gain, offset, noise and rounding."""
+"""Amplifier and converter of a simulated patch: gain, offset, noise and rounding."""
 
 from __future__ import annotations
 
@@ -12,19 +12,19 @@ from vcan_sim.skin.body import Draws
 from vcan_sim.skin.imperfections import Imperfections
 
 FULL_SCALE: Final = 2.0
-"""Full scale of the converter, in largest resistances at rest."""
+"""Full scale of the converter, as a multiple of the maximum resistance at rest."""
 
 
 class FrontEnd:
     """Amplifier and converter of one patch.
 
-    The amplifier is balanced at rest, so its gain acts on the change in each resistance. A gain of the whole
-    reading would do nothing: nodes send R divided by the R of their tare.
+    The amplifier is balanced at rest, so its gain error acts on the change in each resistance. A gain error
+    of the whole reading would have no effect, because nodes send R divided by the R of their baseline.
 
     Args:
         imperfections: Sizes of the errors.
         draws: Random draws of the patch.
-        rest_ohm: (U, K) float64, ohm: resistances at rest, as they reach the amplifier.
+        rest_ohm: (U, K) float64, ohm: resistances at rest at the amplifier's input.
     """
 
     def __init__(self, imperfections: Imperfections, draws: Draws, rest_ohm: Float) -> None:
@@ -42,17 +42,17 @@ class FrontEnd:
         self._amplifies = bool(imperfections.gain or imperfections.offset)
 
     def amplified_ohm(self, ohm: Float) -> Float:
-        """Return the resistances (U, K) in ohm that the converter's input stands for."""
+        """Return the resistances (U, K) in ohm at the converter's input, after gain and offset errors."""
         if not self._amplifies:
             return ohm
         return np.asarray(ohm + self._gain * (ohm - self._rest_ohm) + self._offset_ohm)
 
     def converted_ohm(self, ohm: Float, reading: int) -> Float:
-        """Return the resistances (U, K) in ohm that the converter returns.
+        """Return the resistances (U, K) in ohm at the converter's output.
 
         Args:
-            ohm: (U, K) float64, ohm: input of the converter.
-            reading: Number of the reading, at least 0, which decides the noise.
+            ohm: (U, K) float64, ohm: resistances at the converter's input.
+            reading: Number of the reading, at least 0, which seeds the noise.
         """
         if self._noise_ohm:
             ohm = ohm + self._noise_ohm * self._draws.stream("noise", reading).standard_normal(ohm.shape)

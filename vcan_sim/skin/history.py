@@ -1,6 +1,6 @@
 """Hysteresis and creep of the rubber: the displacement that a load causes depends on earlier loads.
 
-Both act on every coordinate of every electrode's displacement, hysteresis first:
+Hysteresis and creep act on each coordinate of each electrode's displacement, hysteresis first:
 
 hysteresis   the fraction w of the displacement passes through play operators in parallel, each of which
              follows its input only outside a band of ±r: p ← max(s − r, min(s + r, p)), p = 0 at first. The
@@ -10,10 +10,10 @@ creep        d = s + c₁ q₁ + c₂ q₂ with τᵢ dqᵢ/dt = s − qᵢ: a P
              (Findley, Lai and Onaran, Creep and Relaxation of Nonlinear Viscoelastic Materials, 1976,
              section 5.5). A step of s gives s (1 + Σ cᵢ (1 − exp(−t/τᵢ))).
 
-The electrodes move so: the result is their true displacement. The state advances at steps of
-:data:`STEP_S` from time 0, between which the output of the hysteresis is taken as linear; a time inside a
-step is reached by a partial step that is not kept. The result therefore depends on the time alone, not on the
-times that were asked before.
+The result is the true displacement of the electrodes. The state advances in time steps of :data:`STEP_S` from
+time 0, and the output of the hysteresis is assumed to be linear within a step. A time within a step is
+reached by a partial step that is not stored. The result therefore depends only on the time, not on earlier
+requests.
 """
 
 from __future__ import annotations
@@ -30,40 +30,41 @@ from skinnode.model.layout import Float
 from vcan_sim.skin.imperfections import Imperfections
 
 STEP_S: Final = 1.0 / 32.0
-"""Time step of the state, s; a power of two, so that the times of the steps are exact."""
+"""Time step of the rubber's state, s; a power of two, so that the times of all steps are exact."""
 THRESHOLDS: Final = (0.0025, 0.005, 0.01, 0.02)
-"""Thresholds r of the play operators, clearances; the operators have equal weights."""
+"""Thresholds r of the play operators, as fractions of the clearance; the operators have equal weights."""
 _RECENT: Final = 128
-"""Number of states of consecutive steps that are kept."""
+"""Number of most recent time steps whose states are stored."""
 _KEPT_EVERY: Final = 64
-"""Number of steps between the states that are kept longer: 2 s."""
+"""Number of time steps between the states that are stored longer: 2 s."""
 _KEPT: Final = 300
-"""Number of these states that are kept, for ten minutes; of the older ones, every ``_THINNED`` th."""
+"""Number of states that are stored longer: ten minutes. From older states, only every ``_THINNED``-th is
+kept."""
 _THINNED: Final = 64
 
 Load = Callable[[float], "Float | None"]
-"""Function of the time in s that returns the displacement (U, N, 3) in m that a rubber without memory would
-have, or None at rest."""
+"""Function of the time, s, that returns the displacement (U, N, 3), m, of rubber without memory, or None at
+rest."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class State:
-    """State of the rubber at one time; shapes start with that of the displacement (U, N, 3), in m."""
+    """State of the rubber at one instant, in m, for each coordinate (U, N, 3) of the displacement."""
 
     play: Float
     """(P, U, N, 3): outputs of the play operators."""
     followed: Float
     """(U, N, 3): displacement with hysteresis."""
     delayed: Float
-    """(2, U, N, 3): q of the two terms of creep."""
+    """(2, U, N, 3): delayed displacements q₁ and q₂ of the two creep terms."""
 
 
 class History:
-    """Displacement of the rubber's surface under a load that varies with time.
+    """Displacement of the rubber's surface, with hysteresis and creep, under a varying load.
 
     Args:
         imperfections: Sizes of hysteresis and creep.
-        clearance_m: Clearance of the layout, m, which scales the thresholds of the hysteresis.
+        clearance_m: Clearance between the layers in the layout, m, which scales the hysteresis thresholds.
     """
 
     def __init__(self, imperfections: Imperfections, clearance_m: float) -> None:
@@ -74,14 +75,15 @@ class History:
         self._load: Load | None = None
         self._kept: dict[int, State | None] = {}
         self._recent: OrderedDict[int, State | None] = OrderedDict()
-        self._lock = threading.Lock()  # a node reads while another thread asks for the truth
+        self._lock = threading.Lock()  # a node takes readings while another thread requests the truth
 
     def displacement_m(self, t_s: float, load: Load) -> Float | None:
-        """Return the displacement (U, N, 3) in m at ``t_s``, or None if nothing has happened yet.
+        """Return the rubber's displacement (U, N, 3), m, at ``t_s``; None if it has not been loaded yet.
 
         Args:
             t_s: Time since the start, s. Before 0 there is no history.
-            load: Displacement without memory, a pure function. Another function starts another history.
+            load: Displacement without memory, as a pure function of time. A different function restarts the
+                history.
         """
         if t_s < 0.0:
             return load(t_s)
@@ -98,7 +100,7 @@ class History:
         return np.asarray(state.followed + np.tensordot(self._creep, state.delayed, axes=1))
 
     def _at(self, step: int, load: Load) -> State | None:
-        """Return the state at a step, advanced from the nearest earlier state that is stored."""
+        """Return the state at a time step, advanced from the latest stored state at or before this step."""
         known = step
         while known >= 0 and known not in self._recent and known not in self._kept:
             known -= 1
@@ -123,7 +125,7 @@ class History:
             self._recent.popitem(last=False)
 
     def _advanced(self, state: State | None, load_m: Float | None, dt_s: float) -> State | None:
-        """Return the state ``dt_s`` later, at which the load is ``load_m``."""
+        """Return the state ``dt_s`` later, when the load is ``load_m``."""
         if state is None:
             if load_m is None:
                 return None
@@ -139,6 +141,6 @@ class History:
             return State(play, followed, state.delayed)
         risen = -np.expm1(-dt_s / self._creep_s)
         lag = (followed - state.followed) * (self._creep_s / dt_s)
-        # exact for a load that is linear within the step
+        # exact if the displacement with hysteresis is linear within the step
         delayed = followed - lag * risen + (state.delayed - state.followed) * (1.0 - risen)
         return State(play, followed, delayed)

@@ -1,4 +1,4 @@
-"""Sizes of all imperfections of a patch, as data."""
+"""Sizes of all imperfections of a simulated patch, as data."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ _LIMITS: Final[dict[str, tuple[float, float, str]]] = {
     "row_time_s": (0.0, 1.0, "s"),
     "noise": (0.0, 0.01, ""),
 }
-"""Least value, greatest value and unit of each number."""
+"""Minimum, maximum and unit of each numeric imperfection."""
 _OF_NETWORK: Final = (
     "contact_ohm",
     "upper_wire_ohm",
@@ -42,85 +42,87 @@ _OF_NETWORK: Final = (
     "multiplexer_ohm",
     "virtual_ground_ohm",
 )
-"""Resistances that exist only in a read-out through the network."""
+"""Resistances that exist only with the read-outs ``grounded`` and ``floating``."""
 _WITHOUT_SIZE: Final = ("seed", "temperature_per_k", "warming_s", "creep_s")
-"""Fields that change nothing while every size is zero."""
+"""Fields that have no effect while every size is zero."""
 _BITS: Final = (8, 32)
 
 
 @dataclass(frozen=True, slots=True)
 class Imperfections:
-    """Sizes by which a simulated patch departs from its layout; all zero means exact.
+    """Sizes of a simulated patch's deviations from its layout; if all are zero, the patch is exact.
 
-    A size that is *drawn* is the standard deviation of normal draws, which are clipped at three standard
-    deviations. Each imperfection has its own random stream, so that switching one on does not change the
-    others.
+    A size marked *drawn* is the standard deviation of normal random draws, which are clipped at three
+    standard deviations. Each imperfection has its own random stream, so enabling one imperfection does not
+    change the others.
 
     Raises:
-        ConfigError: A value is of the wrong type or out of range, or a resistance of the network is given
-            with the read-out ``ideal``.
+        ConfigError: If a value has the wrong type or is out of range, or a resistance of the network is
+            nonzero with the read-out ``ideal``.
     """
 
     seed: int = 1
-    """Random seed. The patches of a hand differ although they have the same seed."""
+    """Random seed of the imperfections. The patches of a hand differ although they share the seed."""
 
     # --- geometry
     placement: float = 0.0
-    """Position of each upper and lower wire along x, y and z, pitches; drawn."""
+    """Position error of each upper and lower wire along x, y and z, pitches; drawn."""
     along: float = 0.0
-    """Position of each electrode along its wire, pitches; drawn."""
+    """Position error of each electrode along its wire, pitches; drawn."""
     thickness: float = 0.0
-    """Thickness of the layer, as a fraction of the clearance; drawn."""
+    """Thickness error of the rubber, as a fraction of the clearance between the layers; drawn."""
     tilt: float = 0.0
     """Rise of the upper layer from the middle of the patch to its edge, along x and along y, as a fraction of
-    the clearance; drawn."""
+    the clearance between the layers; drawn."""
     electrode_radius: float = 0.0
     """Radius of the electrodes, which are conducting discs parallel to the x-y plane, pitches."""
 
     # --- rubber
     strain: float = 0.0
-    """Relative change in resistivity per strain of a path between two electrodes."""
+    """Relative change in resistivity per unit strain of a path between two electrodes."""
     warming_k: float = 0.0
-    """Final rise in temperature since the scene's start, K; approached exponentially."""
+    """Final rise in temperature after the scene starts, K; the temperature approaches it exponentially."""
     temperature_per_k: float = 2e-3
-    """Relative change in resistivity per kelvin; acts with ``warming_k``."""
+    """Relative change in resistivity per kelvin; has an effect only with ``warming_k``."""
     warming_s: float = 300.0
     """Time constant of the rise in temperature, s."""
     creep: tuple[float, float] = (0.0, 0.0)
-    """Delayed displacement of the fast and the slow term, as fractions of the immediate displacement."""
+    """Delayed displacements of the fast and the slow creep term, as fractions of the immediate
+    displacement."""
     creep_s: tuple[float, float] = (0.3, 10.0)
-    """Time constants of the two terms of creep, s."""
+    """Time constants of the fast and the slow creep term, s."""
     hysteresis: float = 0.0
-    """Fraction of the displacement that passes through play operators."""
+    """Fraction of the displacement that is subject to hysteresis (play operators)."""
 
     # --- read-out
     gain: float = 0.0
-    """Gain of the amplifier, as a fraction of the change in each resistance since rest; drawn: half of the
-    variance is common to the patch, half independent for each upper wire."""
+    """Gain error of the amplifier, as a fraction of the change in each resistance since rest; drawn. Half of
+    the variance is common to the whole patch; the other half is independent for each upper wire."""
     offset: float = 0.0
-    """Offset of the readings of each upper wire, as a fraction of the median resistance at rest; drawn."""
+    """Offset error of each upper wire's readings, as a fraction of the median resistance at rest; drawn."""
     readout: Readout = "ideal"
-    """``ideal``: each pair of wires is measured as if it were alone. ``grounded``: one upper wire is driven,
-    the others are at ground, and every lower wire ends in an amplifier. ``floating``: one pair of wires is
-    measured while all other wires float, so that sneak paths are in parallel to the pair."""
+    """Read-out of the crossbar. ``ideal``: each pair of wires is measured as if isolated. ``grounded``: one
+    upper wire is driven, the other upper wires are grounded, and each lower wire has an amplifier.
+    ``floating``: one pair of wires is measured while all other wires float, so sneak paths are in parallel
+    with the pair."""
     contact_ohm: float = 0.0
-    """Mean contact resistance at the connector of each wire; a wire's is drawn uniformly from half to one and
-    a half times the mean."""
+    """Mean contact resistance at the connector of each wire, ohm. Each wire's resistance is drawn uniformly
+    from 0.5 to 1.5 times the mean."""
     upper_wire_ohm: float = 0.0
-    """Resistance of an upper wire per electrode pitch, and from the connector to the first electrode."""
+    """Resistance of an upper wire per electrode pitch, and from the connector to the first electrode, ohm."""
     lower_wire_ohm: float = 0.0
-    """Resistance of a lower wire per electrode pitch, and from the connector to the first electrode."""
+    """Resistance of a lower wire per electrode pitch, and from the connector to the first electrode, ohm."""
     multiplexer_ohm: float = 0.0
-    """On-resistance of the multiplexer that connects each upper wire."""
+    """On-resistance of the multiplexer at each upper wire, ohm."""
     virtual_ground_ohm: float = 0.0
-    """Input resistance of the amplifier at each lower wire; an ideal virtual ground has none."""
+    """Input resistance of the amplifier at each lower wire, ohm; 0 for an ideal virtual ground."""
     row_time_s: float = 0.0
     """Time between the samples of neighbouring upper wires, s."""
     noise: float = 0.0
-    """Standard deviation of the converter's noise, as a fraction of its full scale; adds to the noise of the
-    scene, which is relative to the reading."""
+    """Standard deviation of the converter's noise, as a fraction of its full scale. This noise adds to the
+    scene's noise, which is relative to the reading."""
     bits: int = 0
-    """Resolution of the converter, from 8 to 32 bits; 0: no rounding."""
+    """Resolution of the converter, 8 to 32 bits; 0: no rounding."""
 
     def __post_init__(self) -> None:
         for name in ("seed", "bits"):
@@ -146,17 +148,17 @@ class Imperfections:
 
     @classmethod
     def ordinary(cls, seed: int = 1) -> Self:
-        """Return the sizes of a patch from a good workshop, as ``tolerances = "ordinary"`` states them.
+        """Return the sizes of a carefully manufactured patch, consistent with ``tolerances = "ordinary"``.
 
-        The gain, the placement, the thickness and the radius are those of
+        Gain, placement, thickness and electrode radius are the values of
         :data:`skinnode.model.tolerances.ORDINARY`; the other sizes are assumptions. The temperature is
-        constant and the read-out ideal, because the tolerances do not cover their effects.
+        constant and the read-out is ideal, because the tolerances do not cover their effects.
 
         Args:
             seed: Random seed.
 
         Raises:
-            ConfigError: The seed is not an integer of at least 0.
+            ConfigError: If the seed is not an integer of at least 0.
         """
         return cls(
             seed=seed,
@@ -176,14 +178,15 @@ class Imperfections:
 
     @classmethod
     def from_table(cls, table: Mapping[str, Any], key: str = "imperfections") -> Self:
-        """Return the imperfections of a TOML table.
+        """Return the imperfections defined by a TOML table.
 
         Args:
-            table: Fields by name. ``ordinary = true`` starts from :meth:`ordinary` instead of zero.
-            key: Path of the table, for messages.
+            table: Values by field name. With ``ordinary = true``, missing fields come from :meth:`ordinary`
+                instead of the defaults.
+            key: Path of the table, for error messages.
 
         Raises:
-            ConfigError: A key is unknown, or a value is invalid.
+            ConfigError: If a key is unknown or a value is invalid.
         """
         names = [field.name for field in dataclasses.fields(cls)]
         values = dict(table)
@@ -204,7 +207,7 @@ class Imperfections:
 
 
 def _checked(name: str, value: object, least: float, greatest: float, unit: str) -> object:
-    """Return a number as a float, or a pair of them as a tuple. Raises ConfigError if it is not allowed."""
+    """Return a number as a float, or a pair as a tuple. Raises ConfigError if the value is not allowed."""
     allowed = f"a number from {least:g} to {greatest:g} {unit}".rstrip()
     if not name.startswith("creep"):
         return _number(name, value, least, greatest, allowed)
@@ -214,11 +217,11 @@ def _checked(name: str, value: object, least: float, greatest: float, unit: str)
 
 
 def _number(name: str, value: object, least: float, greatest: float, allowed: str) -> float:
-    """Return a value as a float. Raises ConfigError if it is not a number from ``least`` to ``greatest``."""
+    """Return a number as a float. Raises ConfigError if the value is not from ``least`` to ``greatest``."""
     if isinstance(value, bool) or not isinstance(value, int | float) or not least <= value <= greatest:
         raise ConfigError(name, value, allowed)
     return float(value)
 
 
 EXACT: Final = Imperfections()
-"""A patch that equals its layout."""
+"""Imperfections of an exact patch, which equals its layout."""

@@ -1,4 +1,4 @@
-"""Resistances of a patch as it was made, at any time of a scene."""
+"""Resistances of a patch as manufactured, at any time of a scene."""
 
 from __future__ import annotations
 
@@ -17,32 +17,32 @@ from vcan_sim.skin.history import History
 from vcan_sim.skin.imperfections import EXACT, Imperfections
 
 ROW_STEP_S: Final = 1e-3
-"""Maximum time over which the motion between the samples of two upper wires is taken as linear, s."""
+"""Maximum time over which the electrodes' motion during a scan is assumed to be linear, s."""
 
 Surface = Callable[[float], Float]
-"""Function of the time in s that returns the upper electrodes (U, N, 3) in m of a patch that equals its
-layout: ``layout.upper_m`` itself at rest, as :meth:`vcan_sim.scene.Scene.upper_m` does."""
+"""Function of the time, s, that returns the upper electrodes (U, N, 3), m, of an exact patch. At rest it
+returns ``layout.upper_m`` itself, as :meth:`vcan_sim.scene.Scene.upper_m` does."""
 
 
 class PhysicalPatch:
-    """A patch as it was made, and its read-out.
+    """Patch as manufactured, with its read-out.
 
-    An electrode moves as the same electrode of the exact patch does, although the body lies elsewhere by its
-    placement; hysteresis and creep change that motion. The same arguments give the same bytes in whatever
-    order times are asked. With exact imperfections, the resistances are those of :class:`ExactForward`, to
-    the bit and at its cost.
+    Each electrode is displaced by as much as the same electrode of the exact patch, despite its placement
+    error; hysteresis and creep change this displacement. The same arguments produce the same bytes, in
+    whatever order times are requested. Without imperfections, the resistances are bit-identical to those of
+    :class:`ExactForward`, at the same cost.
 
-    In a read-out through the network, the paths of each upper wire are those at the time of its own sample;
-    while another upper wire is sampled, they differ by the motion in the meantime, which changes sneak
-    currents only.
+    With the read-outs ``grounded`` and ``floating``, the conductances of an upper wire's paths are taken at
+    the time when that wire is sampled, also while another upper wire is sampled. The error affects only sneak
+    currents.
 
     Args:
-        layout: Layout of the patch, which a host knows.
-        imperfections: Departures from the layout.
-        number: Number of the patch in the hand; each number has its own draws.
+        layout: Nominal layout of the patch, as in the hand file.
+        imperfections: Deviations from the layout.
+        number: Number of the patch in the hand; each patch has its own random draws.
 
     Raises:
-        ConfigError: The draws leave too small a gap between an upper and a lower electrode.
+        ConfigError: If the draws leave too small a gap between an upper and a lower electrode.
     """
 
     def __init__(self, layout: PatchLayout, imperfections: Imperfections = EXACT, number: int = 0) -> None:
@@ -50,9 +50,9 @@ class PhysicalPatch:
         draws = Draws(imperfections.seed, number)
         body = made(layout, imperfections, draws)
         self.rest_m: Final = body.upper_m
-        """(U, N, 3) float64, m: upper electrodes at rest, as they lie."""
+        """(U, N, 3) float64, m: actual positions of the upper electrodes at rest."""
         self.lower_m: Final = body.lower_m
-        """(K, M, 3) float64, m: lower electrodes, as they lie."""
+        """(K, M, 3) float64, m: actual positions of the lower electrodes."""
         self._electrodes = (*layout.upper_m.shape[:2], *layout.lower_m.shape[:2])
         self._exact = ExactForward(self._electrodes, body.lower_m, layout.resistivity_ohm_per_m)
         self._pointlike = not (
@@ -69,21 +69,22 @@ class PhysicalPatch:
         at_rest_ohm = self._network_ohm(body.upper_m, cold)
         self._front_end = FrontEnd(imperfections, draws, at_rest_ohm)
         self.rest_ohm: Final = self._front_end.amplified_ohm(at_rest_ohm)
-        """(U, K) float64, ohm: resistances at rest at time 0, before the converter; read-only."""
+        """(U, K) float64, ohm: resistances at rest at time 0 at the converter's input; read-only."""
         for shared in (self.rest_m, self.lower_m, self.rest_ohm):
             shared.setflags(write=False)
 
     def upper_m(self, t_s: float, upper_m_at: Surface) -> Float:
-        """Return the true positions of the upper electrodes while the patch is scanned.
+        """Return the true positions of the upper electrodes during a scan of the patch.
 
         Args:
-            t_s: Time of the scan since the scene's start, s: the sample of the first upper wire.
-            upper_m_at: Motion of the exact patch, a pure function.
+            t_s: Scene time at which the first upper wire is sampled, s.
+            upper_m_at: Motion of the exact patch, as a pure function of time.
 
         Returns:
             (U, N, 3) float64, m: upper wire u at ``t_s + u · row_time_s``; ``layout.upper_m`` itself if the
-            patch lies exactly and rests. Subtract :attr:`rest_m` for the displacement, which a solver
-            estimates; the positions themselves depend on the placement, which no solver knows.
+            electrodes have no position errors and the patch is at rest. Subtract :attr:`rest_m` to obtain the
+            displacement, which solvers estimate. The positions also contain the placement errors, which are
+            unknown to solvers.
         """
         if not self.imperfections.row_time_s:
             return self._upper_m(t_s, upper_m_at)
@@ -98,11 +99,11 @@ class PhysicalPatch:
         return np.asarray((1.0 - share) * every[span, wires] + share * every[span + 1, wires])
 
     def analogue_ohm(self, t_s: float, upper_m_at: Surface) -> Float:
-        """Return the resistances (U, K) in ohm that the converter's input stands for.
+        """Return the resistances (U, K) in ohm at the converter's input.
 
         Args:
-            t_s: Time of the scan since the scene's start, s.
-            upper_m_at: Motion of the exact patch, a pure function.
+            t_s: Scene time of the scan, s.
+            upper_m_at: Motion of the exact patch, as a pure function of time.
         """
         upper_m = self.upper_m(t_s, upper_m_at)
         if upper_m is self.rest_m and not self.imperfections.warming_k:
@@ -110,30 +111,30 @@ class PhysicalPatch:
         return self._front_end.amplified_ohm(self._network_ohm(upper_m, self._warmth(t_s)))
 
     def converted_ohm(self, analogue_ohm: Float, reading: int) -> Float:
-        """Return what the converter makes of the resistances at its input.
+        """Return the resistances at the converter's output for the resistances at its input.
 
         Args:
-            analogue_ohm: (U, K) float64, ohm.
-            reading: Number of the reading, at least 0, which decides the noise.
+            analogue_ohm: (U, K) float64, ohm: resistances at the converter's input.
+            reading: Number of the reading, at least 0, which seeds the noise.
 
         Returns:
-            (U, K) float64, ohm; the same array if the converter is exact.
+            (U, K) float64, ohm; the input array itself if the converter is exact.
         """
         return self._front_end.converted_ohm(analogue_ohm, reading)
 
     def resistance_ohm(self, t_s: float, upper_m_at: Surface) -> Float:
-        """Return the resistances (U, K) in ohm that the converter returns for a scan.
+        """Return the resistances (U, K) in ohm at the converter's output for one scan.
 
-        The noise is decided by the time in whole nanoseconds.
+        The scene time in whole nanoseconds seeds the noise.
 
         Args:
-            t_s: Time of the scan since the scene's start, s.
-            upper_m_at: Motion of the exact patch, a pure function.
+            t_s: Scene time of the scan, s.
+            upper_m_at: Motion of the exact patch, as a pure function of time.
         """
         return self.converted_ohm(self.analogue_ohm(t_s, upper_m_at), abs(round(t_s * 1e9)))
 
     def _upper_m(self, t_s: float, upper_m_at: Surface) -> Float:
-        """Return the true positions (U, N, 3) at one time; ``rest_m`` itself at rest."""
+        """Return the true positions (U, N, 3), m, of the upper electrodes; ``rest_m`` itself at rest."""
         layout_m = self.layout.upper_m
         if self._history is None:
             upper = upper_m_at(t_s)
@@ -144,14 +145,14 @@ class PhysicalPatch:
         return self.rest_m if moved is None else np.asarray(self.rest_m + moved)
 
     def _warmth(self, t_s: float) -> Float:
-        """Return the resistivity (U, 1) of the paths of each upper wire at its sample, relative to time 0."""
+        """Return the resistivity (U, 1), relative to time 0, at the time when each upper wire is sampled."""
         sizes = self.imperfections
         since_s = np.maximum(t_s + self._row_s, 0.0)
         risen_k = -sizes.warming_k * np.expm1(-since_s / sizes.warming_s)
         return np.asarray(1.0 + sizes.temperature_per_k * risen_k)[:, None]
 
     def _network(self, draws: Draws) -> tuple[Side, Side]:
-        """Return the upper and the lower wires with their resistances."""
+        """Return the upper and the lower wires of the crossbar, with their series resistances."""
         sizes = self.imperfections
         upper, per_upper, lower, per_lower = self._electrodes
         contact_ohm = sizes.contact_ohm * draws.stream("contacts").uniform(0.5, 1.5, upper + lower)
@@ -161,11 +162,11 @@ class PhysicalPatch:
         )
 
     def _network_ohm(self, upper_m: Float, warmth: Float) -> Float:
-        """Return the resistances (U, K) in ohm that reach the amplifier.
+        """Return the resistances (U, K) in ohm at the amplifier's input.
 
         Args:
             upper_m: (U, N, 3) float64, m: upper electrodes.
-            warmth: (U, 1) float64: resistivity relative to the layout's.
+            warmth: (U, 1) float64: resistivity relative to that of the layout.
         """
         if self._pointlike:
             exact_ohm = self._exact(upper_m)
@@ -182,9 +183,9 @@ class PhysicalPatch:
 
 
 class _Motion:
-    """Displacement of the exact patch as a function of time; None at rest.
+    """Displacement of an exact patch as a function of time; None at rest.
 
-    Two motions are equal if they wrap the same function, so that the history knows a new scene.
+    Two motions are equal if they wrap the same function, so that :class:`History` can detect a new scene.
     """
 
     __slots__ = ("_layout_m", "_upper_m_at")
@@ -199,4 +200,4 @@ class _Motion:
     def __eq__(self, other: object) -> bool:
         return isinstance(other, _Motion) and self._upper_m_at == other._upper_m_at
 
-    __hash__ = None  # type: ignore[assignment]  # equal by a function that need not be hashable
+    __hash__ = None  # type: ignore[assignment]  # the wrapped function need not be hashable

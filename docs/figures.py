@@ -115,7 +115,7 @@ def path(figures: dict[str, Any]) -> str:
         "The paper reports 2.03 s."
     )
     wrong = sum(row["wrong"] for setting in figures["settings"] for row in _all_rows(setting))
-    parts.append(f"Converged and wrong, all settings and schedules: {wrong}.")
+    parts.append(f"Wires CONVERGED but wrong, over all settings and schedules: {wrong}.")
     return "\n\n".join(parts)
 
 

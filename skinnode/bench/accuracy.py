@@ -1,4 +1,4 @@
-"""Accuracy, speed and calibration of the reported uncertainty, each figure next to its requirement."""
+"""Measures accuracy, speed and the calibration of the reported uncertainty, and checks the requirements."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ COVERAGE_LIMITS: Final = (0.90, 0.98)
 ERROR_LIMITS: Final = {"staggered": 0.03, "aligned": 0.10}
 """Maximum error of the posterior on each layout, for a 10 % press at h = 0.5 with relative noise 1e-5."""
 SCENES_A_CELL: Final = 25
-"""Ratio of scenes per coverage row to scenes per cell of the noise and code tables (at least 3 per cell). The
-RMS over a single scene already covers 300 coordinates."""
+"""Number of scenes per coverage row divided by the number per cell of the noise and code tables. A cell needs
+few scenes, because each scene contributes 300 coordinates to the RMS error; the minimum is 3 scenes."""
 
 
 def run(scenes: int, rounds: int) -> dict[str, Any]:
-    """Run the benchmark and return its figures.
+    """Run the accuracy benchmark and return its results.
 
     Args:
         scenes: Number of random scenes for each row of the coverage table.
-        rounds: Number of measurements of each candidate.
+        rounds: Number of times that each solver is timed.
     """
     few = max(3, scenes // SCENES_A_CELL)
     coverage, parts = noise.coverage(scenes)
@@ -47,7 +47,7 @@ def run(scenes: int, rounds: int) -> dict[str, Any]:
 
 
 def requirements(figures: dict[str, Any]) -> list[dict[str, Any]]:
-    """Return a row for each requirement: name, figure, limit as text, and whether the figure meets the limit.
+    """Return a row for each requirement: name, measured value, limit as text, and whether the limit is met.
 
     A time requirement is ``absolute``: it depends on the machine, so failing to meet it is not an error.
     """
@@ -98,12 +98,12 @@ def print_all(figures: dict[str, Any], echo: Callable[[str], object]) -> None:
 
 
 def _text(value: float | None) -> str:
-    """Return a fraction as a percentage, whatever its size, so that a whole column uses one unit."""
+    """Format a fraction as a percentage, so that all rows of a column have the same unit."""
     return "-" if value is None else f"{100.0 * value:.3g}%"
 
 
 def _print_front(panels: list[dict[str, Any]], echo: Callable[[str], object]) -> None:
-    echo(f"\nfour wires, no noise: each solver's fastest way to {ACCURACY:.0e}; *: on the Pareto front")
+    echo(f"\nfour wires, no noise: each solver's fastest result with error {ACCURACY:.0e}; *: Pareto front")
     for panel in panels:
         echo(f"  {panel['scene']:32}{'':22}{'tolerance':>10}{'µs per wire':>11}{'error':>10}")
         for row in best_of_each(panel["rows"]):
@@ -117,7 +117,7 @@ def _print_front(panels: list[dict[str, Any]], echo: Callable[[str], object]) ->
 
 
 def best_of_each(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return each solver's fastest row that reaches ACCURACY or, if none does, its most accurate row."""
+    """Return each solver's fastest row that reaches ACCURACY, or else its most accurate row."""
 
     def rank(row: dict[str, Any]) -> tuple[bool, float]:
         error = float("inf") if row["error"] is None else row["error"]
@@ -145,7 +145,7 @@ def _print_noise(rows: list[dict[str, Any]], echo: Callable[[str], object]) -> N
 
 
 def _print_codes(rows: list[dict[str, Any]], echo: Callable[[str], object]) -> None:
-    echo("\nthe same with codes of R/R0 from 0.25 to 1.25")
+    echo("\n10% press, with codes of R/R0 from 0.25 to 1.25")
     echo(f"  {'layout':16}{'bits':>7}{'exact':>20}{'conv.':>7}{'posterior':>20}{'conv.':>7}")
     for exact, posterior in _pairs(rows):
         echo(
@@ -164,7 +164,7 @@ def _cell(row: dict[str, Any]) -> str:
 
 
 def _print_coverage(rows: list[dict[str, Any]], echo: Callable[[str], object]) -> None:
-    echo("\nrandom scenes: one or two bodies, sharp or blunt, anywhere, 5 to 30% deep")
+    echo("\nrandom scenes: one or two sharp or blunt bodies at random positions, 5 to 30% deep")
     echo(
         f"  {'layout':16}{'noise':>7} {'method':10}{'scenes':>7}{'conv.':>7}{'error':>10}{'reported':>10}"
         f"{'ratio':>7}{'in 95 %':>9}"
@@ -193,13 +193,13 @@ def _print_coverage(rows: list[dict[str, Any]], echo: Callable[[str], object]) -
                 for name in ("normal", "shear")
                 if f"{name}_error" in row
             )
-            right = f"{row['contacts_right']:.0%} with the right number of contacts"
+            right = f"{row['contacts_right']:.0%} of scenes with the right number of contacts"
             right += f", {row['contacts_none']:.0%} with none"
             echo(f"  {where:16}{row['sigma']:7.0e}{parts}{place}  {right}")
 
 
 def _print_parts(rows: list[dict[str, Any]], echo: Callable[[str], object]) -> None:
-    echo("  the posterior's errors in units of √(n + b): variance n due to noise, b due to the prior")
+    echo("  posterior errors divided by √(n + b): variance n due to noise, variance b due to the prior")
     echo(
         f"  {'b / (n + b)':16}{'coordinates':>12}{'RMS':>7}{'by noise':>10}{'b in it':>9}{'95 %':>7}"
         f"{'99.9 %':>8}{'kurtosis':>10}"

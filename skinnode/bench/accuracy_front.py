@@ -1,10 +1,10 @@
-"""Error against time for a few wires: our solvers and their peers on the same compiled F and J.
+"""Measures error versus time for four wires: our solvers and their peers use the same compiled F and J.
 
 Only the most deeply pressed wires of the patch are solved; the samples of the press contain no noise. Every
-solver starts from rest. It solves either the last sample alone or, as in the paper, all samples in turn, each
-from the solution for the previous sample. Each solver runs at several tolerances and gives one point per
-tolerance. The time of ``solve_path`` includes work that the bare operators omit: setting up the patch,
-following the branch, estimating the error.
+solver starts from rest. A solver solves either the last sample alone or, as in the paper, all samples in
+sequence, each starting from the solution for the previous sample. Each solver is run with several tolerances,
+and each tolerance yields one data point. The time of ``solve_path`` includes work that the bare operators
+omit: setting up the patch, following the branch, and estimating the error.
 """
 
 from __future__ import annotations
@@ -28,28 +28,28 @@ from skinnode.solve.paths.step_control import Adaptive, Periodic, Schedule, Unif
 from skinnode.solve.wires.problem import PatchProblem
 
 SCENES: Final = (("staggered", 0.5, 0.3), ("staggered", 1.0, 0.3), ("aligned", 0.5, 0.1))
-"""Preset, height in pitches, depth in heights: a press that all solvers solve from rest, a press that needs
-intermediate samples, and the paper's own layout."""
+"""Scenes as (preset, height in pitches, depth in heights): a press that all solvers solve from rest, a press
+that requires intermediate samples, and a press on the paper's own layout."""
 TOLERANCES: Final = (1e-4, 1e-7, 1e-10, 1e-13)
 SAMPLES: Final = (1, 5, 10, 20)
 SOLVED: Final = 0.01
-"""Maximum error, relative to the displacement, for a result to count as solved and be drawn."""
+"""Maximum error, relative to the displacement, at which a result counts as solved and is plotted."""
 ROUNDING: Final = 1e-11
-"""Error below which results count as equal: rounding error in F, amplified by the condition number of J."""
+"""Error below which results count as equal; it is the rounding error in F times the condition number of J."""
 LOOSE: Final = 1e-6
-"""Tolerance for all samples before the last, as in the paper."""
+"""Solver tolerance for all samples except the last, as in the paper."""
 REPEATS: Final = 7
 LONG_S: Final = 0.1
 
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """A few upper wires, and the samples of a press on these wires."""
+    """Four upper wires, with samples of a press on these wires."""
 
     name: str
     layout: PatchLayout
     samples_ohm: Float
-    """(T, U, K), resistances in ohm, without the sample at rest."""
+    """(T, U, K), resistances of the pressed samples, ohm; the sample at rest is omitted."""
     truth_m: Float
     """(U, N, 3), true displacement at the last sample, metres."""
 
@@ -76,7 +76,7 @@ def scene_of(name: str, height: float, depth: float) -> Scene:
 
 
 def _timed_us(call: Callable[[], object]) -> float:
-    """Return the shortest of a few call times (fewer if calls are slow): other programs can only add time."""
+    """Return the shortest of up to seven call times, because other programs can only increase a call time."""
     times: list[float] = []
     while len(times) < REPEATS and sum(times) < LONG_S:
         start = time.perf_counter()
@@ -86,7 +86,7 @@ def _timed_us(call: Callable[[], object]) -> float:
 
 
 def _path(scene: Scene, operator: str, schedule: Schedule, samples: int) -> tuple[float, float, bool]:
-    """Return the time per wire (µs), the error, and whether every wire converged."""
+    """Time :func:`solve_path`; return the time per wire (µs), the error, and whether every wire converged."""
     frames = scene.thinned(samples)
     call = functools.partial(solve_path, scene.layout, frames, operator=operator, schedule=schedule)
     path = call()
@@ -95,7 +95,7 @@ def _path(scene: Scene, operator: str, schedule: Schedule, samples: int) -> tupl
 
 
 def _bare(scene: Scene, solve: Solve, samples: int, tolerance: float) -> tuple[float, float]:
-    """Return the time per wire (µs) and the error."""
+    """Time a bare operator or a peer; return the time per wire (µs) and the error."""
     problem = PatchProblem.of(scene.layout)
     truth = problem.rest + scene.truth_m.reshape(len(problem.rest), -1) / scene.layout.pitch_m
     frames = scene.thinned(samples) * problem.gain
@@ -109,7 +109,9 @@ def _bare(scene: Scene, solve: Solve, samples: int, tolerance: float) -> tuple[f
                 x = solve(Case(problem, wire, frame, np.ascontiguousarray(x), truth[wire]), loose)
             found[wire] = x
 
-    with np.errstate(all="ignore"):  # a diverging solver is detected by its error
+    with np.errstate(
+        all="ignore"
+    ):  # overflow is harmless here: a diverging solver is recognised by its error
         us = _timed_us(paths) / len(found)
         return us, scene.error(problem.displacement_m(found))
 
@@ -127,7 +129,7 @@ def pareto(rows: list[dict[str, Any]]) -> list[int]:
 
 
 def run() -> list[dict[str, Any]]:
-    """Return the rows of one scatter plot per scene: time, error, and whether the row is on the front."""
+    """Measure all scenes; return rows with time, error, and whether the row is on the Pareto front."""
     panels = []
     for setting in SCENES:
         scene = scene_of(*setting)
@@ -142,7 +144,9 @@ def run() -> list[dict[str, Any]]:
 def _rows(scene: Scene) -> list[dict[str, Any]]:
     rows: list[dict[str, Any]] = []
     solvers = peers(PatchProblem.of(scene.layout))
-    del solvers["skinnode solve_system, Python callables"]  # the same operators, called from Python
+    del solvers[
+        "skinnode solve_system, Python callables"
+    ]  # these operators are already included; Python callables only add overhead
     for tolerance in TOLERANCES:
         for name, solve in solvers.items():
             for samples in (1, 10):
@@ -158,7 +162,7 @@ def _rows(scene: Scene) -> list[dict[str, Any]]:
 
 
 def _schedules(tolerance: float) -> dict[str, tuple[Schedule, int]]:
-    """Return step controls by name, each with its number of samples."""
+    """Return the step controls by name, each with the number of samples that it uses."""
     loose = max(tolerance, LOOSE)
     uniform = Uniform(intermediate_tolerance=loose, final_tolerance=tolerance)
     found: dict[str, tuple[Schedule, int]] = {

@@ -1,7 +1,8 @@
-"""Error against noise, code width and layout, and the calibration of the reported standard deviations.
+"""Measures error versus noise, code width and layout, and the calibration of standard deviations.
 
-Every scene is tracked for four frames from rest; only the last frame counts. Errors and standard deviations
-are pooled over the scenes and the coordinates of converged wires, as RMS values relative to the displacement.
+Every scene is tracked for four frames from rest; only the last frame is scored. Errors and standard
+deviations are pooled over the scenes and the coordinates of converged wires, as RMS values relative to the
+displacement.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ BITS: Final = (12, 14, 16, 24)
 LAYOUTS: Final = tuple((kind, height) for kind in ("staggered", "aligned") for height in (0.3, 0.5, 1.0))
 PRIOR_SHARES: Final = (0.0, 0.1, 0.2, 0.4, 0.6, 0.8, 1.0)
 FEWEST: Final = 1000
-"""Minimum number of coordinates for a 99.9 % quantile."""
+"""Minimum number of coordinates for which a 99.9 % quantile is estimated."""
 SHARES: Final = np.array([0.0, 1 / 3, 2 / 3, 1.0])
 
 PROTOTYPE: Final = {
@@ -45,12 +46,12 @@ PROTOTYPE: Final = {
     ("aligned", 0.5): {"exact": {1e-5: 2.71}, "posterior": {4e-6: 0.05, 1e-5: 0.06, 1e-4: 0.20, 1e-3: 0.38}},
     ("aligned", 1.0): {"exact": {1e-5: 73.0}, "posterior": {4e-6: 0.14, 1e-5: 0.18, 1e-4: 0.24, 1e-3: 0.38}},
 }
-"""RMS errors of the prototype for a 10 % press with shear by a single Hertz-like indenter."""
+"""Relative RMS errors of the prototype for a sheared 10 % press by one Hertz-like indenter."""
 
 
 @dataclass
 class Pool:
-    """Pools the errors and standard deviations of many scenes."""
+    """Accumulates the errors and standard deviations of many scenes."""
 
     scenes: int = 0
     wires: int = 0
@@ -62,7 +63,7 @@ class Pool:
     _size: float = 0.0
 
     def add(self, frame: FieldFrame, truth_m: Float) -> None:
-        """Add a scene's last frame and its true displacement ``truth_m`` (U, N, 3)."""
+        """Add a scene's last frame, given its true displacement ``truth_m`` (U, N, 3)."""
         used = np.array([status is Status.CONVERGED for status in frame.status])
         error, std = (frame.displacement_m - truth_m)[used], frame.displacement_std_m[used]
         self.scenes += 1
@@ -75,7 +76,7 @@ class Pool:
         self._size += float((truth_m[used] ** 2).sum())
 
     def row(self) -> dict[str, Any]:
-        """Return the figures; NaN if no wire converged."""
+        """Return the pooled figures; errors are NaN if no wire converged."""
         size = self._size or math.nan
         return {
             "scenes": self.scenes,
@@ -89,14 +90,14 @@ class Pool:
 
 @dataclass
 class Parts:
-    """Compares the posterior's errors with its variance n + b: n due to noise, b due to the prior."""
+    """Compares the posterior's errors with its variance n + b, where n is due to noise and b to the prior."""
 
     _error: list[Float] = field(default_factory=list)
     _noise: list[Float] = field(default_factory=list)
     _left: list[Float] = field(default_factory=list)
 
     def add(self, frame: FieldFrame, truth_m: Float) -> None:
-        """Add a scene and its truth (U, N, 3); skip held frames, whose variance has additional terms."""
+        """Add a scene, given its true displacement (U, N, 3), metres, unless all of its wires are held."""
         if frame.core_std_m is None or (frame.held is not None and frame.held.all()):
             return
         used = np.array([status is Status.CONVERGED for status in frame.status])
@@ -107,7 +108,7 @@ class Parts:
         self._left.append(left.ravel())
 
     def rows(self) -> list[dict[str, Any]]:
-        """Return one row for each interval of the prior's fraction b / (n + b).
+        """Return one row of statistics for each interval of the prior's fraction b / (n + b).
 
         Each row contains the RMS, quantiles and kurtosis of error / √(n + b), the RMS that n alone would
         give, and the fraction of b that appears in the errors.
@@ -133,13 +134,13 @@ class Parts:
 
 @dataclass
 class Bound:
-    """Pools the Cramér-Rao bounds for wires, without a prior, computed at the truth with the NumPy model."""
+    """Accumulates the wires' Cramér-Rao bounds, computed at the true position without a prior."""
 
     _variance: float = 0.0
     _size: float = 0.0
 
     def add(self, layout: PatchLayout, taken: Stream) -> None:
-        """Add the last frame of a stream."""
+        """Add the bound for the last frame of a stream."""
         truth = taken.truth_m[-1]
         std = bound_std_m(layout, layout.upper_m + truth, taken.noise[-1])
         self._variance += float((std**2).sum())
@@ -147,16 +148,16 @@ class Bound:
 
     @property
     def share(self) -> float:
-        """Bound relative to the displacement."""
+        """RMS of the Cramér-Rao bound, relative to the RMS displacement."""
         return math.sqrt(self._variance / self._size)
 
 
 @dataclass
 class Forces:
-    """Compares contacts, forces and centroids with the truth.
+    """Compares the contacts, forces and centroids of fields with the true loads.
 
-    Force errors, in scenes with a contact, are relative to the true normal force; centroid errors are in
-    metres.
+    Force errors are relative to the true normal force, and only scenes with a contact are included. Centroid
+    errors are in metres.
     """
 
     found_right: int = 0
@@ -167,7 +168,7 @@ class Forces:
     _place: list[tuple[float, float]] = field(default_factory=list)
 
     def add(self, frame: FieldFrame, taken: Stream) -> None:
-        """Add the last frame of a stream."""
+        """Add the contacts in the last frame of a stream."""
         contacts, truth = frame.contacts, taken.force_n[-1]
         self.scenes += 1
         self.found_right += len(contacts) == len(taken.presses)
@@ -187,7 +188,7 @@ class Forces:
                 self._place.append((float(off), float(contacts[0].centroid_std_m[axis])))
 
     def row(self) -> dict[str, Any]:
-        """Return RMS errors, RMS standard deviations and the fractions of errors within 95 % intervals."""
+        """Return RMS errors, RMS standard deviations, and the fractions of errors inside 95 % intervals."""
         figures: dict[str, Any] = {
             "contacts_right": self.found_right / self.scenes,
             "contacts_none": self.found_none / self.scenes,
@@ -209,27 +210,27 @@ class Forces:
 
 def _case(kind: str, height: float) -> Case:
     def never(rng: np.random.Generator) -> Stream:
-        raise RuntimeError("this case has a skin but no stream")
+        raise RuntimeError("this case has no stream, only a skin")
 
     return Case(0, f"{kind} h={height:g}", Skin(preset(kind, height)), never)
 
 
 class Follower:
-    """Solves streams of one layout with every method."""
+    """Solves streams on one layout with every method."""
 
     def __init__(self, kind: str, height: float) -> None:
         self.case = _case(kind, height)
         self._solvers = {name: methods.solver_of(self.case, name) for name in METHODS}
 
     def last(self, taken: Stream) -> dict[str, FieldFrame]:
-        """Return each method's field for the last frame of a stream."""
+        """Solve a stream with each method; return the fields of the last frame by method."""
         return {
             name: methods.fields(self.case, name, solver, taken)[-1] for name, solver in self._solvers.items()
         }
 
 
 def _streams(case: Case, converter: Converter, scenes: int) -> Iterable[Stream]:
-    """Yield streams of 10 % presses: the same presses for all converters and layouts of equal height."""
+    """Yield streams of 10 % presses; the presses depend only on the seed and the layout's size and height."""
     for seed in range(scenes):
         rng = np.random.default_rng([seed, 10])
         press = pad_press(rng, case.skin.layout, 0.1)
@@ -237,10 +238,9 @@ def _streams(case: Case, converter: Converter, scenes: int) -> Iterable[Stream]:
 
 
 def pad_press(rng: np.random.Generator, layout: PatchLayout, depth: float) -> Press:
-    """Return a press by a body the size of a fingertip: contact radius 1.5 to 2.5 pitches at full depth.
+    """Return a random press by a fingertip-sized body with a contact radius of 1.5 to 2.5 pitches.
 
-    It displaces the skin as much as the prototype's indenter does: the two Cramér-Rao bounds agree (see
-    PROTOTYPE).
+    The press is comparable to the prototype's (see PROTOTYPE): the Cramér-Rao bounds of both presses agree.
     """
     press = random_press(rng, layout, depth)
     contact = rng.uniform(1.5, 2.5) * layout.pitch_m
@@ -248,7 +248,7 @@ def pad_press(rng: np.random.Generator, layout: PatchLayout, depth: float) -> Pr
 
 
 def against_noise(scenes: int) -> list[dict[str, Any]]:
-    """Solve 10 % presses with noise. Returns one row per layout, noise and method."""
+    """Solve noisy 10 % presses; return one row per layout, noise level and method."""
     rows = []
     for kind, height in LAYOUTS:
         follower = Follower(kind, height)
@@ -269,7 +269,7 @@ def against_noise(scenes: int) -> list[dict[str, Any]]:
 
 
 def against_codes(scenes: int) -> list[dict[str, Any]]:
-    """Solve 10 % presses with codes but without noise. Returns one row per layout, code width and method."""
+    """Solve quantised, noise-free 10 % presses; return one row per layout, code width and method."""
     rows = []
     for kind in ("staggered", "aligned"):
         follower = Follower(kind, 0.5)
@@ -294,7 +294,7 @@ COVERAGE: Final = (
 
 
 def _random_scene(rng: np.random.Generator, layout: PatchLayout) -> tuple[Press, ...]:
-    """Return one sharp or blunt body or, in three scenes out of ten, one body in each half of the patch."""
+    """Return one sharp or blunt press or, in 30 % of the scenes, one press in each half of the patch."""
     depth = rng.uniform(0.05, 0.3, 2)
     if rng.random() >= 0.3:
         if rng.random() < 0.5:
@@ -313,11 +313,10 @@ def _random_scene(rng: np.random.Generator, layout: PatchLayout) -> tuple[Press,
 
 
 def coverage(scenes: int) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
-    """Solve random scenes.
+    """Solve random scenes with both methods.
 
-    Returns:
-        One row per layout, noise and method, with forces for the posterior; and the posterior's errors in all
-        scenes, grouped by the prior's fraction of the variance.
+    Returns: First, one row per layout, noise level and method, with forces for the posterior. Second,
+    statistics of the posterior's errors in all scenes, grouped by the prior's fraction of the variance.
     """
     rows, parts = [], Parts()
     for kind, height, sigma in COVERAGE:

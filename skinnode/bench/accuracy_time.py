@@ -1,4 +1,4 @@
-"""Time per tracked frame: exact inverse, posterior for a full frame, posterior for a few wires."""
+"""Measures the time per tracked frame, for the exact inverse and the posterior."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ LIMITS_US: Final = {"exact": 500.0, "posterior, full frame": 5000.0, f"posterior
 
 
 class Cycle:
-    """A press and its release, solved frame by frame.
+    """Solves a press and its release frame by frame.
 
-    Every call solves all frames of the cycle, so that no call times only cheap frames.
+    Each call solves all frames of the cycle, so that no measurement covers only the cheap frames.
 
     Args:
         solver: Solver to measure.
-        frames: Frames (T, U, K) of the downward press, ohm.
+        frames: Resistances (T, U, K) of the frames during the downward press, ohm.
         valid: Mask (U, K) of the resistances to use; default: all.
     """
 
@@ -38,7 +38,7 @@ class Cycle:
         self._solver, self._valid = solver, valid
         self.frames = np.concatenate([frames, frames[-2:0:-1]])
         self.active: list[int] = []
-        """Number of wires solved in each frame."""
+        """Number of wires that were solved (not held), one entry per frame."""
 
     def __call__(self) -> None:
         """Solve all frames."""
@@ -49,17 +49,17 @@ class Cycle:
 
 
 def _frames(skin: Skin, press: Press, sigma: float) -> Float:
-    """Return a press that goes from half to full depth."""
+    """Return the frames (T, U, K) of a press from half to full depth, ohm."""
     shares = np.linspace(0.5, 1.0, FRAMES)
     return stream(skin, (press,), shares, Converter(sigma=sigma), np.random.default_rng(5)).frames_ohm
 
 
 def run(rounds: int) -> list[dict[str, Any]]:
-    """Return one row per solver: time in µs per frame, limit, and number of wires solved.
+    """Time each solver; return the time in µs per frame, the limit, and the number of solved wires.
 
-    The time is a mean over the frames and a median over the turns. A press moves the whole half-space, so no
-    real scene moves only three wires; here the resistances of the other wires are masked. No wire is held, so
-    every frame is solved.
+    The time is the mean over the frames of a cycle and the median over the rounds. A real press always moves
+    more than three wires, because it moves the whole half-space. The benchmark therefore masks the
+    resistances of the other wires. Holding is disabled, so every frame is solved.
     """
     skin = Skin(preset("staggered", 0.5))
     layout, rest = skin.layout, skin.rest_ohm

@@ -1,4 +1,4 @@
-"""A hard case: a patch, the options that an informed user would set, and a stream for every seed."""
+"""Defines a hard case: a patch, the solver options that an informed user would set, and a stream per seed."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ PATHS: Final = ("path gauss_newton", "path levenberg_marquardt", "path dogleg", 
 TRACKERS: Final = ("exact", "posterior", "auto")
 PITCH_M: Final = 4e-3
 FINE: Final = Converter(sigma=1e-5)
-"""Converter with roughly the noise of a 16-bit converter."""
+"""Converter whose noise is roughly that of a 16-bit converter."""
 STRIDE: Final = 4
 """Number of path samples per tracker frame."""
 DRIFT: Final = 0.02
 MODEL_ERROR: Final = 0.05
-"""Relative error of the wrong models in case 13 when predicting the change in R. Measured on a 30 % press,
-staggered, h = 0.5: ‖ΔR‖ is off by 2.2 to 5 %; for a single pair of wires, the change is off by 1 to 5 % in
-the median and by 7 % at worst."""
+"""Relative error in the change in R that the wrong models of case 13 predict. On a 30 % press, staggered,
+h = 0.5, the measured error of ‖ΔR‖ is 2.2 to 5 %. For a single pair of wires, the median error is 1 to 5 %
+and the maximum error is 7 %."""
 
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """A hard case. ``make`` returns the stream for a seed's random generator."""
+    """A hard case; ``make`` generates the stream of a seed from the seed's random generator."""
 
     number: int
     name: str
@@ -36,31 +36,31 @@ class Case:
     make: Callable[[np.random.Generator], Stream]
     methods: tuple[str, ...] = TRACKERS
     converter: Converter = FINE
-    """Converter for the streams; the user knows its noise."""
+    """Converter that reads the streams; its noise is stated to the solver."""
     drift: str = "none"
     stride: int = 1
-    """Number of stream frames per tracker frame; a path uses all frames."""
+    """Stride of the frames that a tracker solves; path methods use every frame of the stream."""
     known_wrong: tuple[str, ...] = ()
-    """Methods known to be wrong on this case, as ``docs/limits.md`` states. Their rows are shown, but do not
-    count as wrong."""
+    """Methods known to produce wrong results in this case, as listed in ``docs/limits.md``. Their rows are
+    shown but do not make the benchmark fail."""
     model_error: float = 0.0
-    """Relative error that the user expects the model to make in predicting the change in R."""
+    """Relative error of the predicted change in R, as stated to the solver."""
     tolerances: Tolerances | None = None
-    """Tolerances that the user states."""
+    """Manufacturing tolerances stated to the solver; None if not stated."""
 
 
 def preset(name: str, height: float) -> PatchLayout:
-    """Return a preset of 10 × 10 electrodes with a height of ``height`` pitches."""
+    """Return a preset layout with 10 upper wires of 10 electrodes and a height of ``height`` pitches."""
     return PatchLayout.preset(name, pitch_m=PITCH_M, height_m=height * PITCH_M)
 
 
 def narrowed(layout: PatchLayout) -> PatchLayout:
-    """Return five upper wires, which are enough because paths are solved wire by wire."""
+    """Return the layout reduced to five upper wires, which suffice because paths are solved wire by wire."""
     return PatchLayout(layout.upper_m[[0, 2, 5, 8, 9]], layout.lower_m, layout.resistivity_ohm_per_m)
 
 
 def press_and_release(steps: int) -> Float:
-    """Return fractions of the depth: zero, equal steps up to one, and zero again."""
+    """Return fractions of the full depth: zero, equal steps up to one, and finally zero."""
     return np.array([*np.linspace(0.0, 1.0, steps + 1), 0.0])
 
 
@@ -74,17 +74,17 @@ def pressing(  # noqa: PLR0913 - one argument per way to change a stream
     gain: Callable[[np.random.Generator, int], Float] | None = None,
     presses: Callable[[np.random.Generator], tuple[Load, ...]] | None = None,
 ) -> Callable[[np.random.Generator], Stream]:
-    """Return a function that makes the stream of one random press.
+    """Return a function that generates the stream of one random press.
 
     Args:
         skin: The patch.
-        depth: Depth of the press in heights.
+        depth: Depth of the press as a fraction of the layer height.
         converter: Converter that reads the resistances.
-        shares: Fractions (T,) of the depth, one per frame.
-        spoil: Function that returns a modified stream.
-        gain: Function that returns factors that scale the resistances, (T, U, K) or broadcastable to that
-            shape.
-        presses: Function that returns the presses that replace the single random press.
+        shares: Fractions (T,) of the full depth, one per frame.
+        spoil: Function that returns the stream with errors inserted; default: no errors.
+        gain: Function that returns factors for the resistances, (T, U, K) or broadcastable to that shape;
+            default: 1.
+        presses: Function that returns the presses; default: one random press.
     """
 
     def make(rng: np.random.Generator) -> Stream:

@@ -1,4 +1,4 @@
-"""Hard cases: streams that make solvers fail. New cases are added as they are found.
+"""Hard cases: streams on which solvers tend to fail. New cases are added as they are discovered.
 
  1 symmetric layout, J rank-deficient         8 baseline drift, gain error, contact resistance
  2 thick layers                               9 wrong roots with zero residual
@@ -6,11 +6,11 @@
  4 a press between two frames                11 repeated presses and releases
  5 an electrode almost touching              12 curved layouts, N = 1, K < 3N, K > 3N
  6 noise and code widths                     13 the wrong model
- 7 open, shorted, missing, saturated         14 wrong data that nothing marks
+ 7 open, shorted, missing, saturated         14 wrong data not marked invalid
 15 patches made to ordinary tolerances       16 the whole patch pressed
 
-A case consists of the patch as the solver knows it, the options that an informed user would set and, for
-every seed, a stream of frames with the truth.
+A case consists of the patch model given to the solver, the options that an informed user would set, and a
+generator that returns a stream of frames, with true displacements, for each seed.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ from skinnode.model.layout import Float, PatchLayout
 
 
 def all_cases() -> list[Case]:
-    """Return every case, in the order of the module docstring's list."""
+    """Return all hard cases, in the order of the list in the module docstring."""
     return [
         *_symmetric_and_thick(),
         *_deep(),
@@ -250,10 +250,10 @@ def _wrong_roots() -> Iterator[Case]:
 
 
 def _sheared() -> Iterator[Case]:
-    """Yield deep presses dragged by 0.8 of their pressure, under which the skin itself crosses folds.
+    """Yield deep presses with a friction of 0.8, during which the true displacement passes through folds.
 
-    The smooth root that a start from the smoothest displacement, the posterior and the live trackers find is
-    then wrong on some wires. Only a path has the samples that show it.
+    The smooth root, which the posterior and the live trackers find, is then wrong on some wires. Only a path
+    contains the intermediate samples that reveal the error.
     """
     for name, height in (("aligned", 0.5), ("aligned", 1.0), ("staggered", 1.0)):
         for contacts in (1, 2):
@@ -272,14 +272,14 @@ def _sheared() -> Iterator[Case]:
 
 
 def _dragged(press: Press, rng: np.random.Generator) -> Press:
-    """Return the press with a traction of 0.8 of its pressure in a random direction."""
+    """Return the press with an added shear traction: 0.8 times the pressure, in a random direction."""
     angle = rng.uniform(0.0, 2.0 * np.pi)
     traction = (0.8 * float(np.cos(angle)), 0.8 * float(np.sin(angle)))
     return Press(press.center_m, press.radius_m, press.depth_m, traction)
 
 
 def _swap(rng: np.random.Generator, layout: PatchLayout, share: float) -> Float:
-    """Rotate two adjacent electrodes of a wire by 180° about their midpoint, which restores the initial F."""
+    """Rotate two adjacent electrodes of a wire about their midpoint; 180° restores the initial F."""
     wire, first = rng.integers(layout.shape[0]), rng.integers(layout.upper_m.shape[1] - 1)
     middle = 0.5 * (layout.upper_m[wire, first] + layout.upper_m[wire, first + 1])
     angle = np.pi * share
@@ -292,7 +292,7 @@ def _swap(rng: np.random.Generator, layout: PatchLayout, share: float) -> Float:
 
 
 def _mirror(rng: np.random.Generator, layout: PatchLayout, share: float) -> Float:
-    """Move one electrode through the lower layer to its mirror image, which restores the initial F."""
+    """Move one electrode through the lower layer towards its mirror image, where F has its initial value."""
     moved = np.zeros(layout.upper_m.shape)
     wire, electrode = rng.integers(layout.shape[0]), rng.integers(layout.upper_m.shape[1])
     moved[wire, electrode, 2] = -2 * share * layout.height_m
@@ -304,10 +304,10 @@ def _after_detour(
     detour: Callable[[np.random.Generator, PatchLayout, float], Float],
     converter: Converter,
 ) -> Callable[[np.random.Generator], Stream]:
-    """Return a stream with an impossible motion that ends at the rest resistances, then a real press.
+    """Return a generator of streams in which a physically impossible motion precedes a real press.
 
-    The impossible motion has no truth, because F does not distinguish a wire from the same wire with two
-    electrodes swapped or one mirrored.
+    The impossible motion ends at the rest resistances. Its frames have no true displacement, because F is the
+    same if two electrodes of a wire are swapped or one electrode is mirrored.
     """
 
     def make(rng: np.random.Generator) -> Stream:
@@ -318,7 +318,7 @@ def _after_detour(
         frames, valid, noise = converter.read(resistance, skin.rest_ohm, rng)
         press = (random_press(rng, skin.layout, 0.2),)
         after = stream(skin, press, np.array([0.3, 0.6, 1.0, 0.0]), converter, rng)
-        odd[0], odd[1:-1], odd[-1] = 0.0, np.nan, 0.0  # the detour ends at the rest resistances
+        odd[0], odd[1:-1], odd[-1] = 0.0, np.nan, 0.0  # the impossible motion ends at the rest resistances
         return Stream(
             np.concatenate([frames, after.frames_ohm]),
             np.concatenate([valid, after.valid]),
@@ -417,7 +417,7 @@ def _shapes() -> Iterator[Case]:
 
     yield Case(12, "fingertip, 30%", tip, pressing(tip, 0.3, FINE, shares, presses=on_tip))
     for lower, depth in ((3, 0.1), (6, 0.3)):
-        # with one electrode per wire there is no pitch along the wire: the patch is a narrow line
+        # one electrode per wire has no pitch along the wire, so the patch is a narrow line
         layout = PatchLayout.preset("staggered", upper_electrodes=1, lower_wires=lower)
         skin = Skin(layout)
 

@@ -1,6 +1,6 @@
-"""Dense kernels compared with LAPACK, in a process that limits LAPACK to one thread, as used by ours.
+"""Compares our dense kernels with LAPACK, in a process that limits LAPACK to a single thread.
 
-LAPACK's worker threads keep spinning for a while after each call. If they share a core with the next
+After each call, LAPACK's worker threads keep spinning for some time. If they share a core with the next
 candidate, that candidate takes up to three times as long; on a busy machine the threads also wait for each
 other.
 """

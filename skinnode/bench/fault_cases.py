@@ -1,8 +1,9 @@
-"""Hard cases 14 to 16 of ``skinnode bench stability``: wrong data, patches made to tolerances, wide touches.
+"""Hard cases 14 to 16 of ``skinnode bench stability``: wrong data, imperfect patches and wide touches.
 
-The data of case 14 are wrong and not marked. A wire is claimed if it is CONVERGED and trusted. Only a tracker
-tests the data, so the bare posterior does not solve these cases. A tracker gets resistances: only the host
-sees codes that repeat, which give a frozen wire away (:mod:`skinnode.host.frozen_parts`).
+In case 14, the data are wrong but not marked invalid. Accuracy is claimed for a wire if it is CONVERGED and
+trusted. Only a tracker tests the data, so case 14 does not use the bare posterior. A tracker receives
+resistances. It cannot detect a frozen wire by repeated codes, as the host does
+(:mod:`skinnode.host.frozen_parts`).
 """
 
 from __future__ import annotations
@@ -23,11 +24,11 @@ from skinnode.protocol.codes import CodeScale
 Spoil = Callable[[np.random.Generator, Stream, Skin], Stream]
 
 SHARES: Final = np.array([0.0, 0.0, 0.0, 0.0, 0.25, 0.5, 0.75, 1.0, 1.0, 1.0, 1.0, 0.6, 0.3, 0.0])
-"""Fractions of the depth in case 14."""
+"""Fractions of the full depth in case 14, one per frame."""
 FAILS: Final = 5
-"""Frame, during the press, from which the data of case 14 are wrong."""
+"""First frame with wrong data in case 14; the press has already begun."""
 TESTED: Final = ("exact", "auto")
-"""Methods of case 14."""
+"""Methods that solve case 14."""
 KNOWN: Final = {
     ("upper wire frozen", "1e-5"),
     ("upper wire frozen", "1e-4"),
@@ -35,13 +36,14 @@ KNOWN: Final = {
     ("bits flipped", "1e-4"),
     ("lower wires crossed, tared", "1e-4"),
 }
-"""Faults and noises at which a few wires are trusted and wrong; ``docs/limits.md`` says why."""
+"""Faults and noise levels for which a few trusted wires are wrong; ``docs/limits.md`` explains the
+reasons."""
 UPPER, LOWER = 1, 2
-"""Axes of the wires in an array (T, U, K)."""
+"""Axes of the upper and of the lower wires in an array (T, U, K)."""
 
 
 def fault_cases() -> Iterator[Case]:
-    """Return the cases with wrong data, with patches made to tolerances, and with wide or sheared touches."""
+    """Yield the cases with wrong data, with imperfectly made patches, and with wide or sheared touches."""
     yield from _wrong_data()
     yield from _tolerances()
     yield from _touches()
@@ -69,7 +71,7 @@ def _wrong_data() -> Iterator[Case]:
 def _tolerances() -> Iterator[Case]:
     layout = preset("staggered", 0.5)
     for off in (0.01, 0.02, 0.05):
-        # The shifts are drawn for the case, not for the stream: solvers are set up with the baseline.
+        # All streams of a case share the same shifts, because solvers are set up with the case's baseline.
         rng = np.random.default_rng([15, round(1000 * off)])
         upper, lower = (off * PITCH_M * rng.standard_normal((count, 3)) for count in layout.shape)
         skin = Skin(layout, upper_shift_m=upper, lower_shift_m=lower)
@@ -106,12 +108,12 @@ def _spoilt(taken: Stream, frames: np.ndarray, valid: np.ndarray | None = None) 
 
 
 def _moved(taken: Stream, skin: Skin) -> np.ndarray:
-    """Return how far the press moves the resistances (U, K)."""
+    """Return the relative change (U, K) that the press causes in the resistances."""
     return np.asarray(np.abs(taken.frames_ohm[8] / skin.rest_ohm - 1.0))
 
 
 def _wire(rng: np.random.Generator, taken: Stream, skin: Skin, axis: int) -> int:
-    """Draw one of the three wires that the press moves most."""
+    """Choose one of the three wires that the press affects most."""
     return int(rng.choice(np.argsort(_moved(taken, skin).max(axis=2 - axis))[-3:]))
 
 
@@ -148,7 +150,7 @@ def _flipped(rng: np.random.Generator, taken: Stream, skin: Skin) -> Stream:
 
 
 def _open(axis: int) -> Spoil:
-    """Break a wire whose converter input then floats near the top of its range."""
+    """Break a wire, so that the converter input floats near the top of its range."""
 
     def spoil(rng: np.random.Generator, taken: Stream, skin: Skin) -> Stream:
         frames, wire = taken.frames_ohm.copy(), int(rng.integers(taken.frames_ohm.shape[axis]))
@@ -162,7 +164,7 @@ def _open(axis: int) -> Spoil:
 
 
 def _shorted(axis: int) -> Spoil:
-    """Connect two neighbouring wires: both read the two resistances in parallel."""
+    """Short two neighbouring wires, so that both read the two resistances in parallel."""
 
     def spoil(rng: np.random.Generator, taken: Stream, skin: Skin) -> Stream:
         frames, wire = taken.frames_ohm.copy(), int(rng.integers(taken.frames_ohm.shape[axis] - 1))
@@ -174,7 +176,7 @@ def _shorted(axis: int) -> Spoil:
 
 
 def _crossed(axis: int) -> Spoil:
-    """Swap two neighbouring wires before the baseline was measured, so that the ratios to it are swapped."""
+    """Swap two neighbouring wires before the baseline is measured, so that their R/R₀ are swapped."""
 
     def spoil(rng: np.random.Generator, taken: Stream, skin: Skin) -> Stream:
         frames, wire = taken.frames_ohm.copy(), _wire(rng, taken, skin, axis)
@@ -188,7 +190,7 @@ def _crossed(axis: int) -> Spoil:
 
 
 def _half(rng: np.random.Generator, taken: Stream, skin: Skin) -> Stream:
-    """Drop half of the chunks of three codes, drawn anew for every frame."""
+    """Drop a random half of the chunks of three codes in every frame."""
     valid = taken.valid.copy()
     lost = np.repeat(rng.random((len(valid), valid[0].size // 3)) < 0.5, 3, axis=1)
     valid &= ~lost.reshape(valid.shape)

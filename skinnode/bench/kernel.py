@@ -1,6 +1,6 @@
-"""The compiled kernels compared with NumPy and LAPACK.
+"""Compares the compiled kernels with NumPy and LAPACK.
 
-The benchmark measures F + J and one step of each operator for one wire of the reference patch, and the dense
+The benchmark times F + J and one step of each operator for one wire of the reference patch, and the dense
 kernels at the size used by the patch's posterior.
 """
 
@@ -23,7 +23,7 @@ from skinnode.solve.operators.work import LIMIT, Work, workspace
 from skinnode.solve.wires.problem import PatchProblem
 
 SHORT: Final = 1e-3
-"""Trust radius, pitches per coordinate: far smaller than a Newton step, so every operator must search."""
+"""Trust radius, pitches per coordinate; much smaller than a Newton step, so every operator must search."""
 
 
 class NumpyWire:
@@ -90,7 +90,7 @@ def numpy_step(operator: str, wire: NumpyWire, x: Float, a: Float) -> Float:
                 )
         else:
             n = x.size
-            augmented = np.zeros((r.size + n, n + 1))  # gives R and Qᵀr without Q, in 70 % of the time
+            augmented = np.zeros((r.size + n, n + 1))  # yields Qᵀr without forming Q, in 70 % of the time
             augmented[: r.size, :n] = j
             augmented[: r.size, n] = r
             np.fill_diagonal(augmented[r.size :], 0.1 * scale)
@@ -179,7 +179,7 @@ def run(rounds: int) -> dict[str, Any]:
 
 
 def potential_of(x: Float, lower: Float) -> Float:
-    """Return F of one wire, computed by the compiled kernel."""
+    """Compute F of one wire with the compiled kernel."""
     f, jt = np.empty(lower.shape[2]), np.empty((x.size, lower.shape[2]))
     potential_jacobian(x, lower, f, jt)
     return f

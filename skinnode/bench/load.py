@@ -1,9 +1,9 @@
-"""Load for ``skinnode bench pipeline``: frames from real nodes, replayed in real time by another process.
+"""Generates load for ``skinnode bench pipeline``: node frames that another process replays in real time.
 
-The nodes are those of ``skinnode node``, measuring the simulator's patches. In simulated time their frames
-cross a bus with CAN arbitration: whenever the bus is free, the waiting frame with the lowest identifier is
-sent and occupies the bus for the duration of its bits, stuff bits included. This file may import the
-simulator, as the demo may, because frames generated from the solver's own assumptions would prove nothing.
+The nodes are those of ``skinnode node`` and measure simulated patches. In simulated time, their frames cross
+a bus with CAN arbitration. Whenever the bus is free, the pending frame with the lowest identifier is sent. It
+occupies the bus for the duration of its bits, including stuff bits. This module may import the simulator, as
+the demo may, because frames generated from the solver's own assumptions would prove nothing.
 """
 
 from __future__ import annotations
@@ -36,37 +36,37 @@ from vcan_sim.scene import Scene
 from vcan_sim.sensor import SimulatedPatch
 
 TICK_S: Final = 0.25e-3
-"""Polling interval of the sender; on a full bus two frames are then sent at a time, as by a USB adapter."""
+"""Polling interval of the sender, s; on a full bus, it sends two frames at a time, as a USB adapter does."""
 LEAD_S: Final = 0.5
-"""Time from :meth:`Generator.begin` to the first frame."""
+"""Time from the call of :meth:`Generator.begin` to the first SYNC, s."""
 _BEAT_S: Final = 0.1
 _FULL_S: Final = 1e-4
 
 _Queued = tuple[int, int, bytes, bool]
-"""Time in ns at which a node had the frame ready; COB-ID; data; whether it is a CAN FD frame."""
+"""Time at which the node queued the frame, ns; COB-ID; data; whether the frame is a CAN FD frame."""
 
 
 @dataclass(frozen=True, slots=True)
 class Sent:
-    """Figures of a replay."""
+    """Results of a replay."""
 
     frames: dict[str, int]
-    """Number of frames sent on each bus, excluding the heartbeats before the start."""
+    """Number of frames sent on each bus, excluding heartbeats sent before the replay."""
     bus_load: dict[str, float]
-    """Fraction of the time during which frames occupied the simulated bus."""
+    """Fraction of the time during which each simulated bus was busy."""
     late_p99_ms: float
-    """Delay of the frames relative to their times on the simulated bus, caused by the generator itself."""
+    """99th percentile of the delay that the generator itself adds to the simulated send times, ms."""
     late_max_ms: float
     cpu_s: float
 
 
 class Generator:
-    """A process that replays the load of a hand; it is ready when the constructor returns.
+    """Child process that replays the load of a hand; the process is ready when the constructor returns.
 
     Args:
         hand: Hand to replay.
-        seconds: Duration of the load.
-        touched: Whether all patches are pressed and stroked as in the demo; otherwise none is touched.
+        seconds: Duration of the load, s.
+        touched: Whether all patches are pressed and stroked as in the demo; if False, all patches rest.
         core: Processor core to which the process is bound; None for any.
     """
 
@@ -80,17 +80,17 @@ class Generator:
         self._receive()
 
     def send_heartbeats(self, buses: Sequence[str]) -> None:
-        """Start sending the heartbeats of the patches on ``buses``, so that a host finds the patches."""
+        """Start sending the heartbeats of the patches on ``buses``, so that a host detects the patches."""
         self._pipe.send(list(buses))
 
     def begin(self) -> int:
-        """Start the replay :data:`LEAD_S` from now, and return its start time, monotonic ns."""
+        """Schedule the replay to start after :data:`LEAD_S`, and return its start time, monotonic ns."""
         t_ns = time.monotonic_ns() + round(LEAD_S * 1e9)
         self._pipe.send(t_ns)
         return t_ns
 
     def wait(self) -> Sent:
-        """Wait for the end of the replay, and return its figures."""
+        """Wait for the end of the replay, and return its results."""
         sent: Sent = self._receive()
         return sent
 
@@ -107,7 +107,7 @@ class Generator:
             answer = self._pipe.recv()
         except EOFError:
             self._process.join()
-            raise BusError("the load generator ended unexpectedly") from None
+            raise BusError("the load generator process ended unexpectedly") from None
         if isinstance(answer, Exception):
             raise answer
         return answer
@@ -134,16 +134,16 @@ def _serve(pipe: Connection, hand: HandConfig, seconds: float, touched: bool, co
 
 @dataclass(frozen=True, slots=True)
 class Stream:
-    """The frames on a bus in simulated time."""
+    """Frames on a bus, in simulated time."""
 
     t_ns: list[int]
-    """End of each frame, ns from the first SYNC, ascending."""
+    """End times of the frames, ns after the first SYNC, in ascending order."""
     packets: list[bytes]
     load: float
 
 
 def stream_of(hand: HandConfig, bus: BusConfig, seconds: float, *, touched: bool = True) -> Stream:
-    """Return the frames on ``bus`` during ``seconds`` of the hand's operation, including SYNC."""
+    """Simulate ``seconds`` of operation and return all frames on ``bus``, including SYNC."""
     scans = round(seconds / hand.sync.period_s)
     late_ns = round([each.name for each in hand.buses].index(bus.name) * hand.sync.stagger_s * 1e9)
     syncs = _syncs(hand, scans, late_ns)
@@ -164,7 +164,7 @@ def _syncs(hand: HandConfig, scans: int, late_ns: int) -> list[_Queued]:
 def _node_frames(
     hand: HandConfig, patch: PatchConfig, number: int, syncs: Sequence[_Queued], touched: bool
 ) -> list[_Queued]:
-    """Return the frames that a patch's node has ready to send after the given SYNCs."""
+    """Return the frames that the node of ``patch`` queues in response to the given SYNCs."""
     bus, layout = hand.bus(patch.bus), patch.layout.build()
     profile = PatchProfile.from_config(patch, bus)
     source = SimulatedPatch(Scene(layout, hand.simulation, number))
@@ -194,7 +194,9 @@ def _node_frames(
         (od.TPDO1_PARAMETER, od.PDO_COB_ID, chunk, 4),
     ):
         out.clear()
-        command = 0x23 | (4 - size) << 2  # expedited download of `size` bytes, CiA 301, 7.2.4.3.3
+        command = (
+            0x23 | (4 - size) << 2
+        )  # command byte of an expedited SDO download of `size` bytes, CiA 301, 7.2.4.3.3
         multiplexer = index.to_bytes(2, "little") + bytes([subindex])
         node.on_frame(request, bytes([command]) + multiplexer + value.to_bytes(4, "little"), now_ns)
         assert out[-1][2][0] == 0x60, f"0x{index:04X}:{subindex} refused"
@@ -230,14 +232,14 @@ def _durations_ns(bus: BusConfig, frames: Sequence[_Queued]) -> list[int]:
 
 
 def _arbitrate(frames: Sequence[tuple[int, int, bytes, bool, int]], durations: Sequence[int]) -> Stream:
-    """Arbitrate the frames, which occupy the bus one at a time.
+    """Simulate bus arbitration and return the frames in the order in which they are sent.
 
-    Frames from a node keep their order, as in the queue of its controller; of the frames at the heads of
-    these queues, the frame with the lowest identifier is sent.
+    The frames of each node keep their order, as in the queue of a CAN controller. Of the frames at the heads
+    of these queues, the frame with the lowest identifier is sent first.
     """
     order = sorted(range(len(frames)), key=lambda i: frames[i][0])
-    waiting: dict[int, list[int]] = {}  # by node, in reverse order
-    heads: list[tuple[int, int]] = []  # identifier and node
+    waiting: dict[int, list[int]] = {}  # indices of waiting frames by node, newest first
+    heads: list[tuple[int, int]] = []  # heap of (identifier, node) for the first frame of each queue
     times, packets = [], []
     now_ns = busy_ns = next_in = 0
     while next_in < len(order) or heads:
@@ -294,7 +296,7 @@ def _play(pipe: Connection, hand: HandConfig, loads: Sequence[tuple[BusConfig, S
 def _replay(
     sockets: Sequence[socket.socket], streams: Sequence[Stream], begin_ns: int, sent: list[int]
 ) -> list[int]:
-    """Send every frame at its scheduled time. Returns the delay of the first frame of each burst, ns."""
+    """Send every frame at its scheduled time; return the delay of the first frame of each burst, ns."""
     late_ns, clock = [], time.monotonic_ns
     at = [0] * len(streams)
     left = sum(len(stream.packets) for stream in streams)
@@ -326,7 +328,7 @@ def _connect(bus: BusConfig) -> socket.socket:
 
 
 def _send(sock: socket.socket, packet: bytes) -> int:
-    """Send a packet. Returns the number of packets sent: 1, or 0 if no receiver is open yet."""
+    """Send a packet; return the number of packets sent: 1, or 0 if no receiver has opened its socket yet."""
     while True:
         try:
             sock.send(packet)
@@ -335,6 +337,6 @@ def _send(sock: socket.socket, packet: bytes) -> int:
         except OSError as error:
             if error.errno != errno.ENOBUFS:
                 raise
-            time.sleep(_FULL_S)  # the queue of the CAN interface is full
+            time.sleep(_FULL_S)  # the transmit queue of the CAN interface is full
         else:
             return 1

@@ -1,4 +1,4 @@
-"""Solvers, set up for a case as an informed user would; each gives one estimate per frame of a stream."""
+"""Sets up solvers for a hard case as an informed user would, and solves the case's streams with them."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ Method = Callable[[Stream], Solved]
 
 
 def set_up(case: Case, name: str) -> Method:
-    """Return the method ``name``, set up for ``case``; it is reset at the start of every stream."""
+    """Set up the method ``name`` for ``case``; the method starts each stream in its initial state."""
     if last_only(name):
         return functools.partial(_path, case, name.removeprefix("path "))
     solver = solver_of(case, name)
@@ -32,12 +32,12 @@ def set_up(case: Case, name: str) -> Method:
 
 
 def last_only(name: str) -> bool:
-    """Return whether the method solves only the last frame."""
+    """Return whether a method returns an estimate only for the last frame of a stream."""
     return name.startswith("path ")
 
 
 def _path(case: Case, how: str, stream: Stream) -> Solved:
-    """Solve a path. ``how`` is ``adaptive`` or the name of an operator, which is applied to all samples."""
+    """Solve a stream as a path; ``how`` is ``adaptive`` or the operator to apply to all samples."""
     adaptive = how == "adaptive"
     path = solve_path(
         case.skin.layout,
@@ -46,7 +46,7 @@ def _path(case: Case, how: str, stream: Stream) -> Solved:
         schedule=Adaptive() if adaptive else Uniform(),
         baseline_ohm=case.skin.rest_ohm,
     )
-    # the estimate is an upper bound, and an error may reach LIMIT standard deviations
+    # The error estimate is an upper bound, whereas an error may reach LIMIT standard deviations.
     std = np.broadcast_to(path.error_estimate_m[:, None, None] / LIMIT, path.displacement_m.shape)
     return Solved(path.displacement_m[None], std[None], _converged(path.status)[None])
 
@@ -60,8 +60,8 @@ def fields(case: Case, name: str, solver: Tracker | Posterior, stream: Stream) -
 
 
 def solver_of(case: Case, name: str) -> Tracker | Posterior:
-    """Return a solver for the case: ``exact``, ``posterior`` or ``auto``."""
-    # every frame also carries its own noise
+    """Create a solver for the case; ``name`` is ``exact``, ``posterior`` or ``auto``."""
+    # This noise is only a default: each frame is passed with its own noise.
     common: dict[str, Any] = {
         "relative_noise": case.converter.relative_std,
         "baseline_ohm": case.skin.rest_ohm,
@@ -80,7 +80,7 @@ def solver_of(case: Case, name: str) -> Tracker | Posterior:
 
 
 def _noise_for_exact(case: Case, stream: Stream) -> Float:
-    """Convert drift and model errors to independent noise, the only error that the exact inverse models."""
+    """Add drift and model errors to the noise, because the exact inverse models only independent noise."""
     change = np.nan_to_num(np.abs(stream.frames_ohm / case.skin.rest_ohm - 1.0), posinf=0.0)
     drift = 0.0 if case.drift == "none" else DRIFT
     return np.asarray(np.sqrt(stream.noise**2 + drift**2 + (case.model_error * change) ** 2))
@@ -95,7 +95,7 @@ def _solved(frames: list[FieldFrame]) -> Solved:
 
 
 def _claimed(frame: FieldFrame) -> NDArray[np.bool_]:
-    """Return the wires (U,) that are CONVERGED and, if trust was assessed, trusted."""
+    """Return a mask (U,) of the wires that are CONVERGED and, if trust was assessed, trusted."""
     converged = _converged(frame.status)
     return converged if frame.wires_trusted is None else converged & frame.wires_trusted
 

@@ -1,9 +1,9 @@
-"""Timing and cost of a node: chunk pacing, SYNC to first chunk, heartbeat on a full bus, µs per frame.
+"""Measures a node: chunk pacing, time from SYNC to first chunk, heartbeat on a full bus, and µs per frame.
 
-A frame's time is the time at which the node passes it to its interface, on the monotonic clock that also
-stamps SYNC. SYNC and load come from another endpoint in another thread of the same process, so the
-interpreter lock affects the result. Other processes on the machine affect the result even more; to get the
-figures of an idle machine, run ``chrt -f 20 skinnode bench node``.
+The time of a frame is the time at which the node passes the frame to its interface, on the monotonic clock
+that also stamps SYNC. Another thread of the same process sends SYNC and load through a second endpoint, so
+the interpreter lock affects the result. Other processes on the machine affect the result even more. For
+results as on an idle machine, run ``chrt -f 20 skinnode bench node``.
 """
 
 from __future__ import annotations
@@ -27,11 +27,13 @@ from skinnode.transport import CanPort
 
 NODE_ID: Final = 4
 FULL_BUS_HZ: Final = 8_000
-"""Number of frames per second, with eight data bytes each, that fills a bus at 1 Mbit/s."""
+"""Frame rate that fills a bus at 1 Mbit/s, Hz, with eight data bytes per frame."""
 SCAN_PERIOD_S: Final = 0.1
 BEAT_MS: Final = 10
-_BURST_S: Final = 1e-3  # one burst per millisecond, because no thread can wake 8000 times a second
-_MOST_S: Final = 5e-3  # frames overdue by more than this are dropped: a real bus cannot catch up
+_BURST_S: Final = 1e-3  # no thread can wake 8000 times per second, so frames are sent in bursts
+_MOST_S: Final = (
+    5e-3  # frames that are later than this are dropped, because a full real bus could not catch up
+)
 
 Row = dict[str, Any]
 
@@ -47,13 +49,13 @@ class _Still:
 
 
 class _Rig:
-    """A node and a manager on a bus, for one measurement."""
+    """A node and a bus manager, set up for one measurement."""
 
     def __init__(self, config: BusConfig, pacing: Pacing) -> None:
         layout = PatchLayout.preset("staggered")
         self.manager, self._port = CanPort(config), CanPort(config)
         self.sent: list[tuple[int, int]] = []
-        """COB-ID and time of every frame sent by the node."""
+        """COB-ID and time of each frame that the node has sent."""
         node = PatchNode(NODE_ID, layout, _Still(layout), send=self._send, pacing=pacing)
         self.inhibit_ns = node.profile.default_inhibit_100us * 100_000
         self._runner = NodeRunner(self._port, [node])
@@ -79,7 +81,7 @@ class _Rig:
         return self._port.received
 
     def take(self) -> None:
-        """Discard the node's frames, because a full queue would stop the node."""
+        """Discard the frames received from the node, because a full queue would block the node."""
         while self.manager.recv(0.0) is not None:
             pass
 
@@ -105,7 +107,7 @@ def run(seconds: float, rounds: int, interface: str, channel: str | None) -> dic
 
 
 def _row(what: str, late_ns: Float, goal_ms: float, load_hz: float = 0.0) -> Row:
-    """Return the row for signed deviations from the nominal time, ns."""
+    """Return a result row, given signed deviations from the nominal time, ns."""
     late_ms = np.abs(late_ns) / 1e6
     p50, p99, most = np.percentile(late_ms, [50, 99, 100]).tolist() if len(late_ms) else [None] * 3
     spread = {"p50_ms": p50, "p99_ms": p99, "max_ms": most}
@@ -166,9 +168,9 @@ def _load(rig: _Rig, rate_hz: int, stop: threading.Event) -> None:
 
 
 def handlers() -> dict[str, Callable[[], object]]:
-    """Return one function per kind of frame; each makes a node without a bus handle one such frame.
+    """Return one function per kind of frame; a call makes a node without a bus handle one such frame.
 
-    Each function also queries the next deadline, as the thread that runs a node does.
+    Each function also queries the node's next deadline, as the thread that runs a node does.
     """
     layout = PatchLayout.preset("staggered")
     node = PatchNode(NODE_ID, layout, _Still(layout), send=lambda _can_id, _data: None, pacing=EXACT)
@@ -186,7 +188,7 @@ def handlers() -> dict[str, Callable[[], object]]:
             now_ns = node.next_deadline_ns() or now_ns
             node.on_timer(now_ns)
 
-    # Map the error register to TPDO3, sent on remote request.
+    # Map the error register to TPDO3, and let the node send TPDO3 on remote request.
     sdo = od.sdo_request_cob_id(NODE_ID)
     for request in ("23021a0108000110", "2f021a0001000000", "2f021802fd000000", "2302180184030000"):
         give(sdo, bytes.fromhex(request))

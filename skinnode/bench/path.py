@@ -1,23 +1,24 @@
-"""The paper's path experiments, repeated with its protocol and compared with its values (``paper.toml``).
+"""Repeats the paper's path experiments and compares the results with its published values (``paper.toml``).
 
 Each experiment uses one upper wire of 10 electrodes (30 unknowns), without the other wires of the patch. A
 sphere with a radius of 6 to 12 mm presses on rubber (Hertz's closed form with friction) at a random point in
-the middle of the patch; the wire nearest to that point is solved. Of 1000 samples of the downward motion, n
-evenly spaced samples are used.
+the middle of the patch; the wire nearest to that point is solved. The downward motion consists of 1000
+samples, of which n evenly spaced samples are used.
 
-Counts. The paper counts function calls with finite-difference Jacobians, each of which costs 30 calls in
-addition to the call of F itself. Here F and J together cost about as much as two evaluations of F; ×31 gives
-the cost with finite differences. Calls per step are means over all samples but the last, as in the paper. The
-accuracy is ‖X − X*‖ / ‖X* − X(0)‖ (RMS), averaged over the experiments that converged. The first-order
-optimality is that of r = a F − 1, dimensionless with lengths in pitches; MATLAB would give that of F, which
-is larger by a factor of F² and depends on the unit of length, which the paper does not state.
+Counts: The paper counts function calls with finite-difference Jacobians, each of which costs 30 calls in
+addition to the call of F itself. Our analytic F and J together cost about as much as two evaluations of F;
+multiplying our counts by 31 yields the cost with finite differences. Calls per step are averaged over all
+samples except the last, as in the paper. The accuracy is the RMS error ‖X − X*‖ / ‖X* − X(0)‖, averaged over
+the experiments that converged. The first-order optimality is computed for r = a F − 1, which is
+dimensionless, with lengths in pitches. MATLAB computes the optimality of F, which is larger by a factor of F²
+and depends on the unit of length. The paper does not state this unit.
 
-Settings. Gauss-Newton never fails here at the paper's 10 %: on ``aligned``, h = 0.3, 0.4 … 1, it solves all
-10 experiments with any number of steps. The hardest ``aligned`` setting at that depth is therefore h = 1. At
-h = 0.7 and 30 %, Gauss-Newton fails as it did for the authors: in 6 of 10 experiments with 5 steps and in 2
-with 10 steps, but in none with 20 or more. This setting was found by searching h = 0.3 … 1 and presses of 15
-… 30 %; at h = 1 and 25 %, 5 and 3 experiments fail, respectively, but there levenberg_marquardt also fails
-with more steps.
+Settings: At the paper's press depth of 10 %, our Gauss-Newton never fails: on ``aligned`` with h = 0.3, 0.4 …
+1, it solves all 10 experiments with any number of steps. The hardest ``aligned`` setting at that depth is
+therefore h = 1. At h = 0.7 and 30 %, Gauss-Newton fails as reported in the paper: in 6 of 10 experiments with
+5 steps and in 2 experiments with 10 steps, but never with 20 or more steps. This setting was found by a
+search over h = 0.3 … 1 and depths of 15 … 30 %. At h = 1 and 25 %, 5 experiments fail with 5 steps and 3 with
+10 steps, but there levenberg_marquardt also fails with more steps.
 """
 
 from __future__ import annotations
@@ -41,7 +42,7 @@ from skinnode.solve.paths.path import PathResult, solve_path
 from skinnode.solve.paths.step_control import Adaptive, Periodic, Schedule, Uniform, shortest_cycle
 
 SETTINGS: Final = (("staggered", 0.5, 0.1), ("aligned", 1.0, 0.1), ("aligned", 0.7, 0.3))
-"""Preset, height in pitches, depth of the press in heights."""
+"""Settings as (preset, height in pitches, depth of the press as a fraction of the height)."""
 PITCH_M: Final = 4e-3
 SAMPLES: Final = 1000
 SEED: Final = 2018
@@ -56,7 +57,7 @@ LABELS: Final = {
     "gauss_newton": "Gauss-Newton",
     "dogleg": "dogleg",
 }
-"""The operators in the paper's tables, in the order of their rows."""
+"""Display names of the operators, in the order of the rows in the paper's tables."""
 UNKNOWNS: Final = 30
 DIFFERENCES: Final = UNKNOWNS + 1
 """Number of calls of F needed to compute F and J by forward differences."""
@@ -65,19 +66,19 @@ WRONG: Final = 1e-4
 
 
 def printed() -> dict[str, Any]:
-    """Return the paper's printed values."""
+    """Return the values published in the paper."""
     text = resources.files("skinnode.bench").joinpath("paper.toml").read_text(encoding="utf-8")
     return tomllib.loads(text)
 
 
 @dataclass(frozen=True, eq=False)
 class Experiment:
-    """One wire being pressed."""
+    """Press of a single wire."""
 
     layout: PatchLayout
     """Layout of the single wire."""
     samples_ohm: Float
-    """(SAMPLES, 1, K), ohm."""
+    """(SAMPLES, 1, K), resistances of the wire, ohm."""
     truth_m: Float
     """(1, N, 3), true displacement at the last sample, metres."""
     patch: PatchLayout
@@ -90,19 +91,19 @@ class Experiment:
             return solve_path(self.layout, chosen, operator=operator, schedule=schedule)
 
     def error(self, path: PathResult) -> float:
-        """Return ‖X − X*‖ / ‖X* − X(0)‖."""
+        """Return the relative error ‖X − X*‖ / ‖X* − X(0)‖ of a path's result."""
         with np.errstate(all="ignore"):
             wrong = np.linalg.norm(path.displacement_m - self.truth_m)
         return float(wrong / np.linalg.norm(self.truth_m))
 
 
 def preset(name: str, height: float) -> PatchLayout:
-    """Return a preset of the reference patch; ``height`` in pitches."""
+    """Return a preset layout of the reference patch with a height of ``height`` pitches."""
     return PatchLayout.preset(name, pitch_m=PITCH_M, height_m=height * PITCH_M)
 
 
 def experiments(layout: PatchLayout, depth: float, count: int) -> list[Experiment]:
-    """Return ``count`` random presses, ``depth`` heights deep."""
+    """Generate ``count`` random presses, each ``depth`` layer heights deep."""
     rng = np.random.default_rng(SEED)
     span = layout.upper_m[..., :2].max(axis=(0, 1))
     made = []
@@ -126,7 +127,7 @@ def experiments(layout: PatchLayout, depth: float, count: int) -> list[Experimen
 
 
 def run(count: int) -> dict[str, Any]:
-    """Run the benchmark with ``count`` experiments per setting, and return all figures."""
+    """Run the path benchmark with ``count`` experiments per setting, and return all results."""
     settings = []
     for name, height, depth in SETTINGS:
         layout = preset(name, height)
@@ -146,7 +147,7 @@ def run(count: int) -> dict[str, Any]:
 
 def _setting(made: list[Experiment]) -> dict[str, Any]:
     first = made[0]
-    first.solve(Uniform())  # the first solve loads the kernels, which no row should pay for
+    first.solve(Uniform())  # the first solve also loads the kernels, so it must not be timed
     operators, ours = (
         {operator: [_row(made, Uniform(plain=plain), operator, n) for n in STEPS] for operator in LABELS}
         for plain in (True, False)
@@ -210,7 +211,7 @@ def _mean(values: Sequence[float]) -> float | None:
 
 
 def _path_rows(path: PathResult) -> slice:
-    """Return the rows of the path itself, without the cycle search, second attempts or checks."""
+    """Return the slice of the path's own rows, without cycle search, second attempts and checks."""
     at = path.position[path.searched :, 0]
     return slice(path.searched, path.searched + int(np.argmax(at == np.nanmax(at))) + 1)
 
@@ -220,19 +221,19 @@ def _final(path: PathResult) -> float:
 
 
 def _calls(made: list[Experiment], samples: int) -> list[float]:
-    """Return figure 8: mean calls at each step but the last."""
+    """Return the data of figure 8: mean number of calls at each step except the last."""
     paths = [one.solve(Uniform(plain=True), samples=samples) for one in made]
     return [float(each) for each in np.mean([path.evaluations[: samples - 1, 0] for path in paths], axis=0)]
 
 
 def _optimality(one: Experiment, samples: int, tolerance: float) -> list[float]:
-    """Return figures 9 and 10: first-order optimality at the end of each step but the last."""
+    """Return the data of figures 9 and 10: first-order optimality after each step except the last."""
     path = one.solve(Uniform(plain=True, intermediate_tolerance=tolerance), samples=samples)
     return [float(each) for each in path.optimality[: samples - 1, 0]]
 
 
 def _cycle(made: list[Experiment], samples: int, tolerance: float) -> float | None:
-    """Return the median cycle of the experiments that have a cycle; None if none has one."""
+    """Return the median cycle length of all experiments with a cycle; None if no experiment has a cycle."""
     cycles = []
     for one in made:
         path = one.solve(Uniform(plain=True, intermediate_tolerance=tolerance), samples=samples)
@@ -243,7 +244,7 @@ def _cycle(made: list[Experiment], samples: int, tolerance: float) -> float | No
 
 
 def _iterations(made: list[Experiment], samples: int) -> dict[str, Any]:
-    """Return figure 11: operator steps over the path, in total and at each sample of one experiment."""
+    """Return the data of figure 11: operator steps on the whole path and, for one experiment, by sample."""
     uniform = [one.solve(Uniform(plain=True), samples=samples) for one in made]
     periodic = [one.solve(Periodic(plain=True), samples=samples) for one in made]
     return {
@@ -257,7 +258,7 @@ def _iterations(made: list[Experiment], samples: int) -> dict[str, Any]:
 
 
 def _last_step(one: Experiment, periodic: bool) -> list[float]:
-    """Return figure 12: optimality at the start of the last of 50 samples and after its iterations."""
+    """Return the data of figure 12: optimality at the last of 50 samples, before and after each iteration."""
     cycle = one.solve(Periodic(plain=True), samples=50).cycle if periodic else None
 
     def schedule(most: int) -> Schedule:
@@ -288,17 +289,17 @@ def correction(layout: PatchLayout, upper_m: Float, frame_ohm: Float) -> float:
 
 
 def _linear(layout: PatchLayout, upper_m: Float, frame_ohm: Float) -> tuple[Float, Float]:
-    """Return r and J of the single wire."""
+    """Return the residual r (K,) and the Jacobian J (K, 3N) of the single wire."""
     a = frame_ohm[0] / layout.resistivity_ohm_per_m
     r = a * potential_per_m(layout, upper_m)[0] - 1.0
     return r, jacobian(layout, upper_m)[0].reshape(len(a), -1) * a[:, None] * layout.pitch_m
 
 
 def _ten_steps() -> list[dict[str, Any]]:
-    """Return the time and error of the ten-step path on ``staggered``.
+    """Measure the time and error of the ten-step path on ``staggered``.
 
-    There are rows for one wire alone, with each operator and with our own step control, and for one wire in a
-    patch of ten.
+    A single wire is solved with each operator and with our own step control. The last row is for one wire in
+    a patch of ten wires.
     """
     layout = preset(*SETTINGS[0][:2])
     one = experiments(layout, SETTINGS[0][2], 1)[0]
@@ -330,9 +331,9 @@ def _ten_steps() -> list[dict[str, Any]]:
 
 
 def _surface() -> dict[str, Any]:
-    """Return figure 13: heights of the surface of the whole patch in µm, at the hardest setting.
+    """Return the data of figure 13: surface of the whole patch at the hardest setting, µm.
 
-    The patch is solved with 5 and 20 samples as in the paper, and with our step control.
+    The patch is solved with 5 and with 20 samples as in the paper, and with our step control.
     """
     name, height, depth = SETTINGS[-1]
     layout = preset(name, height)
@@ -372,11 +373,11 @@ Say = Callable[[str], None]
 
 
 def print_all(figures: dict[str, Any], say: Say) -> None:
-    """Print the tables and the figure data, with the paper's value next to each number."""
+    """Print the tables and the figure data, each value next to the corresponding value from the paper."""
     paper, count = figures["paper"], figures["experiments"]
     say(f"Means of {count} experiments; one wire, {UNKNOWNS} unknowns; tolerances 1e-6 and 1e-12.")
     say("As in the paper: Uniform(plain=True). Ours: Uniform(), with extrapolation and a second attempt.")
-    say("Tol_X: the largest remaining correction, pitches. Times: medians per call for the single wire.")
+    say("Tol_X: largest remaining correction, in pitches. Times: median per call for the single wire.")
     say("Ten-step path of one wire (paper: 2.03 s)")
     for row in figures["ten_steps"]:
         say(f"  {row['what']:32}{row['ms']:6.2f} ms, error {100 * row['error']:.0e} %")
@@ -386,9 +387,9 @@ def print_all(figures: dict[str, Any], say: Say) -> None:
         _print_dogleg(setting, paper, count, say)
         _print_figures(setting, paper, say)
     wrong = sum(row["wrong"] for setting in figures["settings"] for row in _rows(setting))
-    say(f"\nConverged and wrong, all settings and schedules: {wrong}")
+    say(f"\nWires CONVERGED but wrong, over all settings and schedules: {wrong}")
     surface = figures["surface"]
-    say("figure 13, surface at the last setting: largest error of a coordinate, and wires not converged")
+    say("figure 13, surface at the last setting: maximum coordinate error, wires not converged")
     for path in surface["paths"]:
         say(f"  {path['title']:44}{path['error_um']:10.2e} µm  {path['converged'].count(False)} of 10")
 
@@ -404,7 +405,7 @@ def _rows(setting: dict[str, Any]) -> list[dict[str, Any]]:
 
 
 def _accuracy(row: dict[str, Any], count: int) -> str:
-    """Return the mean over the converged experiments, and the number of experiments that did not converge."""
+    """Format the mean error of the converged experiments, and the number of experiments that failed."""
     if row["failed"] == count:
         return f"failed {count}/{count}"
     text = f"{row['accuracy_percent']:.0e} %"
@@ -441,8 +442,8 @@ def _print_operators(setting: dict[str, Any], paper: dict[str, Any], count: int,
                 f"  {_accuracy(own, count)}"
             )
     say(
-        f"ours: all experiments solved, more accurately than in the paper, in {better} of "
-        f"{len(LABELS) * len(STEPS)} cells"
+        f"cells in which ours solves all experiments more accurately than the paper: {better} of "
+        f"{len(LABELS) * len(STEPS)}"
     )
 
 
@@ -478,14 +479,14 @@ def _print_figures(setting: dict[str, Any], paper: dict[str, Any], say: Say) -> 
         shown = calls if len(calls) <= 19 else calls[:19]
         dots = "" if len(calls) <= 19 else " …"
         say(f"  {n:>3} steps  " + " ".join(f"{each:.1f}" for each in shown) + dots)
-    say("figures 9 and 10, first-order optimality at 1e-4: samples from one solve to the next (cycle T)")
+    say("figures 9 and 10, first-order optimality: number of samples between solves (cycle T)")
     say(f"  {'tolerance':>10}" + "".join(f"{n + ' samples':>13}" for n in ("20", "50", "100")))
     for tolerance, cycles in setting["cycles"].items():
         say(f"  {tolerance:>10}" + "".join(f"{_figure(cycles[n], 'g'):>13}" for n in ("20", "50", "100")))
     section = paper["section5"]
     say(
-        f"  the paper's T at 1e-4 and 50 samples: {section['cycle_at_50_steps_tol_1e-4']}. Its optimality is "
-        f"that of F and would be {setting['unscaled']:.0f} times ours if its unit of length were the pitch."
+        f"  the paper's T at 1e-4 and 50 samples: {section['cycle_at_50_steps_tol_1e-4']}. The paper's "
+        f"optimality refers to F; with lengths in pitches, it is {setting['unscaled']:.0f} times ours."
     )
     totals, printed_totals = setting["figure11"], paper["figure11_iterations"]
     say("figure 11, iterations per path")
@@ -494,7 +495,7 @@ def _print_figures(setting: dict[str, Any], paper: dict[str, Any], say: Say) -> 
         ("uniform, 100 samples", "100", "uniform", printed_totals["uniform_100_steps"]),
         ("periodic, 100 samples", "100", "periodic", printed_totals["periodic_100_steps"]),
     ):
-        search = f", and {totals[n]['search']:.0f} once to find the cycle" if key == "periodic" else ""
+        search = f", plus {totals[n]['search']:.0f} to find the cycle" if key == "periodic" else ""
         say(f"  {label:24}{totals[n][key]:7.1f}   paper {theirs}{search}")
     for row in setting["periodic"]:
         say(
@@ -502,10 +503,10 @@ def _print_figures(setting: dict[str, Any], paper: dict[str, Any], say: Say) -> 
             f"{row['iterations']:.1f} iterations, {_figure(row['accuracy_percent'], '.0e')} %, "
             f"{row['failed']} failed"
         )
-    say("figure 12, optimality of the last step of 50")
+    say("figure 12, optimality during the last of 50 steps")
     for label, theirs in (
         ("uniform", section["final_first_order_optimality_uniform_50"]),
         ("periodic", section["final_first_order_optimality_periodic_50"]),
     ):
         trace = " ".join(f"{each:.0e}" for each in setting["figure12"][label])
-        say(f"  {label:10}{trace}   paper ends at {theirs:.2e}")
+        say(f"  {label:10}{trace}   final value in the paper: {theirs:.2e}")

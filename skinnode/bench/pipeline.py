@@ -1,8 +1,8 @@
-"""Throughput and latency of a host, and CPU time per thread group, by number of buses and patches.
+"""Measures a host's throughput, latency and CPU time per thread group, for several numbers of buses.
 
-The host is that of ``skinnode host``, a guest on the bus of a robot whose master and nodes are replayed by
-another process (:mod:`skinnode.bench.load`). Frames arrive over UDP, through SocketCAN's reader (see
-:mod:`skinnode.transport.datagram`), or on a real CAN interface.
+The host is that of ``skinnode host``. It is a guest on the buses of a robot, whose master and nodes another
+process replays (:mod:`skinnode.bench.load`). Frames arrive on a real CAN interface, or over UDP through the
+receiver for SocketCAN (see :mod:`skinnode.transport.datagram`).
 """
 
 from __future__ import annotations
@@ -33,11 +33,11 @@ from skinnode.transport.datagram import DatagramPort, free_channel
 
 PATCHES_A_BUS: Final = 4
 CLASSIC_MS: Final = 50
-"""SYNC period with classic CAN: four patches of 101 frames give 8,080 frames/s plus SYNC and heartbeats."""
+"""SYNC period with classic CAN, ms; four patches of 101 frames send 8,080 frames/s plus heartbeats."""
 FD_MS: Final = 25
 STAGGER_MS: Final = 3.0
-"""Offset in ms between the SYNCs of successive buses when staggered; the four patches on one bus are then
-solved before the next four are due."""
+"""Offset between the SYNCs of successive buses when staggered, ms; the four patches on one bus are then
+solved before the scans of the next bus are complete."""
 SCENES: Final = (
     (False, True, 0.0),
     (False, True, STAGGER_MS),
@@ -46,9 +46,9 @@ SCENES: Final = (
     (True, True, STAGGER_MS),
     (True, False, 0.0),
 )
-"""Whether CAN FD is used, whether the patches are touched, and the offset between SYNCs in ms."""
+"""Scenes as (whether CAN FD is used, whether the patches are touched, offset between SYNCs in ms)."""
 DEADLINE_US: Final = 1000
-"""Deadline of a field. An exact inverse takes 200 µs, or 13 ms if the posterior has to check the result."""
+"""Deadline for solving a scan, µs; an exact inverse takes 200 µs, or 13 ms if the posterior must check it."""
 RECEIVE_US: Final = 5.0
 LATENCY_MS: Final = 5.0
 SETTLE_S: Final = 5.0
@@ -66,19 +66,19 @@ def run(  # noqa: PLR0913 - the options of the command
     all_cores: bool,
     report: Callable[[Row], None],
 ) -> dict[str, Any]:
-    """Run all hands.
+    """Measure all hands.
 
     Args:
         seconds: Duration of each measurement.
-        short: Whether to run only the rows that have a requirement.
+        short: Whether to measure only the rows for which there is a requirement.
         interface: ``udp`` or ``socketcan``.
-        channel: Channel for socketcan.
+        channel: Channel of the ``socketcan`` interface.
         all_cores: Whether host and load generator may use all cores; otherwise each is bound to a single
             core.
-        report: Called with each row when it is ready.
+        report: Function that receives each row as soon as it is complete.
 
     Returns:
-        The figures.
+        The rows and the requirements.
 
     Raises:
         BusError: A bus fails.
@@ -106,7 +106,7 @@ def run(  # noqa: PLR0913 - the options of the command
                     rows.append(_measure(_part(hand, buses), generator) | {"touched": touched})
                     report(rows[-1])
     road = "a CAN interface" if interface == "socketcan" else "UDP"
-    where = "the host on one core" if apart else "the host on all cores"
+    where = "host restricted to one core" if apart else "host on all cores"
     return {"machine": machine() | {"road": road, "": where}, "rows": rows, "must": _must(rows)}
 
 
@@ -151,13 +151,13 @@ def _hand(  # noqa: PLR0913 - the properties in which hands differ
             "stream": {"capacity_fields": 100_000},
         }
     )
-    # Skip validation, which refuses a bus this full: frames of maximum length would not fit.
+    # Skip validation, which rejects this bus load because frames of maximum length would not fit.
     full = tuple(bus.model_copy(update={"max_load": 2.0}) for bus in hand.buses)
     return hand.model_copy(update={"buses": full})
 
 
 def _part(hand: HandConfig, buses: int) -> HandConfig:
-    """Return the hand reduced to its first ``buses`` buses."""
+    """Return a copy of the hand that contains only its first ``buses`` buses."""
     kept = hand.buses[:buses]
     patches = tuple(patch for patch in hand.patches if patch.bus in {bus.name for bus in kept})
     return hand.model_copy(update={"buses": kept, "patches": patches})
@@ -169,7 +169,7 @@ def _measure(hand: HandConfig, generator: Generator) -> Row:
     generator.send_heartbeats(names)
     with Host.from_config(hand, open_port=open_port) as host, _Reader(host.fields()) as reader:
         begin_ns = generator.begin()
-        time.sleep(LEAD_S / 2)  # the last heartbeats before the start have arrived
+        time.sleep(LEAD_S / 2)  # until the last heartbeats sent before the replay have arrived
         read_before = _read(host)
         before, begin_s = _cpu_s(), time.monotonic()
         sent = generator.wait()
@@ -217,7 +217,7 @@ def _spread(late_ms: list[float]) -> dict[str, float | None]:
 
 
 def lost(row: Row) -> int:
-    """Return the number of frames, chunks and scans lost between the load generator and the fields."""
+    """Return the total number of frames, chunks and scans lost between load generator and fields."""
     frames = row["sent"] - row["received"] + row["queue_dropped"]
     return int(frames + row["chunks_lost"] + row["scans_missed"] + row["scans"] - row["fields"])
 
@@ -247,7 +247,7 @@ def _must(rows: list[Row]) -> list[Row]:
 
 
 class _Reader:
-    """A program that reads fields and records when it received each."""
+    """Subscriber that records the arrival time of each field."""
 
     def __init__(self, fields: Subscription) -> None:
         self._stamps: list[tuple[ScanStamp, int]] = []
@@ -255,7 +255,7 @@ class _Reader:
         self._thread = threading.Thread(target=self._run, name="subscriber", daemon=True)
 
     def since(self, begin_ns: int) -> tuple[list[float], list[float]]:
-        """Return the ms from last frame to field and to delivery, for scans that ended after ``begin_ns``."""
+        """Return the latencies of fields and of their delivery, ms, for scans that end after ``begin_ns``."""
         stamps = [(stamp, read_ns) for stamp, read_ns in self._stamps if stamp.t_receive_ns >= begin_ns]
         published = [(stamp.t_solved_ns - stamp.t_receive_ns) * 1e-6 for stamp, _ in stamps]
         return published, [(read_ns - stamp.t_receive_ns) * 1e-6 for stamp, read_ns in stamps]
@@ -278,7 +278,7 @@ def _read(host: Host) -> int:
 
 
 def _settle(host: Host) -> None:
-    """Wait until the counters stop changing."""
+    """Wait until the host's counters stop changing."""
     end_s, last = time.monotonic() + SETTLE_S, None
     while time.monotonic() < end_s:
         stats = host.stats()
@@ -312,15 +312,15 @@ HEAD: Final = (
     f"\n{'':94}{'p50   p99   max':>20}{'p50   p99':>14}{'frame':>6}{'fraction of a core':>24}"
 )
 LEGEND: Final = (
-    "lost: frames, chunks and scans, lost anywhere. published, read: time from the last frame of a scan\n"
-    "(kernel timestamp) to its field, and to the delivery of that field. µs: time in the receive and\n"
-    "mainline threads, including wake-ups. load: of the bus; of the replaying process. The scans started by\n"
-    "one SYNC end at the same time on all patches, except where the SYNCs of the buses are a few ms apart."
+    "lost: total number of frames, chunks and scans lost. published, read: time from the kernel timestamp\n"
+    "of a scan's last frame to the publication of the field, and to its delivery. µs: time per frame in the\n"
+    "receive and mainline threads, including wake-ups. load: of the bus (left) and of the load generator\n"
+    "(right). The scans of all patches end at the same time, unless the SYNCs of the buses are staggered."
 )
 
 
 def line(row: Row) -> str:
-    """Return a row as one line of text."""
+    """Format a row as one line of text."""
 
     def ms(spread: dict[str, float | None], *names: str) -> str:
         return "".join("     -" if spread[name] is None else f"{spread[name]:6.1f}" for name in names)

@@ -1,9 +1,9 @@
-"""Scores decoded fields against the truth: error, reported uncertainty, and the bound set by the codes.
+"""Scores decoded fields by comparison with the truth: error, reported uncertainty, and theoretical bound.
 
-The bound is the Cramér-Rao bound for one scan: with S the diagonal matrix of the standard deviations of the
-relative residuals F/b − 1, and J their Jacobian at the true position, no unbiased estimator of a wire's
-electrode positions has a covariance below J⁻¹ S Sᵀ J⁻ᵀ. The bound is computed here from the NumPy reference
-model, independently of the solver.
+The bound is the Cramér-Rao bound for one scan. Let S be the diagonal matrix of the standard deviations of the
+relative residuals F/b − 1, and J the Jacobian of the residuals at the true position. No unbiased estimator of
+a wire's electrode positions has a covariance below J⁻¹ S Sᵀ J⁻ᵀ. This module computes the bound from the
+NumPy reference model, independently of the solver.
 """
 
 from __future__ import annotations
@@ -18,15 +18,15 @@ from skinnode.model.layout import Float, PatchLayout
 
 OUTLIER_DEVIATIONS = 6.0
 """Maximum error that does not count as a fault, in reported standard deviations. A run scores about 1e5
-coordinates; by chance alone, 2e-4 coordinates are expected beyond six standard deviations: one false alarm in
-5,000 runs."""
+coordinates. By chance alone, 2e-4 of these coordinates exceed six standard deviations, which causes one false
+alarm in 5,000 runs."""
 
 EXCESS_LIMIT = 1.15
 """Maximum ratio of a run's RMS error to its RMS reported standard deviation, as required by this project."""
 
 
 def bound_std_m(layout: PatchLayout, upper_m: Float, relative_std: Float) -> Float:
-    """Return the Cramér-Rao bound for every coordinate as a standard deviation (U, N, 3), metres.
+    """Compute the Cramér-Rao bound of each coordinate as a standard deviation (U, N, 3), metres.
 
     Args:
         layout: The patch.
@@ -34,7 +34,7 @@ def bound_std_m(layout: PatchLayout, upper_m: Float, relative_std: Float) -> Flo
         relative_std: Relative standard deviations (U, K) of the resistances.
 
     Returns:
-        The bound; inf for a wire whose Jacobian is singular.
+        The bound (U, N, 3), metres; inf for a wire whose Jacobian is singular.
     """
     potential = potential_per_m(layout, upper_m)
     slopes = jacobian(layout, upper_m).reshape(*layout.shape, layout.unknowns)
@@ -49,28 +49,28 @@ def bound_std_m(layout: PatchLayout, upper_m: Float, relative_std: Float) -> Flo
 
 @dataclass(frozen=True, slots=True)
 class Score:
-    """Figures for one patch in a run; lengths in metres, NaN if no scan was scored."""
+    """Results for one patch in a run; lengths are in metres, and NaN if no scan was scored."""
 
     scans: int
     untrusted: int
-    """Scans in which at least one wire did not converge; the other figures exclude these scans."""
+    """Number of scans whose field was not trusted; these scans are excluded from the other results."""
     deepest_m: float
-    """Largest true displacement of an electrode."""
+    """Largest component of a true electrode displacement."""
     error_rms_m: float
     reported_rms_m: float
     bound_rms_m: float
-    """RMS of the bound due to the codes alone, without the converter's noise."""
+    """RMS Cramér-Rao bound due to quantisation alone, without the converter's noise."""
     error_max_m: float
     relative_error: float
-    """‖X − X*‖ / ‖X* − X(0)‖ in the scan with the largest true displacement."""
+    """Relative error ‖X − X*‖ / ‖X* − X(0)‖ of the scan with the largest true displacement."""
     coverage95: float
     """Fraction of coordinates whose error is within the reported 95 % interval."""
     worst_deviations: float
-    """Largest error of a coordinate in reported standard deviations."""
+    """Largest error of any coordinate, in reported standard deviations."""
 
     @property
     def within_uncertainty(self) -> bool:
-        """Whether the RMS error and every single error are consistent with the reported uncertainty."""
+        """Whether the RMS error and every individual error are consistent with the reported uncertainty."""
         return (
             self.scans > 0
             and self.untrusted == 0
@@ -81,12 +81,12 @@ class Score:
 
 @dataclass
 class Scorer:
-    """Accumulates one patch's run. ``code_std`` is the standard deviation of R / R0 due to quantisation."""
+    """Scores one patch during a run; ``code_std`` is the standard deviation of R / R0 due to quantisation."""
 
     layout: PatchLayout
     code_std: float
     bound_every: int = 10
-    """Interval, in scans, at which :meth:`score` computes the bound, which changes slowly."""
+    """Number of scans per computation of the Cramér-Rao bound, which changes slowly."""
     _scans: int = 0
     _untrusted: int = 0
     _squares: float = 0.0
@@ -98,7 +98,7 @@ class Scorer:
     _deepest: tuple[float, float] = (0.0, float("nan"))
 
     def add(self, frame: FieldFrame, true_upper_m: Float) -> float:
-        """Add a scan with its true positions (U, N, 3), metres. Returns its RMS error in metres."""
+        """Add a scan, given its true positions (U, N, 3), metres; return the RMS error in metres."""
         truth = true_upper_m - self.layout.upper_m
         error = frame.displacement_m - truth
         rms = float(np.sqrt(np.mean(error**2)))
@@ -121,11 +121,11 @@ class Scorer:
         return rms
 
     def score(self) -> Score:
-        """Return the figures for the scans added so far."""
+        """Compute the score of the scans added so far."""
         count = self._scans or float("nan")
         at_rest = potential_per_m(self.layout, self.layout.upper_m)
         bounds = [
-            # relative standard deviation of R: code_std R0 / R = code_std F / F0
+            # The relative standard deviation of R is code_std R0 / R = code_std F / F0.
             bound_std_m(self.layout, upper_m, self.code_std * potential_per_m(self.layout, upper_m) / at_rest)
             for upper_m in self._bound_at
         ]

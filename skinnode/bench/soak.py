@@ -1,12 +1,12 @@
-"""Soak test of a hand under random faults: does the host survive, do patches recover, do the counts agree?
+"""Soak test under random faults: checks that host and patches recover, and that all frame counts agree.
 
-Simulated nodes, with faults, and the host share this process and two virtual buses. A round injects one to
-three faults, such as dropped frames of any kind, into one patch or into all patches. It then clears the
-faults and waits until every patch is operational and streaming again, while subscribers come and go. In
-some rounds other processes occupy the processors. Memory use is compared at two idle instants, one after a
-warm-up and one at the end: blocks allocated by Python (:func:`sys.getallocatedblocks`, which would reveal a
-leak of one object per scan) and resident memory. This file may import the simulator, as the demo may, because
-it needs a source of faults.
+The host and simulated nodes run in this process and communicate over two virtual buses. Each round injects
+one to three kinds of fault, such as dropped frames, into one patch or into all patches, while subscribers
+come and go. The round then clears the faults and waits until every patch is operational and streaming again.
+In some rounds, other processes occupy the processors. Memory use is measured twice while the host is
+undisturbed, after a warm-up and at the end. The measured quantities are resident memory and the number of
+blocks allocated by Python (:func:`sys.getallocatedblocks`), which would reveal a leak of one object per scan.
+This module may import the simulator, as the demo may, because the simulator provides the faults.
 """
 
 from __future__ import annotations
@@ -45,24 +45,24 @@ from vcan_sim.sensor import REMEMBERED_READINGS
 WARM_UP: Final = 0.25
 """Fraction of the run after which memory use is measured for the first time."""
 BLOCKS: Final = 2000
-"""Maximum growth in the number of blocks. The number of blocks varies by a few hundred; a leak of one block
-per scan adds 10,000 in three minutes."""
+"""Maximum growth in the number of memory blocks. The number normally varies by a few hundred blocks; a leak
+of one block per scan adds 10,000 blocks in three minutes."""
 RESIDENT_MB: Final = 8.0
-"""Maximum growth of resident memory in MB; the C allocator may return freed memory late."""
+"""Maximum growth of resident memory, MB; the C allocator may return freed memory with a delay."""
 BACK_S: Final = 15.0
-"""Time after which a stream that has not resumed counts as lost, s. Recovery should take one second; a loaded
-machine may need more."""
+"""Time after which a stream that has not resumed counts as lost, s. Recovery should take one second, but may
+take longer on a loaded machine."""
 SLOW_S: Final = 1.0
-"""Duration above which the recovery in a round is reported as slow, s."""
+"""Recovery time above which a round is reported as slow, s."""
 STARVED: Final = 0.1
-"""Fraction of rounds in which other processes occupy the processors."""
+"""Fraction of the rounds in which other processes occupy the processors."""
 STARVED_S: Final = 3.0
 TARED: Final = 0.2
 """Fraction of the rounds in which a patch is tared."""
 CALM_S: Final = 1.5
 _PATCHES: Final = 4
 _MANY: Final = 8
-"""Minimum number of simultaneous faults for which a line gives their count instead of their names."""
+"""Minimum number of simultaneous kinds of fault that are reported by number and not by name."""
 
 _KINDS: Final[tuple[dict[str, Any], ...]] = (
     {"lost": 0.05},
@@ -131,7 +131,7 @@ _KINDS: Final[tuple[dict[str, Any], ...]] = (
 
 @dataclass(frozen=True, slots=True)
 class _Size:
-    """Figures that must not grow."""
+    """Resource usage of this process, which must not grow during the test."""
 
     blocks: int
     resident_mb: float
@@ -148,23 +148,23 @@ def warm_up() -> None:
 
 
 def run(minutes: float, seed: int, report: Callable[[str], None]) -> dict[str, Any]:
-    """Run a soak test of a hand and return its figures. Raises as :meth:`Host.from_config`.
+    """Run a soak test and return its results. Raises the same errors as :meth:`Host.from_config`.
 
     Args:
-        minutes: Duration of the soak.
+        minutes: Duration of the test.
         seed: Seed of the faults.
-        report: Called with each line of progress.
+        report: Function that receives each line of progress.
     """
     chance = random.Random(seed)
     hand = _hand()
     counter = sums.FrameCounter([bus.name for bus in hand.buses])
     kept = logging.getLogger("skinnode")
     level = kept.level
-    kept.setLevel(logging.CRITICAL)  # injected faults cause thousands of warnings
+    kept.setLevel(logging.CRITICAL)  # injected faults would cause thousands of warnings
     try:
         fleet = Fleet(hand, faults=Faults(seed=seed))
         for source in fleet.patches.values():
-            for k in range(REMEMBERED_READINGS):  # fill its record of readings, which must not grow later
+            for k in range(REMEMBERED_READINGS):  # fill the history before memory use is measured
                 source.read(-1000 * TIME_STEP_US * (k + 1))
         with fleet:
             before = {bus.name: Counter(fleet.passed(bus.name).sent) for bus in hand.buses}
@@ -181,7 +181,7 @@ def run(minutes: float, seed: int, report: Callable[[str], None]) -> dict[str, A
                     *sums.injected_otherwise(stats, injected),
                     *sums.received_otherwise(fleet, counter, before),
                 ]
-            time.sleep(CALM_S)  # time for the host's last frames to reach the nodes
+            time.sleep(CALM_S)  # until the host's last frames have reached the nodes
         wrong += sums.sent_otherwise(fleet, counter)
     finally:
         kept.setLevel(level)
@@ -204,9 +204,9 @@ def run(minutes: float, seed: int, report: Callable[[str], None]) -> dict[str, A
 
 
 def summary_lines(figures: dict[str, Any]) -> list[str]:
-    """Return the figures as readable lines."""
+    """Format the results as lines of text."""
     lines = [
-        f"{figures['rounds']} rounds, {figures['starved_rounds']} of them starved of CPU time; "
+        f"{figures['rounds']} rounds, {figures['starved_rounds']} of which were starved of CPU time; "
         f"{figures['frames']} frames received, {figures['scans']} scans, {figures['fields']} fields, "
         f"{figures['rejoins']} bring-ups",
         f"all patches back within {figures['slowest_back_s']:.2f} s; "
@@ -218,8 +218,8 @@ def summary_lines(figures: dict[str, Any]) -> list[str]:
         for row in figures[key]:
             numbers = (row["wanted"], row["dropped"], row["held_back"], row["arrived"])
             lines.append(f"  {row['kind']:<30} " + " ".join(f"{number:>9}" for number in numbers))
-    lines.append("dropped: lost in transit because of a fault")
-    lines.append("held back: the node was silent, unplugged, deaf or off the bus, or the chunk was late")
+    lines.append("dropped: frames lost in transit because of an injected fault")
+    lines.append("held back: frames of a silent, unplugged, deaf or bus-off node, and late chunks")
     for key in ("not_back", "not_operational", "defects", "discrepancies"):
         lines += [f"  {line}" for line in figures[key]]
     return lines
@@ -276,7 +276,7 @@ def _soak(
         if back_s >= BACK_S:
             lost.append(f"round {rounds} ({what}): {waited_for}")
         if rounds % 20 == 0 or back_s >= SLOW_S:
-            late = f"; waited longest for {waited_for}" if back_s >= SLOW_S else ""
+            late = f"; the last patch was {waited_for}" if back_s >= SLOW_S else ""
             say(f"round {rounds}, {what}: all patches back after {back_s:.2f} s{late}")
     time.sleep(CALM_S)
     last = _size()
@@ -297,7 +297,7 @@ def _soak(
 
 
 def _all_at_once(host: Host, fleet: Fleet, names: list[str]) -> None:
-    """Bring up all patches at the same time, to reach the maximum number of threads."""
+    """Bring up all patches at the same time, so that the number of threads reaches its maximum."""
     fleet.inject(Faults(unplugged=True))
     time.sleep(CALM_S)
     _calm(fleet)
@@ -306,7 +306,7 @@ def _all_at_once(host: Host, fleet: Fleet, names: list[str]) -> None:
 
 
 def _inject(fleet: Fleet, chance: random.Random, names: list[str]) -> str:
-    """Inject the faults for a round. Returns their description."""
+    """Inject the faults of a round, and return their description."""
     if chance.random() < 0.05:
         bus = chance.choice(fleet.hand.buses).name
         fleet.bus_off(bus, off=True)
@@ -321,10 +321,10 @@ def _inject(fleet: Fleet, chance: random.Random, names: list[str]) -> str:
 
 
 def _tare(host: Host, name: str) -> str:
-    """Tare a patch if it is running. Returns the outcome as text."""
+    """Tare a patch if the patch is running, and return the outcome as text."""
     try:
         host.tare(name)
-    except BusError:  # includes NodeError, raised if the patch is not operational
+    except BusError:  # NodeError, raised if the patch is not operational, is a BusError
         return f"{name} could not be tared"
     return f"{name} tared"
 
@@ -339,7 +339,7 @@ def _wait_for_patches(host: Host, names: list[str]) -> tuple[float, str]:
     """Wait until every patch is operational and has published a field for a SYNC sent after the call.
 
     Returns:
-        The duration of the wait in s, and the last patch that was waited for, with the reason.
+        The waiting time in s, and the last patch that was not ready, with the reason.
     """
     begin_ns, waited_for = time.monotonic_ns(), ""
 
@@ -359,13 +359,13 @@ def _wait_for_patches(host: Host, names: list[str]) -> tuple[float, str]:
 
 
 def _not_operational(host: Host) -> list[str]:
-    """Return one line for each patch that is not operational, with the reason."""
+    """Return one line of text for each patch that is not operational, with the reason."""
     healths = (host.health(patch.name) for patch in host.hand.patches)
     return [f"{health.patch}, {health.condition}: {health.reason}" for health in healths if health.reason]
 
 
 def _broken(field: FieldFrame) -> None:
-    raise RuntimeError("a subscriber's own defect")
+    raise RuntimeError("deliberate failure of a subscriber")
 
 
 def _patient(field: FieldFrame) -> None:
@@ -373,7 +373,7 @@ def _patient(field: FieldFrame) -> None:
 
 
 def _standing_still(host: Host) -> HostStats:
-    """Return the counters once they have stopped changing."""
+    """Wait until the host's counters stop changing, and return them."""
     last, stats = None, host.stats()
     for _ in range(100):
         now = (
@@ -416,9 +416,9 @@ def _must(figures: dict[str, Any]) -> list[dict[str, Any]]:
         ("growth: resident memory, MB", figures["grown_mb"], RESIDENT_MB),
         ("growth: threads", figures["grown_threads"], 0),
         ("growth: file descriptors", figures["grown_descriptors"], 0),
-        (f"rounds after which a patch was not back within {BACK_S:g} s", len(figures["not_back"]), 0),
-        ("patches that are not operational at the end", len(figures["not_operational"]), 0),
+        (f"rounds after which a patch did not recover within {BACK_S:g} s", len(figures["not_back"]), 0),
+        ("patches not operational at the end", len(figures["not_operational"]), 0),
         ("defects of the host", len(figures["defects"]), 0),
-        ("sums that do not agree", len(figures["discrepancies"]), 0),
+        ("frame counts that do not agree", len(figures["discrepancies"]), 0),
     )
     return [{"what": what, "got": got, "asked": most, "reached": got <= most} for what, got, most in asked]

@@ -1,4 +1,4 @@
-"""Damaged copy of the kernel cache, used at the start of a soak test."""
+"""Prepares a damaged copy of the kernel cache, with which a soak test starts."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from typing import Final
 
 CACHE_ENVIRONMENT: Final = "SKINNODE_CACHE_DIR"
 _DAMAGED: Final = 4
-"""Number of cache files to damage; recompiling each takes up to a few seconds."""
+"""Number of cache files to damage; recompiling a kernel takes up to a few seconds."""
 _COMPILE_S: Final = 600.0
-"""Maximum time to compile all kernels on a slow machine, s."""
+"""Time limit for compiling all kernels, s; sufficient for a slow machine."""
 
 
 def fill(folder: Path) -> None:
-    """Fill a cache under ``folder`` with the kernels that a soak test needs.
+    """Fill a kernel cache under ``folder`` with all kernels that a soak test needs.
 
     The kernels are copied from the user's cache or, if that cache is empty, compiled in a child process. The
-    user's cache is not changed.
+    user's cache is never modified.
 
     Raises:
         subprocess.SubprocessError: The child process fails.
@@ -38,14 +38,14 @@ def fill(folder: Path) -> None:
 
 
 def environment(folder: Path) -> dict[str, str]:
-    """Return the environment of a process that keeps its kernels under ``folder``."""
+    """Return environment variables that make a process use the kernel cache under ``folder``."""
     return {**os.environ, CACHE_ENVIRONMENT: str(folder)}
 
 
 def damage(folder: Path, seed: int) -> list[str]:
     """Damage cache files under ``folder``, alternately by truncation and by filling with random bytes.
 
-    The same seed always damages the same files. Returns one line per file.
+    The same seed always damages the same files. Returns one line of text per damaged file.
     """
     chance = random.Random(seed)
     files = sorted(file for file in folder.rglob("*.nb[ci]") if file.stat().st_size > 1)

@@ -1,4 +1,4 @@
-"""Starvation of a soak test: busy-looping child processes deprive the test of CPU time for a while."""
+"""Deprives a soak test of CPU time by means of child processes that run busy loops."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from collections.abc import Iterator
 from typing import Final
 
 _NICE: Final = -5
-"""Nice value of the children if this process may set it; otherwise they inherit the soak test's value."""
+"""Nice value of the child processes; without the permission to set it, they inherit the parent's value."""
 _CHILDREN_PER_PROCESSOR: Final = 3
 _LONGEST_S: Final = 30.0
-"""Maximum lifetime of a child, s; it also exits as soon as its parent has exited."""
+"""Maximum lifetime of a child process, s; it also exits as soon as its parent has exited."""
 
 _BUSY: Final = """
 import os, sys, time
@@ -34,7 +34,7 @@ def starved_processor() -> Iterator[int]:
             command = [sys.executable, "-S", "-c", _BUSY, str(_LONGEST_S)]
             child = subprocess.Popen(command, stdin=subprocess.DEVNULL)
             children.append(child)
-            with contextlib.suppress(OSError):  # only root may raise a priority
+            with contextlib.suppress(OSError):  # only root may increase a process's priority
                 os.setpriority(os.PRIO_PROCESS, child.pid, _NICE)
         yield count
     finally:

@@ -1,4 +1,4 @@
-"""Comparison of a soak test's counts of sent and dropped frames with the host's counts, by kind."""
+"""Compares the numbers of frames sent and dropped in a soak test with the host's counters, by kind."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from vcan_sim.tally import Kind, kind_of
 
 
 class FrameCounter:
-    """Counter of the frames that a host receives and sends, by bus and kind.
+    """Counts the frames that a host receives and sends, by bus and kind.
 
     Implements :class:`~skinnode.host.tap.HostTap`.
     """
@@ -27,14 +27,14 @@ class FrameCounter:
         self._counting = threading.Lock()  # several threads send frames
 
     def received(self, bus: str, frames: Sequence[Frame]) -> None:
-        """Count a batch of frames."""
+        """Count a batch of received frames."""
         counter = self.received_on[bus]
         for frame in frames:
             if not (frame.error or frame.extended):
                 counter[kind_of(frame.can_id, frame.data, frame.remote)] += 1
 
     def sent(self, bus: str, frame: Frame) -> None:
-        """Count a frame."""
+        """Count a sent frame."""
         with self._counting:
             self.sent_on[bus][kind_of(frame.can_id, frame.data, frame.remote)] += 1
 
@@ -53,20 +53,20 @@ class FrameCounter:
 
 @dataclass(frozen=True, slots=True)
 class KindSums:
-    """Counts of the frames of one kind over a whole soak test."""
+    """Numbers of frames of one kind in a whole soak test."""
 
     kind: str
     wanted: int
-    """Frames to send, including frames added by faults."""
+    """Number of frames that were to be sent, including frames added by faults."""
     dropped: int
-    """Frames dropped in transit by a fault."""
+    """Number of frames that a fault dropped in transit."""
     held_back: int
-    """Frames not sent or not received because the node was silent, unplugged, deaf or bus-off."""
+    """Number of frames not sent or received, because the node was silent, unplugged, deaf or bus-off."""
     arrived: int
 
 
 def of_nodes(fleet: Fleet) -> list[KindSums]:
-    """Return the sums of frames from the nodes to the host, by kind."""
+    """Count the frames from the nodes to the host, by kind."""
     sums = []
     for kind in Kind:
         tallies = [fleet.tally(patch.name) for patch in fleet.hand.patches]
@@ -79,9 +79,9 @@ def of_nodes(fleet: Fleet) -> list[KindSums]:
 
 
 def of_host(fleet: Fleet) -> list[KindSums]:
-    """Return the sums of frames from the host to the nodes, by kind.
+    """Count the frames from the host to the nodes, by kind.
 
-    A frame counts once for each node that could receive it.
+    A frame is counted once for each node that could receive it.
     """
     sums = []
     for kind in Kind:
@@ -99,13 +99,13 @@ def of_host(fleet: Fleet) -> list[KindSums]:
 
 
 def received_otherwise(fleet: Fleet, counter: FrameCounter, before: Mapping[str, Counter[Kind]]) -> list[str]:
-    """Return one line for each mismatch in the counts of frames from the nodes to the host.
+    """Return one line of text for each mismatch in the counts of frames from the nodes to the host.
 
-    Call while the nodes are silent.
+    Call this function while the nodes are silent.
 
     Args:
-        fleet: Fleet of the nodes.
-        counter: Counts made by the host.
+        fleet: Simulated nodes.
+        counter: Counter attached to the host.
         before: Number of frames that each bus carried before the host opened it.
     """
     found = []
@@ -116,16 +116,16 @@ def received_otherwise(fleet: Fleet, counter: FrameCounter, before: Mapping[str,
             sent, received = fleet.passed(bus.name).sent[kind], counter.received_on[bus.name][kind]
             if not emitted == sent == received + before[bus.name][kind]:
                 found.append(
-                    f"{bus.name}: {kind} frames: nodes sent {emitted}, the bus took {sent}, "
+                    f"{bus.name}: {kind} frames: the nodes sent {emitted}, the bus carried {sent}, "
                     f"the host received {received}"
                 )
     return found
 
 
 def sent_otherwise(fleet: Fleet, counter: FrameCounter) -> list[str]:
-    """Return one line for each mismatch in the counts of frames from the host, in total and by node.
+    """Return one line of text for each mismatch in the counts of frames from the host to the nodes.
 
-    Call after the host has closed and the nodes have stopped.
+    Call this function after the host has closed and the nodes have stopped.
     """
     found = []
     for bus in fleet.hand.buses:
@@ -137,7 +137,7 @@ def sent_otherwise(fleet: Fleet, counter: FrameCounter) -> list[str]:
                     f"{bus.name}: {kind} frames: the host sent {sent}, the nodes' interface received {heard}"
                 )
             found += [
-                f"{patch.name}: {kind} frames: interface received {passed.heard[kind]}, node {of_node}"
+                f"{patch.name}: {kind} frames: {passed.heard[kind]} at the interface, {of_node} at the node"
                 for patch in fleet.hand.patches_on(bus.name)
                 if (of_node := fleet.tally(patch.name).heard[kind]) != passed.heard[kind]
             ]
@@ -147,7 +147,7 @@ def sent_otherwise(fleet: Fleet, counter: FrameCounter) -> list[str]:
 
 
 def injected_otherwise(stats: HostStats, injected: Mapping[str, Injected]) -> list[str]:
-    """Return one line for each host counter that does not match the number of injected faults."""
+    """Return one line of text for each host counter that differs from the number of injected faults."""
     found = [
         f"{name}: the host counted {stats.patches[name].frames} chunks and summaries, {each.pdos} were sent"
         for name, each in injected.items()

@@ -1,8 +1,8 @@
-"""One wire of the reference patch solved to 1e-9 from a nearby start, by us and by peers on the same F and J.
+"""Solves one wire to 1e-9 from a nearby start, with our solvers and with other libraries on the same F and J.
 
-The start is the second-to-last sample of a ten-step path to a 10 % press. Every peer runs at the loosest
-tolerance that reduces the displacement error to 1e-9; a peer that never reaches this error is listed without
-a time.
+The wire belongs to the reference patch. The start is the second-to-last sample of a ten-step path to a 10 %
+press. Every peer runs with the loosest tolerance at which the displacement error is at most 1e-9. A peer that
+never reaches this error is listed without a time.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ Solve = Callable[["Case", float], Float]
 
 
 class Case:
-    """Residual r = a F − 1 of one wire and its Jacobian for any solver, with a start and the truth."""
+    """Test problem for a solver: residual r = a F − 1 of one wire, its Jacobian, a start and the solution."""
 
     def __init__(self, problem: PatchProblem, wire: int, a: Float, start: Float, truth: Float) -> None:
         self.wire, self.a, self.start, self.truth = wire, a, start, truth
@@ -44,30 +44,30 @@ class Case:
         self._jt = np.empty((unknowns, equations))
 
     def residual(self, x: Float) -> Float:
-        """Return r (K,) at x."""
+        """Return the residual r (K,) at x."""
         potential(x, self._lower, self._f)
         return np.asarray(self.a * self._f - 1.0)
 
     def jacobian_transposed(self, x: Float) -> Float:
-        """Return Jᵀ (3N, K) at x."""
+        """Return the transposed Jacobian Jᵀ (3N, K) at x."""
         potential_jacobian(x, self._lower, self._scratch, self._jt)
         return np.asarray(self._jt * self.a)
 
     def residual_beside_jacobian(self) -> Float:
-        """Return r at the point of the last Jacobian; the two are computed together."""
+        """Return r at the point of the most recent Jacobian, which is computed together with r."""
         return np.asarray(self.a * self._scratch - 1.0)
 
     def jacobian(self, x: Float) -> Float:
-        """Return J (K, 3N) at x."""
+        """Return the Jacobian J (K, 3N) at x."""
         return self.jacobian_transposed(x).T
 
     def error(self, x: Float) -> float:
-        """Return the largest error of a coordinate, relative to the largest displacement."""
+        """Return the maximum error of a coordinate, relative to the largest displacement."""
         return float(np.abs(x - self.truth).max()) / self.size
 
 
 def press(layout: PatchLayout, depth: float) -> Float:
-    """Return the displacement (U, N, 3) in metres of a smooth dent with shear, ``depth`` heights deep."""
+    """Return the displacement (U, N, 3), metres, of a smooth sheared dent that is ``depth`` heights deep."""
     middle = layout.upper_m[..., :2].mean(axis=(0, 1)) + 0.3 * layout.pitch_m
     away = ((layout.upper_m[..., :2] - middle) ** 2).sum(axis=-1) / (2.0 * layout.pitch_m) ** 2
     dent = depth * layout.height_m / (1.0 + away)
@@ -75,7 +75,7 @@ def press(layout: PatchLayout, depth: float) -> Float:
 
 
 def peers(problem: PatchProblem) -> dict[str, Solve]:
-    """Return every solver by name, ours first: functions of case and tolerance that return x."""
+    """Return all solvers by name, ours first; each is a function of case and tolerance that returns x."""
     from scipy import optimize
 
     solver = PatchSolver(problem, 0)
@@ -138,7 +138,7 @@ def peers(problem: PatchProblem) -> dict[str, Solve]:
 
 
 def ceres() -> Solve:
-    """Return Ceres as a silent solver with dense QR and traditional dogleg."""
+    """Return a solver that calls Ceres with dense QR and the traditional dogleg, without log output."""
     pyceres = importlib.import_module("pyceres")
     options = pyceres.SolverOptions()
     options.trust_region_strategy_type = pyceres.TrustRegionStrategyType.DOGLEG
@@ -165,7 +165,7 @@ def ceres() -> Solve:
 
     def solve(case: Case, tolerance: float) -> Float:
         x = case.start.copy()
-        options.function_tolerance = tolerance**2  # tolerance on the sum of squares
+        options.function_tolerance = tolerance**2  # this tolerance applies to the sum of squares
         options.gradient_tolerance = tolerance
         options.parameter_tolerance = tolerance
         problem = pyceres.Problem()
@@ -183,7 +183,7 @@ def _solve_all(solve: Solve, cases: list[Case], tolerance: float) -> None:
 
 
 def run(rounds: int) -> dict[str, Any]:
-    """Run the benchmark and return µs per wire, ratio to our dogleg, and error."""
+    """Run the benchmark; return the time per wire (µs), the ratio to our dogleg, and the error."""
     layout = PatchLayout.preset("staggered", pitch_m=4e-3, height_m=2e-3)
     problem = PatchProblem.of(layout)
     cases = []

@@ -1,4 +1,4 @@
-"""Every hard case, solved for many seeds: error, reported uncertainty, status and verdict of each method."""
+"""Solves every hard case for many seeds; reports error, uncertainty, status and verdict of each method."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from skinnode.process.child_processes import starting_children
 from skinnode.text.json_values import plain
 
 TWIN_SEEDS: Final = 2
-"""Number of streams on which ``auto`` must match another method bit for bit before ``auto`` is skipped."""
+"""Number of streams on which ``auto`` must match another method exactly before ``auto`` is skipped."""
 
 
 @contextlib.contextmanager
@@ -32,7 +32,7 @@ def processes(jobs: int) -> Iterator[ProcessPoolExecutor]:
     with ProcessPoolExecutor(jobs, spawn) as pool:
         try:
             yield pool
-        except BaseException:  # cancelling would make Python 3.11 print a traceback
+        except BaseException:  # cancelling the jobs would make Python 3.11 print a traceback
             for process in multiprocessing.active_children():
                 process.kill()
             raise
@@ -46,18 +46,17 @@ def run(
     jobs: int = 1,
     report: Callable[[dict[str, Any]], object] = lambda row: None,
 ) -> dict[str, Any]:
-    """Solve the hard cases.
+    """Solve the hard cases and judge the results.
 
     Args:
         seeds: Number of streams per case.
         cases: Cases to solve; default: all.
         only: Methods to use; default: all methods of each case.
-        jobs: Number of processes that solve cases in parallel; the number does not affect the streams or the
-            rows.
-        report: Called with each row when it is ready.
+        jobs: Number of processes that solve cases in parallel; it does not affect streams or rows.
+        report: Function that receives each row as soon as it is complete.
 
     Returns:
-        The figures.
+        The rows and the number of wrong wires.
     """
     rows: list[dict[str, Any]] = []
     with contextlib.ExitStack() as stack:
@@ -82,17 +81,17 @@ def run(
 
 
 def _numbered(seeds: int, only: Sequence[str] | None, number: int) -> list[dict[str, Any]]:
-    """Return the rows of a case, given by number because the closures in a case cannot be pickled."""
+    """Return the rows of a case; the case is passed by number, because its closures cannot be pickled."""
     return _rows(all_cases()[number], only, seeds)
 
 
 def _rows(case: Case, only: Sequence[str] | None, seeds: int) -> list[dict[str, Any]]:
-    """Return one row per method; all methods solve the same streams."""
+    """Solve the same streams with every method of a case, and return one row per method."""
     chosen = [name for name in case.methods if only is None or name in only]
     solvers = {name: methods.set_up(case, name) for name in chosen}
     tallies = {name: Tally(case.converter.exact) for name in chosen}
     twins = [other for other in ("exact", "posterior") if "auto" in chosen and other in chosen]
-    name_code = zlib.crc32(case.name.encode())  # adding or moving a case does not change the others' streams
+    name_code = zlib.crc32(case.name.encode())  # independent of the other cases
     for seed in range(seeds):
         stream = case.make(np.random.default_rng([seed, name_code]))
         tracked = stream.every(case.stride)
@@ -116,22 +115,22 @@ def _rows(case: Case, only: Sequence[str] | None, seeds: int) -> list[dict[str, 
 
 
 HEAD = (
-    f"{'':49}{'':22}{'error, share of the displacement':>32}{'wires':>18}\n"
+    f"{'':49}{'':22}{'error relative to displacement':>32}{'wires':>18}\n"
     f" # {'case':46}{'method':22}{'median':>11}{'worst':>10}{'reported':>11}{'conv.':>8}"
     f"{'accurate':>9}{'flagged':>9}{'wrong':>7}"
 )
 
 
 LEGEND = (
-    "# is the number of the hard case. error and reported standard deviation are relative to the\n"
-    "displacement of the CONVERGED wires in the deepest frame; the worst error is that of any frame.\n"
-    "Wires of all frames are accurate, flagged (not CONVERGED, or not trusted), or wrong: claimed, but\n"
-    "off by more than chance and the reported standard deviation allow."
+    "#: number of the hard case. Errors and reported standard deviations are relative to the displacement\n"
+    "of the CONVERGED wires in the deepest frame. worst: largest error in any frame. accurate, flagged,\n"
+    "wrong: numbers of wires in all frames. A wire is flagged if it is not CONVERGED or not trusted.\n"
+    "Another wire is wrong if its error exceeds what chance and reported standard deviation can explain."
 )
 
 
 def line(row: dict[str, Any]) -> str:
-    """Return a row of the table as text."""
+    """Format a row of the table."""
     method = row["method"] if row["same_as"] is None else f"{row['method']} = {row['same_as']}"
     return (
         f"{row['number']:2} {row['case']:46}{method:22}{share(row['median_error']):>11}"
@@ -141,7 +140,7 @@ def line(row: dict[str, Any]) -> str:
 
 
 def share(value: float) -> str:
-    """Return a fraction as a percentage, or as a power of ten if very small or large; a dash for NaN."""
+    """Format a fraction as a percentage, or as a power of ten if very small or large; NaN becomes a dash."""
     if not np.isfinite(value):
         return "-" if np.isnan(value) else "inf"
     if 1e-4 <= value < 1:

@@ -1,4 +1,4 @@
-"""Fair timing on a shared machine: candidates take turns, and ratios are computed within a round."""
+"""Times functions fairly on a shared machine: candidates alternate, and ratios are formed per round."""
 
 from __future__ import annotations
 
@@ -15,22 +15,22 @@ from typing import Any, Final
 from skinnode.files.output_file import write_text
 
 ROUNDS: Final = 31
-"""Default number of rounds; odd, so that the median is a measured time."""
+"""Default number of rounds; an odd number, so that the median is one of the measured times."""
 TURN_S: Final = 4e-3
-"""Duration of a turn, s: long compared with the clock's resolution, short compared with bursts of
-background load."""
+"""Duration of a candidate's turn, s; long compared with the clock's resolution, but short compared with
+bursts of background load."""
 
 
 @dataclass(frozen=True)
 class Timing:
-    """Median time of one call, and the median ratio to the first candidate's time in the same round."""
+    """Median time of one call, µs, and median ratio to the first candidate's time in the same round."""
 
     call_us: float
     ratio: float
 
 
 def take_turns(candidates: Mapping[str, Callable[[], object]], *, rounds: int = ROUNDS) -> dict[str, Timing]:
-    """Time every candidate in every round; ratios are to the first candidate."""
+    """Time every candidate in every round, and compute its ratio to the first candidate."""
     calls = {name: _calls_in_a_turn(function) for name, function in candidates.items()}
     times: dict[str, list[float]] = {name: [] for name in candidates}
     for _ in range(rounds):
@@ -51,14 +51,14 @@ def take_turns(candidates: Mapping[str, Callable[[], object]], *, rounds: int = 
 
 
 def _calls_in_a_turn(function: Callable[[], object]) -> int:
-    function()  # compiles, fills caches
+    function()  # the first call compiles kernels and fills caches
     start = time.perf_counter()
     function()
     return max(1, int(TURN_S / max(time.perf_counter() - start, 1e-7)))
 
 
 def machine() -> dict[str, str]:
-    """Return the library versions and the processor used for the measurements."""
+    """Return the library versions and the processor of this machine."""
     import numba
     import numpy
     import scipy
@@ -86,5 +86,5 @@ def _processor() -> str:
 
 
 def write_json(path: Path, figures: dict[str, Any]) -> None:
-    """Write ``figures`` as readable JSON, in a stable order."""
+    """Write benchmark results as indented JSON, with keys in their original order."""
     write_text("--json", path, json.dumps(figures, indent=2) + "\n")

@@ -1,9 +1,9 @@
-"""Ground truth for scoring the solvers in benchmarks, made without any of the solvers' assumptions.
+"""Generates ground truth for benchmarks, without any of the solvers' assumptions.
 
 Displacements are closed-form solutions for rigid spheres on rubber
-(:class:`skinnode.model.elastic.HertzContact`), so they have no grid and do not depend on a prior. Resistances
-come from :class:`Skin`, which can differ from the solver's model: electrodes of finite size, rubber whose
-resistivity depends on strain, a different thickness, a contact resistance in series. Converters add noise and
+(:class:`skinnode.model.elastic.HertzContact`), so they use neither a grid nor a prior. Resistances are
+computed by :class:`Skin`, which can differ from the solver's model: electrodes of finite size,
+strain-dependent resistivity, a different thickness, or a series contact resistance. Converters add noise and
 quantise readings to codes, as real converters do.
 """
 
@@ -23,13 +23,13 @@ from skinnode.protocol.codes import CodeScale, decode, encode
 
 RUBBER: Final = Rubber()
 EXACT_NOISE: Final = 1e-9
-"""Relative noise passed to a tracker for noiseless data; determines the tolerance of the solve."""
+"""Relative noise passed to a tracker for noise-free data; it determines the solver's tolerance."""
 RING: Final = 4
-"""Number of points on the rim of a finite electrode, giving 16 distances per pair of electrodes."""
+"""Number of points on the rim of a finite electrode; a pair of electrodes has 16 distances."""
 
 
 class Load(Protocol):
-    """A body that presses on the skin, to a share of its full depth."""
+    """Body that presses on the skin; ``share`` is the present depth as a fraction of the full depth."""
 
     @property
     def center_m(self) -> tuple[float, float]:
@@ -43,22 +43,23 @@ class Load(Protocol):
         """Return the displacement (P, 3) of surface points (P, 2), metres."""
 
     def force_n(self, share: float) -> Float:
-        """Return the load (3,) on the rubber, newtons; NaN if the body does not determine it."""
+        """Return the force (3,) on the rubber, newtons; NaN if the body does not determine the force."""
 
 
 @dataclass(frozen=True)
 class Press:
-    """A sphere at full depth; lengths in metres. ``share`` is always a fraction of the depth."""
+    """Press by a sphere; lengths are in metres. ``share`` is the fraction of the full depth."""
 
     center_m: tuple[float, float]
     radius_m: float
     depth_m: float
     traction_ratio: tuple[float, float] = (0.0, 0.0)
     shear_only: bool = False
-    """Whether only the traction along the surface acts: contact with friction minus frictionless contact."""
+    """Whether only the tangential traction acts; computed as contact with friction minus frictionless
+    contact."""
 
     def contacts(self, share: float) -> tuple[tuple[int, HertzContact], ...]:
-        """Return the closed-form solutions, each with its sign."""
+        """Return the closed-form solutions to superpose, each with its sign."""
         depth = share * self.depth_m
         full = HertzContact(RUBBER, self.radius_m, depth, self.center_m, self.traction_ratio)
         if not self.shear_only:
@@ -73,7 +74,7 @@ class Press:
         return moved
 
     def force_n(self, share: float) -> Float:
-        """Return the load (3,) on the rubber, newtons."""
+        """Return the force (3,) on the rubber, newtons."""
         force = np.zeros(3)
         for sign, contact in self.contacts(share):
             force += sign * np.array(contact.force_n)
@@ -82,16 +83,17 @@ class Press:
 
 @dataclass(frozen=True, eq=False)
 class Skin:
-    """A real patch; the solver knows only its ``layout``.
+    """Simulated real patch; the solver receives only its ``layout``.
 
     Args:
         layout: Layout passed to the solver.
-        height: True height of the upper layer, as a fraction of the layout's.
-        electrode: Radius of every electrode, pitches; 0 for point electrodes, as the solver assumes.
-        strain: β in ρ d (1 + β (d/d₀ − 1)), where d₀ is the distance at rest.
-        series: Contact resistance in series with each pair of wires, as a fraction of the pair's R₀.
+        height: True height of the upper layer, as a fraction of the height in the layout.
+        electrode: Radius of the electrodes, pitches; 0 for point electrodes, which the solver assumes.
+        strain: Coefficient β of the strain-dependent resistance ρ d (1 + β (d/d₀ − 1)), where d₀ is the
+            distance d at rest.
+        series: Contact resistance in series with each crossing, as a fraction of the crossing's R₀.
         points_m: Positions (U, N, 2) of the electrodes along the surface, if it is not flat.
-        axes: Axes (U, N, 3, 3) along, across and out of the surface (rows) at each electrode.
+        axes: Local axes (U, N, 3, 3) at each electrode; the rows point along, across and out of the surface.
         upper_shift_m: Shifts (U, 3) of the upper wires from their places in the layout, metres.
         lower_shift_m: Shifts (K, 3) of the lower wires from their places in the layout, metres.
     """
@@ -108,13 +110,13 @@ class Skin:
 
     @functools.cached_property
     def body(self) -> PatchLayout:
-        """The true layout."""
+        """True layout of the patch."""
         if self.height == 1.0 and self.upper_shift_m is None and self.lower_shift_m is None:
             return self.layout
         upper, lower = self.layout.upper_m, self.layout.lower_m
         if self.axes is None:
             upper = upper * np.array([1.0, 1.0, self.height])
-        else:  # the surface moves along its normals
+        else:  # on a curved patch, height is measured along the surface normals
             upper = upper + (self.height - 1.0) * self._gap_m[..., None] * self.axes[:, :, 2]
         if self.upper_shift_m is not None:
             upper = upper + self.upper_shift_m[:, None]
@@ -124,7 +126,7 @@ class Skin:
 
     @property
     def _gap_m(self) -> Float:
-        """Heights (U, N) of the upper electrodes over the nearest lower ones, along the normals."""
+        """Heights (U, N), metres, of upper above nearest lower electrodes, along the surface normals."""
         gap = self.layout.upper_m[:, :, None] - self.layout.lower_m.reshape(-1, 3)
         nearest = np.argmin((gap**2).sum(axis=-1), axis=-1)[..., None, None]
         assert self.axes is not None
@@ -133,7 +135,7 @@ class Skin:
         )
 
     def displacement_m(self, presses: tuple[Load, ...], share: float) -> Float:
-        """Return the displacement (U, N, 3) of the electrodes under all presses, metres."""
+        """Return the displacement (U, N, 3) of the electrodes due to all presses, metres."""
         points = self.body.upper_m[..., :2] if self.points_m is None else self.points_m
         moved = np.zeros((points.shape[0] * points.shape[1], 3))
         for press in presses:
@@ -143,11 +145,11 @@ class Skin:
 
     @functools.cached_property
     def rest_ohm(self) -> Float:
-        """Resistances (U, K) at rest, without noise: the baseline passed to the solver."""
+        """Noise-free resistances (U, K) at rest, ohm; the solver receives them as its baseline."""
         return self.resistance_ohm(np.zeros(self.layout.upper_m.shape))
 
     def resistance_ohm(self, displacement_m: Float) -> Float:
-        """Return the resistances (U, K) for a displacement (U, N, 3)."""
+        """Return the resistances (U, K), ohm, for a displacement (U, N, 3), metres."""
         upper = self.body.upper_m + displacement_m
         if self.strain:
             found = self._strained(upper)
@@ -162,7 +164,7 @@ class Skin:
         return self._points(self.body.upper_m)
 
     def _points(self, upper: Float) -> Float:
-        """Compute the same as :func:`skinnode.model.forward.resistance_ohm`, in a fifth of the time."""
+        """Compute the same result as :func:`skinnode.model.forward.resistance_ohm`, five times as fast."""
         lower = self.body.lower_m.reshape(-1, 3)
         square = np.zeros((upper.shape[0] * upper.shape[1], len(lower)))
         for axis in range(3):
@@ -177,7 +179,7 @@ class Skin:
         return self._distance(self.body.upper_m)
 
     def _distance(self, upper: Float) -> Float:
-        """Return the distances (U, K, M, N)."""
+        """Return the distances (U, K, M, N) between upper and lower electrodes, metres."""
         gap = upper[:, None, None, :, :] - self.body.lower_m[None, :, :, None, :]
         return np.asarray(np.sqrt(np.einsum("ukmna,ukmna->ukmn", gap, gap)))
 
@@ -187,7 +189,7 @@ class Skin:
         return np.asarray(self.layout.resistivity_ohm_per_m / (1.0 / path).sum(axis=(2, 3)))
 
     def _finite(self, upper: Float) -> Float:
-        """Average the potential of the lower rims over the upper rims."""
+        """Return the resistances (U, K) between electrodes of finite size, averaged over their rims, ohm."""
         radius = self.electrode * self.layout.pitch_m
         rims = []
         for points, turned in ((upper, 0.0), (self.body.lower_m, 0.5)):
@@ -203,10 +205,10 @@ class Skin:
 
 @dataclass(frozen=True)
 class Converter:
-    """A converter with noise in every reading (``sigma``, relative) and, unless ``bits`` is 0, codes of R/R₀.
+    """Converter with relative noise ``sigma`` that, unless ``bits`` is 0, quantises R/R₀ to codes.
 
-    Codes are those of the protocol: they span ``lo`` to ``hi`` and include three reserved codes. Codes of 16
-    and 24 bits are encoded and decoded by the protocol's own codec.
+    As in the protocol, the codes span the range from ``lo`` to ``hi``, and three codes are reserved. The
+    protocol's own codec encodes and decodes codes of 16 and 24 bits.
     """
 
     sigma: float = 0.0
@@ -221,7 +223,7 @@ class Converter:
 
     @property
     def relative_std(self) -> float:
-        """Relative standard deviation of a reading at rest, known to the user."""
+        """Relative standard deviation of a reading at rest, as stated to the solver."""
         if self.exact:
             return EXACT_NOISE
         rounding = (self.hi - self.lo) / ((1 << self.bits) - 4) / math.sqrt(12.0) if self.bits else 0.0
@@ -230,7 +232,7 @@ class Converter:
     def read(
         self, resistance: Float, rest: Float, rng: np.random.Generator
     ) -> tuple[Float, NDArray[np.bool_], Float]:
-        """Return the readings, their validity and relative standard deviations, all of the same shape."""
+        """Read resistances; return the readings, their validity, and their relative standard deviations."""
         if self.exact:
             return resistance, np.ones(resistance.shape, bool), np.full(resistance.shape, EXACT_NOISE)
         noisy = resistance * (1.0 + self.sigma * rng.standard_normal(resistance.shape))
@@ -253,22 +255,22 @@ class Converter:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Stream:
-    """Input of a solver, with the corresponding truth."""
+    """Sequence of frames to be solved, with the true displacements and forces."""
 
     frames_ohm: Float
-    """(T, U, K), resistances in ohm; not finite where invalid."""
+    """(T, U, K), readings in ohm; invalid readings are not finite."""
     valid: NDArray[np.bool_]
     """(T, U, K)"""
     noise: Float
-    """(T, U, K), relative standard deviation of the converter."""
+    """(T, U, K), relative standard deviation of each reading."""
     truth_m: Float
-    """(T, U, N, 3), true displacement in metres; NaN in frames that no skin can produce."""
+    """(T, U, N, 3), true displacement, metres; NaN in physically impossible frames."""
     force_n: Float
-    """(T, 3), sum of all loads in newtons; NaN in the same frames as ``truth_m``."""
+    """(T, 3), total force of all loads, newtons; NaN in physically impossible frames."""
     presses: tuple[Load, ...] = ()
 
     def every(self, stride: int) -> Stream:
-        """Return every ``stride``-th frame, beginning with the first."""
+        """Return a stream of every ``stride``-th frame, beginning with the first."""
         return Stream(
             self.frames_ohm[::stride],
             self.valid[::stride],
@@ -287,12 +289,12 @@ def stream(  # noqa: PLR0913 - the parts of a stream
     rng: np.random.Generator,
     gain: Float | None = None,
 ) -> Stream:
-    """Return a stream of presses at the given fractions of their full depth.
+    """Generate a stream of frames of one or more superposed presses.
 
     Args:
-        skin: Patch that is pressed.
-        presses: Superposed presses.
-        shares: Fractions (T,) of the depth, one per frame.
+        skin: Patch to press.
+        presses: Presses whose displacements are added.
+        shares: Fractions (T,) of the full depth, one per frame.
         converter: Converter that reads the resistances.
         rng: Random generator for the noise.
         gain: Factors that scale the resistances, (T, U, K) or broadcastable to that shape.
@@ -316,15 +318,15 @@ def random_press(  # noqa: PLR0913 - keyword arguments, each a range
     margin: float = 2.0,
     where: Literal["inside", "edge", "half off"] = "inside",
 ) -> Press:
-    """Return a random press by a sphere.
+    """Choose a random press by a sphere.
 
     Args:
         rng: Random generator.
         layout: Patch to press.
-        depth: Depth in heights.
-        radius: Range of the sphere's radius, pitches.
-        shear: Maximum friction.
-        margin: Distance from the centre to the border of the patch, pitches.
+        depth: Depth as a fraction of the layer height.
+        radius: Minimum and maximum radius of the sphere, pitches.
+        shear: Maximum coefficient of friction.
+        margin: Minimum distance from the centre to the border of the patch, pitches.
         where: ``inside``; ``edge``, with the centre on the border in x; or ``half off``, with the centre half
             a contact radius outside the border.
     """

@@ -1,26 +1,26 @@
-"""Verdicts on solved wires against the truth: accurate, flagged or wrong.
+"""Judges solved wires by comparison with the truth.
 
-A wire in a frame is
+Each wire of a frame receives one of three verdicts:
 
-flagged    if its status is not CONVERGED or its data failed a test (``wires_trusted``), so that no accuracy
-           was claimed
-accurate   if accuracy was claimed and every coordinate is within the reported uncertainty
-wrong      if accuracy was claimed and an error is too large, or if it is not finite, whatever its status
+flagged    no accuracy was claimed, because the status is not CONVERGED or the data failed a test
+           (``wires_trusted``)
+accurate   accuracy was claimed, and every coordinate is within the reported uncertainty
+wrong      accuracy was claimed but an error is too large, or, whatever the status, a value is not finite
 
-With noise, an error may reach 5 reported standard deviations; chance alone puts 6e-7 of all coordinates
-beyond this limit. A long run must not fail by chance, and a fault must not be attributed to chance, so each
-row must meet two conditions. For errors that are Gaussian with the reported standard deviation, each
-condition fails with a probability of 1e-4:
+With noise, an error may reach 5 reported standard deviations; 6e-7 of all coordinates exceed this limit by
+chance alone. A long run must not fail by chance, and a fault must not be attributed to chance. Each row must
+therefore meet two conditions. If errors are Gaussian with the reported standard deviation, each condition
+fails with a probability of 1e-4:
 
-- no coordinate is beyond z(n) or 5, whichever is larger, where any of n independent coordinates exceeds z(n)
-  standard deviations with probability 1e-4. z is 5.7 for 9,000 coordinates and 6.4 for 1e6 (Bonferroni's
-  bound: correlation only makes it safer)
-- the number of seeds with a coordinate beyond 5 is within the limit of a binomial distribution whose
-  probability is the expected number of such coordinates per seed (again a bound); seeds are independent even
-  though coordinates are not
+- No coordinate exceeds z(n) or 5 standard deviations, whichever is larger. z(n) is the limit that any of n
+  independent coordinates exceeds with probability 1e-4: 5.7 for 9,000 coordinates and 6.4 for 1e6. This is
+  Bonferroni's bound; correlated coordinates only decrease the probability.
+- The number of seeds with a coordinate beyond 5 is within the limit of a binomial distribution. The
+  probability of the distribution is the expected number of such coordinates per seed (an upper bound). Seeds
+  are independent even though coordinates are not.
 
-If the second condition fails, every wire with an error beyond 5 is wrong. With exact data, chance plays no
-part: the limit is 5 reported standard deviations or 1e-6 of the wire's largest displacement, whichever is
+If the second condition fails, every wire with an error beyond 5 is wrong. With exact data, there is no
+chance: the limit is 5 reported standard deviations or 1e-6 of the wire's largest displacement, whichever is
 larger.
 """
 
@@ -37,11 +37,11 @@ from numpy.typing import NDArray
 from skinnode.model.layout import Float
 
 LIMIT: Final = 5.0
-"""Maximum error, in reported standard deviations."""
+"""Maximum error of a coordinate, in reported standard deviations."""
 CHANCE: Final = 1e-4
-"""Probability that a correct row is judged wrong: with 350 rows per run, one false alarm in 30 runs."""
+"""Probability that a correct row is judged wrong; 350 rows per run cause one false alarm in 30 runs."""
 EXACT_SHARE: Final = 1e-6
-"""Tolerance with exact data, relative to the wire's largest displacement."""
+"""Maximum error with exact data, relative to the wire's largest displacement."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -51,12 +51,12 @@ class Solved:
     displacement_m: Float
     """(F, U, N, 3)"""
     std_m: Float
-    """(F, U, N, 3), reported standard deviation, or a fifth of an error estimate."""
+    """(F, U, N, 3), reported standard deviation, metres; for paths, a fifth of the error estimate."""
     converged: NDArray[np.bool_]
-    """(F, U) wires that are CONVERGED and, if trust was assessed, trusted."""
+    """(F, U), whether a wire is CONVERGED and, if trust was assessed, trusted."""
 
     def equals(self, other: Solved) -> bool:
-        """Return whether both results are equal, bit for bit."""
+        """Return whether both results are bitwise equal."""
         return (
             np.array_equal(self.displacement_m, other.displacement_m, equal_nan=True)
             and np.array_equal(self.std_m, other.std_m, equal_nan=True)
@@ -65,12 +65,12 @@ class Solved:
 
 
 def beyond(deviations: float) -> float:
-    """Return the probability that a normal variable is more than ``deviations`` sigma from its mean."""
+    """Return the probability that a Gaussian error exceeds ``deviations`` standard deviations."""
     return math.erfc(deviations / math.sqrt(2.0))
 
 
 def limit_of(coordinates: int) -> float:
-    """Return z(n), as defined in the module docstring, for n ``coordinates``; never less than 5."""
+    """Return the limit z(n), as defined in the module docstring, for n ``coordinates``; at least 5."""
     from scipy.special import ndtri
 
     if coordinates == 0:
@@ -79,7 +79,7 @@ def limit_of(coordinates: int) -> float:
 
 
 def allowed_seeds(coordinates: int, seeds: int) -> int:
-    """Return the maximum number of seeds with a coordinate beyond 5 that chance can explain."""
+    """Return the maximum number of seeds in which chance can explain a coordinate beyond 5."""
     from scipy.stats import binom
 
     if seeds == 0:
@@ -89,7 +89,7 @@ def allowed_seeds(coordinates: int, seeds: int) -> int:
 
 @dataclass
 class Tally:
-    """Accumulates one row: a case solved by one method for all seeds."""
+    """Accumulates the row of the report for one case and one method, over all seeds."""
 
     exact: bool
     seeds: int = 0
@@ -101,10 +101,10 @@ class Tally:
     _reported: list[float] = field(default_factory=list)
     _worst_error: float = math.nan
     _deviations: list[tuple[float, int, int, int]] = field(default_factory=list)
-    """(standard deviations, seed, frame, wire) of every wire beyond 5; inf if the wire is not finite."""
+    """Wires with an error beyond 5, as (error in standard deviations or inf, seed, frame, wire)."""
 
     def add(self, seed: int, solved: Solved, truth_m: Float) -> None:
-        """Add a seed. ``truth_m`` (F, U, N, 3) is the truth of the frames; NaN frames are left out."""
+        """Add a seed's result; frames whose true displacement ``truth_m`` (F, U, N, 3) is NaN are ignored."""
         self.seeds += 1
         kept = np.flatnonzero(np.isfinite(truth_m).all(axis=(1, 2, 3)))
         truth_m, moved, std = truth_m[kept], solved.displacement_m[kept], solved.std_m[kept]
@@ -125,10 +125,10 @@ class Tally:
         self._shares(np.where((converged & finite)[..., None, None], error, np.nan), std, truth_m)
 
     def _shares(self, error: Float, std: Float, truth: Float) -> None:
-        """Add the relative error and standard deviation of the converged wires in the deepest frame.
+        """Add the error and standard deviation of the converged wires in the deepest frame.
 
-        Both are relative to the displacement. The worst error is the largest in any frame, relative to the
-        displacement in the deepest frame.
+        Both values are relative to the displacement in the deepest frame, as is the worst error, which is the
+        largest error in any frame.
         """
         deepest = int(np.argmax(np.linalg.norm(truth.reshape(len(truth), -1), axis=1)))
         used = np.isfinite(error[deepest])
@@ -144,7 +144,7 @@ class Tally:
             self._worst_error = float(np.fmax(self._worst_error, worst))
 
     def row(self) -> dict[str, Any]:
-        """Return the figures and the verdict."""
+        """Return the accumulated figures, and the numbers of wires by verdict."""
         limit = LIMIT if self.exact else limit_of(self._coordinates)
         hit = {seed for _, seed, _, _ in self._deviations}
         by_count = self.exact or len(hit) > allowed_seeds(self._coordinates, self.seeds)
@@ -172,7 +172,7 @@ class Tally:
 
 
 def named(row: Mapping[str, Any]) -> str:
-    """Describe a wrong row in one line: the case, the size of the error, and how to reproduce the error."""
+    """Describe a wrong row in one line: the case, the size of the error, and how to reproduce it."""
     worst = row["worst"]
     far = "not finite" if worst["deviations"] is None else f"{worst['deviations']:.3g} standard deviations"
     return (

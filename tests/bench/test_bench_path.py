@@ -46,7 +46,7 @@ def test_whatever_fails_is_said_to_and_is_not_wrong(outcome):
         for row in [*rows(setting, "operators"), *setting["dogleg"], *setting["ours"], setting["adaptive"]]:
             assert row["wrong"] == 0
             assert (row["accuracy_percent"] is None) == (row["failed"] == figures["experiments"])
-    assert "Converged and wrong, all settings and schedules: 0" in output
+    assert "Wires CONVERGED but wrong, over all settings and schedules: 0" in output
 
 
 def test_more_samples_take_fewer_calls_a_step_and_ours_fewer_than_plain(outcome):

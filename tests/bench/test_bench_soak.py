@@ -112,7 +112,7 @@ def test_what_grows_or_is_miscounted_is_found(tmp_path: Path, monkeypatch: pytes
     monkeypatch.setattr(PatchStream, "on_summary", losing)
     code, output, figures = soak(tmp_path, "0.1")
     assert code == 1
-    assert {"growth: blocks of Python", "sums that do not agree"} <= set(missed(figures)), output
+    assert {"growth: blocks of Python", "frame counts that do not agree"} <= set(missed(figures)), output
     assert any("chunks and summaries" in text for text in figures["discrepancies"])
     assert "The soak failed: " in output.splitlines()[-1]
 
@@ -130,5 +130,5 @@ def test_a_frame_that_is_lost_uncounted_is_found(tmp_path: Path, monkeypatch: py
     monkeypatch.setattr(FaultyPort, "send", losing)
     code, output, figures = soak(tmp_path, "0.1")
     assert code == 1
-    assert missed(figures) == ["sums that do not agree"], output
+    assert missed(figures) == ["frame counts that do not agree"], output
     assert all("heartbeat frames" in text or "boot-up frames" in text for text in figures["discrepancies"])

@@ -1,4 +1,4 @@
-"""Plots of benchmarks, which need matplotlib.
+"""Plots of benchmark results; these modules require matplotlib.
 
-``ratios`` serves ``kernel`` and ``solve``; the other modules are named after their benchmarks.
+``ratios`` plots the benchmarks ``kernel`` and ``solve``; the other modules are named after their benchmarks.
 """

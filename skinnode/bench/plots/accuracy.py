@@ -1,4 +1,4 @@
-"""Figure of the accuracy benchmark: Pareto fronts, error by noise and codes, coverage, time per frame."""
+"""Plots the accuracy benchmark: Pareto fronts, error versus noise and code width, coverage and time."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ ALIGNED: Final = {("aligned", 0.3): "#fdae6b", ("aligned", 0.5): "#e6550d", ("al
 
 
 def draw(file: Path, figures: dict[str, Any]) -> None:
-    """Draw the figures of :func:`skinnode.bench.accuracy.run` to ``file``."""
+    """Plot the results of :func:`skinnode.bench.accuracy.run` and write the plot to ``file``."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 

@@ -1,4 +1,4 @@
-"""Plot of ``skinnode bench path``: figures 8 to 13 of the paper, redrawn."""
+"""Plots the results of ``skinnode bench path`` as figures 8 to 13 of the paper."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ COLOURS: Final = ("tab:blue", "tab:orange", "tab:green", "tab:red")
 
 
 def draw(file: Path, figures: dict[str, Any]) -> None:
-    """Draw three rows: cost of the steps, optimality along the path, recovered surface."""
+    """Plot three rows: cost of the steps, optimality along the path, and recovered surface."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -52,7 +52,7 @@ def _draw_calls(axes: Any, setting: dict[str, Any]) -> None:
 
 
 def _draw_iterations(axes: Any, setting: dict[str, Any], paper: dict[str, Any]) -> None:
-    """Draw the cumulative iterations along the path of the first press."""
+    """Plot the cumulative number of iterations along the path of the first press."""
     for colour, marker, size, steps in ((COLOURS[0], "s", 8, "50"), (COLOURS[1], "o", 4, "100")):
         data = setting["figure11"][steps]
         each = np.array(data["uniform_each"])
@@ -73,7 +73,7 @@ def _draw_iterations(axes: Any, setting: dict[str, Any], paper: dict[str, Any]) 
 
 
 def _draw_table(axes: Any, setting: dict[str, Any], paper: dict[str, Any]) -> None:
-    """Draw the time per path against the number of steps, next to the paper's times."""
+    """Plot the time per path versus the number of steps, together with the paper's times."""
     table = paper["table4_dogleg"]
     axes.loglog(table["steps"], table["runtime_s"], "s-", color="0.5", label="paper (dogleg)")
     for colour, key, label in (
@@ -150,7 +150,7 @@ def _draw_surface(figure: Any, surface: dict[str, Any]) -> None:
 
 
 def _length(um: float) -> str:
-    """Return a length in a suitable unit."""
+    """Format a length with a suitable unit."""
     if not um < 1e6:
         return "beyond 1 m"
     if um >= 1e3:

@@ -1,4 +1,4 @@
-"""Bar chart of ``skinnode bench pipeline``: latency and CPU load for each hand."""
+"""Plots the results of ``skinnode bench pipeline``: latency and CPU load for each hand."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _GROUPS: Final = {"receive": "tab:blue", "mainline": "tab:orange", "solve": "tab
 
 
 def draw(file: Path, figures: dict[str, Any]) -> None:
-    """Draw the figures of :func:`skinnode.bench.pipeline.run` to ``file``."""
+    """Plot the results of :func:`skinnode.bench.pipeline.run` and write the plot to ``file``."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 

@@ -1,4 +1,4 @@
-"""Bar charts of ``skinnode bench kernel`` and ``bench solve``: each time, and its ratio to ours."""
+"""Plots ``skinnode bench kernel`` and ``skinnode bench solve``: times, and their ratios to ours."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def _save(figure: Any, file: Path, figures: dict[str, Any]) -> None:
 
 
 def _bars(axes: Any, rows: list[dict[str, Any]], heights: list[float], ours: list[bool]) -> None:
-    """Draw times on a logarithmic axis, each labelled with its value and ratio."""
+    """Plot times as bars on a logarithmic axis; label each bar with its time and ratio."""
     times = [row["us"] for row in rows if row["us"] is not None]
     low = 0.5 * min(times)
     axes.set_xscale("log")
@@ -51,7 +51,7 @@ def _bars(axes: Any, rows: list[dict[str, Any]], heights: list[float], ours: lis
 
 
 def draw_kernel(file: Path, figures: dict[str, Any]) -> None:
-    """Draw one group of bars per operation; ratios are to the group's compiled kernel."""
+    """Plot one group of bars per operation, with ratios to the time of the compiled kernel."""
     heights, rows, heads = [], figures["rows"], []
     height = 0.0
     for what, group in groupby(rows, key=lambda row: row["what"]):
@@ -65,13 +65,13 @@ def draw_kernel(file: Path, figures: dict[str, Any]) -> None:
         axes.text(axes.get_xlim()[0] * 1.05, at + 0.1, what, va="center", fontweight="bold", fontsize="small")
     axes.set_yticks(heights, [row["who"] for row in rows], fontsize="small")
     axes.set_ylim(height - 0.6, -0.8)
-    axes.set_xlabel("time (µs; F + J and steps: per wire); in brackets: ratio to ours")
+    axes.set_xlabel("time (µs; for F + J and steps: per wire); ratio to ours in brackets")
     axes.set_title("Compiled kernels (blue) and their peers, one thread each")
     _save(figure, file, figures)
 
 
 def draw_solve(file: Path, figures: dict[str, Any]) -> None:
-    """Draw each solver's time per wire and the error it reached, fastest first."""
+    """Plot each solver's time per wire, fastest first, labelled with the error reached."""
     rows = sorted(figures["rows"], key=lambda row: (row["us"] is None, row["us"] or 0.0))
     heights = [float(i) for i in range(len(rows))]
     ours = [row["who"].startswith("skinnode") for row in rows]
@@ -79,7 +79,7 @@ def draw_solve(file: Path, figures: dict[str, Any]) -> None:
     _bars(time, rows, heights, ours)
     time.set_yticks(heights, [row["who"] for row in rows], fontsize="small")
     time.set_ylim(len(rows) - 0.4, -0.6)
-    time.set_xlabel("time per wire (µs); in brackets: ratio to skinnode dogleg")
+    time.set_xlabel("time per wire (µs); ratio to skinnode dogleg in brackets")
     error.scatter([row["error"] for row in rows], heights, c=[OURS if own else "0.35" for own in ours], s=22)
     error.axvline(figures["accuracy"], color="tab:red", lw=1)
     error.annotate(

@@ -1,4 +1,4 @@
-"""Figure of the hard cases: verdicts by case and method, error against reported uncertainty."""
+"""Plots the hard cases: verdicts by case and method, and error versus reported uncertainty."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ COLUMNS: Final = (
 VERDICTS: Final = (("accurate", "#3a9e6e"), ("flagged", "#e3b23c"), ("wrong", "#c8322b"))
 COLOURS: Final = {"path": "0.5", "exact": "tab:blue", "posterior": "tab:orange", "auto": "tab:purple"}
 LEAST: Final = 1e-13
-"""Lower end of both axes; smaller errors and standard deviations are drawn at this value."""
+"""Lower limit of both axes; smaller errors and standard deviations are plotted at this value."""
 
 
 def draw(file: Path, figures: dict[str, Any]) -> None:
-    """Draw the figures of :func:`skinnode.bench.stability.run` to ``file``."""
+    """Plot the results of :func:`skinnode.bench.stability.run` and write the plot to ``file``."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -50,7 +50,7 @@ def draw(file: Path, figures: dict[str, Any]) -> None:
 
 
 def _verdicts(axes: Any, rows: list[dict[str, Any]], names: list[str]) -> None:
-    """Draw the fractions of the verdicts, one bar per case and method; the ``wrong`` part is enlarged."""
+    """Plot the fractions of the verdicts, one bar per case and method; the ``wrong`` part is enlarged."""
     place = {name: number for number, name in enumerate(names)}
     column = {method: number for number, (_, method) in enumerate(COLUMNS)}
     for row in rows:
@@ -81,7 +81,7 @@ def _verdicts(axes: Any, rows: list[dict[str, Any]], names: list[str]) -> None:
 
 
 def _scatter(axes: Any, rows: list[dict[str, Any]]) -> None:
-    """Draw each row's median error and median standard deviation, both relative to the displacement."""
+    """Plot each row's median error versus its median standard deviation, relative to the displacement."""
     for kind, colour in COLOURS.items():
         points = [
             (max(row["reported"], LEAST), max(row["median_error"], LEAST), row["wrong"] > 0)
@@ -91,7 +91,7 @@ def _scatter(axes: Any, rows: list[dict[str, Any]]) -> None:
         if not points:
             continue
         reported, error, wrong = np.array(points).T
-        label = "path (reported: a fifth of its error estimate)" if kind == "path" else kind
+        label = "path (reported: a fifth of the error estimate)" if kind == "path" else kind
         axes.scatter(reported, error, s=14, color=colour, label=label, alpha=0.8, lw=0)
         bad = wrong > 0
         axes.scatter(reported[bad], error[bad], s=46, facecolors="none", edgecolors=VERDICTS[2][1], lw=1)
@@ -111,7 +111,7 @@ def _scatter(axes: Any, rows: list[dict[str, Any]]) -> None:
 
 
 def _list(axes: Any, wrong: list[dict[str, Any]], most: int) -> None:
-    """List the worst rows as text."""
+    """List the rows with the largest errors as text."""
     axes.axis("off")
     worst = sorted(wrong, key=lambda row: -row["wrong"] / row["wires"])
     lines = [named(row) for row in worst[:most]]

@@ -1,17 +1,17 @@
-"""Contacts and loads from exact fields.
+"""Estimation of contacts and loads from exact fields.
 
-The field of the exact inverse is u = G q + slack + e: the loads q ~ N(0, s²) of the elastic prior move the
-electrodes, and e ~ N(0, ν² Σ) is the error of the inverse, with the covariance Σ at rest and a factor ν² from
-the standard deviations of the field. In the basis U of the singular value decomposition
+The field of the exact inverse is modelled as u = G q + slack + e. The loads q ~ N(0, s²) of the elastic prior
+move the electrodes by G q. The error e ~ N(0, ν² Σ) of the inverse has the covariance Σ at rest, scaled by a
+factor ν² from the standard deviations of the field. In the basis U of the singular value decomposition
 
     Σ^(−1/2) [G, ε I] = U S Vᵀ,   z = Uᵀ Σ^(−1/2) u,   B = Uᵀ Σ^(−1/2) G
 
-the covariance s² S² + ν² of z is diagonal for every s and ν. Both matrices are computed once per patch, so a
-frame costs two products of a matrix and a vector: z, and q = s² Bᵀ (s² S² + ν²)⁻¹ z. The scale s is that of
-the largest evidence.
+the covariance s² S² + ν² of z is diagonal for every s and ν. The matrices Uᵀ Σ^(−1/2) and B are computed once
+per patch. A frame then requires only two matrix-vector products, one for z and one for
+q = s² Bᵀ (s² S² + ν²)⁻¹ z. The scale s maximises the evidence.
 
 Wires without a position, or with a much larger standard deviation than the others, are left out: their rows
-are projected out of z and B, which costs a few milliseconds once.
+are projected out of z and B. The projection of B takes a few milliseconds and is cached.
 """
 
 from __future__ import annotations
@@ -39,29 +39,29 @@ from skinnode.solve.posterior.elastic_prior import SLACK, ElasticPrior
 from skinnode.solve.wires.problem import PatchProblem
 
 UNTOUCHED: Final = 4.0
-"""Largest displacement of an untouched patch, in standard deviations. Noise exceeds it in 2 % of frames,
-which are then searched for contacts."""
+"""Maximum displacement of an untouched patch, in standard deviations. Noise exceeds this limit in 2 % of
+frames, which are then searched for contacts."""
 WILD: Final = 16.0
 """Ratio of a wire's variances to those of the others above which the wire is left out."""
 SCALE_STEPS: Final = 30
-"""Maximum number of steps of the scale s²."""
+"""Maximum number of iterations for the scale s²."""
 SCALE_CLOSE: Final = 0.01
-"""Relative change of s² that ends the search; the loads change by less."""
+"""Relative change in s² at which the iteration ends; the loads change by a smaller fraction."""
 SCALE_LEAST: Final = 1e-12
 """Smallest s², pitch²."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LoadFactors:
-    """Matrices of one patch at one noise; see the module's docstring."""
+    """Matrices of one patch at one noise level, as defined in the module's docstring."""
 
     prior: ElasticPrior
     whitening: Float
     """(n, n) transpose of Uᵀ Σ^(−1/2) for the free coordinates, 1/pitch."""
     rows: Float
-    """(n, 3Q) B."""
+    """(n, 3Q) matrix B of the module's docstring."""
     gain: Float
-    """(n,) S²."""
+    """(n,) squared singular values, the diagonal of S²."""
     rest_std: Float
     """(n,) standard deviations of the exact inverse at rest, pitches."""
     free: Index
@@ -69,7 +69,7 @@ class LoadFactors:
 
 
 class ExactContacts:
-    """Contacts of a stream of exact fields. Do not share an instance between owners.
+    """Contact estimator for a stream of exact fields; each stream needs its own instance.
 
     Args:
         layout: The patch.
@@ -108,13 +108,13 @@ class ExactContacts:
         self._ratio, self._sorted = np.empty((2, layout.upper_m.shape[0]))
         self._no_contacts: tuple[Contact, ...] = ()
         self.no_force_n = np.zeros(layout.upper_m.shape)
-        """Forces on an untouched patch, read-only."""
+        """(U, N, 3) forces on an untouched patch, all zero; read-only."""
         self.no_force_n.setflags(write=False)
         self._wire = factors.free // (3 * layout.upper_m.shape[1])
         self.reset()
         solved = np.full(n, 1e-3)
         self._finder.warm_up(self._estimate(solved, 1.0))
-        # compiles what a stream needs
+        # compiles the kernels before a stream starts
         self._find(np.zeros(layout.upper_m.shape), np.ones(layout.upper_m.shape))
         self._estimate_without(np.arange(len(layout.upper_m)) == 0, 1.0)
         self.reset()
@@ -127,12 +127,13 @@ class ExactContacts:
         self._without: tuple[bytes, float, float, Float] | None = None
 
     def add(self, field: FieldFrame) -> FieldFrame:
-        """Return the field with its contacts and, unless the paper's law gave them, its forces.
+        """Return the field with its contacts and, unless the paper's law determines them, its forces.
 
-        Wires with an infinite standard deviation do not count. A field without any other wire has neither.
+        Wires with an infinite standard deviation are ignored. If all wires are ignored, the field has no
+        contacts, and its forces are zero.
 
         Args:
-            field: Exact field, checked.
+            field: Exact field, after the checks of its roots and data.
         """
         start = perf_counter()
         held = field.held is not None and bool(field.held.all())
@@ -155,7 +156,7 @@ class ExactContacts:
             self._field, factors.free, factors.rest_std, self.layout.pitch_m, self._moved, self._ratio,
             self._sorted,
         )  # fmt: skip
-        if not largest > UNTOUCHED:  # also if nothing is known: every standard deviation is infinite
+        if not largest > UNTOUCHED:  # also true if every standard deviation is infinite
             self._finder.reset()
             return self.no_force_n, ()
         if wild:
@@ -167,7 +168,7 @@ class ExactContacts:
         return self._finder.find(loads, displacement_m, std_m)
 
     def _estimate(self, moved: Float, level: float) -> LoadEstimate:
-        """Return the loads of a displacement (n,), pitches, with ν² = ``level``."""
+        """Return the loads that explain a displacement (n,) in pitches, with ν² = ``level``."""
         factors = self._factors
         self._scale2 = _solve_loads(
             moved, factors.whitening, factors.gain, factors.rows, level, self._scale2,
@@ -176,9 +177,9 @@ class ExactContacts:
         return LoadEstimate(self._load.reshape(-1, 3), factors.rows, self._weight, self._share, self._scale2)
 
     def _estimate_without(self, left_out: NDArray[np.bool_], level: float) -> LoadEstimate:
-        """Return the loads without the wires ``left_out`` (U,).
+        """Return the loads that explain a displacement without the wires ``left_out`` (U,).
 
-        The scale follows from the displacement with the most probable positions of those wires.
+        The scale s is computed with the left-out wires at their most probable positions.
         """
         factors, gone = self._factors, left_out[self._wire]
         moved = np.where(gone, 0.0, self._moved)
@@ -232,7 +233,7 @@ def _cached_factors(
 
 
 def _factors(layout: PatchLayout, rubber: Rubber | None, noise: Float, normal_only: bool) -> LoadFactors:
-    """Return the matrices of a patch with the relative noise (U, K)."""
+    """Return the matrices of a patch whose relative noise is ``noise`` (U, K)."""
     problem, prior, pitch = PatchProblem.of(layout), ElasticPrior.of(layout, rubber), layout.pitch_m
     wires, electrodes = layout.upper_m.shape[:2]
     slopes = jacobian(layout, layout.upper_m) * pitch**2 * problem.a_rest[..., None, None]
@@ -270,14 +271,14 @@ def _judge(  # noqa: PLR0913 - a kernel: field, factors and outputs by name
     ratio: Float,
     ordered: Float,
 ) -> tuple[float, float, bool]:
-    """Compare a field (2, 3UN) of displacements and standard deviations, m, with the one at rest.
+    """Compare a field (2, 3UN) of displacements and standard deviations, m, with the rest position.
 
-    Writes the free displacements (n,) in pitches to ``moved``, and the mean ratio of each wire's variances to
-    those at rest to ``ratio`` (U,), inf if one is infinite. ``ordered`` (U,) is scratch.
+    Writes the free displacements (n,) in pitches to ``moved``. Writes the mean ratio of each wire's variances
+    to its variances at rest to ``ratio`` (U,); inf if a variance is infinite. ``ordered`` (U,) is scratch.
 
     Returns:
         The largest displacement in standard deviations, the median ratio of the wires with finite ratios,
-        and whether a wire's ratio exceeds the median by :data:`WILD`.
+        and whether a wire's ratio exceeds the median by a factor of more than :data:`WILD`.
     """
     largest, each, known = 0.0, free.size // ratio.size, 0
     for u in range(ratio.size):
@@ -315,7 +316,7 @@ def _solve_loads(  # noqa: PLR0913, C901 - a kernel: field, matrices and outputs
     weight: Float,
     loads: Float,
 ) -> float:
-    """Find s² and the loads of a displacement; return s².
+    """Estimate s² and the loads that explain a displacement; return s².
 
     Writes z (n,), the factors (s² S² + ν²)^(−1/2) to ``weight`` (n,), and the mean loads (3Q,).
     """

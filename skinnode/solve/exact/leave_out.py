@@ -1,19 +1,20 @@
-"""Options of the exact tracker that omit unknowns, and standard deviations of the omitted coordinates.
+"""Options of the exact tracker that omit coordinates from the unknowns, with a standard deviation for each.
 
 With ``normal_only``, x and y of every electrode stay at their rest values. With ``active_only``, electrodes
-that no contact moves stay at rest: a wire starts with all electrodes at rest; while χ² rejects the fit, the
-electrode that explains most of the residual joins the unknowns together with its neighbours; once more than
-half have joined, all join. All electrodes return to rest when the rest position explains the frame. The
-standard deviation of an omitted coordinate is the smallest movement that χ² would detect if no other
-electrode moved, to first order at rest: √(quantile − degrees of freedom) σ / ‖the coordinate's column of J
-outside the range of the unknowns and of the electrode's other columns‖.
+that no contact moves stay at rest. A wire starts with all electrodes at rest. While χ² rejects the fit, the
+electrode that explains most of the residual becomes an unknown, together with its neighbours. If more than
+half of the electrodes have become unknowns, all electrodes do. All electrodes return to rest when the rest
+position explains the frame. The standard deviation of an omitted coordinate is the smallest movement that χ²
+would detect if no other electrode moved. To first order at rest, this movement is √(quantile − degrees of
+freedom) σ / ‖component of the coordinate's column of J outside the range of the unknowns and of the
+electrode's other columns‖.
 
 Each option rests on an assumption about the skin, and the standard deviations of the unknowns are valid only
-if the assumption holds. χ² tests the assumption of active_only well, and that of normal_only less well,
-because a smooth shear resembles a gradient of z. On the staggered layout, h = 0.5, noise 1e-5, a strong
-Hertzian press whose shear is 30 % of its depth is rejected; a weaker press is accepted, with errors in z of
-up to 16 standard deviations (only 0.2 % of h). Allowing for these errors would cost more than solving for the
-shear.
+if the assumption holds. A χ² test detects violations of the assumption of active_only reliably. The test is
+less sensitive for normal_only, because smooth shear resembles a gradient of z. On the staggered layout, h =
+0.5, noise 1e-5, the test rejects a strong Hertzian press whose shear is 30 % of its depth. The test accepts a
+weaker press, with errors in z of up to 16 standard deviations (only 0.2 % of h). Standard deviations that
+allowed for these errors would lose more accuracy than solving for the shear.
 """
 
 from __future__ import annotations
@@ -36,14 +37,14 @@ from skinnode.solve.wires.hold import Z_HOLD, chi2_quantile
 from skinnode.solve.wires.stages import DEADLINE, STALE
 
 Z_WIDEN: Final = 3.719
-"""Normal quantile of the χ² probability, 1 − 1e-4, at which electrodes join the unknowns; at 100 frames/s, a
-long press gains one electrode by chance every 100 s."""
+"""Normal quantile of 1 − 1e-4, the χ² probability above which electrodes become unknowns. At 100 frames/s,
+chance adds one electrode to a long press every 100 s."""
 TINY: Final = 1e-200
 """Smallest squared slope used as a divisor: far below real slopes, yet large enough to avoid overflow."""
 
 
 class LeftOut:
-    """Electrodes omitted from the unknowns of a stream, and the size of movements that would go unnoticed."""
+    """Electrodes omitted from the unknowns of a stream, and the sizes of their undetectable movements."""
 
     def __init__(self, stream: StreamState, active_only: bool) -> None:
         problem = stream.problem
@@ -56,7 +57,7 @@ class LeftOut:
         # (U, 3N) undetectable movement of each coordinate, pitches per unit of σ, and its weights (U, K)
         self._unnoticed = np.zeros((layout.shape[0], layout.unknowns))
         self._unnoticed_weight = np.zeros(layout.shape)
-        # limits of χ² by degrees of freedom
+        # limits of χ², indexed by degrees of freedom
         self._chi2_hold, self._chi2_widen, self._chi2_refuse = (
             np.array([chi2_quantile(max(dof, 1), z) for dof in range(layout.shape[1] + 1)])
             for z in (Z_HOLD, Z_WIDEN, Z_REFUSE)
@@ -75,7 +76,7 @@ class LeftOut:
             self._set_electrodes(u, np.arange(self._layout.unknowns // 3))
 
     def leave_out(self, sigma: float) -> None:
-        """Move wires back to rest if that explains the frame; write the std of omitted coordinates."""
+        """Return wires to rest if the rest position explains the frame; write omitted coordinates' std."""
         solver, arrays = self._stream.solver, self._stream.arrays
         if self._active_only:
             a_rest = self._stream.problem.a_rest
@@ -86,7 +87,7 @@ class LeftOut:
             known = (chi2 <= self._chi2_hold[count]) & (count >= solver.each * self._layout.unknowns // 3)
             for u in np.flatnonzero(known & (solver.free > 0)).tolist():
                 self._set_electrodes(u, np.arange(0))
-                self._unnoticed_weight[u] = 0.0  # measured below
+                self._unnoticed_weight[u] = 0.0  # recomputed below
         arrays.unknowns[:] = self._stream.unknowns
         if solver.each * solver.free.min() < self._layout.unknowns:
             for u in np.flatnonzero(_changed(arrays.used, self._unnoticed_weight)).tolist():
@@ -96,7 +97,7 @@ class LeftOut:
     def widen(self, frame: Frame, turns: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """Add unknowns to the processed wires with an unexplained residual; return these wires (U,).
 
-        Sets ``turns`` (U,) to False for wires reached after the deadline.
+        Sets ``turns`` (U,) to False for wires not processed before the deadline.
         """
         unexplained = turns & ~self._explained()
         for u in [u for u in frame.order.tolist() if unexplained[u]]:
@@ -146,7 +147,7 @@ class LeftOut:
         return np.asarray(whole | (self._stream.roots() & content))
 
     def _widen(self, u: int, frame: Frame) -> None:
-        """Add electrodes of wire u until they explain the frame; undo this if even all of them do not."""
+        """Add unknown electrodes to wire u until the frame is explained; remove them if there is no root."""
         stream, solver, most = self._stream, self._stream.solver, self._layout.unknowns // 3
         before = solver.electrodes(u).copy()
         while stream.solvable()[u] and not self._explained()[u]:
@@ -155,7 +156,9 @@ class LeftOut:
                 break
             electrodes = np.arange(most)
             near = not stream.problem.out_of_reach(solver.x)[u]
-            if near and solver.measure[u, wires.CHI2] < np.inf:  # a minimum, although χ² is too large
+            if (
+                near and solver.measure[u, wires.CHI2] < np.inf
+            ):  # the solve reached a minimum with too large a χ²
                 joined = np.union1d(solver.electrodes(u), self._most_explaining(u))
                 electrodes = electrodes if 2 * len(joined) > most else joined
             self._set_electrodes(u, electrodes)

@@ -21,17 +21,18 @@ from skinnode.solve.wires.arrays import solve_options
 from skinnode.solve.wires.stages import DEADLINE
 
 BRIDGES: Final = (3, 5, 10)
-"""Number of substeps in each successive bridge. On the staggered layout, h = 0.5, from rest, 3 substeps solve
-every wire if a 50 % press occurs between two frames, and 5 substeps solve 23 of 24 wires at 70 %. Adaptive
-steps restricted to the trusted branch do worse, because the straight line crosses singular points that the
-press avoids."""
+"""Number of substeps in each successive bridge. On the staggered layout, h = 0.5, 3 substeps solve every wire
+if a press of 50 % starts from rest between two frames; for a press of 70 %, 5 substeps solve 23 of 24 wires.
+Adaptive steps restricted to the trusted branch solve fewer wires, because the straight line in R crosses
+singular points that the press avoids."""
 BRIDGE_TOLERANCE: Final = 1e-6
 """Tolerance of bridge substeps: the paper's intermediate tolerance."""
 BRIDGE_STEPS: Final = 20
 """Maximum steps per substep."""
 RECOVERY_STEPS: Final = 300
-"""Maximum total steps of all bridges in a frame, about 15 ms; a corrupt frame must not stall the stream."""
-# Bridges use Levenberg-Marquardt, the operator most robust to gaps, whatever the stream's operator is.
+"""Maximum total number of steps of all bridges in a frame, about 15 ms; prevents a corrupt frame from
+stalling the stream."""
+# Bridges always use Levenberg-Marquardt, which crosses large gaps most reliably, not the stream's operator.
 _ACROSS: Final = solve_options(op.LEVENBERG_MARQUARDT, 0, BRIDGE_TOLERANCE, BRIDGE_TOLERANCE, BRIDGE_STEPS)
 _LAST: Final = solve_options(op.LEVENBERG_MARQUARDT, TASKS, TOLERANCE, TOLERANCE, BRIDGE_STEPS)
 
@@ -42,7 +43,7 @@ def recover_lost(
     """Recover the wires that are not at a root; write ``good`` and ``status`` of the stream's arrays.
 
     Gives up on wires that fail, and on ``exhausted`` wires (U,), for which all attempts have been made. Sets
-    ``turns`` (U,) to False for wires reached after the deadline.
+    ``turns`` (U,) to False for wires not processed before the deadline.
     """
     solver, arrays = stream.solver, stream.arrays
     good, status = arrays.good, arrays.status
@@ -84,11 +85,11 @@ def recover(stream: StreamState, u: int, frame: Frame) -> bool:
 def _bridge(  # noqa: PLR0913 - both ends of the bridge
     stream: StreamState, u: int, x_from: Float, a_from: Float, frame: Frame, substeps: int
 ) -> bool:
-    """Solve wire u along a straight line from its resistances ``a_from`` (K,) to those of the frame.
+    """Solve wire u along a straight line from the resistances ``a_from`` (K,) to the frame's resistances.
 
-    Only the last point counts: the line is not a deformation of rubber, so intermediate points may lie on any
-    branch. The outcome is in the solver's report on the wire. Returns False if the deadline interrupts the
-    bridge.
+    Only the last point is checked: the line does not follow a deformation of rubber, so intermediate points
+    may be on any branch. The solver's report on the wire contains the outcome. Returns False if the deadline
+    interrupts the bridge.
     """
     todo, a_to = stream.only(u), stream.arrays.a[u]
     between = stream.arrays.a.copy()

@@ -26,12 +26,13 @@ from skinnode.solve.wires.patch_solver import PatchSolver
 from skinnode.solve.wires.problem import PatchProblem
 
 TOLERANCE: Final = 1e-9
-"""Tolerance of r and, in pitches, of x: four orders of magnitude below the noise of a 24-bit converter, and
-one Newton step away from 1e-5."""
+"""Tolerance of r and, in pitches, of x. The value is four orders of magnitude below the noise of a 24-bit
+converter; a single Newton step leads from an error of 1e-5 to this tolerance."""
 FRAME_STEPS: Final = 12
-"""Maximum steps per solve; quadratic convergence from within the trust region takes 3 to 6."""
+"""Maximum number of steps per solve; quadratic convergence from within the trust region takes 3 to 6
+steps."""
 TASKS: Final = wires.COVARIANCE | wires.REUSE
-"""Tasks of every solve that may be the last in a frame."""
+"""Additional tasks of each solve whose result may become the result of the frame."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -54,7 +55,7 @@ class Frame:
 class StreamState:
     """Solver and arrays of one stream, modified in place by the parts of the tracker.
 
-    Do not share an instance between owners.
+    Each stream needs its own instance.
 
     Args:
         problem: The patch in solver units.
@@ -73,7 +74,7 @@ class StreamState:
         self.options = solve_options(operator, TASKS, TOLERANCE, TOLERANCE, FRAME_STEPS)
 
     def reset(self) -> None:
-        """Go back to the rest position."""
+        """Discard the state of the stream and return to the rest position."""
         solver, arrays = self.solver, self.arrays
         arrays.x[:], arrays.a_solved[:] = self.problem.rest, self.problem.a_rest
         solver.inverse[:] = self._rest_inverse
@@ -102,8 +103,8 @@ class StreamState:
         Args:
             todo: (U,) LEAVE, SOLVE, PREDICT or HOLD.
             frame: Frame with σ and the order of the wires.
-            a: (U, K) resistances; by default those of the frame.
-            options: Solver options; by default those of the stream.
+            a: (U, K) resistances; the frame's resistances by default.
+            options: Solver options; the stream's options by default.
             units: As in :meth:`PatchSolver.solve`.
         """
         self.solver.solve(
@@ -117,13 +118,13 @@ class StreamState:
         )
 
     def only(self, u: int) -> NDArray[np.uint8]:
-        """Return actions (U,) that solve wire u and leave the others."""
+        """Return actions (U,) that solve wire u and skip all other wires."""
         todo = np.full(len(self.solver.x), wires.LEAVE, np.uint8)
         todo[u] = wires.SOLVE
         return todo
 
     def roots(self) -> NDArray[np.bool_]:
-        """Return the wires (U,) at a root on the branch of the rest position, within reach."""
+        """Return the wires (U,) at a root that is within reach and on the branch of the rest position."""
         solver = self.solver
         report, out_of_reach = solver.report, self.problem.out_of_reach(solver.x)
         return on_rest_branch(

@@ -1,7 +1,7 @@
-"""Exact tracker: solves each frame of a live stream from the previous one, as the paper follows a path.
+"""Exact tracker: solves each frame of a live stream from the solution of the previous frame.
 
 hold       keep the position of a wire whose resistances changed no more than their noise (see ``hold``)
-predict    move by (∂x/∂R) ΔR with the J⁻¹ of an earlier frame, computed for its covariance anyway
+predict    move by (∂x/∂R) ΔR with the J⁻¹ that an earlier frame computed for its covariance
 follow     take simplified Newton steps with the same J⁻¹ while it is still accurate enough
 correct    otherwise iterate the operator, to a tolerance far below any noise
 widen      add an omitted electrode to the unknowns if it seems to move (see ``leave_out``)
@@ -37,17 +37,17 @@ from skinnode.solve.wires.solve_wires import COVARIANCE_UNITS
 from skinnode.solve.wires.stages import DEADLINE
 
 UNIT_S: Final = 10e-6
-"""Maximum time for one evaluation of F and J and the step that follows, s. Each call solves as many wires as
-are certain to fit into the remaining time, because splitting one call into ten takes as much extra time as
+"""Maximum time for one evaluation of F and J and the step that follows, s. Each call includes all wires that
+are certain to be solved in the remaining time, because ten calls instead of one take as much extra time as
 solving ten wires."""
 WIRE_UNITS: Final = FRAME_STEPS + 1 + COVARIANCE_UNITS
-"""Maximum cost of a wire per frame, in evaluations."""
+"""Maximum cost of a wire per frame, in evaluations of F and J."""
 
 
 class ExactTracker:
     """Tracker for one patch, using the exact inverse of each wire.
 
-    Do not share an instance between owners. Compiled code releases the GIL.
+    Each patch needs its own tracker. The tracker's compiled code runs without the GIL.
 
     Args:
         layout: The patch, with K ≥ 3N, or K ≥ N if ``normal_only``.
@@ -62,7 +62,8 @@ class ExactTracker:
         normal_only: Whether only z is unknown.
         active_only: Whether to solve only for electrodes that contacts move.
         codes: Mapping from the codes passed to :meth:`update_codes` to resistances.
-        noise_estimate: Estimate of the stream's noise, which scales the stated noise; the owner resets it.
+        noise_estimate: Estimate of the stream's noise, which scales the stated noise; the caller must reset
+            the estimate.
 
     The constructor compiles the kernels. Raises ValueError if an argument has the wrong shape or is out of
     range.
@@ -96,7 +97,7 @@ class ExactTracker:
         problem = PatchProblem.of(layout, baseline_ohm)
         self.stiffness_n_per_m = stiffness_n_per_m
         self.untouched_force_n: Float | None = None
-        """(U, N, 3) forces put into fields without a stiffness, N; those of an untouched patch, if any."""
+        """(U, N, 3) forces on an untouched patch, N; used for all fields if no stiffness is given."""
         self._noise = checked_noise(relative_noise, layout)
         self._sigma = float(self._noise.min())
         self._seconds = math.inf if deadline_us is None else deadline_us * 1e-6
@@ -143,13 +144,14 @@ class ExactTracker:
             valid: (U, K) bool, False if a chunk or wire is missing; default all True.
             relative_noise: As in the constructor, for this frame only; resistances whose noise is not
                 positive and finite are ignored.
-            left_out: (U, K) readings that are not used, although they are valid and show the noise.
+            left_out: (U, K) readings that the solve ignores although they are valid; the noise estimate uses
+                them.
 
         No resistance value raises an exception. A wire with fewer usable resistances than unknowns is
         ILL_CONDITIONED, or NON_FINITE if resistances not marked as missing were unusable. Such a wire, and
         any wire for which no solve finds a root, keeps its last trusted position with an infinite standard
-        deviation; its residual is computed at that position, or is inf if the deadline left no time. Raises
-        ValueError if a shape is wrong.
+        deviation. The residual of such a wire is computed at this position; it is inf if no time remains
+        before the deadline. Raises ValueError if a shape is wrong.
         """
         start = perf_counter()
         arrays = self.arrays
@@ -169,7 +171,7 @@ class ExactTracker:
         return self._advance(stage.SCALE, start)
 
     def update_codes(self, codes: NDArray[np.uint32]) -> FieldFrame:
-        """Return the field of a scan of codes (U, K), as :meth:`update` does for resistances.
+        """Return the field of a scan, given as codes (U, K); see :meth:`update`.
 
         Afterwards :attr:`arrays` contains the resistances and :attr:`invalid_codes` the number of invalid
         codes. Raises ValueError if ``codes`` has the wrong shape or is not uint32.
@@ -183,7 +185,7 @@ class ExactTracker:
             self._code_factor = estimate.factor
             arrays.code_map[NOISE] = self._code_noise[0, 0] * estimate.factor
         field = self._advance(stage.DECODE | stage.SCALE, start)
-        estimate.see(arrays.ohm, self._code_noise, arrays.rounding_ohm)  # for the next frame
+        estimate.see(arrays.ohm, self._code_noise, arrays.rounding_ohm)  # affects the next frame
         return field
 
     def update_again(self, left_out: NDArray[np.bool_]) -> FieldFrame:
@@ -255,7 +257,7 @@ class ExactTracker:
         """
         solver, arrays = self._stream.solver, self.arrays
         turns = solver.report[:, wires.TURN] == 1
-        exhausted = np.zeros_like(turns)  # all attempts have been made
+        exhausted = np.zeros_like(turns)  # wires for which all attempts have been made
         if self._active_only:
             exhausted = self._left_out.widen(frame, turns)
         recover_lost(self._stream, frame, turns, exhausted)
@@ -278,7 +280,7 @@ class ExactTracker:
             arrays.a_solved[u, missing] = stream.a_at(arrays.x[u])[missing]
 
     def adopt(self, wires_: NDArray[np.bool_], displacement_m: Float) -> None:
-        """Continue from these displacements (U, N, 3) of the wires (U,) as if they had been solved."""
+        """Continue from these displacements (U, N, 3) of the wires (U,), as if they were solutions."""
         stream, arrays = self._stream, self.arrays
         moved = (displacement_m / self.layout.pitch_m).reshape(arrays.x.shape)
         if self._active_only:  # make every electrode an unknown again
@@ -289,7 +291,7 @@ class ExactTracker:
             arrays.predictable[u] = False
 
     def distrust(self, wires_: NDArray[np.bool_]) -> None:
-        """Solve these wires (U,) from rest in the next frame, whatever the outcome in this frame."""
+        """Solve these wires (U,) from rest in the next frame, regardless of the outcome in this frame."""
         problem, arrays = self._stream.problem, self.arrays
         arrays.x[wires_], arrays.a_solved[wires_] = problem.rest[wires_], problem.a_rest[wires_]
         arrays.predictable[wires_] = False

@@ -1,4 +1,4 @@
-"""Operators Gauss-Newton, Levenberg-Marquardt and dogleg: one file each, with a common ``work`` space.
+"""Operators Gauss-Newton, Levenberg-Marquardt and dogleg, in one file each, and their workspace ``work``.
 
 ``trust_region`` decides whether to accept a step, and ``loop`` iterates the operator selected by its number
 in ``codes``. ``system`` solves any square or tall system in one or more attempts (``attempt``), ``minimum``

@@ -1,7 +1,7 @@
-"""One attempt of ``solve_system``: an operator with its trust region, from the start to a judged point.
+"""One attempt of ``solve_system``: an operator and its trust region, run until a point can be classified.
 
-The compiled loop stops at roots and near stationary points of ‖r‖. Decided here is what its CONVERGED leaves
-open: whether the equations determine x, and whether a stationary point with r ≠ 0 is a minimum.
+The compiled loop stops at roots and near stationary points of ‖r‖. For a loop that ends as CONVERGED, this
+module decides whether the equations determine x, and whether a stationary point with r ≠ 0 is a minimum.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ from skinnode.solve.operators.result import PointKind
 from skinnode.solve.operators.work import LIMIT, NORM, workspace
 
 NEAR: Final = 1e-2
-"""Largest cosine between r and a column of J from which Newton's method is tried for a minimum before the
-operator has converged. If r is large, the operators' own steps converge linearly (Brown & Dennis: 454
-steps)."""
+"""Maximum cosine between r and a column of J at which Newton's method is tried before the operator has
+converged to a minimum. If r is large, the operators' own steps converge only linearly (454 steps on the
+problem of Brown & Dennis)."""
 
 
 class System:
-    """The caller's functions; counts their calls and checks their arrays.
+    """Wrapper of the caller's functions that counts their calls and checks their arrays.
 
     An array returned by a method may be the caller's own, which the next call may overwrite.
     """
@@ -41,7 +41,7 @@ class System:
         first = residual(x0.copy())
         shape: tuple[int | str, ...] = ("m",)
         if type(first) is np.ndarray and first.ndim == 1 and first.size > 0:
-            shape = first.shape  # known, so that nothing is left to check
+            shape = first.shape  # exact shape: the check then takes its fast path
         self.first = require_array("residual(x0)", first, shape, finite=False).copy()
         self.m = self.first.size
 
@@ -55,17 +55,17 @@ class System:
         self.jacobians += 1
         j, shape = self._jacobian(x.copy()), (self.m, self.n)
         if type(j) is np.ndarray and j.dtype == np.float64 and j.shape == shape:
-            return j  # in any order: the workspace has J transposed
+            return j  # in any memory order, because the workspace stores J transposed
         return require_array("jacobian(x)", j, shape, finite=False)
 
     @property
     def steps(self) -> int:
-        """Trial points so far: every evaluation of r after the first."""
+        """Number of trial points so far: all evaluations of r after the first."""
         return self.evaluations - 1
 
 
 class Attempt:
-    """A solve that can pause after any number of steps.
+    """Attempt to solve a system, which can pause after any number of steps.
 
     ``limit`` is the initial trust radius: 0 for Moré's column scaling and radius, −radius for D = I.
     """
@@ -82,7 +82,7 @@ class Attempt:
 
     @property
     def at(self) -> Point:
-        """The best iterate; its arrays change when the attempt goes on."""
+        """Best iterate; its arrays change when the attempt continues."""
         return self._settled or Point(self._w.x, self._w.r, self._w.jt.T)
 
     @property
@@ -92,16 +92,16 @@ class Attempt:
 
     @property
     def ended(self) -> bool:
-        """Whether the attempt has a status."""
+        """Whether the attempt has ended with a status."""
         return self.went >= 0
 
     @property
     def decided(self) -> bool:
-        """Whether other attempts are useless: x is a root or minimum, or not determined."""
+        """Whether no other attempt is needed, because x is a root or minimum or is not determined."""
         return self.went in (op.CONVERGED, op.INVALID_START) or self.kind in (PointKind.ROOT, PointKind.FLAT)
 
     def run(self, steps: int, tol_f: float, tol_x: float) -> None:
-        """Take at most this many steps; at the end of the solve, or near a minimum, judge the point."""
+        """Take at most this many steps; classify the point at the end of the solve or near a minimum."""
         code, w, system, went, left = self._code, self._w, self._system, self.went, steps
         while went < 0:
             if went == op.TRY:
@@ -121,7 +121,7 @@ class Attempt:
             self.settle(tol_x, left)
 
     def _is_root(self, tol_f: float) -> bool:
-        """Return whether the ended solve reached r = 0; estimate the error, and refuse an undetermined x."""
+        """Return whether the solve ended at r = 0; estimate the error, and reject an undetermined x."""
         w, system = self._w, self._system
         square = system.m == system.n
         if self.went == op.CONVERGED:
@@ -133,7 +133,7 @@ class Attempt:
         return self.ended and float(np.abs(w.r).max()) <= tol_f
 
     def settle(self, tol_x: float, steps: int) -> None:
-        """If a minimum of ‖r‖ is near, go there by Newton's method; tell minima, flats and saddles apart."""
+        """Move to a nearby minimum of ‖r‖ by Newton's method; classify minima, flats and saddles."""
         at, system, converged = self.at, self._system, self.went == op.CONVERGED
         if converged:
             self.went = op.ILL_CONDITIONED

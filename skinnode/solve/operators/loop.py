@@ -5,14 +5,16 @@
     shorten    if the Newton step leaves the trust region, replace the trial with one inside it
     assess     given r at ``trial`` in ``r_trial``, accept or reject the step, and update the radius
 
-The same compiled steps therefore serve the compiled solver for a skin wire and any pair of Python callables.
-Gauss-Newton accepts every step in full; Levenberg-Marquardt and dogleg accept a step only if it reduces r.
+The compiled solver for a skin wire and a solve with any pair of Python callables therefore share the same
+compiled steps. Gauss-Newton accepts every step in full; Levenberg-Marquardt and dogleg accept a step only if
+it reduces r.
 
 For a square system, CONVERGED means a root: max|r| ≤ tol_f *and* a simplified Newton correction
 ‖J⁻¹ r₊‖∞ ≤ tol_x · max(1, ‖x‖∞) with the current factors. If rounding keeps r above tol_f, an r within the
 rounding error of J·x counts as zero. For a tall system, CONVERGED means a minimum: ‖P r‖ ≤ tol_f ‖r‖, with P
-the projection onto the range of J, and the same condition on the correction; ``minimum`` tells minima from
-saddles. A stationary point of a square system with r ≠ 0 is ILL_CONDITIONED, because J is singular there.
+the projection onto the range of J, and the same condition on the correction; ``minimum`` distinguishes minima
+from saddles. A stationary point of a square system with r ≠ 0 is ILL_CONDITIONED, because J is singular
+there.
 """
 
 from __future__ import annotations
@@ -82,7 +84,7 @@ def begin(w: Work) -> int:
 
 @njit_part
 def set_trial(operator: int, w: Work) -> None:
-    """Set ``trial`` to x + step and, if there is a trust region, LENGTH and ``js``."""
+    """Set ``trial`` to x + step; for operators with a trust region, also set LENGTH and ``js``."""
     for j in range(w.x.size):
         w.trial[j] = w.x[j] + w.step[j]
     if operator != GAUSS_NEWTON:

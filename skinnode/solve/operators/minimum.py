@@ -1,9 +1,10 @@
 """Second-order test of a stationary point of ‖r‖, and Newton's method for a minimum with r ≠ 0.
 
 The Hessian of ½ ‖r‖² is JᵀJ + S, S = Σ_k r_k ∇²r_k, with S from central differences of Jᵀr at constant r.
-With D the column norms of J and J D⁻¹ = U Σ Vᵀ, it is D V (Σ² + C) Vᵀ D, C = Vᵀ D⁻¹ S D⁻¹ V, so JᵀJ is never
-formed. Row and column k of Σ² + C are divided by √(σ_k² + ν), with ν the rounding error of C. The smallest
-eigenvalue that remains is 1 at a minimum with r = 0, and at most about 0 at a saddle or in a flat direction.
+With D the column norms of J and J D⁻¹ = U Σ Vᵀ, the Hessian is D V (Σ² + C) Vᵀ D, C = Vᵀ D⁻¹ S D⁻¹ V, so JᵀJ
+is never formed. Row and column k of Σ² + C are divided by √(σ_k² + ν), with ν the rounding error of C. The
+smallest eigenvalue that remains is 1 at a minimum with r = 0, and at most about 0 at a saddle or in a flat
+direction.
 """
 
 from __future__ import annotations
@@ -19,17 +20,19 @@ from skinnode.model.layout import Float
 from skinnode.solve.operators.codes import EPS, STATIONARY
 
 DIFFERENCE: Final = EPS ** (1 / 3)
-"""Step of a central difference, relative to the coordinate: truncation and rounding errors are equal."""
+"""Step of a central difference, relative to the coordinate, at which truncation and rounding errors are
+equal."""
 NOISE: Final = EPS ** (2 / 3)
-"""Relative rounding error of a central difference with this step."""
+"""Relative rounding error of a central difference with the step :data:`DIFFERENCE`."""
 CURVED: Final = 0.05
 """Smallest scaled eigenvalue of the Hessian that counts as positive. On the problems of Moré, Garbow &
-Hillstrom, it is at most 2e-6 at flat points and at least 0.38 at isolated minima, except 0.003 at Watson's
-with n = 12, where rounding hides the curvature."""
+Hillstrom, this eigenvalue is at most 2e-6 at flat points and at least 0.38 at isolated minima. The exception
+is 0.003 on Watson's problem with n = 12, where rounding hides the curvature."""
 CONTRACTION: Final = 0.5
 """Largest ratio of successive Newton steps that counts as convergence."""
 NEWTON_STEPS: Final = 8
-"""Maximum Newton steps to a minimum, twice the number that quadratic convergence takes from a 1 % error."""
+"""Maximum number of Newton steps to a minimum, twice the number for quadratic convergence from a 1 %
+error."""
 
 
 @dataclass(frozen=True)
@@ -42,7 +45,7 @@ class Point:
 
     @property
     def norm(self) -> float:
-        """‖r‖₂."""
+        """Euclidean norm ‖r‖₂ of the residual."""
         return float(np.linalg.norm(self.r))
 
     @property
@@ -65,14 +68,14 @@ class Point:
 
 @dataclass(frozen=True)
 class Curvature:
-    """The Hessian at a point, reduced to a verdict and a step."""
+    """Smallest eigenvalue, Newton step and error estimate from the Hessian at a point."""
 
     lowest: float
     """Smallest scaled eigenvalue; about 0 if a direction is flat, NaN if a number overflowed."""
     step: Float
     """(n,) Newton step for Jᵀr = 0."""
     error: float
-    """Effect of rounding r, J and x on the minimum, max |δx|."""
+    """Shift max |δx| of the minimum due to rounding of r, J and x."""
 
     @property
     def positive(self) -> bool:
@@ -86,11 +89,11 @@ def column_norms(j: Float) -> Float:
 
 
 def curvature(jacobian: Callable[[Float], Float], at: Point) -> Curvature:
-    """Return the Hessian at a point, from 2n Jacobians."""
+    """Return the curvature at a point, from a Hessian computed with 2n Jacobians."""
     n = at.x.size
     d = column_norms(at.j)
     d[d == 0.0] = 1.0
-    reach = at.norm / d  # the move of one coordinate that changes r by its own norm
+    reach = at.norm / d  # change in one coordinate that changes r by ‖r‖
     size = np.maximum(np.abs(at.x), np.minimum(reach, 1.0))
     s = np.empty((n, n))
     for k in range(n):
@@ -111,8 +114,8 @@ def curvature(jacobian: Callable[[Float], Float], at: Point) -> Curvature:
     if not bend[0] > CURVED:
         return Curvature(float(bend[0]), np.zeros(n), math.inf)
     half = (q.T * share) @ vt / d
-    inverse = (half.T / bend) @ half  # of the Hessian
-    pseudo = (half.T / bend) @ (q.T * (share * sigma)) @ u.T  # the inverse of the Hessian times Jᵀ
+    inverse = (half.T / bend) @ half  # inverse of the Hessian
+    pseudo = (half.T / bend) @ (q.T * (share * sigma)) @ u.T  # inverse of the Hessian, times Jᵀ
     rounded = np.abs(pseudo) @ at.rounding + EPS * (np.abs(inverse) @ (np.abs(at.j).T @ np.abs(at.r)))
     return Curvature(float(bend[0]), -pseudo @ at.r, float((rounded + EPS * np.abs(at.x)).max()))
 
@@ -135,7 +138,7 @@ def settle(
     tol_x: float,
     max_steps: int,
 ) -> Settled:
-    """Take Newton steps for Jᵀr = 0 while they contract and ‖r‖ does not grow; judge the last point."""
+    """Take Newton steps for Jᵀr = 0 while they contract and ‖r‖ does not grow; assess the last point."""
     before = math.inf
     for left in range(min(NEWTON_STEPS, max_steps), -1, -1):
         bent = curvature(jacobian, at)
@@ -148,6 +151,6 @@ def settle(
         if not float(np.linalg.norm(r)) <= at.norm * (1.0 + STATIONARY):
             break
         before, at = size, Point(x, r, jacobian(x))
-    # A step that does not contract any more is rounding if Jᵀr is as small as rounding makes it
+    # A step that no longer contracts is a rounding error if Jᵀr is as small as rounding permits
     known = bent.positive and (reached or at.cosine <= STATIONARY)
     return Settled(at, bent.lowest, size + bent.error if known else math.inf)

@@ -16,7 +16,7 @@ class PointKind(enum.Enum):
     """Kind of the point at which ``solve_system`` stopped."""
 
     ROOT = "root"
-    """r is zero to within ``tol_f`` or the rounding of x."""
+    """The residual r is zero to within ``tol_f`` or the rounding of x."""
     MINIMUM = "minimum"
     """‖r‖ has an isolated minimum above zero: Jᵀr is zero, and the Hessian of ½ ‖r‖² is positive definite."""
     FLAT = "flat"
@@ -35,9 +35,9 @@ class Solution:
     """(n,) best iterate."""
     status: Status
     """CONVERGED at a root and, if there are more equations than unknowns, at a minimum. ILL_CONDITIONED at a
-    minimum of a square system, which is no root, and wherever x is not determined by the equations."""
+    minimum of a square system that is not a root, and at any point that the equations do not determine."""
     kind: PointKind
-    """Root, minimum, or neither."""
+    """Kind of the point: root, minimum or neither."""
     residual_norm: float
     """‖r‖₂ at ``x``."""
     optimality: float

@@ -2,9 +2,9 @@
 
 Levenberg-Marquardt and dogleg make up to three attempts from the same start, which differ in their trust
 region: Moré's column scaling with a radius of 100 ‖D x₀‖, as in MINPACK, then D = I with a radius of ‖x₀‖,
-then of a tenth of it. No scaling is best for every system: column scaling suits unknowns of different units,
-but a column that was large near the start confines all later steps. Therefore the attempts take turns of 100,
-200, 400, … steps until one ends at a root or minimum.
+then of 0.1 ‖x₀‖. No single scaling is best for every system: column scaling suits unknowns with different
+units, but a column that was large near the start confines all later steps. Therefore the attempts take turns
+of 100, 200, 400, … steps until one attempt ends at a root or minimum.
 """
 
 from __future__ import annotations
@@ -27,12 +27,13 @@ from skinnode.solve.operators.minimum import Point
 from skinnode.solve.operators.result import PointKind, Solution
 
 TURN: Final = 100
-"""Steps of an attempt's first turn, doubled at each later turn. On 46 problems of Moré, Garbow & Hillstrom,
-from three starts each, column scaling alone converges on 90, and within 100 steps on 79 (dogleg) or 72
-(Levenberg-Marquardt)."""
+"""Number of steps in an attempt's first turn; doubled for each later turn. On 46 problems of Moré, Garbow &
+Hillstrom with three starts each, column scaling alone converges from 90 starts, and within 100 steps from 79
+(dogleg) or 72 starts (Levenberg-Marquardt)."""
 RADII: Final = (1.0, 0.1)
-"""Initial trust radii of the attempts with D = I, relative to ‖x₀‖. On the same problems, dogleg converges on
-93 or 99, Levenberg-Marquardt on 102 or 101, and with each radius where it does not with the other."""
+"""Initial trust radii of the attempts with D = I, relative to ‖x₀‖. On the problems listed under
+:data:`TURN`, dogleg converges from 93 or 99 starts with these radii, and Levenberg-Marquardt from 102 or 101.
+Each radius succeeds from some starts at which the other fails."""
 
 
 def operator_code(name: str) -> int:
@@ -67,17 +68,17 @@ def solve_system(  # noqa: PLR0913 - keyword arguments of the public interface
         jacobian: Function that returns ∂r/∂x (m, n) for x (n,).
         x0: (n,) starting point.
         operator: ``dogleg``, ``levenberg_marquardt`` or ``gauss_newton``.
-        tol_f: Largest |r| at a root; at a minimum, largest fraction of r in the range of J.
+        tol_f: Maximum |r| at a root; at a minimum, maximum fraction of r in the range of J.
         tol_x: Largest remaining correction, relative to max(1, max|x|).
         max_steps: Maximum number of trial steps of all attempts together, including rejected steps.
 
     Returns:
         The best iterate with its status and kind. CONVERGED means a root or, if there are more equations
-        than unknowns, an isolated minimum of ‖r‖; ``kind`` says which. A minimum of a square system with
-        r ≠ 0 is no solution, and ILL_CONDITIONED, because J is singular there; so is every point that the
-        equations do not determine. INVALID_START means fewer equations than unknowns, or a residual or
-        Jacobian that is not finite at ``x0``. Testing a minimum takes 2 n Jacobians or more; ``stats``
-        counts them.
+        than unknowns, an isolated minimum of ‖r‖; ``kind`` says which. A minimum of a square system with r ≠
+        0 is not a solution: its status is ILL_CONDITIONED, because J is singular there. A point that the
+        equations do not determine is ILL_CONDITIONED too. INVALID_START means fewer equations than unknowns,
+        or a residual or Jacobian that is not finite at ``x0``. Testing a minimum takes 2 n Jacobians or more;
+        ``stats`` counts them.
 
     Raises:
         ValueError: If an argument is out of range, or an argument or returned array has the wrong shape. A
@@ -108,7 +109,7 @@ def solve_system(  # noqa: PLR0913 - keyword arguments of the public interface
 def _solve(  # noqa: PLR0913 - the arguments of solve_system
     code: int, system: System, start: Point, tol_f: float, tol_x: float, max_steps: int
 ) -> Attempt:
-    """Let the attempts take turns until one decides; return it, else that with the smallest residual."""
+    """Run the attempts in turns; return the first that decides, else that with the smallest residual."""
     attempts = [Attempt(code, system, start, 0.0)]
     later = [] if code == op.GAUSS_NEWTON else list(RADII)
     turn = TURN if later else max_steps
@@ -128,7 +129,7 @@ def _solve(  # noqa: PLR0913 - the arguments of solve_system
 
 
 def _best(attempts: list[Attempt], tol_x: float, steps: int) -> Attempt:
-    """Return the attempt with the smallest residual, its point judged."""
+    """Return the attempt with the smallest residual, after classifying its point."""
     best = min(attempts, key=lambda each: each.norm)
     if best.kind is PointKind.UNFINISHED and best.went != op.INVALID_START:
         best.settle(tol_x, steps)

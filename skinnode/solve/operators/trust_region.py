@@ -1,4 +1,4 @@
-"""Trust region ‖D s‖ ≤ radius: its size, and the decision on whether to accept a step.
+"""Trust region ‖D s‖ ≤ radius: choice of the radius, and acceptance or rejection of a step.
 
 A step is accepted only if it reduces r. Source: Moré, The Levenberg-Marquardt algorithm, 1978.
 """
@@ -79,7 +79,7 @@ def measure_newton(w: Work) -> None:
 
 @njit_part
 def _gain_noise(w: Work) -> float:
-    """Return the rounding error in the relative decrease in ‖r‖² for a step with a small predicted change."""
+    """Return the rounding error in the relative decrease of ‖r‖² for a step that predicts little change."""
     noise, before = 4.0 * EPS, w.s[NORM]
     rounding(w, w.x)
     for k in range(w.r.size):
@@ -107,7 +107,7 @@ def _resize(w: Work, norm: float, gain: float, slope: float, ratio: float) -> No
         shrink = 0.1
         if gain >= 0.0:
             shrink = 0.5
-        elif norm < 10.0 * s[NORM]:  # the minimiser of the parabola through both residuals
+        elif norm < 10.0 * s[NORM]:  # minimiser of the parabola through both residuals
             shrink = 0.5 * slope / (slope + 0.5 * gain)
             shrink = 0.1 if shrink < 0.1 else (0.5 if shrink > 0.5 else shrink)
         reach = 10.0 * s[LENGTH]

@@ -1,4 +1,4 @@
-"""Workspace that every step of a solve reads and writes, and products with its Jacobian.
+"""Workspace for the steps of a solve, and products with the Jacobian that it contains.
 
 The symbols are those of the paper: r is the residual (m,), J its Jacobian (m, n), stored transposed, and lam
 the Levenberg-Marquardt parameter. The trust region is ‖D s‖ ≤ radius, where D is the running maximum of the
@@ -39,13 +39,13 @@ class Work(NamedTuple):
     """β of the reflectors of Q."""
     v: Annotated[Float, "n"]
     bd: Annotated[Float, "n"]
-    """Diagonal of the bidiagonal form of J D⁻¹; ``bu`` is its superdiagonal."""
+    """Diagonal of the bidiagonal form of J D⁻¹; its superdiagonal is ``bu``."""
     bu: Annotated[Float, "n"]
     across: Annotated[Float, "n"]
     down: Annotated[Float, "n"]
     """β of the reflectors of the bidiagonal form, as in ``across``."""
     inverse: Annotated[Float, "n"]
-    """Reciprocal diagonal of the damped form; ``ru`` is the superdiagonal."""
+    """Reciprocal diagonal of the damped bidiagonal form; its superdiagonal is ``ru``."""
     ru: Annotated[Float, "n"]
     r: Annotated[Float, "m"]
     r_trial: Annotated[Float, "m"]
@@ -64,7 +64,7 @@ class Work(NamedTuple):
     left: Annotated[Float, "n lanes_n+3"]
     """Left reflectors of the bidiagonal form."""
     wide: Annotated[Float, "lanes_m"]
-    """Scratch of the same length as a row of ``right``."""
+    """Scratch array of the same length as a row of ``right``."""
     pivot: Annotated[Index, "n"]
     s: Annotated[Float, "scalars"]
     flag: Annotated[Index, "flags"]

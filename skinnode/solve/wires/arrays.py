@@ -38,7 +38,7 @@ SOLVE: Final = 1
 PREDICT: Final = 2
 """Solve the wire, starting at x + (∂x/∂a) (a − a of the last solve)."""
 HOLD: Final = 3
-"""Like PREDICT, but keep x if its residual is within noise."""
+"""Like PREDICT, but keep x unchanged if its residual is within noise."""
 
 # Additional tasks of a solve, combined with bitwise or
 COVARIANCE: Final = 1
@@ -46,7 +46,7 @@ COVARIANCE: Final = 1
 SKIP: Final = 2
 """Skip a wire whose first-order optimality ‖Jᵀr‖∞ is below tol_f (Xu et al. 2018, section 5.2)."""
 REUSE: Final = 4
-"""Use the stored inverse to follow a wire that moved only a little, and keep that inverse."""
+"""Follow a wire that moved only a little with its stored inverse, and keep this inverse."""
 
 
 class SolveOptions(ArrayTable):
@@ -80,7 +80,7 @@ class SolveOptions(ArrayTable):
 def solve_options(
     operator: int, tasks: int = 0, tol_f: float = 1e-9, tol_x: float = 1e-9, max_steps: int = 12
 ) -> SolveOptions:
-    """Return cached :class:`SolveOptions` with these values."""
+    """Return :class:`SolveOptions` with these values, from a cache if possible."""
     return SolveOptions(int(operator), int(tasks), float(tol_f), float(tol_x), int(max_steps))
 
 
@@ -92,7 +92,7 @@ class SolverArrays(ArrayTable):
     inverse: Annotated[Float, "U 3N K"]
     """∂x/∂r of the last converged solve of each wire."""
     a_solved: Annotated[Float, "U K"]
-    """1/F at the last converged solution; 1 if the equation was missing."""
+    """Value 1/F at the last converged solution; 1 if the equation was missing."""
     noise: Annotated[Float, "U K"]
     """Variance of a at the last converged solution; inf if the equation was missing."""
     std: Annotated[Float, "U 3N"]
@@ -100,12 +100,12 @@ class SolverArrays(ArrayTable):
     report: Annotated[Index, "U report"]
     measure: Annotated[Float, "U measures"]
     tally: Annotated[Index, "3"]
-    """Evaluations of F, evaluations of J, and steps, summed over calls."""
+    """Numbers of evaluations of F, evaluations of J, and steps, summed over calls."""
     lower: Annotated[Float, "3 M K", READONLY]
     electrodes: Annotated[Index, "U N"]
-    """Electrodes of each wire; those with unknowns come first."""
+    """Indices of each wire's electrodes; electrodes with unknowns come first."""
     still: Annotated[Float, "U K"]
-    """Potential of the electrodes without unknowns."""
+    """Contribution to F from the electrodes without unknowns."""
     still_std: Annotated[Float, "U 3N"]
     """Standard deviation of the coordinates that are not unknowns."""
     turn: Annotated[Index, "1"]
@@ -127,7 +127,8 @@ class FrameArrays(ArrayTable):
     code_gain: Annotated[Float, "U K"]
     rounding_ohm: Annotated[Float, "U K"]
     code_map: Annotated[Float, "4"]
-    """R/R0 at code 0, change in R/R0 per code, largest valid code, relative noise before the converter."""
+    """Four entries: R/R0 at code 0, change in R/R0 per code, largest valid code, and relative noise before
+    the converter."""
     ohm: Annotated[Float, "U K"]
     noise: Annotated[Float, "U K"]
     """Relative standard deviation of the resistance."""
@@ -137,9 +138,10 @@ class FrameArrays(ArrayTable):
     a: Annotated[Float, "U K"]
     """Resistance in the units of the problem."""
     weight: Annotated[Float, "U K"]
-    """σ divided by the standard deviation; 0 if the latter is unknown or the resistance is invalid."""
+    """Ratio of σ to the standard deviation; 0 if the standard deviation is unknown or the resistance
+    invalid."""
     used: Annotated[Float, "U K"]
-    """Like ``weight``, but also 0 if a is out of range."""
+    """Same as ``weight``, but also 0 if a is out of range."""
     todo: Annotated[Bytes, "U"]
     """LEAVE, SOLVE, PREDICT or HOLD."""
     order: Annotated[Index, "U"]
@@ -152,9 +154,9 @@ class FrameArrays(ArrayTable):
     a_solved: Annotated[Float, "U K"]
     """Value of a at the last trusted position."""
     weight_solved: Annotated[Float, "U K"]
-    """Weights for which the inverse of each wire was computed."""
+    """Weights with which the inverse of each wire was computed."""
     predictable: Annotated[Mask, "U"]
-    """Wires whose inverse in the solver belongs to their x."""
+    """Whether the inverse of each wire in the solver was computed for the wire's x."""
     unknowns: Annotated[Index, "U"]
     """Number of unknowns of each wire."""
     rest: Annotated[Float, "U 3N"]
@@ -162,7 +164,7 @@ class FrameArrays(ArrayTable):
     """Sign of det J at rest."""
     clearance: Annotated[Float, "U N"]
     good: Annotated[Mask, "U"]
-    """Wires that the solver brought to an acceptable root."""
+    """Whether the solver reached an acceptable root for each wire."""
     status: Annotated[Index, "U"]
     moved_m: Annotated[Float, "U 3N"]
     """Displacement."""

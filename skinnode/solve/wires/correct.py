@@ -1,10 +1,11 @@
-"""Compiled corrector: brings one wire to a root of r = w (a F − 1) with an operator.
+"""Compiled corrector: solves r = w (a F − 1) = 0 for one wire with an operator.
 
-A wire is solved for all coordinates of its electrodes or for fewer: some electrodes may stay at rest, or z
-may be the only unknown (``normal_only``). With fewer unknowns than equations, the system is tall, and χ² = Σ
-(ρ_k/σ_k)² at its minimum tests the fit. Above the 1 − 1e-9 quantile, no position explains the frame, and the
-wire is ILL_CONDITIONED; above the 95 % quantile, the standard deviations are multiplied by √(χ²/dof) (Birge,
-Phys. Rev. 40, 207, 1932). This test replaces the sign of det J, which only a square system has.
+The unknowns of a wire are all coordinates of its electrodes or fewer: some electrodes may stay at rest, or z
+may be the only unknown (``normal_only``). A system with fewer unknowns than equations is tall; χ² = Σ
+(ρ_k/σ_k)² at its minimum tests the fit. If χ² is above its 1 − 1e-9 quantile, no position explains the frame,
+and the wire is ILL_CONDITIONED. If χ² is above its 95 % quantile, the standard deviations are multiplied by
+√(χ²/dof) (Birge, Phys. Rev. 40, 207, 1932). The χ² test replaces the test of the sign of det J, which is
+defined only for a square system.
 """
 
 from __future__ import annotations
@@ -44,7 +45,8 @@ from skinnode.solve.wires.arrays import (
 from skinnode.solve.wires.hold import chi2_quantile_part
 
 DATA_ROUNDING: Final = 2.0
-"""Relative rounding error of a F, in eps: R, gain, their product and F are each rounded to half an eps."""
+"""Relative rounding error of a F, in eps. R, gain, their product and F each have a rounding error of half an
+eps."""
 
 Z_95_ONE_SIDED: Final = 1.645
 """Normal quantile for a probability of 95 %."""
@@ -129,7 +131,7 @@ def correct(  # noqa: PLR0913 - one wire of a call
         w.s[ERROR] = 0.0
         return CONVERGED, evaluations, jacobians, steps, True
     while status < 0:
-        # with known noise, x is at the minimum if the part of r in the range of J is below tol_f
+        # if the noise is known, x is a minimum when the component of r in the range of J is below tol_f
         tol_r = tol_f
         if tall and sigma > 0.0:
             tol_r = min(0.1, tol_f / max(tol_f, w.s[NORM]))
@@ -159,7 +161,8 @@ def report_correction(  # noqa: C901, PLR0913 - one wire of a call; its results 
     """Write x, report and measures of wire ``u``, for which :func:`correct` returned ``status``.
 
     ``count`` is the number of equations. If COVARIANCE is one of the tasks, also writes the inverse and the
-    arrays that belong to it. Returns ``status``, or ILL_CONDITIONED if the root is too poorly determined.
+    arrays that belong to it. Returns ``status``, or ILL_CONDITIONED if the root is poorly determined or fails
+    the χ² test.
     """
     w: Any = solver.work
     unknowns, tol_f = w.x.size, options.tol_f
@@ -168,7 +171,7 @@ def report_correction(  # noqa: C901, PLR0913 - one wire of a call; its results 
     x_u, electrodes, measure = solver.x[u], solver.electrodes[u], solver.measure[u]
     for j in range(unknowns):
         value = w.x[j]
-        if status == CONVERGED and not skipped:  # the correction that proved convergence is free
+        if status == CONVERGED and not skipped:  # adds the correction already computed to test convergence
             value += w.newton[j]
         x_u[coordinate(electrodes, j, each)] = value
     measure[RESIDUAL] = math.sqrt(dot(w.r, w.r) / count)

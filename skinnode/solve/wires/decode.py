@@ -15,12 +15,12 @@ from skinnode.solve.wires.arrays import FrameArrays
 
 A_MIN: Final = 1e-12
 A_MAX: Final = 1e12
-"""Range of usable a; at rest a is about 1 / (N M), and no plausible resistance lies outside the range."""
+"""Range of usable a. At rest, a is about 1 / (N M), so no plausible resistance is outside this range."""
 
 
 @njit_part
 def decode(frame: FrameArrays) -> int:
-    """Write ``ohm``, ``noise`` and ``valid`` from ``codes``; NaN for an invalid code.
+    """Convert ``codes`` to ``ohm``, ``noise`` and ``valid``; an invalid code yields NaN.
 
     ``noise`` combines the noise of the front end with the error due to rounding to codes. Returns the number
     of invalid codes.
@@ -46,7 +46,7 @@ def decode(frame: FrameArrays) -> int:
 
 @njit_part
 def scale(frame: FrameArrays, sigma: float) -> float:
-    """Write ``a``, ``weight`` and ``used`` from ``ohm``, ``noise`` and ``valid``.
+    """Compute ``a``, ``weight`` and ``used`` from ``ohm``, ``noise`` and ``valid``.
 
     Returns σ, the smallest known standard deviation, or ``sigma`` if none is known.
     """

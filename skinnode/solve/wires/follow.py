@@ -1,9 +1,9 @@
 """Compiled solver for a wire that moved only a little, using the inverse of an earlier position.
 
-Simplified Newton steps with the old inverse need only F, and use the same convergence test as Newton's method
-(Deuflhard, Newton methods for nonlinear problems, 2004, 2.1). Their contraction ratio shows how much the
-inverse has changed along the path; while the change is small, the inverse is also kept for the standard
-deviations.
+Simplified Newton steps with the old inverse require only F, not J, and use the same convergence test as
+Newton's method (Deuflhard, Newton methods for nonlinear problems, 2004, 2.1). The contraction ratio of the
+steps shows how much the inverse has changed along the path. While the change is small, the old inverse is
+also used for the standard deviations.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ from skinnode.model.layout import Float
 from skinnode.solve.linalg.vectors import largest
 
 FOLLOW_STEPS: Final = 4
-"""Maximum number of simplified steps; each costs a fifth as much as a new inverse."""
+"""Maximum number of simplified steps; each step takes a fifth of the time of a new inverse."""
 CONTRACTION: Final = 0.1
-"""Maximum size of a step relative to the previous step; a larger step needs a new Jacobian."""
+"""Maximum size of a step relative to the previous step; a larger step requires a new Jacobian."""
 FRESH: Final = 0.01
-"""Maximum size of the first step, relative to the prediction, at which the inverse is kept."""
+"""Maximum size of the first step, relative to the prediction, for the inverse to be kept."""
 
 
 @njit_part

@@ -1,19 +1,20 @@
 """Compiled test of whether a wire can be held because its resistances changed no more than their noise.
 
 The residual ρ_k = a_k F_k(x) − 1 at the last position is known from the last solve, without evaluating F
-again. The residual is within noise if Σ (ρ_k/σ_k)² is below its 99 % quantile. ρ contains the noise of the
-new frame, with variance σ², and the error of x, which is due to the noise of the frame that x was solved
-from, with variance s², and lies in the n directions of the range of J. With t = s²/σ², the sum has the mean K
-+ n t, and half its variance is K + 2 n t + n t² (2 χ²_K for a square system, χ²_K at rest, where t = 0). The
-quantile is that of a scaled distribution c χ²_ν with the same mean and variance (Satterthwaite 1946).
+again. The residual is within noise if Σ (ρ_k/σ_k)² is below its 99 % quantile. The residual ρ contains two
+errors. The noise of the new frame has the variance σ². The error of x, due to the noise of the frame from
+which x was solved, has the variance s² in the n directions of the range of J. With t = s²/σ², the sum has the
+mean K + n t, and half its variance is K + 2 n t + n t² (2 χ²_K for a square system, χ²_K at rest, where t =
+0). The quantile is computed from a scaled distribution c χ²_ν with the same mean and variance (Satterthwaite
+1946).
 
-A slow movement may go unnoticed in this sum, especially along the worst-determined of the K directions of a
-wire. The variance of a held coordinate allows for such a movement: its correction c = Σ_k (∂x_j/∂r_k) ρ_k
-contains the movement and the noise of both frames, and the excess of c² over that noise is a lower bound on
-the variance. Measured coverage of the 95 % intervals (staggered layout, h = 0.5, noise 1e-5): 98 % for
-unmoved wires (99 % of the frames held), 97 % for a press that grows by 5 % of h in 100 to 1600 frames, and 96
-% for a movement by 40 standard deviations along the worst-determined direction in 200 or 800 frames (86 %
-without the allowance).
+This sum may fail to reveal a slow movement, especially along the worst-determined of the K directions of a
+wire. The variance of a held coordinate allows for such a movement. The coordinate's correction c = Σ_k
+(∂x_j/∂r_k) ρ_k contains the movement and the noise of both frames, so the excess of c² over the noise
+variance is a lower bound on the variance. Measured coverage of the 95 % intervals (staggered layout, h = 0.5,
+noise 1e-5): 98 % for unmoved wires (99 % of the frames held), 97 % for a press that grows by 5 % of h in 100
+to 1600 frames, and 96 % for a movement by 40 standard deviations along the worst-determined direction in 200
+or 800 frames (86 % without the allowance).
 """
 
 from __future__ import annotations
@@ -26,9 +27,10 @@ from skinnode.compiled.simd import LANES, fma, load, splat, total
 from skinnode.model.layout import Float
 
 Z_HOLD: Final = 2.326
-"""Normal quantile for 99 %: an unmoved wire is solved needlessly once in a hundred frames."""
+"""Normal quantile for 99 %; an unmoved wire is solved unnecessarily in one frame of a hundred."""
 FRESHER: Final = 2.0
-"""Maximum ratio of noise variances (frame x was solved from / current frame) at which a wire is held."""
+"""Maximum noise variance of the frame from which x was solved, relative to the current frame, for a wire to
+be held."""
 
 
 def chi2_quantile(dof: float, z: float) -> float:
@@ -52,7 +54,7 @@ def within_noise(  # noqa: PLR0913 - arrays of one wire
 ) -> float:  # fmt: skip
     """Return the RMS of w ρ if the wire can be held, else −1; write ``std`` (n,) of a held wire's unknowns.
 
-    ``noise`` (K,) is the noise variance of the frame that x was solved from; ``rho``, ``variance`` and
+    ``noise`` (K,) is the noise variance of the frame from which x was solved; ``rho``, ``variance`` and
     ``before`` (K,) are scratch. The variance of a held coordinate is the largest of three values: the
     variance due to ``noise``, the variance due to the noise of the current frame, and the excess of its
     squared correction over both.

@@ -1,8 +1,8 @@
 """Buffers of one patch, and the single compiled call that reads and writes them.
 
-Each frame needs work before and after its solve (see ``decode`` and ``stages``). One call does all this work,
-because a call from Python, whose arguments must be checked and unpacked, costs more than any of these steps,
-especially with cold caches.
+Each frame needs work before and after its solve (see ``decode`` and ``stages``). A single compiled call does
+all this work: each call from Python must check and unpack its arguments, which takes longer than any of these
+steps, especially with cold caches.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ SOLVE: Final = 8
 ACCEPT: Final = 16
 """Determine which wires reached an acceptable root."""
 STORE: Final = 32
-"""Store the outcome; after ACCEPT, only if all wires are good."""
+"""Store the outcome; if ACCEPT runs in the same call, only if all wires are good."""
 
 # Findings of a call, combined with bitwise or
 ALL_GOOD: Final = 1
@@ -51,7 +51,7 @@ INCOMPLETE: Final = 2
 """See :func:`skinnode.solve.wires.stages.store`."""
 
 REST_TOLERANCE: Final = 1e-9
-"""Tolerance at the rest position, which is a root by construction, apart from rounding."""
+"""Tolerance of the solve at the rest position, which is a root by construction, apart from rounding."""
 _NO_FRAME: Final = np.zeros((1, 4), np.int64)
 
 
@@ -96,7 +96,7 @@ def solve_patch(  # noqa: PLR0913 - numba unpacks a tuple of arguments eight tim
 
 
 class PatchSolver:
-    """Buffers of one patch for :func:`solve_patch`. Do not share an instance between owners or threads.
+    """Buffers of one patch for :func:`solve_patch`; each tracker and each thread needs its own instance.
 
     Args:
         problem: The patch in solver units.
@@ -119,10 +119,10 @@ class PatchSolver:
         self.report = np.zeros((upper, wires.REPORT), np.int64)
         self.measure = np.zeros((upper, wires.MEASURES))
         self.tally = np.zeros(3, np.int64)
-        """Evaluations of F, evaluations of J, and steps since the owner last set this array to zero."""
+        """Numbers of evaluations of F, evaluations of J, and steps since this array was last set to zero."""
         self.turn = np.zeros(1, np.int64)
-        """(1,) frame number, incremented by SCALE; determines which wires get a new inverse if inverses are
-        reused."""
+        """(1,) frame number, incremented by SCALE; determines which wires receive a new inverse if inverses
+        are reused."""
         self.still_std = np.full((upper, unknowns), np.inf)
         """(U, 3N) standard deviation of the coordinates that are not unknowns, pitches."""
         self.each = 1 if normal_only else 3
@@ -200,7 +200,7 @@ class PatchSolver:
                     f"{np.dtype(dtype)} array of shape {due}"
                 )
         sizes = self._sizes or sorted(set(self.free[todo != wires.LEAVE].tolist()))
-        for size in sizes:  # only one size, unless electrodes are omitted
+        for size in sizes:  # more than one size only if electrodes are omitted
             chosen = todo if len(sizes) == 1 else np.where(self.free == size, todo, wires.LEAVE)
             spent, _, _, _ = solve_patch(
                 SOLVE,

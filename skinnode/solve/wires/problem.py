@@ -3,8 +3,8 @@
 Lengths are in pitches, and residuals are relative: r_k = w_k (a_k F_k − 1) with a_k = R_k / (R₀ F₀)_k. A
 residual is therefore a fraction of a resistance, regardless of the rubber and the size of the patch. If the
 rest resistances R₀ were measured, the resistivity and the gain of the front end cancel; otherwise R₀ F₀ is
-the layout's resistivity. The weights w_k = σ_min / σ_k account for noise that differs between equations (so
-that solving a tall system minimises χ²); a weight of 0 drops an equation.
+the layout's resistivity. The weights w_k = σ_min / σ_k account for noise that differs between equations, so
+that solving a tall system minimises χ². A weight of 0 drops an equation.
 """
 
 from __future__ import annotations
@@ -21,8 +21,9 @@ from skinnode.model.kernels import lower_rows
 from skinnode.model.layout import Float, PatchLayout, require_array
 
 TRUST_SHARE: Final = 0.25
-"""Initial trust radius as a fraction of the electrodes' clearance at rest: F is smooth on the scale of the
-distance to the nearest charge, and in live scans the skin does not move farther between two frames."""
+"""Initial trust radius as a fraction of the electrodes' clearance at rest. F is smooth on the scale of the
+distance to the nearest charge, and in a live stream the skin moves less than this radius between two
+frames."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,7 +38,7 @@ class PatchProblem:
     gain: Float
     """(U, K) 1 / (R₀ F₀): a = R · gain."""
     a_rest: Float
-    """(U, K) a at rest, 1 / F."""
+    """(U, K) value of a at rest, 1 / F."""
     share_at_rest: Float
     """(U, N, K) contribution of each electrode at rest to F."""
     clearance: Float
@@ -73,7 +74,7 @@ class PatchProblem:
         """Return the wires (U,) with an electrode farther from rest than its clearance at rest.
 
         F does not change if electrodes are reflected in the lower layer, or if two electrodes swap places.
-        Such roots lie out of reach, because rubber pressed from outside does not move by more than its own
+        Such roots are out of reach, because rubber pressed from outside does not move by more than its own
         thickness.
         """
         moved = (x - self.rest).reshape(self.layout.upper_m.shape)
@@ -81,7 +82,7 @@ class PatchProblem:
             return np.asarray(((moved**2).sum(axis=-1) > self.clearance**2).any(axis=1))
 
 
-@functools.lru_cache(maxsize=64)  # takes 2 ms per layout, as long as solving ten paths of a wire
+@functools.lru_cache(maxsize=64)  # takes 2 ms per layout, as long as following ten paths of a wire
 def _at_rest(layout: PatchLayout) -> tuple[Float, Float, Float, Float, Float]:
     """Return rest, lower, F, share_at_rest and clearance for a :class:`PatchProblem`, all read-only."""
     pitch = layout.pitch_m

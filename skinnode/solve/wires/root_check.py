@@ -37,7 +37,7 @@ class RootCheck(ArrayTable):
     lost: Annotated[Mask, "U"]
     """Output: wires without a root."""
     unsure: Annotated[Mask, "U"]
-    """Output: solved wires that are folded or moved by more than ``jump_m``."""
+    """Output: solved wires that have folds, or that moved by more than ``jump_m``."""
     rough: Annotated[Mask, "U"]
     """Output: solved wires farther than ``far_m`` from rest and rougher than ``rough_limit``."""
     jump_m: float

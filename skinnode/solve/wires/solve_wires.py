@@ -24,17 +24,18 @@ from skinnode.solve.wires.follow import FRESH, follow, newton_step, standard_dev
 from skinnode.solve.wires.hold import within_noise
 
 REFRESH: Final = 8
-"""Maximum number of consecutive frames for which a followed wire keeps its inverse; wires renew their
-inverses in turn."""
+"""Maximum number of consecutive frames for which a followed wire keeps its inverse. The wires take turns in
+renewing their inverses."""
 COVARIANCE_UNITS: Final = 3.0
-"""Cost of the covariance of a square system of 30 unknowns, in evaluations of F and J with their step."""
+"""Cost of the covariance of a square system with 30 unknowns, in units of one evaluation of F and J plus one
+step."""
 HELD_UNITS: Final = 0.25
-"""Cost of finding that a wire can be held, in evaluations of F and J with their step."""
+"""Cost of finding that a wire can be held, in units of one evaluation of F and J plus one step."""
 
 
 @njit_part
 def _drop_unusable(a: Float, weight: Float) -> tuple[int, int]:
-    """Set a to 1 and weight to 0 where either is unusable; return the numbers of equations kept and lost."""
+    """Set a to 1 and weight to 0 where either is unusable; return the numbers of kept and lost equations."""
     count, lost = 0, 0
     for k in range(a.size):
         if weight[k] > 0.0:
@@ -121,7 +122,7 @@ def _report_followed(u: int, solver: SolverArrays, a: Float, weight: Float, sigm
 def _solve_wire(  # noqa: C901, PLR0913 - one wire of a call, from start to report
     u: int, todo: int, solver: SolverArrays, options: SolveOptions, a: Float, weight: Float, sigma: float
 ) -> float:
-    """Solve wire ``u``; return the cost, in evaluations of F and J with their step."""
+    """Solve wire ``u``; return the cost, in units of one evaluation of F and J plus one step."""
     w: Any = solver.work
     point, x_u, electrodes = solver.point, solver.x[u], solver.electrodes[u]
     report, measure, std = solver.report[u], solver.measure[u], solver.std[u]
@@ -188,7 +189,7 @@ def solve_wires(  # noqa: PLR0913 - what changes from call to call
     sigma: float,
     units: float,
 ) -> float:
-    """Solve r_k = w_k (a_k F_k(x) − 1) = 0 for every upper wire in ``todo``, each from its x in ``solver``.
+    """Solve r_k = w_k (a_k F_k(x) − 1) = 0 for every upper wire in ``todo``, from its x in ``solver``.
 
     Args:
         solver: Starting points and results; ``x`` and ``inverse`` come from the last converged solve.
@@ -198,8 +199,8 @@ def solve_wires(  # noqa: PLR0913 - what changes from call to call
         weight: (U, K) weights; 0 drops an equation.
         order: (U,) wires in processing order.
         sigma: Standard deviation of a residual of weight 1; 0 if unknown.
-        units: Time allowed, in evaluations of F and J with their step. The call ends before the first wire
-            that may need more than the remaining time.
+        units: Time allowed, in units of one evaluation of F and J plus one step. The call ends before the
+            first wire that may need more than the remaining time.
 
     Returns the estimated time spent, in the same unit as ``units``. A wire with fewer equations than unknowns
     keeps its x and is ILL_CONDITIONED, or NON_FINITE if a weight was set to 0.

@@ -1,7 +1,7 @@
 """Compiled stages of a frame before and after its solve.
 
-``start`` and ``choose`` run before the solve, ``accept_roots`` and ``store`` after it. They replace about
-thirty NumPy calls on 300 numbers each, which took longer than solving a patch at rest.
+``start`` and ``choose`` run before the solve, ``accept_roots`` and ``store`` after it. These kernels replace
+about thirty NumPy calls on 300 numbers each, which would take longer than solving a patch at rest.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from skinnode.solve.wires import arrays as wires
 from skinnode.solve.wires.arrays import FrameArrays, SolverArrays
 
 STALE: Final = 2.0
-"""Maximum change in an equation's weight, as a factor, before the J⁺ of a tall system is recomputed."""
+"""Factor by which an equation's weight may change before the J⁺ of a tall system is recomputed."""
 DEADLINE: Final = int(Status.DEADLINE)
 
 
@@ -100,10 +100,11 @@ def accept_roots(solver: SolverArrays, frame: FrameArrays) -> bool:
 
 @njit_part
 def store(solver: SolverArrays, frame: FrameArrays) -> bool:
-    """Store position, a and weights of the solved wires; write the outcome of all wires.
+    """Store the position, a and weights of each solved wire; write the outcome of all wires.
 
-    The outcome is the displacement, its standard deviation and whether the wire was held. Returns whether a
-    solved wire had an equation of zero weight, whose ``a`` is therefore still unknown.
+    The outcome of a wire is its displacement, the standard deviation, and whether the wire was held. Returns
+    whether a solved wire had an equation with zero weight; the value of ``a`` in such an equation is still
+    unknown.
     """
     report, good = solver.report, frame.good
     solved_x, solved_a, solved_std = solver.x, solver.a_solved, solver.std

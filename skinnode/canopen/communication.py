@@ -1,4 +1,4 @@
-"""Communication objects 0x1000 to 0x1FFF of a node (CiA 301 v4.2, 7.5.2), with the defaults for a patch."""
+"""Communication objects 0x1000 to 0x1FFF of a node (CiA 301 v4.2, 7.5.2), with a patch's default values."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ _GROUPS = ("all", "communication", "application")
 
 @dataclass(frozen=True, slots=True)
 class PdoDefault:
-    """Default configuration of a PDO after a reset."""
+    """Configuration that a PDO has after a reset."""
 
     purpose: str
-    """Purpose, shown in the names of the PDO's records."""
+    """Purpose of the PDO, which becomes part of its records' names."""
     cob_id: int
-    """COB-ID including the flag bits of 0x1800:1; the node-ID is added if ``plus_node_id``."""
+    """COB-ID with its flag bits, as in 0x1800:1; the node-ID is added if ``plus_node_id`` is true."""
     kind: int = 254
     """Transmission type."""
     mapped: tuple[Entry, ...] = ()
-    """Mapped objects, in order."""
+    """Mapped objects, in payload order."""
     inhibit_100us: int = 0
     """Inhibit time, in units of 100 µs."""
     plus_node_id: bool = True
@@ -33,11 +33,11 @@ class PdoDefault:
 
 
 def spare_pdo(cob_id: int | None) -> PdoDefault:
-    """Return a PDO that is unused until a client maps objects into it and enables it.
+    """Return the defaults of a spare PDO, which stays disabled until a client maps objects into it.
 
     Args:
-        cob_id: COB-ID without the node-ID, from the pre-defined connection set; None if the set does not
-            contain this PDO.
+        cob_id: COB-ID in the pre-defined connection set, without the node-ID; None if the set does not
+            include this PDO.
     """
     return PdoDefault("spare", od.PDO_INVALID | (cob_id or 0), plus_node_id=cob_id is not None)
 
@@ -51,10 +51,10 @@ def communication_objects(
     """Return all communication objects in ascending order of index.
 
     Args:
-        rpdos: the RPDOs.
-        tpdos: the TPDOs.
-        slots: maximum number of objects mapped into a PDO.
-        revision: value of 0x1018:3.
+        rpdos: defaults of the RPDOs, starting with RPDO1.
+        tpdos: defaults of the TPDOs, starting with TPDO1.
+        slots: maximum number of objects in a PDO mapping.
+        revision: revision number (0x1018:3).
     """
     return (
         *_device_objects(revision),
@@ -160,6 +160,7 @@ def _mapping(index: int, name: str, pdo: PdoDefault, slots: int) -> Object:
     entries = tuple(
         Entry(index, sub, f"Mapped object {sub}", _U32, "rw", value) for sub, value in enumerate(values, 1)
     )
-    # No upper limit here, because mapping too many objects has its own abort code.
+    # No upper limit is declared, because too many mapped objects must cause a different abort code than a
+    # value above its limit.
     first = Entry(index, 0, "Number of mapped objects", _U8, "rw", len(pdo.mapped))
     return record(index, f"{name} mapping parameter: {pdo.purpose}", entries, first)

@@ -7,17 +7,17 @@ from typing import Final
 from skinnode.text.words import counted
 
 FD_LENGTHS: Final[tuple[int, ...]] = (*range(9), 12, 16, 20, 24, 32, 48, 64)
-"""Data lengths of a CAN FD frame in bytes, by length code."""
+"""Data lengths of CAN FD frames, bytes, indexed by data length code (DLC)."""
 
 
 def fd_length(n_bytes: int) -> int:
-    """Return the shortest CAN FD data length that can hold the given number of bytes.
+    """Return the shortest CAN FD data length, in bytes, that is at least ``n_bytes``.
 
     Args:
-        n_bytes: number of bytes.
+        n_bytes: number of bytes to send.
 
     Raises:
-        ValueError: if the number exceeds 64, the maximum for a frame.
+        ValueError: if ``n_bytes`` exceeds 64, the maximum data length of a CAN FD frame.
     """
     for length in FD_LENGTHS:
         if n_bytes <= length:

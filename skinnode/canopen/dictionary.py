@@ -1,6 +1,6 @@
-"""Declaration of an object dictionary as plain data, without values.
+"""Declarations of the objects in an object dictionary, without their current values.
 
-Numbers and terms follow CiA 301 (object codes, data types) and CiA 306 (access types).
+Object codes and data types follow CiA 301; access types follow CiA 306.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ class ObjectType(enum.IntEnum):
 
 
 class DataType(enum.IntEnum):
-    """Indices of the static data types used in this project."""
+    """CiA 301 data types used in this project, with their indices."""
 
     UNSIGNED8 = 0x05
     UNSIGNED16 = 0x06
@@ -34,7 +34,7 @@ class DataType(enum.IntEnum):
 
     @property
     def bits(self) -> int:
-        """Length of a value in bits; 0 if the length varies."""
+        """Length of a value of this data type, bits; 0 if the length varies."""
         return _BITS[self]
 
 
@@ -51,33 +51,33 @@ _BITS = {
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """Declaration of one value at an index and sub-index."""
+    """Declaration of the value at one index and sub-index of an object dictionary."""
 
     index: int
     subindex: int
     name: str
-    """Parameter name in the EDS."""
+    """Name of the parameter in the EDS file."""
     data_type: DataType
     access: str
-    """ro, rw, wo, const, or rww (rw and mappable into an RPDO)."""
+    """Access type: ro, rw, wo, const or rww, where rww means rw and mappable into an RPDO."""
     default: Value | None = None
-    """Default value; None if it is device-specific, such as a serial number, and therefore starts at zero."""
+    """Default value; None for a device-specific value, such as a serial number, which is initially zero."""
     plus_node_id: bool = False
-    """Whether the node-ID is added to the default at start-up, as for a COB-ID."""
+    """Whether the node-ID is added to the default value at start-up, as for a COB-ID."""
     mappable: bool = False
     """Whether the entry can be mapped into a PDO."""
     low: int | None = None
-    """Minimum value, if limited."""
+    """Minimum value; None if there is no lower limit."""
     high: int | None = None
-    """Maximum value, if limited."""
+    """Maximum value; None if there is no upper limit."""
 
     @property
     def mapping(self) -> int:
-        """PDO mapping value of the entry, composed of index, sub-index and length in bits."""
+        """Value that maps this entry into a PDO: index, sub-index and length in bits, packed into 32 bits."""
         return self.index << 16 | self.subindex << 8 | self.data_type.bits
 
     def value_at_start(self, node_id: int) -> Value | None:
-        """Return the default value for a node.
+        """Return the default value, including the node-ID if ``plus_node_id`` is true.
 
         Args:
             node_id: node-ID of the node.
@@ -89,7 +89,7 @@ class Entry:
 
 @dataclass(frozen=True, slots=True)
 class Object:
-    """Object with its entries in ascending order of sub-index; VAR and DOMAIN have only sub-index 0."""
+    """Object of an object dictionary; an object of type VAR or DOMAIN has a single entry at sub-index 0."""
 
     index: int
     name: str
@@ -114,7 +114,7 @@ def var(  # noqa: PLR0913 - one argument for each column of the standard's table
     mappable: bool = False,
     high: int | None = None,
 ) -> Object:
-    """Declare a single value or a domain. The arguments are the fields of :class:`Entry`."""
+    """Declare an object of type VAR or DOMAIN. The arguments are fields of :class:`Entry`."""
     entry = Entry(index, 0, name, data_type, access, default, plus_node_id, mappable, None, high)
     kind = ObjectType.DOMAIN if data_type is DataType.DOMAIN else ObjectType.VAR
     return Object(index, name, kind, (entry,))
@@ -125,7 +125,7 @@ def highest(index: int, highest: int) -> Entry:
 
     Args:
         index: index of the object.
-        highest: highest sub-index.
+        highest: highest sub-index of the object.
     """
     return Entry(index, 0, "Highest sub-index supported", DataType.UNSIGNED8, "const", highest)
 
@@ -136,8 +136,8 @@ def record(index: int, name: str, entries: Sequence[Entry], first: Entry | None 
     Args:
         index: index of the record.
         name: name of the record.
-        entries: sub-objects from sub-index 1, in ascending order.
-        first: sub-index 0, if it is not a constant.
+        entries: entries from sub-index 1 on, in ascending order of sub-index.
+        first: entry at sub-index 0; None for the usual constant that contains the highest sub-index.
     """
     first = first or highest(index, entries[-1].subindex)
     return Object(index, name, ObjectType.RECORD, (first, *entries))
@@ -155,9 +155,10 @@ def array(  # noqa: PLR0913 - one argument for each column of the standard's tab
     mappable: bool = False,
     high: int | None = None,
 ) -> Object:
-    """Declare an array with one entry for each of ``labels``.
+    """Declare an array with one entry per label.
 
-    ``first`` has the same meaning as in :func:`record`; the other arguments are the fields of :class:`Entry`.
+    The entries from sub-index 1 on are named after ``labels``. The argument ``first`` has the same meaning as
+    in :func:`record`; all other arguments are fields of :class:`Entry`.
     """
     entries = tuple(
         Entry(index, sub, label, data_type, access, default, mappable=mappable, high=high)

@@ -1,9 +1,9 @@
-"""Writes an object dictionary as an EDS or DCF file (CiA 306).
+"""Conversion of an object dictionary to the text of an EDS or DCF file (CiA 306).
 
-An EDS (electronic data sheet) describes a type of device; a DCF (device configuration file) describes the
+An EDS (electronic data sheet) describes a type of device. A DCF (device configuration file) describes the
 configuration of one device. REAL32 defaults are written as hexadecimal IEEE 754 bit patterns, as conforming
-tools expect. The canopen library expects decimal numbers and discards a hexadecimal default; 0 is the same in
-both notations.
+tools expect. The Python library ``canopen`` expects decimal numbers and ignores a hexadecimal REAL32 default;
+only 0 is the same in both notations.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from typing import Final
 from skinnode.canopen import indices as od
 from skinnode.canopen.dictionary import DataType, Entry, Object, ObjectType
 
-_DATE, _TIME = "01-01-2025", "12:00AM"  # fixed, so that regenerating a file does not change it
+_DATE, _TIME = "01-01-2025", "12:00AM"  # fixed, so that a regenerated file is identical
 _BIT_RATES_KBPS: Final = (10, 20, 50, 125, 250, 500, 800, 1000)
 _MANDATORY: Final = (0x1000, 0x1001, 0x1018)
 _DUMMY_TYPES: Final = range(1, 8)
@@ -24,7 +24,7 @@ _DUMMY_TYPES: Final = range(1, 8)
 
 @dataclass(frozen=True, slots=True)
 class DeviceInfo:
-    """Device description in the header sections of an EDS."""
+    """Description of a device for the header sections of an EDS."""
 
     file_name: str
     description: str
@@ -40,7 +40,7 @@ class DeviceInfo:
 
 @dataclass(frozen=True, slots=True)
 class Commissioning:
-    """Data that a DCF adds to an EDS."""
+    """Information about one node that a DCF contains in addition to the contents of an EDS."""
 
     node_id: int
     bitrate_kbps: int
@@ -50,12 +50,12 @@ class Commissioning:
 
 
 def render_eds(info: DeviceInfo, objects: Iterable[Object], device: Commissioning | None = None) -> str:
-    """Return the text of an EDS or DCF file; it depends only on the arguments, and its lines end in LF.
+    """Return the text of an EDS or DCF file, with LF line endings; equal arguments give equal text.
 
     Args:
-        info: the device.
+        info: description of the device.
         objects: object dictionary of the device.
-        device: for a DCF, the node whose start values are written; None for an EDS.
+        device: the node whose configuration a DCF describes; None for an EDS.
     """
     listed = tuple(objects)
     lines = [*_head(info, device)]
@@ -118,7 +118,7 @@ def _head(info: DeviceInfo, device: Commissioning | None) -> Iterator[str]:
     )
     if device is not None:
         yield from _section(
-            "DeviceComissioning",  # spelt as in CiA 306
+            "DeviceComissioning",  # the misspelling is part of CiA 306
             [
                 ("NodeID", str(device.node_id)),
                 ("NodeName", device.node_name),
@@ -171,7 +171,7 @@ def _options(entry: Entry, kind: ObjectType, device: Commissioning | None) -> It
 
 
 def _is_configuration(entry: Entry) -> bool:
-    """Return whether a DCF sets the entry; commands and histories are excluded."""
+    """Return whether a DCF contains a value for the entry; commands and the error history have none."""
     refused = entry.index in (od.ERROR_FIELD, od.STORE, od.RESTORE)
     return entry.access not in ("ro", "const") and entry.default is not None and not refused
 

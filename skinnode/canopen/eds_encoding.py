@@ -1,8 +1,8 @@
-"""Reads the text of an EDS or DCF file in any encoding.
+"""Decoding of EDS and DCF files with an unknown character encoding.
 
-CiA 306 requires ASCII, but tools also write other encodings. Reading is lossless: each non-ASCII byte
-becomes a lone surrogate (PEP 383), from which the original bytes of a value can be recovered.
-:func:`for_people` decodes text for display.
+CiA 306 requires ASCII, but some tools write other encodings. No information is lost: each non-ASCII byte
+becomes a lone surrogate (PEP 383), from which the original byte can be recovered. The function
+:func:`for_people` decodes such text for display.
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ from typing import Final, NamedTuple
 ASCII: Final = "ASCII"
 
 MOST_EDS_BYTES: Final = 2 << 20
-"""Maximum file size, bytes; twenty times the size of a patch's EDS, and larger than the EDS of any known
-device."""
+"""Maximum size of an EDS file, bytes; twenty times the size of a patch's EDS, and more than the largest known
+EDS."""
 
 _UTF_16: Final = {codecs.BOM_UTF16_LE: "utf-16-le", codecs.BOM_UTF16_BE: "utf-16-be"}
 _CODECS: Final = {
@@ -25,44 +25,45 @@ _CODECS: Final = {
     "Windows-1252": "cp1252",
     "Latin-1": "latin-1",
 }
-"""Python codec for the original bytes of an :class:`EdsText`, by encoding."""
+"""Python codec that decodes the original bytes of an :class:`EdsText`, keyed by the name of the encoding."""
 
 
 class EdsText(NamedTuple):
-    """Text of a file and its assumed encoding."""
+    """Text of an EDS or DCF file, and the encoding that was assumed."""
 
     text: str
-    """ASCII text with lone surrogates for other bytes; lines end in ``\\n``."""
+    """ASCII text in which lone surrogates represent all non-ASCII bytes; lines end in ``\\n``."""
     encoding: str
-    """Human-readable name of the encoding."""
+    """Name of the encoding, for display."""
 
     @property
     def codec(self) -> str:
-        """Codec for the bytes that the surrogates represent; UTF-16 has been converted to UTF-8."""
+        """Python codec for the bytes that the surrogates represent; UTF-8 if the file was in UTF-16."""
         return _CODECS[self.encoding]
 
     @property
     def readable(self) -> str:
-        """Decoded text."""
+        """Text with its non-ASCII bytes decoded, for display."""
         return for_people(self.text, self.codec)
 
     @property
     def note(self) -> str:
-        """One-line note for the user; empty for an ASCII file."""
+        """One-line note about an encoding other than ASCII, for display; empty for an ASCII file."""
         return "" if self.encoding == ASCII else f"read as {self.encoding}: an EDS should be ASCII"
 
 
 def read_eds_text(data: bytes) -> EdsText:
-    """Return the text of a file and its encoding.
+    """Return the text and the encoding of an EDS or DCF file.
 
-    The byte order mark determines the encoding. Without a mark, the encoding is the first of ASCII, UTF-8,
-    Windows-1252 and Latin-1 that fits. Nothing but the mark is lost.
+    A byte order mark determines the encoding. Without a byte order mark, the encoding is the first of ASCII,
+    UTF-8, Windows-1252 and Latin-1 that can decode the file. The text contains everything except the byte
+    order mark.
 
     Args:
-        data: the bytes of the file.
+        data: content of the file.
 
     Raises:
-        UnicodeDecodeError: if the text is malformed UTF-16.
+        UnicodeDecodeError: if a file with a UTF-16 byte order mark is not valid UTF-16.
     """
     bom = data[:2]
     if bom in _UTF_16:
@@ -80,17 +81,17 @@ def read_eds_text(data: bytes) -> EdsText:
 
 
 def octets_text(data: bytes) -> str:
-    """Return bytes as text from which :func:`octets` can recover them."""
+    """Decode bytes to text from which :func:`octets` can recover the bytes."""
     return data.decode("ascii", "surrogateescape")
 
 
 def octets(text: str) -> bytes:
-    """Return the original bytes of a file's text; genuine non-ASCII characters are encoded as UTF-8."""
+    """Encode text to its original bytes: surrogates become bytes, other non-ASCII characters become UTF-8."""
     return text.encode("utf-8", "surrogateescape")
 
 
 def for_people(text: str, codec: str) -> str:
-    """Decode the text of a file for display; bytes that the codec cannot decode become U+FFFD."""
+    """Decode text that contains surrogates, for display; bytes that the codec cannot decode become U+FFFD."""
     return octets(text).decode(codec, "replace")
 
 

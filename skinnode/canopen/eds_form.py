@@ -1,4 +1,4 @@
-"""Checks for EDS format errors (CiA 306) that parsers ignore silently; reports each with its line number."""
+"""Checks for CiA 306 format errors that EDS parsers ignore silently."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from skinnode.errors import ProfileError, Shown
 _HEADER: Final = re.compile(r"\[(.+)\]")
 _OBJECT: Final = re.compile(r"[0-9a-f]{4}(sub[0-9a-f]{1,2})?", re.IGNORECASE)
 _FURTHER: Final = re.compile(r"[0-9a-f]{4}(?!sub)[g-z]\w*", re.IGNORECASE)
-"""Pattern for section titles such as 1003Value and 1003ObjectLinks."""
+"""Pattern for titles of supplementary object sections, such as 1003Value and 1003ObjectLinks."""
 _OF_OBJECT: Final = re.compile(r"[0-9]\w*|[0-9a-f]{4}sub.*", re.IGNORECASE)
-"""Pattern for section titles apparently intended for an object."""
+"""Pattern for section titles that were probably meant to denote an object, even if they are malformed."""
 _NUMBER: Final = re.compile(r"0x[0-9a-f]{1,8}|[0-9]{1,10}", re.IGNORECASE)
 _LISTS: Final = ("mandatoryobjects", "optionalobjects", "manufacturerobjects")
 _NUMBERS: Final = ("objecttype", "datatype", "pdomapping", "subnumber", "compactsubobj")
@@ -21,14 +21,14 @@ _LONGEST_SHOWN: Final = 60
 
 
 def check_form(text: str, source: str) -> None:
-    """Check the titles of object sections, and the object lists.
+    """Check the titles of the object sections, and the object lists, of an EDS file.
 
     Args:
-        text: text of the file.
-        source: name of the file, shown in the error.
+        text: content of the EDS file.
+        source: name of the EDS file, shown in the error.
 
     Raises:
-        ProfileError: for the first mistake, with its line number.
+        ProfileError: if there is a format error; the error names the line of the first one.
     """
     for line, section, key, value in _lines(text):
         if not key:
@@ -46,7 +46,7 @@ def check_form(text: str, source: str) -> None:
 
 
 def no_eds(error: Exception, source: str, text: str = "") -> ProfileError:
-    """Return a ProfileError for a parser error in ``text``, with the line or section if known."""
+    """Convert an EDS parser's error to a ProfileError that names the line or section, if known."""
     numbers = [getattr(error, "lineno", None), *(line for line, _ in getattr(error, "errors", ()))]
     line = next(filter(None, numbers), None)
     if line is not None:
@@ -82,9 +82,9 @@ def _mistake(key: str, got: str, allowed: str, source: str, line: int | None = N
 
 
 def _lines(text: str) -> Iterator[tuple[int, str, str, str]]:
-    """Yield the number, section, key and value of each line; key and value are empty for a section header.
+    """Yield line number, section, key and value for each line; key and value of a section header are empty.
 
-    Skips comments and continuation lines.
+    Comments and continuation lines are skipped.
     """
     section = ""
     for number, line in enumerate(text.split("\n"), 1):

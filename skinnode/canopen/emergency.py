@@ -1,7 +1,7 @@
-"""Texts for emergency messages, the error register and the error history.
+"""Human-readable texts for emergency messages (EMCY), the error register and the error history.
 
-The codes follow CiA 301 v4.2, 7.2.7, tables 26 and 48. Any further meaning of a code, and the bytes after it,
-are manufacturer-specific and known only for skinnode patches.
+The codes follow CiA 301 v4.2, 7.2.7, tables 26 and 48. The manufacturer-specific bytes after an error code
+are decoded only for skinnode patches, which also give some codes a more precise meaning.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from skinnode.text.words import counted
 
 
 class EmcyCode(IntEnum):
-    """Error codes sent by a skinnode patch."""
+    """Error codes in the emergency messages of a skinnode patch."""
 
     RESET = 0x0000
     HARDWARE = 0x5000
@@ -25,27 +25,28 @@ class EmcyCode(IntEnum):
     BUS_OFF_RECOVERED = 0x8140
     CAN_ID_COLLISION = 0x8150
     SYNC_WINDOW = 0x8200
-    """A synchronous TPDO was not ready within the synchronous window (0x1007). Detail: u16 TPDO number. CiA
-    301 does not define a code for this error, so the generic protocol error code is used."""
+    """A synchronous TPDO was not ready within the synchronous window (0x1007). Detail bytes: u16 TPDO number.
+    CiA 301 does not define a code for this error, so a patch sends the generic protocol error code."""
     PDO_NOT_PROCESSED = 0x8210
     PDO_LENGTH_EXCEEDED = 0x8220
     SYNC_LENGTH = 0x8240
     RPDO_TIMEOUT = 0x8250
     SOURCE = 0xFF00
-    """The converter did not return a valid reading. Detail: u8 fault (1 failed, 2 wrong array shape), u16
-    count.
+    """The converter did not return a valid reading. Detail bytes: u8 fault (1 failed, 2 wrong array shape),
+    u16 number of failures.
     """
 
     @property
     def register_bit(self) -> int:
-        """Error register mask for the code, with bit 4 (communication) or 7 (manufacturer-specific) set."""
+        """Error register mask for this code: bit 4 (communication) or bit 7 (manufacturer-specific)."""
         return 0x10 if self >> 12 == 8 else 0x80
 
 
 TOO_SLOW: Final = 1
-"""Third detail byte of EMCY 0x8110 if a slow computer or bus delayed chunks beyond the inhibit time.
+"""Third detail byte of EMCY 0x8110 if scans were skipped because the node's computer or the bus is too slow.
 
-This byte follows the u16 count of skipped scans; 0 means that a scan takes longer than the scan period.
+The first two detail bytes contain the number of skipped scans. A third byte of 0 means that a scan takes
+longer than the scan period even at the pace set by the inhibit time.
 """
 
 _CODES: Final = {
@@ -70,7 +71,7 @@ _OWN_CODES: Final[dict[int, str]] = {
     EmcyCode.PDO_NOT_PROCESSED: "PDO not processed: too short",
     EmcyCode.SOURCE: "no reading from the converter",
 }
-"""Meaning of each code when sent by a skinnode patch."""
+"""Meaning of each error code that a skinnode patch uses in a more precise sense than CiA 301."""
 _CLASSES: Final = {
     0x10: "generic error",
     0x20: "current",
@@ -119,12 +120,13 @@ _REGISTER: Final = (
 
 
 def error_text(code: int, detail: bytes = b"", *, ours: bool) -> str:
-    """Return the text for an emergency error code.
+    """Return a description of an emergency error code.
 
     Args:
-        code: the error code.
-        detail: the manufacturer-specific bytes; the first two are also in the error history.
-        ours: whether vendor-ID and product code identify a skinnode patch; if not, the text follows CiA 301.
+        code: error code.
+        detail: manufacturer-specific bytes; the error history contains only the first two.
+        ours: whether vendor-ID and product code identify a skinnode patch; if not, the description follows
+            CiA 301.
     """
     own = _OWN_CODES.get(code) if ours else None
     text = own or _CODES.get(code) or _CLASSES.get(code >> 8) or f"error of class 0x{code >> 12:X}000"
@@ -133,7 +135,7 @@ def error_text(code: int, detail: bytes = b"", *, ours: bool) -> str:
 
 
 def history_text(entry: int, *, ours: bool) -> str:
-    """Return the text for an entry of 0x1003.
+    """Return a description of an entry in the error history (0x1003).
 
     Args:
         entry: error code in the lower 16 bits, two manufacturer-specific bytes in the upper 16 bits.
@@ -147,17 +149,17 @@ def history_text(entry: int, *, ours: bool) -> str:
 def says_too_slow(code: int, detail: bytes) -> bool:
     """Return whether an emergency reports scans skipped because of a slow computer or bus.
 
-    Such skipped scans do not indicate a fault in the skin.
+    Scans that were skipped for this reason do not indicate a fault in the skin.
 
     Args:
-        code: the error code.
-        detail: the manufacturer-specific bytes.
+        code: error code.
+        detail: manufacturer-specific bytes.
     """
     return code == EmcyCode.CAN_OVERRUN and detail[:2] != b"\0\0" and detail[2:3] == bytes((TOO_SLOW,))
 
 
 def register_text(register: int) -> str:
-    """Return the names of the bits set in an error register (0x1001)."""
+    """Return the names of the bits that are set in an error register (0x1001)."""
     return ", ".join(name for bit, name in enumerate(_REGISTER) if register >> bit & 1) or "no error"
 
 
@@ -210,4 +212,5 @@ _DETAILS: Final[dict[int, Callable[[bytes], str]]] = {
     EmcyCode.CAN_ID_COLLISION: lambda detail: f"0x{_word(detail):03X}",
     EmcyCode.SOURCE: lambda detail: _SOURCE_FAULTS.get(detail[0], ""),
 }
-"""Functions that convert the manufacturer-specific bytes (at least two) from a skinnode patch to text."""
+"""For each error code, the function that describes the manufacturer-specific bytes (at least two) of a
+skinnode patch."""

@@ -1,4 +1,4 @@
-"""Layer setting services (CiA 305 v3.0): constants shared by master and slave."""
+"""Layer setting services (LSS, CiA 305 v3.0): constants that the LSS master and the LSS slave share."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from enum import IntEnum
 from typing import Final, NamedTuple
 
 NOT_CONFIGURED: Final = 0xFF
-"""Node-ID value that marks a node without a node-ID."""
+"""Value that stands for a missing node-ID."""
 
 BIT_RATES_BPS: Final = {
     0: 1_000_000,
@@ -18,22 +18,22 @@ BIT_RATES_BPS: Final = {
     7: 20_000,
     8: 10_000,
 }
-"""Bit rates in table 0 of the bit timing service, bit/s; entry 5 is reserved, and entry 9 means automatic
-detection."""
+"""Bit rate for each entry of the CiA 301 bit timing table, bit/s. Entry 5 is reserved, and entry 9 means
+automatic bit rate detection."""
 
 LSS_DONE: Final = 0
-"""Error code returned by a successful configuration service."""
+"""Error code in the response to a configuration request that succeeded."""
 
 LSS_MANUFACTURER_ERROR: Final = 0xFF
-"""Error code announcing that the next byte holds a manufacturer-specific error code."""
+"""Error code that indicates a manufacturer-specific error code in the next byte."""
 
 RESET_SCAN: Final = 0x80
-"""Fastscan bit-check value that makes every node without a node-ID answer, and restarts the
-scan at the vendor-ID."""
+"""Fastscan bit-check value that makes every node without a node-ID answer, and restarts the search at the
+vendor-ID."""
 
 
 class LssCommand(IntEnum):
-    """Command specifiers. A response without its own specifier repeats the request's specifier."""
+    """LSS command specifiers. A response repeats the request's specifier unless it has its own."""
 
     SWITCH_GLOBAL = 0x04
     CONFIGURE_NODE_ID = 0x11
@@ -55,14 +55,14 @@ class LssCommand(IntEnum):
 
 
 class LssState(IntEnum):
-    """States of the slave, with the values of the mode byte of *switch state global*."""
+    """States of an LSS slave, with the values of the mode byte in *switch state global*."""
 
     WAITING = 0
     CONFIGURATION = 1
 
 
 class LssAddress(NamedTuple):
-    """LSS address: the fields of the identity object (0x1018) in order; unique to each device worldwide."""
+    """LSS address, which is unique to each device: the fields of the identity object (0x1018), in order."""
 
     vendor_id: int
     product_code: int

@@ -9,9 +9,9 @@ OPERATIONAL       command 1            the same, and PDO
 STOPPED           command 2            NMT, error control
 ================  ===================  ===========================================================
 
-A node obeys every command in every state except INITIALISING, in which it does not receive commands. *Reset
-node* (129) resets all objects to their defaults; *reset communication* (130) resets only the objects from
-0x1000 to 0x1FFF. The node boots after either command.
+A node executes NMT commands in every state except INITIALISING, in which it receives no commands. The command
+*reset node* (129) resets all objects to their power-on values. The command *reset communication* (130) resets
+only the objects from 0x1000 to 0x1FFF. After either command the node boots.
 """
 
 from __future__ import annotations
@@ -22,17 +22,17 @@ from typing import Final
 from skinnode.text.words import counted
 
 ALL_NODES: Final = 0
-"""Node-ID in an NMT command that addresses every node on a bus."""
+"""Node-ID in an NMT command that addresses all nodes on the bus."""
 
 STATE_MASK: Final = 0x7F
-"""Bits of a heartbeat or guarding response that hold the state."""
+"""Mask for the NMT state in a heartbeat or guarding response."""
 
 GUARD_TOGGLE: Final = 0x80
-"""Bit of a guarding response that toggles with each response."""
+"""Bit that toggles between successive guarding responses of a node."""
 
 
 class NmtState(IntEnum):
-    """NMT states, with the values sent in heartbeats. A node without power also counts as INITIALISING."""
+    """NMT states, with their values in heartbeats. A node that is switched off is also INITIALISING."""
 
     INITIALISING = 0
     STOPPED = 4
@@ -41,12 +41,12 @@ class NmtState(IntEnum):
 
     @property
     def communicates(self) -> bool:
-        """Whether the SDO, SYNC, TIME and EMCY services are available."""
+        """Whether the SDO, SYNC, TIME and EMCY services are available in this state."""
         return self in (NmtState.PRE_OPERATIONAL, NmtState.OPERATIONAL)
 
 
 class NmtCommand(IntEnum):
-    """Command specifiers."""
+    """NMT command specifiers."""
 
     START = 1
     STOP = 2
@@ -61,27 +61,27 @@ STATE_NAMES: Final[dict[int, str]] = {
     NmtState.OPERATIONAL: "operational",
     NmtState.PRE_OPERATIONAL: "pre-operational",
 }
-"""Names of the states for display."""
+"""Names of the NMT states, for display."""
 
 AFTER_COMMAND: Final = {
     NmtCommand.START: NmtState.OPERATIONAL,
     NmtCommand.STOP: NmtState.STOPPED,
     NmtCommand.ENTER_PRE_OPERATIONAL: NmtState.PRE_OPERATIONAL,
 }
-"""State after each command other than the resets."""
+"""NMT state that each command other than a reset leads to."""
 
 
 def state_name(state: int) -> str:
-    """Return the name of a state for display, or ``state N`` for a number that CiA 301 does not define.
+    """Return the name of an NMT state for display, or ``state N`` if CiA 301 does not define the state.
 
     Args:
-        state: the state byte of a heartbeat, without the toggle bit.
+        state: state byte of a heartbeat, without the toggle bit.
     """
     return STATE_NAMES.get(state, f"state {state}")
 
 
 def encode(command: NmtCommand, node_id: int) -> bytes:
-    """Return the data of an NMT frame, which is sent on COB-ID 0.
+    """Return the payload of an NMT command, which is sent with COB-ID 0.
 
     Args:
         command: the command specifier.
@@ -91,14 +91,14 @@ def encode(command: NmtCommand, node_id: int) -> bytes:
 
 
 def parse(data: bytes, node_id: int) -> NmtCommand | None:
-    """Return the command in a frame on COB-ID 0; None if the frame addresses another node.
+    """Return the command in a frame with COB-ID 0; None if the frame addresses another node.
 
     Args:
         data: the payload.
         node_id: the node-ID of this node.
 
     Raises:
-        ValueError: if the payload is not two bytes long, or the specifier is unknown.
+        ValueError: if the payload is not two bytes long, or if the command specifier is unknown.
     """
     if len(data) != 2:
         raise ValueError(f"NMT: got {counted(len(data), 'byte')}, must be 2")

@@ -1,4 +1,4 @@
-"""Service data objects on the wire (CiA 301 v4.2, 7.2.4.3): definitions shared by client and server."""
+"""Service data objects (SDO, CiA 301 v4.2, 7.2.4.3): definitions that SDO clients and servers share."""
 
 from __future__ import annotations
 
@@ -6,20 +6,20 @@ import struct
 from typing import Final
 
 SEGMENT_BYTES: Final = 7
-"""Maximum number of data bytes in a segment."""
+"""Maximum number of data bytes in an SDO segment."""
 
 MAX_BLOCK_SEGMENTS: Final = 127
-"""Maximum number of segments in a block."""
+"""Maximum number of segments in a block of an SDO block transfer."""
 
 ABORT: Final = 0x80
-"""First byte of an abort from either side."""
+"""First byte of an SDO abort, sent by a client or a server."""
 
 UPLOAD: Final = 0x40
-"""First byte of a request to read an object."""
+"""First byte of an SDO request to read an object."""
 
 _MULTIPLEXER: Final = struct.Struct("<BHB")
 
 
 def upload_request(index: int, subindex: int) -> bytes:
-    """Return the eight bytes of a request to read an object."""
+    """Return the eight bytes of an SDO request to read an object."""
     return _MULTIPLEXER.pack(UPLOAD, index, subindex).ljust(8, b"\0")

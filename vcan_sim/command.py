@@ -37,9 +37,9 @@ def simulate(  # noqa: PLR0913 - Typer makes a command's options of its argument
     fault: Annotated[
         list[str] | None,
         typer.Option(
-            help="Faults for every node, such as lost=0.01,restart_every_s=5,frozen, or for one node, "
+            help="Faults of every node, such as lost=0.01,restart_every_s=5,frozen, or of one patch or bus, "
             "such as palm:open_upper=3. Can be repeated.",
-            metavar="[PATCH:]FAULTS",
+            metavar="[PLACE:]FAULTS",
         ),
     ] = None,
     scene: Annotated[
@@ -58,7 +58,6 @@ def simulate(  # noqa: PLR0913 - Typer makes a command's options of its argument
     from skinnode.config import load_hand
     from skinnode.process.garbage_collection import without_long_collections
     from skinnode.process.signals import stop_on_signal
-    from vcan_sim.faults import faults_of
     from vcan_sim.fleet import Fleet
     from vcan_sim.scenes import load_scene
 
@@ -67,8 +66,7 @@ def simulate(  # noqa: PLR0913 - Typer makes a command's options of its argument
         _preview(plan, scene, plot)
         return
     simulated = Fleet(plan, scene=None if scene is None else load_scene(scene, plan))
-    for patch, faults in faults_of(fault or [], [each.name for each in plan.patches]).items():
-        simulated.inject(faults, patch)
+    simulated.faults.inject(*fault or [])
     with stop_on_signal() as stop, simulated as fleet, without_long_collections():
         where = ", ".join(f"{bus.name} ({bus.interface} {bus.channel})" for bus in plan.buses)
         patches = counted(len(plan.patches), "patch", "patches")

@@ -5,9 +5,7 @@ A chunk has at most one fault, so that the counts can be compared with a receive
 
 from __future__ import annotations
 
-import dataclasses
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -63,7 +61,7 @@ class Faults:
     """Faults of one node; none by default.
 
     Raises:
-        ConfigError: A fraction is not between 0 and 1, the fractions of chunks or of scans add up to more
+        ConfigError: If a fraction is not between 0 and 1, the fractions of chunks or of scans add up to more
             than 1, or a rate is negative.
     """
 
@@ -260,59 +258,18 @@ class Injected:
 NO_FAULTS: Final = Faults()
 
 
-def faults_of(texts: Sequence[str], patches: Sequence[str]) -> dict[str, Faults]:
-    """Return the faults for each patch from the values of ``--fault``.
+def check_wires(faults: Faults, patch: str, shape: tuple[int, int]) -> None:
+    """Check that a patch has the wires that faults name.
 
     Args:
-        texts: ``lost=0.01,silent`` applies to all patches, ``palm:open_upper=3`` to one. Later texts add to
-            or override earlier texts.
-        patches: Names of the hand's patches.
+        faults: The faults.
+        patch: Name of the patch.
+        shape: Number of its upper and of its lower wires.
 
     Raises:
-        ConfigError: A patch is not in the hand, or a text is invalid (see :func:`parse_faults`).
+        ConfigError: If the patch does not have a wire.
     """
-    found = dict.fromkeys(patches, NO_FAULTS)
-    for text in texts:
-        patch, colon, listed = text.rpartition(":")
-        if colon and patch not in found:
-            raise ConfigError("--fault", patch, f"a patch of the hand: {', '.join(patches)}")
-        for name in [patch] if colon else patches:
-            found[name] = parse_faults(listed, found[name])
-    return found
-
-
-def parse_faults(text: str, added_to: Faults = NO_FAULTS) -> Faults:
-    """Return the faults in a text such as ``lost=0.01,restart_every_s=2,silent``.
-
-    Args:
-        text: Fault names with their values, separated by commas.
-        added_to: Faults to extend.
-
-    Raises:
-        ConfigError: A name is unknown or a value is invalid.
-    """
-    kinds = {field.name: type(field.default) for field in dataclasses.fields(Faults)}
-    values: dict[str, int | float | bool] = {}
-    for part in filter(None, (part.strip() for part in text.split(","))):
-        name, _, value = part.partition("=")
-        if name not in kinds:
-            raise ConfigError("--fault", name, ", ".join(kinds))
-        try:
-            values[name] = _value(kinds[name], value)
-        except ValueError:
-            raise ConfigError(f"--fault {name}", value, _allowed(kinds[name])) from None
-    return dataclasses.replace(added_to, **values)  # type: ignore[arg-type]  # types match
-
-
-def _value(kind: type, text: str) -> int | float | bool:
-    if kind is bool:
-        if text not in ("", "true", "false"):
-            raise ValueError
-        return text != "false"
-    return float(text) if kind is float else int(text)
-
-
-def _allowed(kind: type) -> str:
-    if kind is bool:
-        return "no value, or true or false"
-    return "a number" if kind is float else "an integer"
+    for number, name in enumerate(OF_WIRES):
+        wires = shape[number % 2] - name.startswith("crossed")  # the last wire has no next one
+        if (wire := getattr(faults, name)) is not None and wire >= wires:
+            raise ConfigError(f"{patch}: {name}", wire, f"an integer from 0 to {wires - 1}")

@@ -121,6 +121,8 @@ class FaultyNode(PatchNode):
 
     def on_frame(self, can_id: int, data: bytes, t_ns: int, remote: bool = False) -> None:
         """Pass a frame to the node, unless a fault drops it."""
+        if self.faults.unplugged != self._unplugged:
+            self._plug(t_ns)
         kind = kind_of(can_id, data, remote)
         self.tally.heard[kind] += 1
         if self.faults.deaf or self._unplugged:

@@ -18,10 +18,13 @@ from skinnode.node import NmtState, NodeRunner
 from skinnode.node.patch.source import ResistanceSource
 from skinnode.protocol.profile import PatchProfile
 from skinnode.transport import CanPort, Frame
-from vcan_sim.faults import NO_FAULTS, OF_WIRES, Faults, Injected
+from vcan_sim.bus_attacker import NO_BUS_FAULTS, BusFaults, InjectedOnBus
+from vcan_sim.fault_player import FaultPlayer
+from vcan_sim.faults import NO_FAULTS, Faults, Injected, check_wires
 from vcan_sim.faulty_node import Emit, FaultyNode
+from vcan_sim.fleet_faults import FleetFaults, Places
 from vcan_sim.scene import Scene
-from vcan_sim.scenes import PatchTruth, SceneConfig, bind_scene
+from vcan_sim.scenes import PatchTruth, SceneConfig, bind_scene, schedule_of
 from vcan_sim.sensor import SimulatedPatch, SkinMotion
 from vcan_sim.skin.imperfections import EXACT, Imperfections
 from vcan_sim.tally import Kind, Tally, kind_of
@@ -67,12 +70,12 @@ class Fleet:
         imperfections: Departures of all patches from their layouts, or of each named patch. The draws differ
             from patch to patch. Default: exact patches.
         scene: Scene in place of the strokes of ``[simulation]``. Its time begins on all patches at once, when
-            the first node has sent its first scan.
+            the first node has sent its first scan. Its faults start and end at their times.
 
     Raises:
         ConfigError: A channel is given for a hand with several buses, imperfections name a patch that the
-            hand does not have, the draws of a patch leave too small a gap between electrodes, or a touch of
-            the scene is impossible on its patch.
+            hand does not have, the draws of a patch leave too small a gap between electrodes, a touch of
+            the scene is impossible on its patch, or a fault is impossible at its place.
     """
 
     def __init__(  # noqa: PLR0913 - keyword arguments, most of them rarely given
@@ -99,7 +102,7 @@ class Fleet:
                 ),
                 SimulatedPatch(self._skin(patch, number), imperfections=sizes.get(patch.name, EXACT)),
                 wire_up,
-                faults,
+                faults.seed,
                 self._begin,
             )
             for number, patch in enumerate(hand.patches)
@@ -107,6 +110,23 @@ class Fleet:
         self._runners: list[NodeRunner] = []
         self._ports: dict[str, FaultyPort] = {}
         self._running = ExitStack()
+        self._segments = {bus.name: _Segment() for bus in self.hand.buses}
+        self.faults: Final = FleetFaults(self._places(), faults)
+        """Faults of the patches and buses: what is injected now, and the log of its changes."""
+        schedule = None if scene is None else schedule_of(scene, self.hand)
+        self._player = FaultPlayer(schedule, self.faults) if schedule and schedule.faults else None
+
+    def _places(self) -> Places:
+        """Return the patches and buses that can have faults."""
+        stations, segments = self._stations, self._segments
+        return Places(
+            tuple(stations),
+            tuple(segments),
+            lambda name, faults: stations[name].check(faults),
+            lambda name, faults: stations[name].inject(faults),
+            lambda name, faults: segments[name].check(faults),
+            lambda name, faults: segments[name].inject(faults),
+        )
 
     def _skin(self, patch: PatchConfig, number: int) -> SkinMotion:
         """Return the motion of a patch's skin."""
@@ -118,6 +138,8 @@ class Fleet:
         """Start the motion of a patch's skin, or a scene on all patches, at the patch's newest reading."""
         t_ns = source.last_read_ns
         with self._beginning:
+            if self._player is not None and not source.started:
+                self._player.begin(t_ns)
             for each in self.patches.values() if self._scenes else (source,):
                 if not each.started:
                     each.start(t_ns)
@@ -132,8 +154,12 @@ class Fleet:
             scene.prepare(PREPARED_S)
         with ExitStack() as opened:
             runners, ports = [], {}
+            if self._player is not None:
+                self._player.start()
+                opened.callback(self._player.stop)
             for bus in self.hand.buses:
                 port = ports[bus.name] = opened.enter_context(FaultyPort(bus))
+                self._segments[bus.name].connect(port)
                 stations = [self._stations[patch.name] for patch in self.hand.patches_on(bus.name)]
                 runner = NodeRunner(port, [station.connect(port.send) for station in stations])
                 runner.start()
@@ -174,15 +200,28 @@ class Fleet:
             ConfigError: The hand does not have this patch, or a patch does not have the wire that a fault
                 names.
         """
-        if patch is not None and patch not in self._stations:
-            raise ConfigError("patch", patch, f"a patch of the hand: {', '.join(self._stations)}")
-        for name, station in self._stations.items():
-            if patch in (None, name):
-                station.inject(faults)
+        patches = self._stations if patch is None else (patch,)
+        self.faults.set_patches(dict.fromkeys(patches, faults))
+
+    def inject_bus(self, bus: str, faults: BusFaults) -> None:
+        """Replace the faults of a bus.
+
+        Args:
+            bus: Name of the bus.
+            faults: New faults.
+
+        Raises:
+            ConfigError: The hand does not have this bus, or the bus cannot have these faults.
+        """
+        self.faults.set_bus(bus, faults)
 
     def injected(self, patch: str) -> Injected:
         """Return the counts of the faults injected so far into a patch's node."""
         return self._stations[patch].injected()
+
+    def injected_bus(self, bus: str) -> InjectedOnBus:
+        """Return the counts of the faults injected so far into a bus."""
+        return self._segments[bus].injected()
 
     def tally(self, patch: str) -> Tally:
         """Return the live counts of the frames of a patch's node, by kind."""
@@ -193,11 +232,8 @@ class Fleet:
         return self._ports[bus].passed
 
     def bus_off(self, bus: str, *, off: bool) -> None:
-        """Put the controller of the nodes on a bus into bus-off, or reconnect the controller.
-
-        The nodes exit if they are bus-off for longer than :data:`skinnode.node.runner.PATIENCE_S`.
-        """
-        self._ports[bus].off = off
+        """Put the controller of the nodes on a bus into bus-off, or reconnect the controller."""
+        self.faults.set_bus(bus, replace(self.faults.bus(bus), bus_off=off))
 
     def truth_m(self, patch: str, device_time_us: int) -> Float:
         """Return the true electrode positions in a scan.
@@ -322,6 +358,31 @@ def _count(frames: list[Frame], counter: Counter[Kind]) -> None:
             counter[kind_of(frame.can_id, frame.data, frame.remote)] += 1
 
 
+class _Segment:
+    """A bus of the hand, with its faults and their counts."""
+
+    def __init__(self) -> None:
+        self._faults, self._counts = NO_BUS_FAULTS, InjectedOnBus()
+        self._port: FaultyPort | None = None
+
+    def connect(self, port: FaultyPort) -> None:
+        """Set the port of the nodes, once it is open."""
+        self._port = port
+        port.off = self._faults.bus_off
+
+    def check(self, faults: BusFaults) -> None:
+        """Raise ConfigError if the bus cannot have the faults."""
+
+    def inject(self, faults: BusFaults) -> None:
+        self._counts.bus_off += faults.bus_off and not self._faults.bus_off
+        self._faults = faults
+        if self._port is not None:
+            self._port.off = faults.bus_off
+
+    def injected(self) -> InjectedOnBus:
+        return replace(self._counts)
+
+
 class _Station:
     """A node, its analogue front end and the counts of its frames."""
 
@@ -331,7 +392,7 @@ class _Station:
         profile: PatchProfile,
         source: SimulatedPatch,
         wire_up: Callable[[SimulatedPatch], ResistanceSource],
-        faults: Faults,
+        seed: int,
         begin: Callable[[SimulatedPatch], None],
     ) -> None:
         self.source, self._begin = source, begin
@@ -339,7 +400,7 @@ class _Station:
         self._profile, self._config = profile, config
         self._pdo_ids = {chunk_cob_id(config.node_id), summary_cob_id(config.node_id)}
         self._node: FaultyNode | None = None
-        self.inject(faults)
+        self._faults = Faults(seed=seed)
         self._frames = self._pdos = 0
 
     def connect(self, emit: Emit) -> FaultyNode:
@@ -357,12 +418,10 @@ class _Station:
         )
         return self._node
 
+    def check(self, faults: Faults) -> None:
+        check_wires(faults, self._config.name, self.source.scene.layout.shape)
+
     def inject(self, faults: Faults) -> None:
-        shape = self.source.scene.layout.shape
-        for number, name in enumerate(OF_WIRES):
-            wires = shape[number % 2] - name.startswith("crossed")  # the last wire has no next one
-            if (wire := getattr(faults, name)) is not None and wire >= wires:
-                raise ConfigError(f"{self._config.name}: {name}", wire, f"an integer from 0 to {wires - 1}")
         self._faults = faults
         if self._node is not None:
             self._node.faults = faults

@@ -174,11 +174,9 @@ def test_of_a_simulator_that_cannot_be(folder: Path, said: Said, line: str) -> N
     ["open_upper=2", "wrong_identity", "silent", "deaf"],
 )
 def test_of_what_is_wrong_with_a_hand(folder: Path, said: Said, fault: str) -> None:
-    from vcan_sim.faults import faults_of
-
     hand = load_hand("one.toml")
     with Fleet(hand) as fleet:
-        fleet.inject(faults_of([fault], ["palm"])["palm"])
+        fleet.faults.inject(f"palm:{fault}")
         for line in (
             "host one.toml --seconds 1",
             "tare --hand one.toml",

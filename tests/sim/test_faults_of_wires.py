@@ -11,7 +11,7 @@ from skinnode.model.layout import Float, PatchLayout
 from skinnode.node import NmtState
 from skinnode.protocol.codes import CodeScale, encode
 from skinnode.protocol.profile import PatchProfile
-from vcan_sim.faults import NO_FAULTS, Faults, faults_of
+from vcan_sim.faults import NO_FAULTS, Faults
 from vcan_sim.faulty_converter import WIRE_NOISE, FaultyConverter
 from vcan_sim.faulty_node import FaultyNode
 from vcan_sim.fleet import Fleet
@@ -68,18 +68,17 @@ def test_what_the_converter_sees() -> None:
 
 
 def test_of_one_patch_or_of_all() -> None:
-    found = faults_of(["lost=0.5", "b:open_upper=3,silent", "b:noisy_lower=0"], ["a", "b"])
-    assert found == {
-        "a": Faults(lost=0.5),
-        "b": Faults(lost=0.5, open_upper=3, silent=True, noisy_lower=0),
-    }
-    assert faults_of([], ["a"]) == {"a": NO_FAULTS}
+    faults = Fleet(HAND).faults
+    faults.inject("lost=0.5", "b:open_upper=3,silent", "b:noisy_lower=0")
+    assert faults.patch("a") == Faults(lost=0.5)
+    assert faults.patch("b") == Faults(lost=0.5, open_upper=3, silent=True, noisy_lower=0)
+    assert Fleet(HAND).faults.patch("a") == NO_FAULTS
 
 
 @pytest.mark.parametrize(
     ("text", "line"),
     [
-        ("c:silent", "--fault: got 'c', allowed: a patch of the hand: a, b"),
+        ("c:silent", "--fault: got 'c', allowed: a patch of the hand: a, b; or a bus: can0"),
         ("a:open_upper=4", "a: open_upper: got 4, allowed: an integer from 0 to 3"),
         ("a:noisy_lower=12", "a: noisy_lower: got 12, allowed: an integer from 0 to 11"),
         ("a:crossed_upper=3", "a: crossed_upper: got 3, allowed: an integer from 0 to 2"),
@@ -88,13 +87,13 @@ def test_of_one_patch_or_of_all() -> None:
             "stuck_lower: got 3, allowed: both stuck_upper and stuck_lower, which name a crossing",
         ),
         ("a:open_upper=-1", "open_upper: got -1, allowed: an integer of at least 0"),
-        ("a:open_upper=x", "--fault open_upper: got 'x', allowed: an integer"),
+        ("a:open_upper=x", "--fault open_upper: got 'x', allowed: an integer, or none"),
     ],
 )
 def test_what_cannot_be(text: str, line: str) -> None:
     fleet = Fleet(HAND)
     with pytest.raises(ConfigError) as caught:
-        fleet.inject(faults_of([text], ["a", "b"])["a"], "a")
+        fleet.faults.inject(text)
     assert str(caught.value) == line
 
 

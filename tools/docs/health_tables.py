@@ -10,6 +10,7 @@ from typing import Final
 import markdown_text as md
 
 from skinnode.host.health import Condition
+from vcan_sim.bus_attacker import BusFaults
 from vcan_sim.faults import OF_CHUNKS, OF_SCANS, OF_WIRES, Faults
 from vcan_sim.skin.imperfections import Imperfections
 
@@ -48,6 +49,16 @@ def faults() -> str:
     return md.table(("fault", "value", "what happens"), rows)
 
 
+def bus_faults() -> str:
+    """Return the table of the faults of a bus."""
+    docs, kinds = md.member_docs(BusFaults), {"bool": "on or off", "int": "integer"}
+    rows = []
+    for name, kind in inspect.get_annotations(BusFaults).items():
+        value = "per second" if name.endswith("_per_s") else kinds.get(str(kind), "fraction")
+        rows.append((md.code(name), value, docs[name]))
+    return md.table(("fault", "value", "what happens"), rows)
+
+
 def imperfections() -> str:
     """Return the table of the imperfections of a simulated patch, with the sizes of an ordinary patch."""
     docs, ordinary = md.member_docs(Imperfections), Imperfections.ordinary()
@@ -67,5 +78,6 @@ def _size(value: object) -> str:
 TABLES: Final[dict[str, Callable[[], str]]] = {
     "conditions": conditions,
     "injected-faults": faults,
+    "injected-bus-faults": bus_faults,
     "imperfections": imperfections,
 }

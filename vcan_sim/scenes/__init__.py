@@ -6,6 +6,7 @@
         -> PatchScene of each patch
     shapes, motions (body pose at a time) -> window (cells under the body) -> history (contact at each step)
         -> response (displacement of the electrodes) -> patch (state at any time) -> truth
+    faults (checks with the hand) -> vcan_sim.fault_schedule
 
 The contact mechanics comes from :mod:`vcan_sim.contact`, which shares no code with the solvers. A scene is a
 function of scene time. Each touch starts and ends with an undeformed skin and is computed at fixed time steps
@@ -13,9 +14,11 @@ in order. The state at a given time therefore does not depend on the order in wh
 """
 
 from vcan_sim.scenes.bind import bind_scene, load_scene
+from vcan_sim.scenes.faults import schedule_of
 from vcan_sim.scenes.patch import PatchScene
 from vcan_sim.scenes.tables import (
     BodyConfig,
+    FaultConfig,
     MotionConfig,
     SceneConfig,
     SkinConfig,
@@ -28,6 +31,7 @@ from vcan_sim.scenes.truth import BodyContact, PatchTruth
 __all__ = [
     "BodyConfig",
     "BodyContact",
+    "FaultConfig",
     "MotionConfig",
     "PatchScene",
     "PatchTruth",
@@ -38,4 +42,5 @@ __all__ = [
     "load_scene",
     "parse_scene",
     "read_scene",
+    "schedule_of",
 ]

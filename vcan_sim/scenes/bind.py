@@ -9,6 +9,7 @@ import numpy as np
 from skinnode.config import HandConfig, PatchConfig
 from skinnode.model.layout import PatchLayout
 from vcan_sim.contact.layer import Layer
+from vcan_sim.scenes.faults import schedule_of
 from vcan_sim.scenes.history import History
 from vcan_sim.scenes.patch import PatchScene
 from vcan_sim.scenes.response import Electrodes
@@ -24,11 +25,12 @@ def load_scene(path: Path | str, hand: HandConfig) -> SceneConfig:
         hand: Hand whose patches the scene touches.
 
     Raises:
-        ConfigError: If the file cannot be read, is not a scene, or contains a touch that is impossible on its
-            patch. The message is one line with file, line and column.
+        ConfigError: If the file cannot be read, is not a scene, or has a touch or a fault that is impossible
+            in the hand. The message is one line with file, line and column.
     """
     scene = read_scene(path)
     bind_scene(scene, hand)
+    schedule_of(scene, hand)
     return scene
 
 

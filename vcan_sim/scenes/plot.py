@@ -8,6 +8,7 @@ from typing import Any, Final
 import numpy as np
 
 from skinnode.config import HandConfig
+from skinnode.errors import ConfigError
 from skinnode.files.plot_file import save_figure
 from vcan_sim.scenes.bind import bind_scene
 from vcan_sim.scenes.patch import PatchScene
@@ -26,12 +27,15 @@ def write_plot(scene: SceneConfig, hand: HandConfig, file: Path) -> None:
         file: Image file to write; its suffix determines the format.
 
     Raises:
-        ConfigError: If a touch is impossible on its patch, or the file cannot be written.
+        ConfigError: If nothing touches a patch, a touch is impossible on its patch, or the file cannot be
+            written.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     touched = {name: patch for name, patch in bind_scene(scene, hand).items() if patch.histories}
+    if not touched:
+        raise ConfigError("--plot", str(file), "only for a scene with touches")
     colours = {body.name: _COLOURS[i % len(_COLOURS)] for i, body in enumerate(scene.bodies)}
     end_s = max(patch.end_s for patch in touched.values()) + 4.0 * scene.step_s
     times = scene.step_s * np.arange(int(end_s / scene.step_s) + 1)

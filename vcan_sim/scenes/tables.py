@@ -1,4 +1,4 @@
-"""Tables and keys of a scene file: ``[skin]``, ``[[bodies]]``, ``[[touches]]``, ``[[touches.motions]]``."""
+"""Tables and keys of a scene file: ``[skin]``, bodies, touches and their motions, and faults."""
 
 from __future__ import annotations
 
@@ -264,8 +264,35 @@ class TouchConfig(Table):
             pressed_s = motion.to_s
 
 
+_FaultText = Annotated[
+    str,
+    Field(min_length=1, max_length=200),
+    Allowed('the text of a fault, such as "lost=0.1" or "unplugged"'),
+]
+
+
+class FaultConfig(Table):
+    """Faults of a patch, of a wire or of a bus from one time to another."""
+
+    where: Annotated[str, Field(min_length=1, max_length=80), Allowed("the name of a patch, wire or bus")]
+    """Name of a patch or a bus, or a wire: ``palm upper 3``. Wires are numbered from 0."""
+    fault: _FaultText
+    """Faults as in ``vcan-sim --fault``: ``unplugged``, ``lost=0.1``, or several separated by commas. For a
+    wire: ``open``, ``shorted``, ``noisy``, ``frozen`` or ``crossed``."""
+    start_s: _Time = 0.0
+    """Scene time at which the faults start, s."""
+    end_s: _Time | None = None
+    """Scene time at which the faults end, s; None: they last until the scene ends or repeats."""
+
+    @model_validator(mode="after")
+    def _end_after_start(self) -> FaultConfig:
+        if self.end_s is not None and self.end_s <= self.start_s:
+            raise ConfigError("end_s", self.end_s, f"later than start_s, {self.start_s} s")
+        return self
+
+
 class SceneConfig(Table):
-    """Scene: bodies that touch the patches of a hand."""
+    """Scene: bodies that touch the patches of a hand, and faults of the patches and buses."""
 
     name: Name = "scene"
     """Name of the scene."""
@@ -278,14 +305,12 @@ class SceneConfig(Table):
     repeat_s: _Duration | None = None
     """Period after which the scene repeats, s; None: the scene plays once."""
     skin: SkinConfig = SkinConfig()
-    bodies: Annotated[
-        tuple[BodyConfig, ...], Field(min_length=1, strict=False), Allowed("at least one [[bodies]]")
-    ]
+    bodies: Annotated[tuple[BodyConfig, ...], Field(strict=False), Allowed("tables [[bodies]]")] = ()
     """Rigid bodies of the scene."""
-    touches: Annotated[
-        tuple[TouchConfig, ...], Field(min_length=1, strict=False), Allowed("at least one [[touches]]")
-    ]
-    """Touches of the scene, in any order."""
+    touches: Annotated[tuple[TouchConfig, ...], Field(strict=False), Allowed("tables [[touches]]")] = ()
+    """Touches of the scene, in any order. Without touches, the skin stays at rest."""
+    faults: Annotated[tuple[FaultConfig, ...], Field(strict=False), Allowed("tables [[faults]]")] = ()
+    """Faults of the scene, in any order."""
     _read_of: Document = PrivateAttr(Document("", {}, {}))
 
     def body(self, name: str) -> BodyConfig:
@@ -299,6 +324,16 @@ class SceneConfig(Table):
     def where(self, key: str) -> str:
         """Return ``file:line:column`` of a dotted key, for error messages; empty if there is no file."""
         return self._read_of.where(key_path(key))
+
+    @model_validator(mode="after")
+    def _faults_in_time(self) -> SceneConfig:
+        if not (self.touches or self.faults):
+            raise ConfigError("touches", NOTHING, "at least one [[touches]] or [[faults]]")
+        for i, fault in enumerate(self.faults):
+            last_s, key = (fault.start_s, "start_s") if fault.end_s is None else (fault.end_s, "end_s")
+            if self.repeat_s is not None and last_s > self.repeat_s:
+                raise ConfigError(f"faults[{i}].{key}", last_s, f"a time by repeat_s, {self.repeat_s} s")
+        return self
 
     @model_validator(mode="after")
     def _cross_checks(self) -> SceneConfig:

@@ -1,0 +1,67 @@
+"""Thread that starts and ends the faults of a scene at their times."""
+
+from __future__ import annotations
+
+from queue import Empty
+
+from skinnode.process import clock
+from vcan_sim.fault_schedule import FaultSchedule, TimedFault
+from vcan_sim.fleet_faults import FleetFaults
+
+
+class FaultPlayer:
+    """Plays a schedule from :meth:`begin` to :meth:`stop`.
+
+    Args:
+        schedule: The schedule.
+        faults: Faults of the fleet, which the player changes.
+    """
+
+    def __init__(self, schedule: FaultSchedule, faults: FleetFaults) -> None:
+        self._schedule, self._faults = schedule, faults
+        self._inbox = clock.queue()
+        """Receives the monotonic time at which the scene begins, ns; None to stop."""
+        self._active: tuple[TimedFault, ...] = ()
+        self._thread = clock.thread(self._run, "faults of the scene")
+
+    def start(self) -> None:
+        """Start the thread, which waits for the scene to begin."""
+        self._thread.start()
+
+    def begin(self, origin_ns: int) -> None:
+        """Begin the scene; called once.
+
+        Args:
+            origin_ns: Monotonic time of scene time 0, ns.
+        """
+        self._inbox.put(origin_ns)
+
+    def stop(self) -> None:
+        """End the thread. Faults that are active stay."""
+        self._inbox.put(None)
+        self._thread.join()
+
+    def _run(self) -> None:
+        origin_ns = self._inbox.get()
+        if origin_ns is None:
+            return
+        due_s: float | None = 0.0
+        while due_s is not None:
+            left_s = due_s - (clock.monotonic_ns() - origin_ns) * 1e-9
+            if left_s > 0.0:
+                try:
+                    self._inbox.get(timeout=left_s)
+                except Empty:
+                    continue
+                return
+            self._follow(due_s)
+            due_s = self._schedule.next_change_s(due_s)
+        self._inbox.get()
+
+    def _follow(self, t_s: float) -> None:
+        """Bring the faults to their state at a scene time."""
+        before, self._active = self._active, self._schedule.active(t_s)
+        ended = [each for each in before if each not in self._active]
+        started = [each for each in self._active if each not in before]
+        if ended or started:
+            self._faults.follow(ended, started)

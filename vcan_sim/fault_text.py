@@ -1,0 +1,180 @@
+"""Faults as text, such as ``palm:lost=0.1,frozen`` or ``can0:bus_off``: parsed and printed.
+
+::
+
+    text     [PLACE:]FAULT[,FAULT...]    PLACE is a patch or a bus; without it, every patch or every bus
+    FAULT    NAME | NAME=VALUE | none    none ends all faults of the place
+
+The options ``--fault`` and ``vcan-sim inject`` and the ``[[faults]]`` of a scene share this form.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Final, TypeVar
+
+from skinnode.errors import ConfigError
+from vcan_sim.bus_attacker import NO_BUS_FAULTS, BusFaults
+from vcan_sim.faults import NO_FAULTS, Faults
+
+NONE: Final = "none"
+"""Word that ends all faults of a place, or the fault of a wire."""
+
+Value = int | float | bool | None
+AnyFaults = TypeVar("AnyFaults", Faults, BusFaults)
+
+OF_PATCHES: Final = {each.name: each.default for each in dataclasses.fields(Faults)}
+"""Defaults of the faults of a patch, by name."""
+OF_BUSES: Final = {each.name: each.default for each in dataclasses.fields(BusFaults)}
+"""Defaults of the faults of a bus, by name."""
+
+
+@dataclass(frozen=True, slots=True)
+class FaultChange:
+    """Change of the faults of one patch or bus."""
+
+    place: str
+    """Name of the patch or bus."""
+    on_bus: bool
+    values: Mapping[str, Value] = field(default_factory=dict)
+    """New values of the faults, by name."""
+    clears: bool = False
+    """Whether all earlier faults of the place end."""
+
+    def of(self, faults: AnyFaults) -> AnyFaults:
+        """Return the faults after this change of ``faults``.
+
+        Raises:
+            ConfigError: If a value is out of range, or the values contradict each other.
+        """
+        kept = type(faults)(seed=faults.seed) if self.clears else faults  # the seed is not a fault
+        return dataclasses.replace(kept, **self.values)  # type: ignore[arg-type]  # types match
+
+
+def parse_changes(
+    texts: Sequence[str], patches: Sequence[str], buses: Sequence[str], key: str = "--fault"
+) -> list[FaultChange]:
+    """Return the changes that some texts describe, in their order.
+
+    Args:
+        texts: Texts such as ``palm:lost=0.1,frozen``, ``can0:bus_off``, ``palm:none`` or ``none``.
+        patches: Names of the hand's patches; a bus with the name of a patch cannot be named.
+        buses: Names of the hand's buses.
+        key: Name of the option, for messages.
+
+    Raises:
+        ConfigError: If a place is not in the hand, a fault is unknown there, or a value has the wrong type.
+    """
+    changes = []
+    for text in texts:
+        place, colon, listed = text.rpartition(":")
+        if not colon:
+            changes += list(_everywhere(listed, patches, buses, key))
+        elif place in patches:
+            changes.append(_change(place, listed, key, on_bus=False))
+        elif place in buses:
+            changes.append(_change(place, listed, key, on_bus=True))
+        else:
+            allowed = f"a patch of the hand: {', '.join(patches)}; or a bus: {', '.join(buses)}"
+            raise ConfigError(key, place, allowed)
+    return changes
+
+
+def parse_values(text: str, *, on_bus: bool, key: str = "--fault") -> dict[str, Value]:
+    """Return the values of faults by name, such as those of ``lost=0.01,silent``.
+
+    Args:
+        text: Names with their values, separated by commas; at least one.
+        on_bus: Whether these are faults of a bus.
+        key: Name of the option, for messages.
+
+    Raises:
+        ConfigError: If a fault is unknown or a value has the wrong type.
+    """
+    return _values(_parts(text, key), OF_BUSES if on_bus else OF_PATCHES, key)
+
+
+def text_of(faults: Faults | BusFaults) -> str:
+    """Return faults as text that :func:`parse_values` reads, without the seed; ``none`` if there are none."""
+    defaults = OF_BUSES if isinstance(faults, BusFaults) else OF_PATCHES
+    shown = [
+        name_and_value(name, getattr(faults, name))
+        for name, default in defaults.items()
+        if name != "seed" and getattr(faults, name) != default
+    ]
+    return ",".join(shown) or NONE
+
+
+def name_and_value(name: str, value: Value) -> str:
+    """Return a fault as text: its name, and its value unless that is True."""
+    return name if value is True else f"{name}={_shown(value)}"
+
+
+def _shown(value: Value) -> str:
+    if value is None:
+        return NONE
+    return str(value).lower() if isinstance(value, bool) else repr(value)
+
+
+def _parts(text: str, key: str) -> list[str]:
+    parts = [part.strip() for part in text.split(",")]
+    parts = [part for part in parts if part]
+    if not parts:
+        raise ConfigError(key, text, f"the name of a fault, or {NONE}")
+    return parts
+
+
+def _change(place: str, listed: str, key: str, *, on_bus: bool) -> FaultChange:
+    parts = _parts(listed, key)
+    values = _values([part for part in parts if part != NONE], OF_BUSES if on_bus else OF_PATCHES, key)
+    return FaultChange(place, on_bus, values, NONE in parts)
+
+
+def _everywhere(listed: str, patches: Sequence[str], buses: Sequence[str], key: str) -> Iterator[FaultChange]:
+    """Yield the changes of a text without a place: the name of a fault says where it belongs."""
+    parts = _parts(listed, key)
+    clears = NONE in parts
+    values = _values([part for part in parts if part != NONE], OF_PATCHES | OF_BUSES, key)
+    for places, known, on_bus in ((patches, OF_PATCHES, False), (buses, OF_BUSES, True)):
+        own = {name: value for name, value in values.items() if name in known}
+        if own or clears:
+            yield from (FaultChange(place, on_bus, own, clears) for place in places)
+
+
+def _values(parts: Sequence[str], known: Mapping[str, object], key: str) -> dict[str, Value]:
+    values: dict[str, Value] = {}
+    for part in parts:
+        name, equals, value = (each.strip() for each in part.partition("="))
+        if name not in known:
+            raise ConfigError(key, name, ", ".join(known))
+        kind = type(known[name])
+        try:
+            values[name] = _value(kind, value, given=bool(equals))
+        except ValueError:
+            raise ConfigError(f"{key} {name}", value, _allowed(kind)) from None
+    return values
+
+
+def _value(kind: type, text: str, *, given: bool) -> Value:
+    if kind is bool:
+        if text not in ("true", "false") and given:
+            raise ValueError
+        return text != "false"
+    if kind is float:
+        return float(text)
+    return None if kind is not int and text == NONE else int(text)
+
+
+def _allowed(kind: type) -> str:
+    if kind is bool:
+        return "no value, or true or false"
+    if kind is float:
+        return "a number"
+    return "an integer" if kind is int else f"an integer, or {NONE}"
+
+
+def none_of(*, on_bus: bool) -> Faults | BusFaults:
+    """Return the faults of a patch or a bus that has none."""
+    return NO_BUS_FAULTS if on_bus else NO_FAULTS

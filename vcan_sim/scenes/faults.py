@@ -1,0 +1,112 @@
+"""Turns the ``[[faults]]`` of a scene into a schedule, checked with the hand."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import re
+from typing import Any, Final
+
+from skinnode.config import HandConfig
+from skinnode.errors import ConfigError
+from vcan_sim.bus_attacker import NO_BUS_FAULTS
+from vcan_sim.fault_schedule import FaultSchedule, TimedFault
+from vcan_sim.fault_text import parse_values
+from vcan_sim.faults import NO_FAULTS, OF_WIRES, check_wires
+from vcan_sim.scenes.tables import FaultConfig, SceneConfig
+
+_WIRE: Final = re.compile(r"(?P<patch>.+) (?P<side>upper|lower) (?P<number>\d{1,4})")
+"""A wire of a patch in ``where``: ``palm upper 3``."""
+
+
+def schedule_of(scene: SceneConfig, hand: HandConfig) -> FaultSchedule:
+    """Return the schedule of a scene's faults.
+
+    Args:
+        scene: The scene.
+        hand: The hand.
+
+    Raises:
+        ConfigError: If a fault names a patch, a wire or a bus that the hand does not have, is unknown or out of
+            range, or contradicts another fault at some time. The message is one line with file, line and
+            column.
+    """
+    found = []
+    for i, fault in enumerate(scene.faults):
+        try:
+            found.append(_timed(i, fault, hand, scene.repeat_s))
+        except ConfigError as error:
+            raise _with_place(scene, i, error) from None
+    schedule = FaultSchedule(tuple(found), scene.repeat_s)
+    shapes: dict[str, tuple[int, int]] = {}
+    for late in found:
+        _check_alone(scene, late, found[: late.number])
+        try:
+            _check_together(schedule, late, hand, shapes)
+        except ConfigError as error:
+            raise _with_place(scene, late.number, error) from None
+    return schedule
+
+
+def _timed(number: int, fault: FaultConfig, hand: HandConfig, repeat_s: float | None) -> TimedFault:
+    place, on_bus, text = _place_and_text(fault, hand)
+    values = parse_values(text, on_bus=on_bus, key="fault")
+    if "seed" in values:
+        raise ConfigError("fault", "seed", "a fault; the seed is not one")
+    end_s = repeat_s if fault.end_s is None else fault.end_s
+    end_s = math.inf if end_s is None else end_s
+    return TimedFault(number, place, on_bus, fault.start_s, end_s, values)
+
+
+def _place_and_text(fault: FaultConfig, hand: HandConfig) -> tuple[str, bool, str]:
+    """Return the patch or bus of a fault, whether it is a bus, and the text of the fault there."""
+    patches, buses = [patch.name for patch in hand.patches], [bus.name for bus in hand.buses]
+    if fault.where in patches:
+        return fault.where, False, fault.fault
+    if fault.where in buses:
+        return fault.where, True, fault.fault
+    wire = _WIRE.fullmatch(fault.where)
+    if wire is None or wire["patch"] not in patches:
+        allowed = f"a patch of the hand: {', '.join(patches)}; a wire, such as '{patches[0]} upper 3'; "
+        raise ConfigError("where", fault.where, f"{allowed}or a bus: {', '.join(buses)}")
+    name = f"{fault.fault}_{wire['side']}"
+    if name not in OF_WIRES or fault.fault == "stuck":
+        kinds = dict.fromkeys(each.partition("_")[0] for each in OF_WIRES if not each.startswith("stuck"))
+        raise ConfigError("fault", fault.fault, f"the fault of a wire: {', '.join(kinds)}")
+    return wire["patch"], False, f"{name}={wire['number']}"
+
+
+def _check_alone(scene: SceneConfig, late: TimedFault, earlier: list[TimedFault]) -> None:
+    """Raise ConfigError if an earlier table sets the same fault at the same place and time."""
+    for early in earlier:
+        same = early.place == late.place and early.on_bus == late.on_bus and early.values.keys() & late.values
+        if same and early.start_s < late.end_s and late.start_s < early.end_s:
+            name = next(name for name in late.values if name in early.values)
+            allowed = f"a time at which faults[{early.number}] does not inject {name} at {late.place!r}"
+            key = f"faults[{late.number}].start_s"
+            raise ConfigError(key, late.start_s, allowed, where=scene.where(key))
+
+
+def _check_together(
+    schedule: FaultSchedule, late: TimedFault, hand: HandConfig, shapes: dict[str, tuple[int, int]]
+) -> None:
+    """Raise ConfigError if a fault and those that are active at its start contradict each other."""
+    values: dict[str, Any] = {}
+    for each in schedule.active(late.start_s):
+        if (each.place, each.on_bus) == (late.place, late.on_bus):
+            values |= each.values
+    if late.on_bus:
+        dataclasses.replace(NO_BUS_FAULTS, **values)
+        return
+    faults = dataclasses.replace(NO_FAULTS, **values)
+    if late.place not in shapes:
+        shapes[late.place] = next(p for p in hand.patches if p.name == late.place).layout.build().shape
+    check_wires(faults, late.place, shapes[late.place])
+
+
+def _with_place(scene: SceneConfig, number: int, error: ConfigError) -> ConfigError:
+    """Return an error about a fault with its place in the scene file."""
+    key = f"faults[{number}].{'where' if error.key == 'where' else 'fault'}"
+    shown = error.key.removeprefix("fault").strip()
+    allowed = f"{shown}: {error.allowed}" if shown and error.key != "where" else error.allowed
+    return ConfigError(key, error.got, allowed, where=scene.where(key))

@@ -27,8 +27,8 @@ def schedule_of(scene: SceneConfig, hand: HandConfig) -> FaultSchedule:
         hand: The hand.
 
     Raises:
-        ConfigError: If a fault names a patch, a wire or a bus that the hand does not have, is unknown or out of
-            range, or contradicts another fault at some time. The message is one line with file, line and
+        ConfigError: If a fault names a patch, a wire or a bus that the hand does not have, is unknown or out
+            of range, or contradicts another fault at some time. The message is one line with file, line and
             column.
     """
     found = []

@@ -118,9 +118,7 @@ class PointResponse:
             for own, other in zip(layer.response(k), half.response(np.full_like(k, np.inf)), strict=True)
         )
         tables = np.empty((4, len(r)))
-        for start in range(
-            0, len(r), 64
-        ):  # in blocks, because a table of all waves at all distances may exceed the memory
+        for start in range(0, len(r), 64):  # in blocks of distances, to limit the memory
             waves = np.outer(r[start : start + 64], k)
             zeroth, first = j0(waves), j1(waves)
             second = np.where(waves > 1e-4, 2.0 * first / np.maximum(waves, 1e-4) - zeroth, 0.0)

@@ -1,4 +1,4 @@
-"""CAN bus with exact times, as a deterministic model without threads and without a clock of its own.
+"""Deterministic model of a CAN bus with exact times, without threads and without a clock.
 
 ::
 
@@ -8,9 +8,10 @@
         -> attempt (delivered or destroyed, and when) -> bus
     confinement (error counters and states), bit_rates (exact times), occupancy (bus load) -> bus
 
-The caller owns time. ``TimedBus.send`` hands in a frame at a time, ``TimedBus.advance`` returns the events up
-to a time, and ``TimedBus.next_event_ns`` says when to advance next. The same calls give the same events. The
-docstrings of ``bus``, ``attempt`` and ``confinement`` list what the model leaves out.
+The caller controls the time. ``TimedBus.send`` queues a frame at a given time, ``TimedBus.advance`` returns
+all events up to a given time, and ``TimedBus.next_event_ns`` is the time to which the caller must advance
+next. The same calls produce the same events. The docstrings of the modules ``bus``, ``attempt`` and
+``confinement`` list the simplifications of the model.
 """
 
 from vcan_sim.timed_bus.bit_rates import BitRates

@@ -1,16 +1,17 @@
-"""Course of one attempt to send a frame: delivered, or destroyed by an error frame, and when.
+"""Course of one transmission attempt: when a frame is delivered, or destroyed by an error frame.
 
-:func:`undisturbed` covers the common case with the bit counts alone; :func:`disturbed` follows the bits.
+:func:`undisturbed` covers the common case and needs only the number of bits; :func:`disturbed` examines the
+individual bits of the frame.
 
-Error frames (ISO 11898-1:2015; Bosch CAN 2.0, part B, sections 3.1.3 and 7). The first station to detect an
-error starts an error flag of 6 bits in the next bit. The other stations start theirs when they detect the
-first flag as an error, up to 6 bits later, so the superposed flags are 6 to 12 bits long. An error delimiter
-of 8 recessive bits and the intermission of 3 bits follow. Flags have the nominal bit rate; the delay of the
-second flag has the bit rate of the phase in which the error occurs.
+Error frames (ISO 11898-1:2015; Bosch CAN 2.0, part B, sections 3.1.3 and 7): The first station to detect an
+error starts an error flag of 6 bits at the next bit. The other stations start their error flags when they
+detect the first flag as an error, up to 6 bits later, so the superposed flags are 6 to 12 bits long. An error
+delimiter of 8 recessive bits and the intermission of 3 bits follow. Error flags use the nominal bit rate; the
+delay of the second flag is counted at the bit rate of the phase in which the error occurs.
 
-Simplifications: a disturbance that all stations see destroys the frame, even if it inverts a recessive bit of
-the arbitration field; error flags and delimiters are not disturbed; passive error flags end with the
-superposed flags; there are no overload frames.
+Simplifications: A disturbance seen by all stations destroys the frame, even if it inverts a recessive bit of
+the arbitration field. Error flags and delimiters are never disturbed. Passive error flags end with the
+superposed flags. There are no overload frames.
 """
 
 from __future__ import annotations
@@ -39,7 +40,7 @@ _ACTIVE, _PASSIVE = 0, 1
 
 @dataclass(frozen=True, slots=True)
 class Participant:
-    """Station in an attempt."""
+    """Station that takes part in a transmission attempt as sender or receiver."""
 
     station: int
     passive: bool
@@ -50,40 +51,40 @@ class Participant:
 
 @dataclass(frozen=True, slots=True)
 class BitError:
-    """Error in an attempt. Times are ticks from the start of frame."""
+    """Error in a transmission attempt. Times are in ticks from the start of frame."""
 
     ticks: int
-    """Start of the first error flag."""
+    """Start of the first error flag, in ticks."""
     bit: int
     cause: Cause
     detected_by: tuple[int, ...]
-    """Stations that detect the error in this bit."""
+    """Stations that detect the error in bit ``bit``."""
 
 
 @dataclass(frozen=True, slots=True)
 class Course:
-    """Course of an attempt. Times are ticks from the start of frame."""
+    """Course of a transmission attempt. Times are in ticks from the start of frame."""
 
     senders: tuple[int, ...]
-    """Stations whose frame is delivered or destroyed at the end."""
+    """Stations whose frame is delivered or destroyed at the end of the attempt."""
     end: int
-    """End of the last bit of the end of frame, or start of the first error flag."""
+    """End of the last bit of the end of frame, or start of the first error flag, in ticks."""
     recessive: int
-    """Time from which the bus stays recessive."""
+    """Time after which the bus stays recessive, in ticks."""
     free: int
-    """End of the intermission."""
+    """End of the intermission, in ticks."""
     error: BitError | None = None
     """Error that destroys the frame; None if the frame is delivered."""
     side_errors: tuple[BitError, ...] = ()
-    """Errors of error-passive stations that do not destroy the frame, in order of time."""
+    """Errors of error-passive stations that do not destroy the frame, in chronological order."""
 
 
 def undisturbed(senders: tuple[int, ...], frame: CanFrame, esi: bool, rates: BitRates) -> Course:
-    """Return the course of an attempt that is acknowledged and not disturbed.
+    """Return the course of a transmission attempt that is acknowledged and not disturbed.
 
     Args:
         senders: stations that send the frame.
-        frame: the frame.
+        frame: frame on the bus.
         esi: whether the senders are error-passive.
         rates: bit rates of the bus.
     """
@@ -95,12 +96,12 @@ def undisturbed(senders: tuple[int, ...], frame: CanFrame, esi: bool, rates: Bit
 def disturbed(
     senders: Sequence[Participant], receivers: Sequence[Participant], hit: Hit | None, rates: BitRates
 ) -> Course:
-    """Return the course of an attempt that is disturbed, not acknowledged, or in which senders collide.
+    """Return the course of a transmission attempt that is disturbed, unacknowledged or has a collision.
 
     Args:
         senders: stations that send frames with the same arbitration field.
         receivers: all other stations on the bus.
-        hit: the disturbed bit, or None.
+        hit: disturbed bit, or None if no rule disturbs the attempt.
         rates: bit rates of the bus.
     """
     wires = {each.station: wire_frame(each.frame, each.passive) for each in senders if each.frame}
@@ -114,7 +115,7 @@ def disturbed(
             receiver = bus.receiving.get(hit.station)
             if receiver is not None and not receiver.passive:
                 return _destroyed_by_receiver(hit, wire, bus)
-            if receiver is not None:  # it sees no valid frame, and does not acknowledge
+            if receiver is not None:  # this receiver sees no valid frame and does not acknowledge
                 bus.side_errors.append(_bit_error(wire, hit.bit, Cause.DISTURBED, (hit.station,), rates))
                 del bus.receiving[hit.station]
             hit = None
@@ -144,12 +145,12 @@ def cut_off(
     receivers: Sequence[Participant],
     rates: BitRates,
 ) -> Course:
-    """Return the course of an attempt whose only sender is disconnected.
+    """Return the course of a transmission attempt whose only sender is disconnected.
 
     Args:
-        frame: the frame.
+        frame: frame on the bus.
         esi: whether the sender is error-passive.
-        bit: position of the last bit that is sent.
+        bit: position of the last transmitted bit.
         receivers: all other stations on the bus.
         rates: bit rates of the bus.
     """
@@ -163,7 +164,7 @@ def cut_off(
 
 @dataclass(slots=True)
 class _OnBus:
-    """Stations on the bus in the course of an attempt."""
+    """Stations that still send or receive during a transmission attempt, and side errors so far."""
 
     sending: dict[int, Participant]
     receiving: dict[int, Participant]
@@ -176,7 +177,7 @@ def _destroyed_by_hit(hit: Hit, wire: WireFrame, bus: _OnBus) -> Course:
     flag = _PASSIVE if all(bus.sending[station].passive for station in detecting) else _ACTIVE
     seen = wire.bits[hit.bit] ^ (hit.station == -1)
     lag = receiver_lag(wire, hit.bit, seen, flag) if bus.receiving else 0
-    if hit.station == -1 and lag == 0:  # the bit itself is an error for the receivers
+    if hit.station == -1 and lag == 0:  # the disturbed bit itself is an error for the receivers
         detecting += tuple(bus.receiving)
     error = _bit_error(wire, hit.bit, Cause.DISTURBED, detecting, bus.rates)
     return _destroyed(error, _lag_ticks(wire, hit.bit, lag, bus.rates), bus)
@@ -216,13 +217,13 @@ def _lag_ticks(wire: WireFrame, bit: int, lag: int, rates: BitRates) -> int:
 
 
 def _sender_lag(wire: WireFrame, bit: int) -> int:
-    """Return the number of bits of an active error flag until a sender sends a recessive bit, at most 6."""
+    """Return how many bits of an active error flag pass before a sender sends a recessive bit, at most 6."""
     later = wire.bits[bit + 1 : bit + 1 + FLAG_BITS]
     return later.index(1) + 1 if 1 in later else FLAG_BITS
 
 
 def _first_difference(streams: Sequence[tuple[int, ...]]) -> int | None:
-    """Return the first position at which the frames of several senders differ, or None."""
+    """Return the first bit position at which several senders' frames differ, or None."""
     for position, bits in enumerate(zip(*streams, strict=False)):
         if 0 < sum(bits) < len(bits):
             return position

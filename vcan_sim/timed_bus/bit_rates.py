@@ -1,4 +1,4 @@
-"""Bit rates, and the unit of time in which all bit times are whole numbers."""
+"""Bit rates of a bus, and the tick, a unit of time in which all bit times are whole numbers."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from typing import Final
 from skinnode.errors import ConfigError
 
 NOMINAL_BPS: Final = range(10_000, 1_000_001)
-"""Nominal bit rates of a high-speed CAN bus, bit/s."""
+"""Allowed nominal bit rates of a high-speed CAN bus, bit/s."""
 
 MAX_DATA_BPS: Final = 8_000_000
-"""Maximum bit rate of the data phase of CAN FD, bit/s."""
+"""Maximum bit rate of the CAN FD data phase, bit/s."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -20,8 +20,8 @@ class BitRates:
     """Bit rates of a bus.
 
     Time is counted in ticks of 1/``ticks_per_s`` s, the longest unit in which a nanosecond, a nominal bit and
-    a data bit are all whole numbers. Time therefore does not drift, however long the bus runs. A tick is 1 ns
-    if both bit times are whole nanoseconds. Only reported times are rounded, each on its own.
+    a data bit are all whole numbers. Bit times are therefore exact, and time does not drift. A tick is 1 ns
+    if both bit times are whole nanoseconds. Only reported times are rounded, each independently.
 
     Raises:
         ConfigError: if a bit rate is out of range.
@@ -36,7 +36,7 @@ class BitRates:
     nominal_ticks: int = field(init=False)
     """Nominal bit time, ticks."""
     data_ticks: int = field(init=False)
-    """Bit time of the data phase, ticks; the nominal bit time on a bus without CAN FD."""
+    """Data bit time, ticks; equal to the nominal bit time on a bus without CAN FD."""
 
     def __post_init__(self) -> None:
         if self.nominal_bps not in NOMINAL_BPS:
@@ -56,9 +56,9 @@ class BitRates:
             object.__setattr__(self, name, value)
 
     def ticks(self, bits: tuple[int, int]) -> int:
-        """Return the duration of a number of nominal bits and a number of data bits, ticks."""
+        """Return the duration in ticks of a number of nominal bits and a number of data bits."""
         return bits[0] * self.nominal_ticks + bits[1] * self.data_ticks
 
     def ceil_ns(self, ticks: int) -> int:
-        """Return a time in ns, rounded up: an event is never reported before it happens."""
+        """Convert ticks to ns, rounded up, so that no event is reported before it happens."""
         return -(-ticks // self.ticks_per_ns)

@@ -1,11 +1,12 @@
-"""The bus: arbitration between the stations, courses of attempts, error counters, and the events.
+"""Simulated CAN bus: arbitration between stations, transmission attempts, error counters, and events.
 
-Stations start a frame at once on an idle bus, otherwise at the end of the intermission. A frame that is
-handed in less than one bit after a start of frame still takes part in the arbitration (Davis, Burns, Bril,
-Lukkien, "Controller Area Network (CAN) schedulability analysis", 2007, section 3). The bus therefore decides
-each arbitration one bit after the start of frame.
+A station starts a frame immediately if the bus is idle, otherwise at the end of the intermission. A frame
+that is queued less than one bit time after a start of frame still takes part in the arbitration (Davis,
+Burns, Bril, Lukkien, "Controller Area Network (CAN) schedulability analysis", 2007, section 3). The model
+therefore decides each arbitration one bit time after the start of frame.
 
-All stations see each bit at the same time: cables have no delay, and all controllers have the same bit time.
+All stations see each bit at the same time, because cables have no delay and all controllers have the same bit
+time.
 """
 
 from __future__ import annotations
@@ -47,12 +48,12 @@ from vcan_sim.timed_bus.wire_frame import wire_frame
 
 
 class TimedBus:
-    """CAN bus with its stations. Times passed to its methods must not decrease.
+    """CAN bus with its stations. Times passed to the methods must not decrease.
 
     Args:
-        stations: the stations, which the methods name by their position in this sequence.
-        rates: bit rates.
-        disturbances: errors to inject.
+        stations: options of the stations; methods refer to a station by its index in this sequence.
+        rates: bit rates of the bus.
+        disturbances: rules that inject errors.
 
     Raises:
         ConfigError: if a disturbance names a station that does not exist.
@@ -87,18 +88,18 @@ class TimedBus:
     # --- what stations do
 
     def send(self, time_ns: int, station: int, frame: CanFrame) -> bool:
-        """Hand in a frame.
+        """Queue a frame for transmission.
 
         Args:
-            time_ns: time, ns.
-            station: the station that sends it.
-            frame: the frame.
+            time_ns: current time, ns.
+            station: index of the sending station.
+            frame: frame to send.
 
         Returns:
-            Whether the station accepts the frame; it does not if its queue is full.
+            True if the frame was queued, False if the station's queue is full.
 
         Raises:
-            ValueError: if the time is before that of an earlier call, or a CAN FD frame is sent on a bus
+            ValueError: if the time is earlier than in a previous call, or a CAN FD frame is sent on a bus
                 without a data bit rate.
             IndexError: if the station does not exist.
         """
@@ -114,14 +115,14 @@ class TimedBus:
         return True
 
     def clear(self, time_ns: int, station: int) -> None:
-        """Drop all frames in a station's queue; the frame being sent goes on.
+        """Drop all frames in a station's queue; a frame that is being sent is not interrupted.
 
         Args:
-            time_ns: time, ns.
-            station: the station.
+            time_ns: current time, ns.
+            station: index of the station.
 
         Raises:
-            ValueError: if the time is before that of an earlier call.
+            ValueError: if the time is earlier than in a previous call.
             IndexError: if the station does not exist.
         """
         sender = self._at(time_ns, station)
@@ -129,14 +130,14 @@ class TimedBus:
         self._withdraw(sender)
 
     def disconnect(self, time_ns: int, station: int) -> None:
-        """Disconnect a station. A frame that it is sending ends in an error frame; its queue is kept.
+        """Disconnect a station; its queue is kept. A frame that it is sending ends in an error frame.
 
         Args:
-            time_ns: time, ns.
-            station: the station.
+            time_ns: current time, ns.
+            station: index of the station.
 
         Raises:
-            ValueError: if the time is before that of an earlier call.
+            ValueError: if the time is earlier than in a previous call.
             IndexError: if the station does not exist.
         """
         leaving = self._at(time_ns, station)
@@ -151,14 +152,14 @@ class TimedBus:
         self._withdraw(leaving)
 
     def connect(self, time_ns: int, station: int) -> None:
-        """Connect a station again, with both error counters at 0.
+        """Reconnect a station, with both error counters at 0.
 
         Args:
-            time_ns: time, ns.
-            station: the station.
+            time_ns: current time, ns.
+            station: index of the station.
 
         Raises:
-            ValueError: if the time is before that of an earlier call.
+            ValueError: if the time is earlier than in a previous call.
             IndexError: if the station does not exist.
         """
         joining = self._at(time_ns, station)
@@ -166,22 +167,22 @@ class TimedBus:
             return
         joining.connected = True
         joining.recovers_from = None
-        # A station takes part after 11 recessive bits (ISO 11898-1:2015, bus integration). During a frame,
-        # these are the last 11 bits before the bus is free.
+        # A station may send after it has seen 11 recessive bits (ISO 11898-1:2015, bus integration). During a
+        # frame, these are the last 11 bits before the bus is free.
         joining.ready = self._now + RECOVERY_RUN_BITS * self._rates.nominal_ticks
         self._receivers.clear()
         self._set_counters(self._now, joining, ZERO)
         self._offer(joining)
 
     def restart(self, time_ns: int, station: int) -> None:
-        """Start the recovery of a station from bus-off; no effect in any other state.
+        """Start a station's recovery from bus-off; this method has no effect in any other state.
 
         Args:
-            time_ns: time, ns.
-            station: the station.
+            time_ns: current time, ns.
+            station: index of the station.
 
         Raises:
-            ValueError: if the time is before that of an earlier call.
+            ValueError: if the time is earlier than in a previous call.
             IndexError: if the station does not exist.
         """
         stopped = self._at(time_ns, station)
@@ -191,10 +192,10 @@ class TimedBus:
             self._plan()
 
     def disturb(self, rule: Disturbance) -> None:
-        """Add a rule that injects errors from the next arbitration on.
+        """Add a rule that injects errors, starting with the next arbitration.
 
         Args:
-            rule: the rule.
+            rule: disturbance rule.
 
         Raises:
             ConfigError: if the rule names a station that does not exist.
@@ -208,22 +209,22 @@ class TimedBus:
 
     @property
     def next_event_ns(self) -> int | None:
-        """Time to which the caller must advance next, ns; None if nothing will happen on its own.
+        """Time to which the caller must advance next, ns; None if no event is pending.
 
-        Some of these times are decisions inside the bus, at which :meth:`advance` returns no event.
+        Some of these times are internal decisions of the bus, for which :meth:`advance` returns no event.
         """
         if self._events:
             return self._rates.ceil_ns(self._now)
         return None if self._next is None else self._rates.ceil_ns(self._next)
 
     def advance(self, time_ns: int) -> list[Event]:
-        """Return all events up to a time that have not been returned yet, in order.
+        """Return all events up to a given time that have not been returned yet, in order.
 
         Args:
-            time_ns: time, ns.
+            time_ns: time up to which to return events, ns.
 
         Raises:
-            ValueError: if the time is before that of an earlier call.
+            ValueError: if the time is earlier than in a previous call.
         """
         self._advance(time_ns)
         events, self._events = self._events, []
@@ -232,29 +233,29 @@ class TimedBus:
     # --- what can be read
 
     def counters(self, station: int) -> Counters:
-        """Return the error counters of a station, which give its error state.
+        """Return a station's error counters, which define its error state.
 
         Args:
-            station: the station.
+            station: index of the station.
         """
         return self._stations[station].counters
 
     def waiting(self, station: int) -> int:
-        """Return the number of frames that a station has to send, including the frame being sent.
+        """Return the number of frames that a station still has to send, including the frame being sent.
 
         Args:
-            station: the station.
+            station: index of the station.
         """
         sender = self._stations[station]
         return len(sender.queue) + (sender.sending is not None)
 
     @property
     def frames(self) -> Mapping[tuple[int, bool], int]:
-        """Number of delivered frames by identifier and whether it is extended."""
+        """Number of delivered frames by identifier and whether the identifier is extended."""
         return MappingProxyType(self._frames)
 
     def busy_share(self, from_ns: int, to_ns: int) -> float:
-        """Return the share of time in which the bus was busy with frames, error frames and intermissions.
+        """Return the fraction of time in which the bus was busy with frames, error frames and intermissions.
 
         Args:
             from_ns: start of the interval, ns.
@@ -269,15 +270,15 @@ class TimedBus:
                 f"interval: got {from_ns} to {to_ns} ns, must end after its start, by {now_ns} ns"
             )
         busy_ns = self._occupancy.busy_ns(from_ns, to_ns)
-        if self._flight is None and self._start is not None:  # start of frame sent, arbitration not decided
+        if self._flight is None and self._start is not None:  # the frame awaits the arbitration
             busy_ns += max(0, to_ns - max(from_ns, self._rates.ceil_ns(self._start)))
         return busy_ns / (to_ns - from_ns)
 
     def forget_load(self, before_ns: int) -> None:
-        """Free the memory of :meth:`busy_share` for the time before an instant.
+        """Free the memory that :meth:`busy_share` needs for times before ``before_ns``.
 
         Args:
-            before_ns: the instant, ns; later intervals must not start before it.
+            before_ns: earliest start of any interval passed to :meth:`busy_share` from now on, ns.
         """
         self._occupancy.forget(before_ns)
 
@@ -314,7 +315,7 @@ class TimedBus:
         self._plan()
 
     def _plan(self) -> None:
-        """Set the time of the next step."""
+        """Set the time of the next internal step of the bus."""
         if self._flight is not None:
             self._next = self._flight.next
             return
@@ -327,7 +328,7 @@ class TimedBus:
         self._next = due
 
     def _offer(self, sender: Station) -> None:
-        """Let a station take part in the next arbitration if it has a frame to send."""
+        """Enter a station into the next arbitration if it has a frame to send."""
         if not len(sender.queue) or not sender.on_bus:
             return
         self._pending[sender.index] = sender
@@ -338,7 +339,7 @@ class TimedBus:
                 self._plan()
 
     def _withdraw(self, sender: Station) -> None:
-        """Update the next start of frame after a station can no longer send."""
+        """Update the next start of frame when a station can no longer send."""
         if self._pending.pop(sender.index, None) and self._flight is None:
             started = self._start is not None and self._start <= self._now
             if not started:
@@ -355,7 +356,7 @@ class TimedBus:
         start = now - self._rates.nominal_ticks
         self._start = None
         contenders = [station for station in self._pending.values() if station.ready <= start]
-        if not contenders:  # withdrawn since the start of frame
+        if not contenders:  # all frames have been withdrawn since the start of frame
             self._choose_start(now)
             return
         if len(contenders) == 1:
@@ -404,7 +405,7 @@ class TimedBus:
         return Attempt(frame, n_bits, bit_at)
 
     def _bit_at(self, frame: CanFrame, esi: bool, ticks: int) -> int | None:
-        """Return the position of the bit on the bus a time after the start of frame, or None."""
+        """Return the position of the bit on the bus at ``ticks`` after the start of frame, or None."""
         if ticks < 0 or ticks >= undisturbed((), frame, esi, self._rates).end:
             return None
         wire = wire_frame(frame, esi)
@@ -484,7 +485,7 @@ class TimedBus:
                 self._set_counters(now, station, reception_failed(station.counters))
 
     def _still_receiving(self, flight: Flight) -> tuple[int, ...]:
-        """Return the stations that have followed an attempt from its start of frame until now."""
+        """Return the stations that have received an attempt without error since its start of frame."""
         receivers, side_errors = flight.receivers, flight.course.side_errors
         if not side_errors and self._receivers.get(tuple(flight.waiting)) is receivers:
             return receivers
@@ -492,7 +493,7 @@ class TimedBus:
         return tuple(index for index in receivers if self._stations[index].on_bus and index not in lost)
 
     def _land(self, now: int, flight: Flight) -> None:
-        """End an attempt: the bus is free after the intermission."""
+        """End the attempt in progress; the bus is free after the intermission."""
         self._flight = None
         self._free = flight.start + flight.course.free
         for index in flight.course.senders:
@@ -500,7 +501,7 @@ class TimedBus:
         self._choose_start(now)
 
     def _return(self, station: Station) -> None:
-        """Put the frame that a station was sending back into its queue."""
+        """Put the frame that a station was sending back into the station's queue."""
         if station.sending is not None:
             station.queue.put_back(station.sending)
             station.sending = None
@@ -508,7 +509,7 @@ class TimedBus:
             self._pending[station.index] = station
 
     def _suspend(self, station: Station, flight: Flight) -> None:
-        """Let an error-passive transmitter pause after its frame (Bosch CAN 2.0, part B, section 3.1.5)."""
+        """Suspend an error-passive transmitter after its frame (Bosch CAN 2.0, part B, section 3.1.5)."""
         if station.passive:
             free = flight.start + flight.course.free
             station.ready = free + SUSPEND_BITS * self._rates.nominal_ticks
@@ -518,7 +519,7 @@ class TimedBus:
         course = flight.course
         if course.error is not None:
             return
-        if leaving.index in course.senders and len(course.senders) > 1:  # others send the same bits
+        if leaving.index in course.senders and len(course.senders) > 1:  # other stations send the same bits
             flight.course = replace(
                 course, senders=tuple(each for each in course.senders if each != leaving.index)
             )
@@ -569,20 +570,20 @@ class TimedBus:
             self._recovering.append(station)
 
     def _runs(self, station: Station, until: int) -> int:
-        """Return the number of complete recessive runs between the last dominant bit and a time."""
+        """Return the number of complete recessive runs between the last dominant bit and ``until``."""
         assert station.recovers_from is not None
         since = max(station.recovers_from, self._recessive_from)
         return max(0, until - since) // (RECOVERY_RUN_BITS * self._rates.nominal_ticks)
 
     def _recovery_end(self, station: Station) -> int:
-        """Return the end of a recovery if the bus stays recessive, ticks."""
+        """Return the time, ticks, at which a station's recovery ends if the bus stays recessive."""
         assert station.recovers_from is not None
         since = max(station.recovers_from, self._recessive_from)
         missing = (RECOVERY_RUNS - station.runs_seen) * RECOVERY_RUN_BITS
         return since + missing * self._rates.nominal_ticks
 
     def _recover(self, now: int) -> bool:
-        """End the recoveries that are complete; return whether there was one."""
+        """End all complete recoveries from bus-off; return whether there was at least one."""
         complete = [station for station in self._recovering if self._recovery_end(station) == now]
         if self._start is not None and self._start < now:
             return False

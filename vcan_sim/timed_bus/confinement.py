@@ -1,7 +1,7 @@
 """Fault confinement: error counters and error states of a station (ISO 11898-1:2015).
 
-The numbers of the rules are those of Bosch CAN 2.0, part B, section 8. Rules 4 to 6 and exception 2 of rule 3
-concern disturbed error flags and stuff errors during arbitration, which the bus does not model.
+The rules are numbered as in Bosch CAN 2.0, part B, section 8. Rules 4 to 6 and exception 2 of rule 3
+concern disturbed error flags and stuff errors during arbitration, which the simulated bus does not model.
 """
 
 from __future__ import annotations
@@ -11,29 +11,29 @@ from dataclasses import dataclass
 from typing import Final
 
 PASSIVE_FROM: Final = 128
-"""Lowest value of an error counter that makes a station error-passive."""
+"""Minimum value of an error counter at which a station becomes error-passive."""
 
 BUS_OFF_FROM: Final = 256
-"""Lowest value of the transmit error counter that puts a station in the bus-off state."""
+"""Minimum value of the transmit error counter at which a station goes bus-off."""
 
 MAX_RECEIVE_ERRORS: Final = 255
-"""Maximum of the receive error counter; the standard sets no limit, controllers count in 7 or 8 bits."""
+"""Maximum receive error counter. The standard sets no limit; controllers count in 7 or 8 bits."""
 
 _BACK_TO_ACTIVE: Final = 119
-"""Receive error counter after a reception by a receiver above 127; the standard allows 119 to 127."""
+"""Receive error counter after a successful reception if it was above 127; the standard allows 119 to 127."""
 
 RECOVERY_RUNS: Final = 128
-"""Number of runs of recessive bits that end the bus-off state."""
+"""Number of runs of recessive bits after which the bus-off state ends."""
 
 RECOVERY_RUN_BITS: Final = 11
-"""Length of such a run, bits."""
+"""Length of a recessive run that counts towards recovery from bus-off, bits."""
 
 SUSPEND_BITS: Final = 8
-"""Pause of an error-passive station after its own frame, beyond the intermission, bits."""
+"""Additional pause of an error-passive station after its own frame and the intermission, bits."""
 
 
 class ErrorState(enum.StrEnum):
-    """Error state of a station."""
+    """Error state of a station, as defined by its error counters."""
 
     ACTIVE = "error-active"
     PASSIVE = "error-passive"
@@ -45,13 +45,13 @@ class Counters:
     """Error counters of a station."""
 
     tec: int = 0
-    """Transmit error counter."""
+    """Transmit error counter (TEC)."""
     rec: int = 0
-    """Receive error counter."""
+    """Receive error counter (REC)."""
 
     @property
     def state(self) -> ErrorState:
-        """Error state that results from the counters."""
+        """Error state that follows from the error counters."""
         if self.tec >= BUS_OFF_FROM:
             return ErrorState.BUS_OFF
         if self.tec >= PASSIVE_FROM or self.rec >= PASSIVE_FROM:
@@ -60,19 +60,19 @@ class Counters:
 
 
 ZERO: Final = Counters()
-"""Counters of a station after its start or its recovery from bus-off."""
+"""Error counters of a station after its start or its recovery from bus-off."""
 
 
 def transmission_failed(counters: Counters, *, unanswered: bool = False) -> Counters:
-    """Return the counters of a transmitter that sends an error flag (rule 3).
+    """Return the error counters of a transmitter after it sends an error flag (rule 3).
 
     Args:
-        counters: the counters before.
+        counters: error counters before the error.
         unanswered: whether the error is a missing acknowledgement and no other station sends a dominant bit
             during the error flag; an error-passive transmitter does not count such an error.
 
     Returns:
-        The counters after.
+        Error counters after the error.
     """
     if unanswered and counters.state is ErrorState.PASSIVE:
         return counters
@@ -80,26 +80,26 @@ def transmission_failed(counters: Counters, *, unanswered: bool = False) -> Coun
 
 
 def reception_failed(counters: Counters, *, first: bool = False) -> Counters:
-    """Return the counters of a receiver that detects an error (rules 1 and 2).
+    """Return the error counters of a receiver after it detects an error (rules 1 and 2).
 
     Args:
-        counters: the counters before.
+        counters: error counters before the error.
         first: whether the receiver detected the error before all other stations, so that it sees a dominant
             bit after its own error flag.
 
     Returns:
-        The counters after.
+        Error counters after the error.
     """
     return Counters(counters.tec, min(MAX_RECEIVE_ERRORS, counters.rec + (9 if first else 1)))
 
 
 def transmission_succeeded(counters: Counters) -> Counters:
-    """Return the counters of a transmitter after a successful transmission (rule 7)."""
+    """Return the error counters of a transmitter after a successful transmission (rule 7)."""
     return Counters(counters.tec - 1, counters.rec) if counters.tec else counters
 
 
 def reception_succeeded(counters: Counters) -> Counters:
-    """Return the counters of a receiver after a successful reception (rule 8)."""
+    """Return the error counters of a receiver after a successful reception (rule 8)."""
     if not counters.rec:
         return counters
     rec = _BACK_TO_ACTIVE if counters.rec >= PASSIVE_FROM else counters.rec - 1

@@ -1,7 +1,7 @@
-"""Rules that inject bit errors, and the bits that they hit.
+"""Rules that inject bit errors, and the bits that the rules disturb.
 
-A disturbance inverts one bit of a frame for all stations, or for one station only. Rules count every attempt
-to send a frame, so a rule can also destroy retransmissions.
+A disturbance inverts one bit of a frame, for all stations or for one station only. Rules count every
+transmission attempt, so a rule can also destroy retransmissions.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from vcan_sim.timed_bus.frame import CanFrame
 
 @dataclass(frozen=True, slots=True)
 class NthFrame:
-    """Disturb consecutive attempts to send an identifier.
+    """Rule that disturbs consecutive attempts to send frames with one identifier.
 
     Raises:
         ConfigError: if a number is out of range.
@@ -29,11 +29,11 @@ class NthFrame:
     attempts: int = 1
     """Number of disturbed attempts."""
     bit: int = 20
-    """Position of the disturbed bit, counted from the start of frame at 0, stuff bits included. A position
-    beyond the last but one bit of the end of frame means that bit."""
+    """Position of the disturbed bit, including stuff bits; the start of frame is 0. Larger positions than
+    that of the last but one bit of the end of frame refer to that bit."""
     extended: bool = False
     station: int | None = None
-    """Station that alone sees the disturbance; None if all stations see it."""
+    """Only station that sees the disturbance; None if all stations see it."""
 
     def __post_init__(self) -> None:
         for name, least in (("first", 1), ("attempts", 1), ("bit", 0)):
@@ -43,14 +43,14 @@ class NthFrame:
 
 @dataclass(frozen=True, slots=True)
 class RandomShare:
-    """Disturb a share of all attempts, at random.
+    """Rule that disturbs a random share of all transmission attempts.
 
     Raises:
         ConfigError: if the share is not a probability, or the position is negative.
     """
 
     share: float
-    """Probability that an attempt is disturbed, 0 to 1."""
+    """Probability that a transmission attempt is disturbed, 0 to 1."""
     seed: int
     can_id: int | None = None
     """Identifier of the disturbed frames; None for all frames."""
@@ -58,7 +58,7 @@ class RandomShare:
     """Position of the disturbed bit, as in :class:`NthFrame`; None for a uniformly distributed position."""
     extended: bool = False
     station: int | None = None
-    """Station that alone sees the disturbance; None if all stations see it."""
+    """Only station that sees the disturbance; None if all stations see it."""
 
     def __post_init__(self) -> None:
         if not 0 <= self.share <= 1:
@@ -69,7 +69,7 @@ class RandomShare:
 
 @dataclass(frozen=True, slots=True)
 class AtTime:
-    """Disturb the bit on the bus at a time; no effect if the bus is idle then.
+    """Rule that disturbs the bit on the bus at a given time; it has no effect if the bus is then idle.
 
     Raises:
         ConfigError: if the time is negative.
@@ -77,7 +77,7 @@ class AtTime:
 
     time_ns: int
     station: int | None = None
-    """Station that alone sees the disturbance; None if all stations see it."""
+    """Only station that sees the disturbance; None if all stations see it."""
 
     def __post_init__(self) -> None:
         if self.time_ns < 0:
@@ -88,31 +88,32 @@ Disturbance = NthFrame | RandomShare | AtTime
 
 
 class Attempt(NamedTuple):
-    """Attempt to send a frame, as the rules see it."""
+    """Transmission attempt, with the data that the rules need."""
 
     frame: CanFrame
     n_bits: Callable[[], int]
-    """Return the number of positions at which the frame can be disturbed."""
+    """Function that returns the number of bit positions at which the frame can be disturbed."""
     bit_at: Callable[[int], int | None]
-    """Return the position of the bit on the bus at a time in ns; None if the frame is not on the bus then."""
+    """Function that returns the position of the bit on the bus at a time, ns, or None if the frame is not
+    then on the bus."""
 
 
 class Hit(NamedTuple):
-    """Disturbed bit; the earliest position sorts first."""
+    """Disturbed bit of a frame; hits sort by bit position."""
 
     bit: int
     station: int
-    """Station that alone sees the disturbance; -1 if all stations see it."""
+    """Only station that sees the disturbance; -1 if all stations see it."""
 
 
 Rule = Callable[[Attempt], int | None]
 
 
 class Disturbances:
-    """Rules in force, with their counts and random numbers.
+    """Active disturbance rules, with their counts of attempts and random generators.
 
     Args:
-        rules: the rules.
+        rules: disturbance rules to start with.
     """
 
     def __init__(self, rules: Sequence[Disturbance] = ()) -> None:
@@ -124,21 +125,21 @@ class Disturbances:
         return bool(self._rules)
 
     def add(self, rule: Disturbance) -> None:
-        """Add a rule, which counts attempts from now on.
+        """Add a rule, which counts transmission attempts from now on.
 
         Args:
-            rule: the rule.
+            rule: disturbance rule to add.
         """
         station = -1 if rule.station is None else rule.station
         self._rules.append((station, _compiled(rule)))
 
     def hit(self, attempt: Attempt) -> Hit | None:
-        """Return the first bit of an attempt that a rule disturbs, or None.
+        """Return the first bit of a transmission attempt that any rule disturbs, or None.
 
-        Call once for each attempt, because the rules count attempts.
+        Call this method exactly once per attempt, because the rules count their calls.
 
         Args:
-            attempt: the attempt.
+            attempt: transmission attempt to check.
         """
         hits = []
         for station, rule in self._rules:

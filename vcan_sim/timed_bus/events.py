@@ -1,4 +1,4 @@
-"""Events on the bus. Times are whole nanoseconds, rounded up from the exact time."""
+"""Events on a simulated bus. Times are whole nanoseconds, rounded up from the exact time."""
 
 from __future__ import annotations
 
@@ -13,50 +13,50 @@ class Cause(enum.StrEnum):
     """Cause of an error frame."""
 
     DISTURBED = "disturbed"
-    """An injected disturbance."""
+    """An injected disturbance inverted a bit."""
     COLLISION = "collision"
     """Another station sent a different frame with the same identifier."""
     NO_ACK = "not acknowledged"
-    """No other station received the frame."""
+    """No other station acknowledged the frame."""
     CUT_OFF = "cut off"
     """The transmitter was disconnected during its frame."""
 
 
 class Delivered(NamedTuple):
-    """Frame that was sent without error, at the last bit of its end of frame."""
+    """Event: a frame was sent without error; its time is the end of the frame's last bit."""
 
     time_ns: int
     station: int
     """Station that sent the frame."""
     frame: CanFrame
     receivers: tuple[int, ...]
-    """Stations that received the frame; empty if another station sent the same bits in the same instant, and
-    the event of that station names the receivers."""
+    """Stations that received the frame. If several stations sent the same bits simultaneously, only the first
+    event lists the receivers; the tuple is empty in the others."""
     queued_ns: int
-    """Time at which the station handed in the frame."""
+    """Time at which the station queued the frame, ns."""
     started_ns: int
-    """Time of the start of frame of the successful attempt."""
+    """Start of frame of the successful attempt, ns."""
 
 
 class ErrorFrame(NamedTuple):
-    """Error flag, at the start of its first bit."""
+    """Event: an error flag; its time is the start of the flag's first bit."""
 
     time_ns: int
     stations: tuple[int, ...]
-    """Stations whose frame failed; they send it again. Empty if only a receiver lost the frame."""
+    """Stations whose frame failed and will be retransmitted; empty if only a receiver lost the frame."""
     frames: tuple[CanFrame, ...]
-    """Frame on the bus; several if different frames collided, in the order of ``stations``."""
+    """Frame on the bus; if different frames collided, all these frames in the order of ``stations``."""
     bit: int
     """Position of the bit in which the error was detected, counted from the start of frame at 0."""
     cause: Cause
     detected_by: tuple[int, ...]
-    """Stations that detected the error in this bit; other stations detect it by the error flag."""
+    """Stations that detected the error in bit ``bit``; other stations are notified by the error flag."""
     destroyed: bool
-    """Whether the error flag destroyed the frame; passive error flags of receivers do not."""
+    """Whether the error flag destroyed the frame; passive error flags of receivers do not destroy frames."""
 
 
 class CountersChanged(NamedTuple):
-    """Change of a station's error counters."""
+    """Event: a station's error counters changed."""
 
     time_ns: int
     station: int
@@ -64,14 +64,14 @@ class CountersChanged(NamedTuple):
 
 
 class BusOff(NamedTuple):
-    """Start of a station's bus-off state; its queue is kept."""
+    """Event: a station went bus-off; its transmit queue is kept."""
 
     time_ns: int
     station: int
 
 
 class Recovered(NamedTuple):
-    """End of a station's bus-off state, with both error counters at 0."""
+    """Event: a station recovered from bus-off, with both error counters at 0."""
 
     time_ns: int
     station: int

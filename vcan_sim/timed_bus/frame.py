@@ -1,4 +1,4 @@
-"""CAN frames as a station hands them to its controller."""
+"""CAN frames, as passed from a station to its controller."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ _VALID_FD_LENGTHS: Final = frozenset(FD_LENGTHS)
 
 @dataclass(frozen=True, slots=True)
 class CanFrame:
-    """Data frame or remote frame, classic or CAN FD.
+    """Data frame or remote frame, classic CAN or CAN FD.
 
-    The error state indicator of a CAN FD frame is not part of it: the controller sends ESI dominant while its
-    station is error-active, and recessive while its station is error-passive.
+    This class does not contain a CAN FD frame's error state indicator (ESI), because the controller sets it:
+    ESI is dominant while the station is error-active, and recessive while the station is error-passive.
 
     Raises:
         ValueError: if the identifier, the length or the combination of flags is not valid.
@@ -26,11 +26,12 @@ class CanFrame:
     can_id: int
     """Identifier of 11 bits, or of 29 bits if ``extended``."""
     data: bytes = b""
-    """Data, 0 to 8 bytes; CAN FD also 12, 16, 20, 24, 32, 48 or 64 bytes; empty for a remote frame."""
+    """Data of 0 to 8 bytes, or with CAN FD also 12, 16, 20, 24, 32, 48 or 64 bytes; empty for a remote
+    frame."""
     extended: bool = False
     remote: bool = False
     dlc: int = 0
-    """Length code of a remote frame, 0 to 8; data frames ignore it."""
+    """Data length code (DLC) of a remote frame, 0 to 8; ignored for data frames."""
     fd: bool = False
     brs: bool = False
     """Whether a CAN FD frame switches to the data bit rate."""
@@ -57,14 +58,14 @@ class CanFrame:
 
 
 def arbitration_key(frame: CanFrame) -> int:
-    """Return the bits of the arbitration field as a number: the frame with the lowest number wins.
+    """Return the arbitration field's bits as a number: the frame with the lowest number wins arbitration.
 
-    The order is that of the bits on the bus, dominant before recessive: base identifier, RTR or SRR, IDE,
-    identifier extension, RTR (ISO 11898-1:2015). A base frame has zeros in the place of the extension;
-    against a base frame, an extended frame loses at SRR or IDE at the latest.
+    The bits are in the order in which they are sent: base identifier, RTR or SRR, IDE, identifier extension,
+    RTR (ISO 11898-1:2015). Dominant bits are 0. A base frame has zeros in place of the extension, because an
+    extended frame loses to a base frame with the same base identifier at SRR or IDE.
 
     Args:
-        frame: the frame.
+        frame: frame to send.
 
     Returns:
         32-bit number.
@@ -76,16 +77,16 @@ def arbitration_key(frame: CanFrame) -> int:
 
 
 def frame_bits(frame: CanFrame, esi: bool = False) -> tuple[int, int]:
-    """Return the exact number of bits of a frame, from start of frame to the end of the inter-frame space.
+    """Return the exact number of bits from a frame's start of frame to the end of the inter-frame space.
 
     Args:
-        frame: the frame.
+        frame: frame to measure.
         esi: whether the error state indicator of a CAN FD frame is recessive.
 
     Returns:
-        Bits at the nominal and at the data bit rate. The bit rate changes at the sample points of BRS and of
-        the CRC delimiter; BRS counts as one nominal bit and the delimiter as one data bit, which gives the
-        same total.
+        Number of bits at the nominal bit rate and at the data bit rate. The bit rate changes at the sample
+        points of the BRS bit and the CRC delimiter. Counting BRS as one nominal bit and the delimiter as one
+        data bit yields the same total duration.
     """
     if frame.fd:
         return exact_fd_bits(frame.can_id, frame.data, extended=frame.extended, brs=frame.brs, esi=esi)

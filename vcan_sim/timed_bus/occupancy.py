@@ -1,4 +1,4 @@
-"""Intervals in which a bus was busy, and its load in any interval."""
+"""Intervals in which a bus was busy, and the bus load in any interval."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from array import array
 
 
 class Occupancy:
-    """Record of busy intervals. Adjacent intervals are merged, so a saturated bus takes one entry.
+    """Record of a bus's busy intervals. Adjacent intervals are merged, so a saturated bus needs one entry.
 
-    An entry takes 24 bytes; :meth:`forget` limits the memory of a long run.
+    An entry takes 24 bytes; :meth:`forget` limits the memory in long runs.
     """
 
     def __init__(self) -> None:
@@ -18,11 +18,11 @@ class Occupancy:
         self._busy_before = array("q")
 
     def add(self, start_ns: int, end_ns: int) -> None:
-        """Add a busy interval that starts at or after the end of the last one.
+        """Add a busy interval, which must not start before the end of the last interval.
 
         Args:
-            start_ns: start, ns.
-            end_ns: end, ns.
+            start_ns: start of the interval, ns.
+            end_ns: end of the interval, ns.
         """
         ends = self._ends
         if ends and ends[-1] == start_ns:
@@ -34,15 +34,15 @@ class Occupancy:
         self._busy_before.append(before)
 
     def end_last_at(self, end_ns: int) -> None:
-        """Change the end of the last interval, ns."""
+        """Set the end of the last busy interval, ns."""
         self._ends[-1] = end_ns
 
     def busy_ns(self, from_ns: int, to_ns: int) -> int:
-        """Return the busy time between two times, ns."""
+        """Return how long the bus was busy between two times, ns."""
         return self._busy_until(to_ns) - self._busy_until(from_ns)
 
     def forget(self, before_ns: int) -> None:
-        """Drop all intervals that ended before a time, ns; later queries must start at or after it."""
+        """Drop all intervals that ended before ``before_ns``; later queries must not start before it."""
         n = bisect.bisect_left(self._ends, before_ns)
         for column in (self._starts, self._ends, self._busy_before):
             del column[:n]

@@ -1,6 +1,6 @@
-"""Stations of the bus: options of their controllers, their state, and the attempt in progress.
+"""Stations of a simulated bus: controller options, station state, and the transmission attempt in progress.
 
-Only :mod:`vcan_sim.timed_bus.bus` changes the state.
+Only :mod:`vcan_sim.timed_bus.bus` changes a station's state.
 """
 
 from __future__ import annotations
@@ -16,18 +16,19 @@ from vcan_sim.timed_bus.transmit_queue import FifoQueue, PriorityQueue, Transmit
 
 @dataclass(frozen=True, slots=True)
 class StationOptions:
-    """Properties of a station's controller.
+    """Options of a station's CAN controller.
 
     Raises:
         ConfigError: if an option is not valid.
     """
 
     queue: Literal["fifo", "priority"] = "fifo"
-    """Order of transmission: as handed in, as a SocketCAN interface does, or the highest priority first."""
+    """Transmission order: first in, first out (``fifo``), as a SocketCAN interface does, or highest priority
+    first."""
     capacity: int | None = None
-    """Maximum number of frames to send, including the frame being sent; None for no limit."""
+    """Maximum number of queued frames, including the frame being sent; None for no limit."""
     restart_ns: int | None = 0
-    """Time from bus-off to the start of the recovery, ns; None to wait for
+    """Delay from bus-off to the start of the recovery, ns; None to wait for a call of
     :meth:`vcan_sim.timed_bus.bus.TimedBus.restart`."""
 
     def __post_init__(self) -> None:
@@ -40,7 +41,7 @@ class StationOptions:
 
 
 class Station:
-    """State of a station."""
+    """State of a station on a simulated bus."""
 
     __slots__ = (
         "connected",
@@ -68,16 +69,17 @@ class Station:
         self.recovers_from: int | None = None
         """Start of the recovery from bus-off, ticks; None if the station is not recovering."""
         self.runs_seen = 0
-        """Number of complete recessive runs seen during the recovery, until the last start of frame."""
+        """Number of complete recessive runs since the recovery began, counted up to the last start of
+        frame."""
 
     @property
     def on_bus(self) -> bool:
-        """Whether the station is connected and not bus-off."""
+        """Whether the station is connected and not in the bus-off state."""
         return self.connected and self.counters.state is not ErrorState.BUS_OFF
 
 
 class Flight:
-    """Attempt in progress."""
+    """Transmission attempt in progress."""
 
     __slots__ = ("course", "receivers", "side", "start", "waiting")
 
@@ -87,14 +89,14 @@ class Flight:
         self.start = start
         self.course = course
         self.waiting = waiting
-        """Frames that the attempt sends, by station."""
+        """Frames being sent in the attempt, by station."""
         self.receivers = receivers
-        """Stations on the bus at the start of frame that do not send."""
+        """Stations that were on the bus at the start of frame and do not send."""
         self.side = 0
-        """Number of side errors that have occurred."""
+        """Number of side errors of the course that have already occurred."""
 
     @property
     def next(self) -> int:
-        """Time of the next event of the attempt, ticks."""
+        """Time of the attempt's next event, ticks."""
         side = self.course.side_errors
         return self.start + (side[self.side].ticks if self.side < len(side) else self.course.end)

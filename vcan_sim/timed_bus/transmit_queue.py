@@ -1,4 +1,4 @@
-"""Transmit queues of a station."""
+"""Transmit queues for the stations of a simulated bus."""
 
 from __future__ import annotations
 
@@ -10,24 +10,24 @@ from vcan_sim.timed_bus.frame import CanFrame
 
 
 class Waiting(NamedTuple):
-    """Frame in a transmit queue; sorts by priority, then by age."""
+    """Frame in a transmit queue; frames sort by priority, then by age."""
 
     key: int
-    """Arbitration key, as :func:`vcan_sim.timed_bus.frame.arbitration_key` gives it."""
+    """Arbitration key from :func:`vcan_sim.timed_bus.frame.arbitration_key`."""
     number: int
-    """Sequence number on the bus."""
+    """Sequence number of the frame among all frames queued on the bus."""
     queued_ns: int
     frame: CanFrame
 
 
 class TransmitQueue(Protocol):
-    """Queue of one station; the frame being sent is not in it."""
+    """Transmit queue of one station, without the frame being sent."""
 
     def push(self, waiting: Waiting) -> None:
-        """Add a frame."""
+        """Add a frame to the queue."""
 
     def put_back(self, waiting: Waiting) -> None:
-        """Return a frame that was popped but not sent."""
+        """Put back a frame that was removed by :meth:`pop` but not sent."""
 
     def head(self) -> Waiting:
         """Return the frame to send next. The queue must not be empty."""
@@ -36,23 +36,23 @@ class TransmitQueue(Protocol):
         """Remove and return the frame to send next. The queue must not be empty."""
 
     def clear(self) -> None:
-        """Remove all frames."""
+        """Remove all frames from the queue."""
 
     def __len__(self) -> int: ...
 
 
 class FifoQueue:
-    """Queue that sends frames in the order in which they were handed in, as a SocketCAN interface does."""
+    """Transmit queue that sends frames in the order of queueing, as a SocketCAN interface does."""
 
     def __init__(self) -> None:
         self._frames: deque[Waiting] = deque()
 
     def push(self, waiting: Waiting) -> None:
-        """Add a frame."""
+        """Add a frame to the queue."""
         self._frames.append(waiting)
 
     def put_back(self, waiting: Waiting) -> None:
-        """Return a frame that was popped but not sent."""
+        """Put back a frame that was removed by :meth:`pop` but not sent."""
         self._frames.appendleft(waiting)
 
     def head(self) -> Waiting:
@@ -64,7 +64,7 @@ class FifoQueue:
         return self._frames.popleft()
 
     def clear(self) -> None:
-        """Remove all frames."""
+        """Remove all frames from the queue."""
         self._frames.clear()
 
     def __len__(self) -> int:
@@ -72,13 +72,13 @@ class FifoQueue:
 
 
 class PriorityQueue:
-    """Queue that sends the frame with the highest priority first, and equal priorities in order."""
+    """Transmit queue that sends the frame with the highest priority first, and equal priorities in order."""
 
     def __init__(self) -> None:
         self._frames: list[Waiting] = []
 
     def push(self, waiting: Waiting) -> None:
-        """Add a frame."""
+        """Add a frame to the queue."""
         heapq.heappush(self._frames, waiting)
 
     put_back = push
@@ -92,7 +92,7 @@ class PriorityQueue:
         return heapq.heappop(self._frames)
 
     def clear(self) -> None:
-        """Remove all frames."""
+        """Remove all frames from the queue."""
         self._frames.clear()
 
     def __len__(self) -> int:

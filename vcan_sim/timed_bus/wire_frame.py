@@ -1,7 +1,7 @@
-"""Frames bit by bit, to place errors in them (ISO 11898-1:2015).
+"""Bits of CAN frames on the bus, for placing errors in individual bits (ISO 11898-1:2015).
 
-This is the slow path: :mod:`vcan_sim.timed_bus.bus` builds the bits of a frame only if a rule disturbs it,
-no station acknowledges it, or two stations send the same identifier.
+Building the bits of a frame is slow. :mod:`vcan_sim.timed_bus.bus` therefore does so only if a rule disturbs
+the frame, no station acknowledges it, or two stations send the same identifier.
 """
 
 from __future__ import annotations
@@ -14,14 +14,15 @@ from skinnode.canopen.data_length import FD_LENGTHS
 from vcan_sim.timed_bus.frame import CanFrame
 
 FLAG_BITS: Final = 6
-"""Length of one station's error flag, bits; also the length of a run that violates the stuff rule."""
+"""Length of one station's error flag, bits; also the length of a run of equal bits that violates the stuff
+rule."""
 
 ACK_TO_END_BITS: Final = 9
-"""Length of ACK slot, ACK delimiter and end of frame, bits."""
+"""Total length of ACK slot, ACK delimiter and end of frame, bits."""
 
 _STUFF_AFTER: Final = 5
 _FIXED_STUFF_SPACING: Final = 5
-_MAX_LAG: Final = 7  # four recessive bits of the CRC, CRC delimiter, ACK slot and ACK delimiter
+_MAX_LAG: Final = 7  # four recessive CRC bits, CRC delimiter, ACK slot and ACK delimiter
 _CRC_15: Final = 0x4599
 _CRC_17: Final = 0x1685B
 _CRC_21: Final = 0x102899
@@ -29,20 +30,21 @@ _CRC_21: Final = 0x102899
 
 @dataclass(frozen=True, slots=True)
 class WireFrame:
-    """Acknowledged frame as its bits on the bus, stuff bits included; 0 is dominant."""
+    """Bits of an acknowledged frame on the bus, including stuff bits; 0 is dominant."""
 
     bits: tuple[int, ...]
     """All bits from start of frame to the last bit of the end of frame."""
     stuffed_end: int
-    """Number of bits that follow the stuff rule: up to the CRC sequence, CAN FD up to the data."""
+    """Number of bits, including stuff bits, that follow the stuff rule: up to the CRC sequence, or in CAN FD
+    up to the data."""
     plain: int
-    """Number of these bits without the stuff bits."""
+    """Number of bits that follow the stuff rule, without the stuff bits."""
     fixed_stuff: tuple[int, ...]
     """Positions of the fixed stuff bits of CAN FD."""
     delimiter: int
     """Position of the CRC delimiter."""
     data_phase: range
-    """Positions of the bits at the data bit rate; empty if the frame does not switch the bit rate."""
+    """Positions of the bits sent at the data bit rate; empty if the frame does not switch the bit rate."""
 
     @property
     def ack_slot(self) -> int:
@@ -50,20 +52,20 @@ class WireFrame:
         return self.delimiter + 1
 
     def bits_through(self, position: int) -> tuple[int, int]:
-        """Return the number of nominal and of data bits from start of frame to a position, inclusive."""
+        """Return the numbers of nominal and data bits from the start of frame through a position."""
         fast = max(0, min(position + 1, self.data_phase.stop) - self.data_phase.start)
         return position + 1 - fast, fast
 
 
 def wire_frame(frame: CanFrame, esi: bool = False) -> WireFrame:
-    """Build the bits of a frame.
+    """Build the bits of a frame on the bus.
 
     Args:
-        frame: the frame.
+        frame: frame to send.
         esi: whether the error state indicator of a CAN FD frame is recessive.
 
     Returns:
-        The frame on the bus, with a dominant ACK slot.
+        Bits of the frame, with a dominant ACK slot.
     """
     tail = (1, 0, 1, *(1,) * 7)  # CRC delimiter, ACK slot, ACK delimiter, end of frame
     head = tuple(_head(frame, esi))
@@ -75,7 +77,7 @@ def wire_frame(frame: CanFrame, esi: bool = False) -> WireFrame:
         return WireFrame((*stuffed, *tail), n, n - len(places), (), n, range(0))
 
     stuffed, places = _stuffed((*head, *payload))
-    if places[-1:] == [len(stuffed) - 1]:  # the first fixed stuff bit takes the place of this one
+    if places[-1:] == [len(stuffed) - 1]:  # the first fixed stuff bit replaces this stuff bit
         del stuffed[-1], places[-1]
     count = len(places) % 8
     gray = count ^ count >> 1
@@ -100,19 +102,20 @@ def wire_frame(frame: CanFrame, esi: bool = False) -> WireFrame:
 def receiver_lag(wire: WireFrame, position: int, seen: int, flag: int) -> int:
     """Return how many bits of an error flag a receiver sees before it detects an error itself.
 
-    The flag starts after ``position``. It violates the stuff rule, the rule for fixed stuff bits, or the form
-    of the delimiters and the end of frame; otherwise the CRC is wrong, which a receiver reports after the ACK
-    delimiter (ISO 11898-1:2015). The receiver removes the stuff bits that it sees itself.
+    The error flag starts after ``position``. It violates the stuff rule, the rule for fixed stuff bits, or
+    the form of the delimiters and the end of frame. If it violates none of these, the CRC is wrong, which a
+    receiver reports after the ACK delimiter (ISO 11898-1:2015). The receiver removes stuff bits from the bits
+    it sees.
 
     Args:
-        wire: the frame.
+        wire: bits of the frame on the bus.
         position: position of the bit in which the first station detects the error.
-        seen: value of this bit as the receiver sees it.
+        seen: value of the bit at ``position`` as seen by the receiver.
         flag: 0 for an active error flag, 1 for a passive error flag.
 
     Returns:
-        Number of bits, 0 to 6 for an active and 0 to 7 for a passive error flag; 0 if the bit itself is an
-        error for the receiver.
+        Number of bits: 0 to 6 for an active error flag, 0 to 7 for a passive error flag; 0 if the bit at
+        ``position`` is itself an error for the receiver.
     """
     stream = (*wire.bits[:position], seen, *(flag,) * _MAX_LAG)
     last = run = plain = 0
@@ -146,7 +149,7 @@ def receiver_lag(wire: WireFrame, position: int, seen: int, flag: int) -> int:
 
 
 def _head(frame: CanFrame, esi: bool) -> Iterator[int]:
-    """Yield the bits from start of frame to the length code."""
+    """Yield a frame's bits from the start of frame to the data length code."""
 
     def field(value: int, width: int) -> Iterator[int]:
         return (value >> shift & 1 for shift in range(width - 1, -1, -1))
@@ -169,7 +172,7 @@ def _head(frame: CanFrame, esi: bool) -> Iterator[int]:
 
 
 def _stuffed(bits: Sequence[int]) -> tuple[list[int], list[int]]:
-    """Return the bits with stuff bits, and the positions of the stuff bits."""
+    """Insert stuff bits; return the stuffed bits and the positions of the stuff bits."""
     out: list[int] = []
     places: list[int] = []
     run = 0
@@ -184,7 +187,7 @@ def _stuffed(bits: Sequence[int]) -> tuple[list[int], list[int]]:
 
 
 def _with_stuff_bits(place: int, stuff_places: Sequence[int]) -> int:
-    """Return the position on the bus of the bit at ``place`` in the unstuffed frame."""
+    """Return the stuffed-frame position of the bit at ``place`` in the unstuffed frame."""
     for stuff in stuff_places:
         if stuff > place:
             break

@@ -1,9 +1,10 @@
-"""Compiled kernel that follows, for each crossing, how often its code has repeated and what moved meanwhile.
+"""Track in a compiled kernel how often each crossing's code has repeated, and how its neighbours changed.
 
-A crossing's *run* is the number of times that its code has arrived again without a change. Its *lead* along
-the upper wire is the change, since its run began, of the codes of its two neighbours on the same upper wire:
-the smaller of the two amounts, with their sign, or 0 if their signs differ. Its lead across is the same for
-its neighbours on the same lower wire. At an edge, the two nearest crossings on one side are the neighbours.
+A crossing's *run* is the number of scans in which its code has been repeated without a change. A crossing's
+*lead* measures how far the codes of its neighbours have changed since the run began. The lead along the upper
+wire is the smaller of the changes of the two neighbours on the same upper wire, or 0 if the changes have
+different signs. The lead across is the same quantity for the two neighbours on the same lower wire. A
+crossing at the edge has the two nearest crossings on one side as neighbours.
 """
 
 from __future__ import annotations
@@ -17,32 +18,33 @@ from skinnode.compiled.jit import njit_brief, njit_part
 from skinnode.protocol.codes import MISSING as _MISSING
 
 LAST, BEFORE, RUN, NAMED, ALONG, ACROSS, _ANCHORS = range(7)
-"""Planes of the state: last code (-1 before the first), its predecessor, run, whether the crossing belongs to
-a part that was named as frozen, lead along the upper wire, lead across; then four neighbours' codes when the
-run began."""
+"""Planes of the state array: last code (-1 before the first code), previous code, run, flag of a crossing in
+a part already detected as frozen, lead along the upper wire, lead across. Four further planes contain the
+neighbours' codes at the beginning of the run."""
 _PLANES: Final = 10
 
 UPPER, LOWER, CROSSING, WIRE_LEAD, CROSSING_LEAD, STEPS, FRESH = range(7)
-"""Limits: runs from which an upper wire, a lower wire and a crossing repeat improbably often; leads from
-which a crossing counts for its wire, and proves that it is frozen itself; highest code of a measurement;
-1 if every code was sent with this scan, 0 if a repeated code is no evidence because unchanged codes were not
-sent."""
+"""Indices of the limits. ``UPPER``, ``LOWER`` and ``CROSSING``: minimum run of a frozen upper wire, lower
+wire and crossing. ``WIRE_LEAD`` and ``CROSSING_LEAD``: minimum lead of a crossing as evidence that its wire,
+or the crossing itself, is frozen. ``STEPS``: highest code of a measurement. ``FRESH``: 1 if the scan contains
+every code, 0 if unchanged codes were not sent and a repeated code is therefore no evidence."""
 MEASURED, CHANGED, RETURNED, LARGEST, RESERVED, LEAST, RELEASED, SUSPECT = range(8)
-"""Results: number of crossings received and measured, of those that changed, and of those that returned to
-the code before; largest change; number of crossings whose last code is reserved; smallest code; number of
-named crossings that changed; whether a part that is not named may be frozen."""
+"""Indices of the results. ``MEASURED``, ``CHANGED`` and ``RETURNED``: number of crossings with a measurement,
+with a changed code, and with the code before the last change. ``LARGEST``: largest change of a code.
+``RESERVED``: number of crossings whose last code is reserved. ``LEAST``: smallest code. ``RELEASED``: number
+of changed crossings in parts detected as frozen. ``SUSPECT``: whether a further part may be frozen."""
 
 LEAST_RUN: Final = 5
-"""Minimum run of a frozen crossing, of a part without noise and of a frozen patch, in scans. A wire whose
-neighbours have moved needs no more than one."""
+"""Minimum run of a frozen crossing, of a frozen part without noise and of a frozen patch, scans. A frozen
+wire whose neighbours have changed needs only a run of one scan."""
 LEADS: Final = 3
-"""Minimum number of crossings of a frozen wire whose neighbours have moved."""
+"""Minimum number of crossings with changed neighbours on a wire detected as frozen by movement."""
 
 _Int = NDArray[np.int64]
 
 
 def new_runs(shape: tuple[int, int]) -> _Int:
-    """Return the state (10, U, K) before the first scan."""
+    """Return the state array before the first scan, (10, U, K) int64."""
     state = np.zeros((_PLANES, *shape), np.int64)
     state[LAST] = state[BEFORE] = -1
     return state
@@ -50,11 +52,11 @@ def new_runs(shape: tuple[int, int]) -> _Int:
 
 @njit_brief
 def follow(codes: NDArray[np.uint32], state: _Int, limits: _Int, found: _Int) -> None:
-    """Update the runs with the codes of a scan.
+    """Update the runs and leads with the codes of a scan.
 
     Args:
         codes: (U, K) codes; a missing code neither repeats nor changes.
-        state: (10, U, K) planes; updated.
+        state: (10, U, K) state array; updated in place.
         limits: (7,) limits.
         found: (8,) results; overwritten.
     """
@@ -91,7 +93,7 @@ def follow(codes: NDArray[np.uint32], state: _Int, limits: _Int, found: _Int) ->
 
 @njit_part
 def _update_leads(state: _Int, steps: int) -> None:
-    """Update the leads, and the neighbours' codes at the beginning of each run."""
+    """Update the leads, and store the neighbours' codes at the beginning of each run."""
     rows, columns = state.shape[1], state.shape[2]
     for u in range(rows):
         for k in range(columns):
@@ -138,13 +140,13 @@ def _set_lead(state: _Int, u: int, k: int, axis: int, a: int, b: int, steps: int
 
 @njit_part
 def _counts(state: _Int, u: int, k: int, steps: int) -> bool:
-    """Return whether a crossing is measured and does not belong to a named part."""
+    """Return whether a crossing's last code is a measurement, and the crossing is not marked as frozen."""
     return bool(0 <= state[LAST, u, k] <= steps and state[NAMED, u, k] == 0)
 
 
 @njit_part
 def _any_crossing(state: _Int, limits: _Int) -> bool:
-    """Return whether a crossing repeats while its neighbours move, or much longer than most others."""
+    """Return whether a crossing repeats its code while its neighbours change, or longer than most others."""
     known = still = longest = 0
     lead = limits[CROSSING_LEAD]
     for u in range(state.shape[1]):
@@ -162,7 +164,7 @@ def _any_crossing(state: _Int, limits: _Int) -> bool:
 
 @njit_part
 def _any_wire(state: _Int, limits: _Int) -> bool:
-    """Return whether a wire repeats while its neighbours move, or much longer than most crossings."""
+    """Return whether a wire repeats its codes while its neighbours change, or longer than most crossings."""
     for side in range(2):
         wires, others = state.shape[1 + side], state.shape[2 - side]
         known = still = 0
@@ -187,7 +189,7 @@ def _any_wire(state: _Int, limits: _Int) -> bool:
 
 
 def compile_kernels() -> None:
-    """Compile the kernel, or load it from the cache, before the first scan, whose codes are read-only."""
+    """Compile the kernel for read-only codes, or load it from the cache, before the first scan arrives."""
     codes = np.zeros((1, 1), np.uint32)
     codes.setflags(write=False)
     follow(codes, new_runs((1, 1)), np.zeros(7, np.int64), np.zeros(8, np.int64))

@@ -1,6 +1,6 @@
-"""Hand frames: the fields and contacts of all patches for one SYNC, assembled on the thread that reads them.
+"""Assemble hand frames, which contain the fields and contacts of all patches for one SYNC.
 
-This module starts no threads.
+Hand frames are assembled on the reading thread; no other thread is started.
 """
 
 from __future__ import annotations
@@ -22,63 +22,63 @@ from skinnode.model.pose import Pose
 from skinnode.process import clock
 
 LATE: Final = "late"
-"""Reason for a missing field: the patch is operational, but its field did not arrive in time."""
+"""Reason for a missing field if the patch is operational but its field did not arrive in time."""
 OVERTAKEN: Final = "overtaken"
-"""Reason for a missing field: a newer scan from the patch arrived first."""
+"""Reason for a missing field if the field of a newer scan of the patch arrived first."""
 
 
 @dataclass(frozen=True, eq=False)
 class HandFrame:
-    """The fields of all patches for one SYNC, and their contacts in the frames of the links and of the hand.
+    """Fields of all patches for one SYNC, with their contacts in the coordinate frames of links and hand.
 
     Contacts and wrenches are computed on first use.
     """
 
     scan: int
-    """Number of this SYNC, counted from the start of the host without wrapping; also the scan number of every
+    """Number of the SYNC, counted from the start of the host without wrapping; also the scan number of every
     field."""
     t_sync_ns: int
-    """Monotonic time at which SYNC was sent or received on the last bus; 0 if unknown. Each field holds the
-    time of its own bus, because SYNC may be staggered (``sync.stagger_ms``)."""
+    """Monotonic time at which SYNC was sent or received on the last bus, ns; 0 if unknown. Because SYNC may
+    be staggered (``sync.stagger_ms``), each field has the time of its own bus."""
     fields: Mapping[str, FieldFrame]
-    """Field by patch name."""
+    """Fields by patch name."""
     missing: Mapping[str, str]
-    """Why the field of a patch is missing: :data:`LATE`, :data:`OVERTAKEN`, or the condition of the patch,
+    """Reasons for missing fields by patch name: :data:`LATE`, :data:`OVERTAKEN`, or the patch's condition,
     such as ``lost``."""
     skeleton: Skeleton = field(default_factory=Skeleton)
-    """Places of the patches on the robot."""
+    """Poses of the patches and links on the robot."""
 
     @property
     def complete(self) -> bool:
-        """Whether all patches are present."""
+        """Whether the fields of all patches are present."""
         return not self.missing
 
     @property
     def trusted(self) -> bool:
-        """Whether no field is missing and all are trusted."""
+        """Whether no field is missing and all fields are trusted."""
         return not self.missing and all(each.trusted for each in self.fields.values())
 
     @property
     def precise(self) -> bool:
-        """Whether no field is missing and the deviations of all are within the limits that the user set."""
+        """Whether no field is missing and all standard deviations are within the user's limits."""
         return not self.missing and all(each.precise for each in self.fields.values())
 
     @property
     def distrust(self) -> Mapping[str, str]:
-        """Why patches are not to be trusted, in words, by patch name; empty if the frame is trusted."""
+        """Reason why each untrusted patch is not trusted, in words, by patch name."""
         reasons = {patch: f"no field: {reason}" for patch, reason in self.missing.items()}
         return reasons | {name: why_not(each) for name, each in self.fields.items() if not each.trusted}
 
     @functools.cached_property
     def contacts(self) -> tuple[HandContact, ...]:
-        """The contacts on all patches in the frame of the hand, largest normal force first."""
+        """Contacts on all patches in the hand's coordinate frame, in descending order of normal force."""
         return tuple(each.moved(self.skeleton.link_pose(each.link)) for each in self._link_contacts)
 
     def contacts_on(self, link: str) -> tuple[HandContact, ...]:
-        """Return the contacts on the patches of a link in the frame of the link, largest normal force first.
+        """Return the contacts on a link's patches in the link's frame, in descending order of normal force.
 
         Args:
-            link: Name of the link; ``hand`` for the patches without a link.
+            link: Name of the link; ``hand`` for patches without a link.
 
         Raises:
             ValueError: if the link carries no patch.
@@ -89,10 +89,10 @@ class HandFrame:
 
     @functools.cached_property
     def wrenches(self) -> Mapping[str, Wrench]:
-        """Force and torque on the skin of each link, by link name, about the origin of the link's frame.
+        """Force and torque on each link's skin about the origin of the link's frame, by link name.
 
-        Each link that carries a patch has an entry, even if nothing touches it. The link of the patches
-        without a link is ``hand``.
+        Each link that carries a patch has an entry, even without a contact. The entry ``hand`` is for patches
+        without a link.
         """
         patches: dict[str, list[str]] = {}
         for patch in (*self.fields, *self.missing):
@@ -114,14 +114,14 @@ class HandFrame:
         return wrench_of(self.contacts, HAND, trusted=self.trusted)
 
     def at(self, link_poses: Mapping[str, Pose]) -> HandFrame:
-        """Return the frame with other poses of the links, for example from the angles of the robot's joints.
+        """Return the hand frame with new link poses, for example from the robot's joint angles.
 
         Args:
-            link_poses: Poses in the frame of the hand by link name. Links that are not listed keep their
-                poses; links without patches are ignored.
+            link_poses: Poses in the coordinate frame of the hand, by link name. Links that are not listed
+                keep their poses; links without patches are ignored.
 
         Raises:
-            ValueError: if ``hand`` is listed, which is the frame of the hand itself.
+            ValueError: if ``hand`` is listed, because its frame is the reference.
         """
         if HAND in link_poses:
             raise ValueError(f"link_poses: got {HAND!r}, must be links that move in the hand")
@@ -130,7 +130,7 @@ class HandFrame:
 
     @functools.cached_property
     def _link_contacts(self) -> tuple[HandContact, ...]:
-        """The contacts on all patches, each in the frame of its link, largest normal force first."""
+        """Contacts on all patches, each in its link's frame, in descending order of normal force."""
         found = [
             HandContact.on_link(contact, patch, self.skeleton.mount(patch), trusted=each.trusted)
             for patch, each in self.fields.items()
@@ -140,19 +140,18 @@ class HandFrame:
 
 
 class HandGatherer:
-    """Assembler of hand frames from fields, in order of scan number.
+    """Assembler of hand frames from fields, in order of scan number. Uses no clock; not thread-safe.
 
-    Has neither a thread nor a clock; only one owner may use it.
-
-    A frame is ready when every awaited patch has delivered its field for the frame, or a newer field. A patch
-    that missed :data:`~skinnode.host.health.SCANS_MISSED` consecutive frames is no longer awaited until it
-    delivers again. No patch is awaited for longer than ``patience_ns`` after the first field.
+    A hand frame is ready when every awaited patch has delivered its field for the frame, or a newer field. A
+    patch whose fields were missing in :data:`~skinnode.host.health.SCANS_MISSED` consecutive hand frames is
+    not awaited until its next field. No patch is awaited for longer than ``patience_ns`` after the first
+    field.
 
     Args:
         patches: Names of the patches.
-        patience_ns: Maximum wait after the first field of a frame.
-        condition: Returns the condition of a patch.
-        skeleton: Places of the patches on the robot.
+        patience_ns: Maximum wait after the first field of a hand frame, ns.
+        condition: Function that returns the condition of a patch.
+        skeleton: Poses of the patches and links on the robot.
     """
 
     def __init__(
@@ -170,10 +169,10 @@ class HandGatherer:
         self._absences = dict.fromkeys(self._patches, 0)
         self._newest_given = 0
         self.late = 0
-        """Number of fields that arrived after their frame had been delivered."""
+        """Number of fields that arrived after their hand frame had been delivered."""
 
     def add(self, field: FieldFrame, now_ns: int) -> None:
-        """Add a field, received at monotonic time ``now_ns``."""
+        """Add a field that was received at monotonic time ``now_ns``."""
         stamp = field.stamp
         assert stamp is not None
         self._newest[stamp.patch] = stamp.scan
@@ -185,7 +184,7 @@ class HandGatherer:
         self._until_ns.setdefault(stamp.scan, now_ns + self._patience_ns)
 
     def next(self, now_ns: int) -> HandFrame | None:
-        """Return the oldest frame if it is ready at ``now_ns``, otherwise None."""
+        """Return the oldest hand frame if the frame is ready at ``now_ns``, otherwise None."""
         if not self._open:
             return None
         scan = min(self._open)
@@ -203,7 +202,7 @@ class HandGatherer:
         return HandFrame(scan, t_sync_ns, fields, missing, self._skeleton)
 
     def next_deadline_ns(self) -> int | None:
-        """Return the time from which :meth:`next` stops waiting for missing fields; None without a frame."""
+        """Return the deadline for the oldest frame's missing fields, ns; None if no frame is waiting."""
         return self._until_ns[min(self._open)] if self._open else None
 
     def _awaited(self, patch: str, scan: int) -> bool:
@@ -217,10 +216,10 @@ class HandGatherer:
 
 
 class HandSubscription:
-    """Subscription to hand frames. Iterate with ``for`` or ``async for``, or use :meth:`get`.
+    """Subscription to hand frames, read with ``for``, ``async for`` or :meth:`get`.
 
-    A slow reader loses the oldest fields, which are counted in ``dropped``, and then receives hand frames
-    with patches missing. One thread reads.
+    A slow reader loses the oldest fields, which are counted in ``dropped``, and receives hand frames with
+    missing fields. Only one thread may read.
     """
 
     def __init__(self, fields: Subscription, gatherer: HandGatherer, timeout_s: float | None) -> None:
@@ -229,22 +228,22 @@ class HandSubscription:
 
     @property
     def dropped(self) -> int:
-        """Fields lost because this subscriber was too slow."""
+        """Number of fields lost because this subscriber was too slow."""
         return self._fields.dropped
 
     @property
     def late(self) -> int:
-        """Number of fields that arrived after their frame had been delivered."""
+        """Number of fields that arrived after their hand frame had been delivered."""
         return self._gatherer.late
 
     def get(self, timeout_s: float | None = None) -> HandFrame | None:
-        """Return the next frame, or None.
+        """Return the next hand frame, or None if no frame arrives.
 
         Args:
-            timeout_s: Maximum wait, s; None: no limit.
+            timeout_s: Maximum wait for a hand frame, s; None for no limit.
 
         Returns:
-            The frame; None if no frame arrived in time, or if the host has closed.
+            The hand frame; None if no frame arrived in time, or if the host has closed.
 
         Raises:
             SkinError: the error that stopped the host, if any.
@@ -259,10 +258,10 @@ class HandSubscription:
         self._fields.close()
 
     def __iter__(self) -> Iterator[HandFrame]:
-        """Yield frames until the host closes.
+        """Yield hand frames until the host closes.
 
         Raises:
-            TimeoutError: if no frame arrived within the subscription's timeout.
+            TimeoutError: if no hand frame arrived within the subscription's timeout.
             SkinError: the error that stopped the host, if any.
         """
         while True:
@@ -275,7 +274,7 @@ class HandSubscription:
             yield frame
 
     async def __aiter__(self) -> AsyncIterator[HandFrame]:
-        """Yield frames asynchronously; otherwise like :meth:`__iter__`."""
+        """Yield hand frames until the host closes; asynchronous version of :meth:`__iter__`."""
         while True:
             end_ns = _end_ns(self._timeout_s)
             while (frame := self._gatherer.next(clock.monotonic_ns())) is None:
@@ -299,7 +298,7 @@ class HandSubscription:
         self.close()
 
     def _next(self, timeout_s: float | None) -> HandFrame | None:
-        """Return the next frame; raise queue.Empty after ``timeout_s``."""
+        """Return the next hand frame; raise queue.Empty after ``timeout_s``."""
         check_timeout(timeout_s)
         end_ns = _end_ns(timeout_s)
         while (frame := self._gatherer.next(clock.monotonic_ns())) is None:

@@ -1,7 +1,7 @@
-"""Limitations of a hand: what its hand file, layouts and noise keep it from delivering.
+"""Determine the limitations of a hand: results that its hand file, layouts and noise make impossible.
 
-A limitation is not an error. ``skinnode hand check`` lists them, so that nobody waits for a result that this
-hand cannot give.
+A limitation is not an error. ``skinnode hand check`` lists the limitations, so that users do not expect
+results that the hand cannot deliver.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ from skinnode.solve.tracker import choose_method
 from skinnode.solve.wires.problem import PatchProblem
 
 BY_PRIOR: Final = 0.3
-"""Standard deviation of the exact inverse at rest, in clearances, above which the displacement comes mostly
-from the neighbours and the elasticity: presses seldom indent the layer by more."""
+"""Standard deviation of the exact inverse at rest, as a fraction of the clearance, above which neighbours and
+elasticity mostly determine the displacement. Few presses indent the layer by a larger fraction."""
 
 
 _BY_PRIOR: Final = "neighbours and elasticity fill the gap (see data_share)"
@@ -32,20 +32,20 @@ _BY_PRIOR: Final = "neighbours and elasticity fill the gap (see data_share)"
 
 @dataclass(frozen=True, slots=True)
 class Limitation:
-    """Something that patches of a hand will not deliver."""
+    """Result that some patches of a hand cannot deliver."""
 
     patches: tuple[str, ...]
     """Names of the patches."""
     key: str
-    """Key of the hand file that could change it."""
+    """Key in the hand file that could remove the limitation."""
     text: str
-    """What is missing, and why."""
+    """Description of the missing result, and the reason."""
 
 
 def limitations(hand: HandConfig) -> list[Limitation]:
-    """Return the limitations of a hand; patches with the same limitation share an entry.
+    """Return the limitations of a hand, with one entry for all patches that share a limitation.
 
-    Nothing is compiled. The deadline is checked only if the kernels have been compiled before.
+    No kernels are compiled, so the solver's deadline is checked only if the kernels are already compiled.
     """
     patches: dict[tuple[str, str], list[str]] = {}
     for patch in hand.patches:
@@ -55,7 +55,7 @@ def limitations(hand: HandConfig) -> list[Limitation]:
 
 
 def _of_results(patch: PatchConfig, solver: SolverConfig) -> Iterator[tuple[str, str]]:
-    """Yield what the solver cannot compute for a patch."""
+    """Yield the keys and texts of results that the solver cannot compute for a patch."""
     layout = patch.layout.build()
     noise = math.hypot(patch.relative_noise, CodeScale(patch.code_bits).relative_std)
     options = tracker_options(patch, solver, relative_noise=noise)
@@ -67,25 +67,25 @@ def _of_results(patch: PatchConfig, solver: SolverConfig) -> Iterator[tuple[str,
         text = f"{layout.shape[1]} lower wires for {unknowns} unknowns per upper wire: {_BY_PRIOR}"
         yield "patches.layout", text
     elif share > BY_PRIOR and method == "posterior":
-        alone = f"at a noise of {noise:.0e} the resistances alone give ± {share:.0%} of the clearance"
+        alone = f"at a noise of {noise:.0e}, resistances alone give errors of ± {share:.0%} of the clearance"
         yield "patches.layout", f"{alone}: {_BY_PRIOR}"
     elif share > BY_PRIOR:
         yield (
             "solver.method",
-            f"at a noise of {noise:.0e} the exact inverse gives ± {share:.0%} of the clearance, which is "
-            'useless; method = "auto" uses the posterior',
+            f"at a noise of {noise:.0e}, the exact inverse has errors of ± {share:.0%} of the clearance, "
+            'which is useless; method = "auto" uses the posterior',
         )
     if method == "exact" and not patch.tolerances.build().exact:
         yield (
             "solver.method",
-            "the exact inverse cannot include the tolerances of the patch: its deviations hold only for "
-            'a patch that equals its layout; method = "auto" uses the posterior',
+            "the exact inverse cannot include the tolerances of the patch: its standard deviations are "
+            'correct only for a patch that equals its layout; method = "auto" uses the posterior',
         )
     if not patch.calibration.force_calibrated:
         yield (
             "patches.calibration",
-            "no calibrated forces: their deviations reach from a half-space to a layer bonded to metal "
-            "(force_calibrated)",
+            "no calibrated forces: their standard deviations cover the range from a half-space to a layer "
+            "bonded to metal (force_calibrated)",
         )
     if solver.normal_only:
         yield "solver.normal_only", "no shear, neither displacement nor force"
@@ -105,15 +105,15 @@ def _of_deadline(layout: PatchLayout, options: TrackerOptions, deadline_us: int)
     if needed_us > deadline_us:
         yield (
             "solver.deadline_us",
-            f"a new touch takes the posterior {needed_us:.0f} µs or more on this machine, longer than the "
-            f"deadline of {deadline_us} µs: its first fields will not be trusted",
+            f"the posterior needs at least {needed_us:.0f} µs for a new touch on this computer, longer than "
+            f"the deadline of {deadline_us} µs: the first fields of a touch will not be trusted",
         )
 
 
 def _of_place(patch: PatchConfig, hand: HandConfig) -> Iterator[tuple[str, str]]:
-    """Yield the frames in which the contacts of a patch are not available."""
+    """Yield the keys and texts of coordinate frames that are unavailable for a patch's contacts."""
     if "pose" not in patch.model_fields_set:
         yield "patches.pose", "no pose: contacts are in the frame of the patch itself"
     if patch.link is not None and patch.link not in [link.name for link in hand.links]:
-        text = f"link {patch.link!r} has no pose in the hand: the program has to give it (HandFrame.at)"
+        text = f"link {patch.link!r} has no pose in the hand: the program must supply the pose (HandFrame.at)"
         yield "links", text

@@ -1,4 +1,4 @@
-"""Decode and solve the scans of a patch: from codes to resistances to a field."""
+"""Decode the codes of a patch's scans to resistances, and solve them for fields."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ class ScanSolver:
 
     Args:
         facts: Layout, code scale and baseline of the patch.
-        config: Settings for the solver.
-        now: Returns the monotonic time at which a field is ready, ns.
+        config: Settings of the solver.
+        now: Function that returns the current monotonic time, ns.
     """
 
     def __init__(
@@ -54,17 +54,18 @@ class ScanSolver:
         self._decoder = Decoder(facts.baseline_ohm, scale)
 
     def decode(self, scan: Scan, stamp: ScanStamp) -> ResistanceFrame:
-        """Return the resistances of a scan, NaN where a code is not a measurement."""
+        """Return the resistances of a scan, with NaN where a code is not a measurement."""
         resistance_ohm, valid = self._decoder.decode(scan.codes)
         if self._codes.gain is not None:
             resistance_ohm *= self._codes.gain
         return ResistanceFrame(resistance_ohm, valid, stamp)
 
     def solve(self, scan: Scan, stamp: ScanStamp) -> tuple[FieldFrame, int]:
-        """Solve a scan. The noise from the front end and the noise in the codes are combined.
+        """Solve a scan, with the converter's noise and the rounding of the codes combined.
 
         Returns:
-            The stamped field, with read-only arrays, and the number of codes that are not measurements.
+            The field with its time stamp and read-only arrays, and the number of codes that are not
+            measurements.
         """
         self._tracker.scan = stamp.scan
         field, invalid = self._tracker.update_codes(scan.codes)
@@ -75,13 +76,13 @@ class ScanSolver:
 def tracker_options(
     patch: PatchConfig, config: SolverConfig, *, relative_noise: float, baseline_ohm: Float | None = None
 ) -> TrackerOptions:
-    """Return the options of the tracker of a patch.
+    """Return the options for a patch's tracker.
 
     Args:
-        patch: The patch.
-        config: Settings for the solver.
-        relative_noise: Relative standard deviation of R.
-        baseline_ohm: (U, K) resistances at rest, ohm; None if they are not known yet.
+        patch: Configuration of the patch.
+        config: Settings of the solver.
+        relative_noise: Standard deviation of a resistance, as a fraction of the resistance.
+        baseline_ohm: (U, K) ohm: resistances at rest; None if they are not known yet.
     """
     calibration = patch.calibration
     return TrackerOptions(
@@ -92,7 +93,7 @@ def tracker_options(
         stiffness_n_per_m=calibration.stiffness_n_per_m or config.stiffness_n_per_m,
         rubber=calibration.rubber,
         force_calibrated=calibration.force_calibrated,
-        # the exact inverse cannot include tolerances
+        # the exact inverse does not support tolerances
         tolerances=None if config.method == "exact" else patch.tolerances.build(),
         deadline_us=config.deadline_us,
         estimate_noise=config.estimate_noise,
@@ -104,12 +105,12 @@ def tracker_options(
 
 
 def check_solvable(patch: PatchConfig, config: SolverConfig) -> None:
-    """Check that a layout can be solved, compile the kernels or load them from the cache, prepare tables.
+    """Check that a patch's layout can be solved, and prepare the solver's kernels and tables.
 
-    Call this function before a node waits for the host.
+    Preparation takes time, so call this function before a node waits for the host.
 
     Raises:
-        ConfigError: if the layout can be sensed but not solved.
+        ConfigError: if the layout cannot be solved.
     """
     layout = patch.layout.build()
     try:

@@ -1,4 +1,4 @@
-"""State that the supervisor keeps for each node."""
+"""Define the state that the supervisor stores for each node."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from skinnode.model.layout import Float
 from skinnode.process import clock
 
 JOIN_DEADLINE_S: Final = 1.0
-"""Maximum time in s for a node that has sent any frame to send its first SDO response or to tare itself."""
+"""Maximum time for a node that has sent any frame to respond by SDO, or to tare itself, s."""
 
 LEAST_NS: Final = 300_000_000
-"""Minimum time from one bring-up of a node to the next, for nodes that restart in a loop."""
+"""Minimum time between two bring-ups of a node that restarts in a loop, ns."""
 
 
 class Phase(enum.StrEnum):
-    """Phase of a node in the supervisor."""
+    """Phase of a supervised node; see :mod:`skinnode.host.supervisor`."""
 
     AWAITED = "awaited"
     JOINING = "joining"
@@ -32,7 +32,7 @@ class Phase(enum.StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class NodeStats:
-    """The supervisor's statistics for a node."""
+    """Bring-up statistics of a node."""
 
     phase: Phase
     rejoins: int
@@ -40,14 +40,14 @@ class NodeStats:
     failures: int
     """Number of bring-ups after the host's start that failed."""
     baselines: int
-    """Number of times that a new baseline came into use."""
+    """Number of new baselines with which scans have been solved."""
     complaint: str | None
-    """Why the last bring-up failed; None if it succeeded."""
+    """Reason why the last bring-up failed; None if it succeeded."""
 
 
 @dataclass(frozen=True, slots=True)
 class Joined:
-    """Result of a job."""
+    """Result of a job that brought up a node or read its baseline."""
 
     solver: ScanSolver | None
     withholdings: int
@@ -55,27 +55,28 @@ class Joined:
 
 @dataclass(slots=True)
 class Supervised:
-    """State of one node. Used only by the supervisor's thread."""
+    """State of one supervised node. Used only by the supervisor's thread."""
 
     remote: RemoteNode
     phase: Phase
     since_ns: int
     read_ns: int
-    """Earliest time for the next reading of the node's baseline."""
+    """Earliest monotonic time for the next reading of the node's baseline, ns."""
     job: Future[Joined | None] | None = None
-    """Job that communicates with the node; its result is None if the job only reads the error register."""
+    """Running job that communicates with the node; the result is None if the job only reads the error
+    register."""
     searching: Future[bool] | None = None
     abandon: threading.Event = field(default_factory=clock.event)
-    """Set to stop the job."""
+    """Event that aborts the running job."""
     pause: Pause = field(default_factory=Pause)
     not_before_ns: int = 0
-    """End of the pause after a failed bring-up or a defect."""
+    """Monotonic time at which the pause after a failed bring-up or a defect ends, ns."""
     was_silent: bool = True
-    """Whether the node was silent, so that any frame from it ends the pause."""
+    """Whether any frame from the node ends the pause, because the node was silent or refused."""
     begun_ns: int = 0
-    """Start time of the newest bring-up."""
+    """Monotonic start time of the most recent bring-up, ns."""
     defects: int = 0
-    """Number of reported defects already handled."""
+    """Number of the node's reported defects that have been handled."""
     upset: bool = False
     """Whether supervising the node raised an exception, so that its state is unknown."""
     probe_ns: int = 0
@@ -83,12 +84,12 @@ class Supervised:
     register_ns: int = 0
     mute_ns: int = 0
     unconfigured: bool = False
-    """Whether a job found that the node has lost its configuration."""
+    """Whether a job has detected that the node lost its configuration."""
     rejoins: int = 0
     failures: int = 0
     baseline_ohm: Float | None = None
-    """Baseline with which the node's scans are solved; None before the first bring-up."""
+    """(U, K) ohm: baseline with which the node's scans are solved; None before the first bring-up."""
     announced: bool = False
-    """Whether the node announced a new baseline that is not in use yet."""
+    """Whether the node has announced a new baseline with which scans are not yet solved."""
     baselines: int = 0
     complaint: str | None = None

@@ -230,7 +230,7 @@ def test_a_hand_whose_displacements_come_from_the_prior_says_so(tmp_path: Path) 
     few = "layout = { lower_wires = 20 }\n"
     listed = notes(tmp_path, PALM + thick + TIP + few)
     by_layout = said(listed, "patches.layout")
-    assert "the resistances alone give ± 225% of the clearance" in by_layout["palm"]
+    assert "resistances alone give errors of ± 225% of the clearance" in by_layout["palm"]
     assert "20 lower wires for 30 unknowns per upper wire" in by_layout["tip"]
     assert not said(notes(tmp_path, PALM), "patches.layout")
 

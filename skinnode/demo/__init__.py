@@ -1,10 +1,10 @@
-"""Bring up, solve, score and show a simulated hand, for ``skinnode demo`` and ``--simulate``.
+"""Runs, scores and displays a simulated hand, for ``skinnode demo`` and ``skinnode monitor --simulate``.
 
 ::
 
     hand -> vcan_sim.fleet (nodes on a virtual bus) -> skinnode.host -> run (score against the truth) -> view,
     plot
 
-Only this package and two benchmarks import both simulator and host. The two communicate only through
-the bus; the simulator's truth is used only for scoring.
+Only this package and some benchmarks import both the simulator and the host. Simulator and host communicate
+only over the bus. The simulator's true displacements are used only for scoring.
 """

@@ -1,4 +1,4 @@
-"""The simulated hand of ``skinnode demo`` and of ``skinnode monitor --simulate``."""
+"""Defines the simulated hand of ``skinnode demo`` and ``skinnode monitor --simulate``."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from skinnode.config import HandConfig, parse_hand
 
 _NAMES: Final = ("palm", "thumb", "index", "middle", "ring", "little", "wrist", "back")
 _SYNC_MS_PER_PATCH: Final = 20
-"""SYNC period per patch, ms: 101 frames of up to 135 bits per scan load a 1 Mbit/s bus to 68 %."""
+"""SYNC period per patch, ms; 101 frames of up to 135 bits per scan then load a 1 Mbit/s bus to 68 %."""
 
 
 def demo_hand(patches: int, seed: int) -> HandConfig:
@@ -17,7 +17,7 @@ def demo_hand(patches: int, seed: int) -> HandConfig:
 
     Args:
         patches: Number of patches, 1 to 127.
-        seed: Seed of the scene and the converter noise.
+        seed: Seed of the simulated touches and of the converter noise.
     """
     names = [_NAMES[i] if i < len(_NAMES) else f"patch{i + 1}" for i in range(patches)]
     return parse_hand(

@@ -1,4 +1,4 @@
-"""Run of ``skinnode demo``: plays the scene, collects the fields and scores them against the truth."""
+"""Runs ``skinnode demo``: simulates the patches, collects the fields and compares them with the truth."""
 
 from __future__ import annotations
 
@@ -35,27 +35,27 @@ BITRATE_BPS: Final = 1_000_000
 _REDRAW_S: Final = 0.2
 _LINE_S: Final = 1.0
 _LULL_S: Final = 0.004
-"""Time without a new field, s, after which all scans of a SYNC are assumed to have been solved."""
+"""Time without a new field after which all scans of a SYNC are assumed to be solved, s."""
 
 
 @dataclass(frozen=True, slots=True)
 class PatchReport:
-    """Row of the report for one patch."""
+    """Results for one patch, shown as one row of the report."""
 
     patch: str
     node_id: int
     scans_sent: int
     scans_solved: int
     scans_skipped: int
-    """Number of scans replaced by a newer scan before a solver was free."""
+    """Number of scans that were skipped because a newer scan arrived before a solver was free."""
     scans_torn: int
     frames_lost: int
-    """Number of PDOs sent by the node that did not become part of a scan."""
+    """Number of PDOs that the node sent but that the host did not assemble into a scan."""
     latency_p50_ms: float
     latency_p99_ms: float
     score: Score
     distrust: str = ""
-    """Why the newest field that was not trusted was not; empty if all were."""
+    """Reason why the most recent untrusted field was not trusted; empty if all fields were trusted."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,17 +68,17 @@ class Report:
     frames_sent: int
     """Number of PDOs that the nodes sent."""
     frames_received: int
-    """Number of PDOs that became part of a scan."""
+    """Number of PDOs that the host assembled into scans."""
     frames_lost: int
     bus_load: float
-    """Fraction of a 1 Mbit/s bus that all frames in the scan phase would have used, including stuff bits."""
+    """Load that all frames of the scan phase would cause on a 1 Mbit/s bus, as a fraction."""
     faults: tuple[str, ...]
-    """Reasons for exit status 1; empty if there are none."""
+    """Reasons for exit status 1; empty if the run succeeded."""
 
 
 @dataclass(frozen=True, slots=True)
 class Run:
-    """Result of a run."""
+    """Report and plot data of a run."""
 
     report: Report
     traces: tuple[PatchTrace, ...]
@@ -86,22 +86,22 @@ class Run:
 
 @dataclass
 class _Watch:
-    """Data of one patch during the run. Owned by the main thread."""
+    """Data collected for one patch during the run; only the main thread uses this object."""
 
     config: PatchConfig
     scorer: Scorer
     arrivals_s: deque[float] = field(default_factory=lambda: deque(maxlen=32))
     latency_ms: list[float] = field(default_factory=list)
     history: list[tuple[float, float, float, float]] = field(default_factory=list)
-    """Time, true depth, RMS error and RMS reported standard deviation of each scan."""
+    """For each scan: time (s), true depth, RMS error and RMS reported standard deviation (m)."""
     deepest: tuple[float, Float, Float] | None = None
     newest: FieldFrame | None = None
     distrust: str = ""
-    """Why the newest field that was not trusted was not."""
+    """Reason why the most recent untrusted field was not trusted; empty if all fields were trusted."""
 
     def take(self, frame: FieldFrame, true_upper_m: Float, t_start_ns: int) -> None:
         stamp = frame.stamp
-        assert stamp is not None  # the host stamps every field
+        assert stamp is not None  # the host attaches a stamp to every field
         truth = true_upper_m - self.scorer.layout.upper_m
         error_m = self.scorer.add(frame, true_upper_m)
         depth_m = float(-truth[..., 2].min())
@@ -149,7 +149,7 @@ def _depth_std_m(frame: FieldFrame) -> float:
 
 
 class _Progress:
-    """Shows the run, as a live view on a terminal or as one line per second elsewhere."""
+    """Displays the progress of a run: a live view on a terminal, one line per second on other outputs."""
 
     def __init__(self, console: Console, hand: HandConfig, watches: Sequence[_Watch], seconds: float) -> None:
         self._console, self._watches, self._seconds = console, watches, seconds
@@ -197,15 +197,15 @@ def play(hand: HandConfig, seconds: float, console: Console) -> Run:
     """Run a hand and score the decoded fields against the truth.
 
     Args:
-        hand: The hand, on a virtual bus.
+        hand: Hand whose patches are on a virtual bus.
         seconds: Duration of the run, from the first scan.
         console: Console on which progress is printed.
 
     Raises:
-        SkinError: The hand cannot be run.
+        SkinError: The simulated patches or the host cannot run.
     """
     if jit.is_cold():
-        console.print("compiling the kernels, once; the next start is immediate")
+        console.print("compiling the kernels; this happens only once, so the next start is immediate")
     layouts = {patch.name: patch.layout.build() for patch in hand.patches}
     watches = {
         patch.name: _Watch(patch, Scorer(layouts[patch.name], CodeScale(patch.code_bits).relative_std))
@@ -218,7 +218,7 @@ def play(hand: HandConfig, seconds: float, console: Console) -> Run:
         soft_wrap=True,
     )
     with responsive_threads(), Fleet(hand) as fleet:
-        # Garbage is collected before the first SYNC.
+        # Entering this block collects garbage before the first SYNC.
         with without_long_collections(), Host.from_config(hand) as host:
             bits_before = _bits(host)
             t_start_ns = time.monotonic_ns()
@@ -232,12 +232,12 @@ def play(hand: HandConfig, seconds: float, console: Console) -> Run:
                     if frame is not None:
                         unscored.append(frame)
                         continue
-                    # Score and draw between two scans, so as not to delay the host.
+                    # Score and display fields between two scans, so as not to delay the host.
                     if unscored:
                         _take(unscored.popleft(), watches, fleet, t_start_ns)
                     progress.update(host, elapsed_s, bits_before)
             bits, elapsed_s = _bits(host) - bits_before, (time.monotonic_ns() - t_start_ns) * 1e-9
-        while (frame := subscription.get(0.0)) is not None:  # solved while the host was closing
+        while (frame := subscription.get(0.0)) is not None:  # fields solved while the host was closing
             unscored.append(frame)
         for frame in unscored:
             _take(frame, watches, fleet, t_start_ns)
@@ -275,8 +275,8 @@ def play(hand: HandConfig, seconds: float, console: Console) -> Run:
 
 
 def _take(frame: FieldFrame, watches: dict[str, _Watch], fleet: Fleet, t_start_ns: int) -> None:
-    assert frame.stamp is not None  # the host stamps every field
-    if frame.stamp.device_time_us == 0:  # summary lost, so the scan's time is unknown
+    assert frame.stamp is not None  # the host attaches a stamp to every field
+    if frame.stamp.device_time_us == 0:  # the time of a scan is unknown if its summary was lost
         return
     true_upper_m = fleet.truth_m(frame.stamp.patch, frame.stamp.device_time_us)
     watches[frame.stamp.patch].take(frame, true_upper_m, t_start_ns)
@@ -287,7 +287,7 @@ def _bits(host: Host) -> int:
 
 
 def _losses(host: Host) -> int:
-    """Return the number of losses counted by the host: frames dropped from its queue, and missing chunks."""
+    """Return the number of losses counted by the host: frames dropped from its queues, and lost chunks."""
     stats = host.stats()
     dropped = sum(bus.dropped for bus in stats.buses.values())
     return dropped + sum(stream.assembler.chunks_lost for stream in stats.patches.values())
@@ -315,7 +315,7 @@ def _faults(rows: Sequence[PatchReport], lost: int) -> tuple[str, ...]:
             why = f" ({row.distrust})" if row.distrust else ""
             found.append(
                 f"{row.patch}: error {1e6 * score.error_rms_m:.2f} µm RMS, "
-                f"{score.worst_deviations:.1f} standard deviations at worst, "
+                f"at most {score.worst_deviations:.1f} standard deviations, "
                 f"{score.untrusted} scans not trusted{why}; "
                 f"reported ± {1e6 * score.reported_rms_m:.2f} µm"
             )
@@ -323,7 +323,7 @@ def _faults(rows: Sequence[PatchReport], lost: int) -> tuple[str, ...]:
 
 
 def print_report(console: Console, report: Report) -> None:
-    """Print the final table and one line per fault."""
+    """Print the results of all patches as a table, and each fault on a line."""
     table = Table(box=None, header_style="dim", padding=(0, 1, 0, 0))
     table.add_column("\npatch")
     for heading in (
@@ -354,7 +354,7 @@ def print_report(console: Console, report: Report) -> None:
     load = f"{100 * report.bus_load:.0f} %"
     console.print(
         f"{report.frames_sent} PDOs sent, {report.frames_lost} lost; "
-        f"{report.scan_rate_hz:.1f} scans/s per patch; load on a 1 Mbit/s bus would have been {load}",
+        f"{report.scan_rate_hz:.1f} scans/s per patch; equivalent load of a 1 Mbit/s bus: {load}",
         soft_wrap=True,
     )
     pressed = [row.score for row in report.patches if row.score.deepest_m > 10 * row.score.reported_rms_m]
@@ -365,22 +365,25 @@ def print_report(console: Console, report: Report) -> None:
             soft_wrap=True,
         )
     else:
-        console.print("no patch was pressed in this time; use a larger --seconds")
+        console.print("no patch was pressed during this run; use a larger --seconds")
     for fault in report.faults:
         console.print("fault: ", style="bold red", end="")
         console.print(fault)
     if not report.faults:
         worst = max(row.score.worst_deviations for row in report.patches)
         console.print(
-            "no scan torn, no frame lost, errors as large as reported", style="green", end=" ", soft_wrap=True
+            "no scan torn, no frame lost, errors consistent with those reported",
+            style="green",
+            end=" ",
+            soft_wrap=True,
         )
         console.print(
-            f"(RMS within {EXCESS_LIMIT} times reported, worst coordinate {worst:.1f} standard deviations)",
+            f"(RMS at most {EXCESS_LIMIT} times the reported RMS, largest error {worst:.1f} standard deviations)",
             soft_wrap=True,
         )
 
 
 def as_json(report: Report) -> dict[str, Any]:
-    """Return the report as plain data, with None for missing values."""
+    """Convert the report to types that JSON supports; missing values become None."""
     result: dict[str, Any] = plain(dataclasses.asdict(report))
     return result

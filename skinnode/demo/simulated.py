@@ -1,7 +1,7 @@
-"""Simulated patches for commands that show a host at work.
+"""Runs simulated patches for commands that demonstrate a host.
 
-The patches run in a separate process. Like a real hand, they do not share an interpreter with the host, so
-the host's figures cover the host alone.
+The patches run in a separate process. Like the patches of a real hand, they do not share a Python interpreter
+with the host, so performance figures measure only the host.
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ from skinnode.process.child_processes import starting_children
 
 
 def on_simulated_buses(hand: HandConfig) -> HandConfig:
-    """Return a copy of the hand on unused virtual buses between processes on this machine.
+    """Return a copy of the hand in which virtual buses between local processes replace the real buses.
 
-    Simulated nodes must not appear on a bus with real nodes. Simulated patches equal their layouts, so the
-    tolerances of the real patches do not apply.
+    Simulated nodes must never send on a bus with real nodes. Simulated patches match their layouts exactly,
+    so the copy states exact tolerances.
     """
     exact = TolerancesConfig.model_validate("exact")
     patches = tuple(patch.model_copy(update={"tolerances": exact}) for patch in hand.patches)
@@ -57,22 +57,22 @@ def simulated(hand: HandConfig) -> Iterator[None]:
         try:
             complaint = ours.recv()
         except EOFError:
-            complaint = "the process that runs them ended immediately"
+            complaint = "their process ended immediately"
         if complaint:
             raise SkinError(f"simulated patches: {complaint}")
         yield
     finally:
-        ours.close()  # ends the child
+        ours.close()  # the child process exits when the pipe is closed
         process.join()
 
 
 def _run_nodes(hand: HandConfig, parent: Connection) -> None:
-    """Run the nodes until the parent closes its end of the pipe or is killed."""
+    """Run the nodes until the parent process closes its end of the pipe or is killed."""
     import signal
 
     from vcan_sim.fleet import Fleet
 
-    signal.signal(signal.SIGTERM, signal.SIG_IGN)  # sent to the whole group; the parent ends this process
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)  # also sent to this process; the parent ends it
     try:
         with Fleet(hand):
             parent.send("")

@@ -1,4 +1,4 @@
-"""Live terminal view of the demo: each patch's height map, health and rates, and the bus load."""
+"""Displays the demo on a terminal: each patch's height map, health and scan rate, and the bus load."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ from skinnode.monitor.field_map import MapStyle, Surface, mean_shear_m, paint_ma
 from skinnode.monitor.patch_panel import shear_text
 
 MAP_SIZE = 16
-"""Width of a height map in characters; each character is two pixels high, so that the map is square."""
+"""Width of a square height map, characters; each character is two pixels high."""
 
 
 @dataclass(frozen=True, slots=True)
 class PatchView:
-    """Data of one patch for the view. Lengths are in metres, NaN if not yet known."""
+    """Data of one patch to display; lengths are in metres, and NaN if not yet known."""
 
     name: str
     health: str
@@ -38,12 +38,12 @@ class PatchView:
     rate_hz: float
     torn: int
     distrust: str = ""
-    """Why the newest field is not trusted; empty if it is."""
+    """Reason why the newest field is not trusted; empty if it is trusted."""
 
 
 @dataclass(frozen=True, slots=True)
 class BusView:
-    """Data of the bus and the run for the view."""
+    """Data of the bus and of the run to display."""
 
     elapsed_s: float
     seconds: float
@@ -55,7 +55,7 @@ class BusView:
 
 
 class HeightMap:
-    """Draws the depth of a surface in the monitor's style, with the first upper wire at the bottom."""
+    """Draws the depth of a patch in the monitor's style, with the first upper wire at the bottom."""
 
     def __init__(self, surface: Surface, full_scale_m: float) -> None:
         height = MAP_SIZE // 2
@@ -71,7 +71,7 @@ class HeightMap:
 
 
 def _surface(displacement_m: Float | None) -> Surface:
-    """Return a field's surface, with zero standard deviations; before the first field, a flat surface."""
+    """Return a field's surface with zero standard deviations, or a flat surface if there is no field yet."""
     moved = np.zeros((2, 2, 3)) if displacement_m is None else displacement_m
     unknown = np.zeros(moved.shape[:2], dtype=np.bool_)
     return Surface(-moved[..., 2], np.moveaxis(moved[..., :2], -1, 0), np.zeros(unknown.shape), unknown, 1.0)
@@ -105,7 +105,7 @@ def _patch_panel(patch: PatchView, full_scale_m: float) -> Panel:
 
 
 def panels_in(columns: int, lines: int) -> int:
-    """Return the number of patches that fit on a terminal of the given size."""
+    """Return how many patches fit on a terminal with the given numbers of columns and lines."""
     across, down = columns // (MAP_SIZE + 4), (lines - 4) // (MAP_SIZE // 2 + 8)
     return max(1, across) * max(1, down)
 
@@ -113,11 +113,11 @@ def panels_in(columns: int, lines: int) -> int:
 def render(
     patches: Sequence[PatchView], bus: BusView, full_scale_m: float, room: int = 1000
 ) -> RenderableType:
-    """Return the whole screen.
+    """Return the contents of the whole screen.
 
     Args:
         patches: Data of each patch.
-        bus: Data of the bus.
+        bus: Data of the bus and of the run.
         full_scale_m: Depth drawn at full brightness, metres.
         room: Maximum number of patches to draw.
     """

@@ -1,8 +1,8 @@
-"""Recordings of a hand, written while a host runs and replayed to give the same fields.
+"""Records the traffic of a running host, and replays recordings to reproduce the same fields.
 
-``recorder`` writes raw frames to a candump log or BLF file and, next to it, a ``journal`` of the other events
-that determined how the host decoded the frames. ``replay`` reads both and decodes the frames with the host's
-own code.
+``recorder`` writes raw frames to a candump log or a BLF file. Next to this file, it writes a ``journal`` of
+all other events that affected how the host decoded the frames. ``replay`` reads both files and decodes the
+frames with the host's own code.
 """
 
 from skinnode.record.recorder import Recorder, RecorderStats

@@ -1,8 +1,9 @@
-"""Journal of a recording: a JSON Lines file next to the log, with all that a replay needs besides the frames.
+"""Reads and writes the journal of a recording, which contains everything except the frames.
 
-The first line holds the hand and the offset of the host's clock (:class:`Header`). Each further line is an
-event that affected how the host decoded the frames: ``at`` is the number of frames received on ``bus`` before
-the event, and ``t_ns`` is its time on the host's monotonic clock.
+The journal is a JSON Lines file next to the log. The first line contains the hand and the offset of the
+host's clock (:class:`Header`). Each further line describes an event that affected how the host decoded the
+frames. In an event, ``at`` is the number of frames received on ``bus`` before the event, and ``t_ns`` is the
+time of the event on the host's monotonic clock.
 
 =============  ==============================================================================
 ``event``      meaning
@@ -40,24 +41,24 @@ FORMAT: Final = "skinnode recording 1"
 SUFFIX: Final = ".jsonl"
 
 COMPLAINTS_KEPT: Final = 100
-"""Maximum number of unreadable lines reported individually; further lines are only counted."""
+"""Maximum number of unreadable lines reported individually; additional lines are only counted."""
 
 _MOST: Final = 2**63 - 1
 _LONGEST_LINE: Final = 2 << 20
-"""Maximum length of a line, bytes: enough for the facts about the largest patch. A longer line is read as
-several lines."""
+"""Maximum length of a line, bytes; the facts about the largest patch fit. A longer line is read as several
+lines."""
 _OF_PATCHES: Final = ("resumed", "withheld", "polled", "overtaken")
 
 
 @dataclass(frozen=True, slots=True)
 class Header:
-    """The first line of a journal."""
+    """Content of the first line of a journal."""
 
     hand: HandConfig
     started: str
     """Local date and time, ISO 8601."""
     wall_minus_mono_ns: int
-    """Offset that, subtracted from a time in the log, gives the time on the host's monotonic clock, ns."""
+    """Log time minus time on the host's monotonic clock, ns."""
 
     def line(self) -> str:
         """Return the header as a line of JSON."""
@@ -67,7 +68,7 @@ class Header:
 
 
 def _without_paths(value: Any) -> Any:
-    """Remove file names, which only bring-up needs; the journal holds the contents of the files."""
+    """Remove file names, because the journal already contains what the host read from the files."""
     if isinstance(value, Mapping):
         kept = {key: item for key, item in value.items() if not isinstance(item, Path)}
         return {key: _without_paths(item) for key, item in kept.items()}
@@ -77,7 +78,7 @@ def _without_paths(value: Any) -> Any:
 
 
 def facts_table(facts: NodeFacts) -> dict[str, Any]:
-    """Return NodeFacts as a JSON table that preserves every bit of its numbers."""
+    """Convert NodeFacts to a JSON table without loss of numerical precision."""
     layout, planned = facts.layout, facts.config.layout.build()
     same = np.array_equal(layout.upper_m, planned.upper_m) and np.array_equal(layout.lower_m, planned.lower_m)
     own = {"upper_m": layout.upper_m.tolist(), "lower_m": layout.lower_m.tolist(), "name": layout.name}
@@ -97,9 +98,9 @@ def facts_of(table: Mapping[str, Any], patch: PatchConfig, bus: BusConfig) -> No
     """Rebuild NodeFacts from the result of :func:`facts_table`.
 
     Args:
-        table: Content of a journal line.
-        patch: The patch.
-        bus: Bus of the patch.
+        table: The table from a journal line.
+        patch: Configuration of the patch.
+        bus: Configuration of the patch's bus.
 
     Raises:
         KeyError, TypeError, OverflowError, ValueError: The table is malformed.
@@ -124,7 +125,7 @@ def facts_of(table: Mapping[str, Any], patch: PatchConfig, bus: BusConfig) -> No
             own["name"],
         )
     scale = CodeScale(patch.code_bits, table["lo"], table["hi"])
-    checked = table.get("checked", False)  # absent from the first versions, whose nodes sent no checks
+    checked = table.get("checked", False)  # missing in journals of early versions, whose nodes sent no checks
     if not isinstance(checked, bool):
         raise TypeError(f"checked: got {checked!r}, must be true or false")
     return NodeFacts(
@@ -139,7 +140,7 @@ def read_journal(path: Path) -> tuple[Header, list[dict[str, Any]], list[str]]:
         path: The journal.
 
     Returns:
-        Header, events, and one line of text per unreadable line.
+        The header, the events, and a line of text for each unreadable line.
 
     Raises:
         ConfigError: The journal cannot be read, or its first line is not a header.
@@ -187,7 +188,7 @@ def _read_lines(path: Path, file: BinaryIO) -> tuple[Header, list[dict[str, Any]
 
 
 def _event(line: bytes, hand: HandConfig) -> dict[str, Any]:
-    """Parse a line. Raises KeyError, TypeError, RecursionError or ValueError if it is not a valid event."""
+    """Parse a line. Raises KeyError, TypeError, RecursionError or ValueError if the event is invalid."""
     event: dict[str, Any] = json.loads(line)
     _whole(event["at"])
     _whole(event["t_ns"])
@@ -197,7 +198,7 @@ def _event(line: bytes, hand: HandConfig) -> dict[str, Any]:
         case "dropped":
             _whole(event["frames"])
         case "ended":
-            _whole(event.get("frames", 0))  # absent from journals of early versions
+            _whole(event.get("frames", 0))  # missing in journals of early versions
         case kind if kind in _OF_PATCHES and hand.patch(event["patch"]).bus == event["bus"]:
             if kind == "overtaken":
                 _whole(event["scan"])
@@ -208,7 +209,7 @@ def _event(line: bytes, hand: HandConfig) -> dict[str, Any]:
 
 
 def _whole(value: object, least: int = 0) -> int:
-    """Return ``value`` if it is a 64-bit integer of at least ``least``. Raises ValueError otherwise."""
+    """Return ``value``. Raises ValueError unless it is a 64-bit integer not less than ``least``."""
     if not isinstance(value, int) or isinstance(value, bool) or not least <= value <= _MOST:
         raise ValueError
     return value

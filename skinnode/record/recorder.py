@@ -1,6 +1,6 @@
-"""Recorder for the frames of a running host.
+"""Records the frames of a running host.
 
-The host's threads queue entries and the recorder's own thread writes them, so that a slow disk delays only
+The host's threads only queue entries. A separate thread writes the entries, so that a slow disk delays only
 the recording.
 """
 
@@ -29,14 +29,15 @@ from skinnode.transport.frame_log import SUFFIXES, FrameLog, LogFormat, LoggedFr
 _log = logging.getLogger(__name__)
 
 FLUSH_S: Final = 0.25
-"""Interval between flushes to the kernel, s; entries older than this survive a crash of this process."""
+"""Interval between flushes to the kernel, s; entries older than one interval survive a crash of this
+process."""
 
 SYNC_S: Final = 1.0
-"""Interval between fsync calls, s; entries older than this are on the disk. Each fsync takes the writer
-thread about 10 ms."""
+"""Interval between fsync calls, s; entries older than one interval are on the disk. Each call blocks the
+writer thread for about 10 ms."""
 
 CAPACITY: Final = 50_000
-"""Maximum number of batches queued for the disk: several seconds of traffic on four fully loaded buses."""
+"""Maximum number of queued batches, equal to several seconds of traffic on four fully loaded buses."""
 
 _ALLOWED: Final = "a folder (created if needed), or a file ending in .log or .blf"
 
@@ -48,11 +49,11 @@ class RecorderStats:
     """Progress of a recorder."""
 
     frames: int
-    """Frames written."""
+    """Number of frames written."""
     dropped: int
-    """Frames not written because the disk was too slow or failed."""
+    """Number of frames not written because the disk was too slow or failed."""
     failure: str | None
-    """One-line reason why writing has stopped; None while the recorder works."""
+    """One-line reason why recording has stopped; None while recording continues."""
 
 
 def name_in(folder: Path, hand: HandConfig, kind: LogFormat, now: datetime.datetime) -> Path:
@@ -62,10 +63,10 @@ def name_in(folder: Path, hand: HandConfig, kind: LogFormat, now: datetime.datet
 
 
 def make_folder(path: Path) -> Path | None:
-    """Create the folder ``path`` and any missing parents, and return it; None if it already existed.
+    """Create the folder ``path`` and any missing parents, and return it; return None if it already existed.
 
-    A name with a suffix is treated as the misspelt name of a recording file. Raises ConfigError for such a
-    name, or if the folder cannot be created.
+    Raises ConfigError if the folder cannot be created, or if the name has a suffix, because it is then
+    probably the misspelt name of a recording file.
     """
     if path.is_dir():
         return None
@@ -81,7 +82,7 @@ def make_folder(path: Path) -> Path | None:
 
 
 def _is_folder(path: Path) -> bool:
-    """Return whether ``path`` is a folder. Raises ConfigError if it can be neither a folder nor a file."""
+    """Return whether ``path`` is a folder. Raises ConfigError if the path is not valid."""
     try:
         return path.is_dir()
     except OSError as error:
@@ -89,23 +90,24 @@ def _is_folder(path: Path) -> bool:
 
 
 class Recorder:
-    """Recording of a host, from construction to :meth:`close`; it is passed to the host as ``tap``.
+    """Records a host, to which it is passed as ``tap``, from construction until :meth:`close`.
 
     Example::
 
         with Recorder(hand, "runs/") as recorder, Host.from_config(hand, tap=recorder) as host:
             ...
 
-    A recording that begins before the host starts is replayed bit for bit. A recording that begins while the
-    host runs (:meth:`Host.tap`) lacks the state of the solvers. A ``with`` block that fails before the first
-    frame leaves no file. If the disk fails, the recording ends, one log line reports the failure, and the
-    host continues. An entry that raises any other exception is lost and counted in ``dropped``.
+    If recording begins before the host starts, a replay reproduces the fields bit for bit. A recording that
+    begins while the host runs (:meth:`Host.tap`) lacks the previous state of the solvers. If a ``with`` block
+    fails before the first frame, no file remains. If the disk fails, recording ends, a log message reports
+    the failure, and the host continues. An entry that causes any other exception is lost and counted in
+    ``dropped``.
 
     Args:
         hand: The hand.
         path: A file ending in .log or .blf, or a folder, created if needed, in which the file is named after
             the hand, the date and the time. The journal is written next to it.
-        kind: Format of a file in a folder.
+        kind: Format of the file if ``path`` is a folder.
 
     Raises:
         ConfigError: A file already exists, or a file or the folder cannot be created.
@@ -114,7 +116,7 @@ class Recorder:
     def __init__(self, hand: HandConfig, path: Path | str, kind: LogFormat = "log") -> None:
         now, asked, path = datetime.datetime.now().astimezone(), str(path), Path(path)
         self._made: Path | None = None
-        """Folder that this recorder created; None if it already existed."""
+        """Folder that this recorder created; None if the folder already existed or is not used."""
         if asked and (_is_folder(path) or path.suffix not in SUFFIXES):
             self._made = make_folder(path)
             path = name_in(path, hand, kind, now)
@@ -145,7 +147,7 @@ class Recorder:
         self._thread.start()
 
     def stats(self) -> RecorderStats:
-        """Return the progress so far."""
+        """Return the number of frames recorded and lost so far."""
         return RecorderStats(self._log.frames, self._lost, self._failure)
 
     # --- called on the host's threads
@@ -159,18 +161,18 @@ class Recorder:
         self._put(lambda: self._write_frames(bus, (frame,), sent=True), 1)
 
     def resumed(self, patch: str, solver: ScanSolver, *, anew: bool) -> None:
-        """Record that scans of a patch are decoded from now on."""
+        """Record that the host starts or resumes decoding the scans of a patch."""
         known = self._solvers.get(patch) is solver
         self._solvers[patch] = solver
         facts: dict[str, Any] = {} if known else {"facts": facts_table(solver.facts)}
         self._event(patch, "resumed", anew=anew, **facts)
 
     def withheld(self, patch: str) -> None:
-        """Record that scans of a patch are no longer decoded."""
+        """Record that the host stops decoding the scans of a patch."""
         self._event(patch, "withheld")
 
     def polled(self, patch: str, t_ns: int) -> None:
-        """Record that a timeout ended a scan."""
+        """Record that a timeout ended an incomplete scan."""
         self._event(patch, "polled", t_ns=t_ns)
 
     def overtaken(self, patch: str, scan: int, t_receive_ns: int) -> None:
@@ -178,7 +180,7 @@ class Recorder:
         self._event(patch, "overtaken", scan=scan, received_ns=t_receive_ns)
 
     def close(self) -> None:
-        """Write the queued entries, join the thread and close the files; later entries are ignored."""
+        """Write all queued entries, stop the thread and close the files; later entries are ignored."""
         if self._thread.is_alive():
             self._queue.put(None)
             self._thread.join()
@@ -190,11 +192,11 @@ class Recorder:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
-        if error is not None and not self._log.frames:  # empty files would block a retry
+        if error is not None and not self._log.frames:  # existing files would make a retry fail
             self.path.unlink(missing_ok=True)
             self.path.with_suffix(SUFFIX).unlink(missing_ok=True)
             if self._made is not None:
-                with suppress(OSError):  # another process may be using the folder
+                with suppress(OSError):  # another process may have written to the folder
                     self._made.rmdir()
 
     def _put(self, entry: _Entry, frames: int) -> None:
@@ -217,7 +219,7 @@ class Recorder:
         self._log.close()
 
     def _turn(self) -> bool:
-        """Wait briefly for the next entry and write it. Returns whether to continue."""
+        """Write the next entry, if one arrives within a flush interval; return whether to continue."""
         if self._ended:
             return False
         with suppress(queue.Empty):
@@ -245,7 +247,7 @@ class Recorder:
             self._defects.report("recording", error)
 
     def _flush(self, *, to_disk: bool) -> None:
-        """Flush the journal before the log, so that the journal never lags behind the log."""
+        """Flush the journal and then the log, so that the journal on disk is never older than the log."""
         if self._lost != self._lost_reported:
             lost, self._lost_reported = self._lost - self._lost_reported, self._lost
             self._write_event("", clock.monotonic_ns(), "dropped", frames=lost)
@@ -253,7 +255,7 @@ class Recorder:
         self._log.flush(to_disk=to_disk)
 
     def _begin(self, header: Header) -> None:
-        """Write the header at once, so that the recording can be read even if the process is killed."""
+        """Write and flush the header, so that the recording is readable even if the process is killed."""
         self._write_line(header.line())
         self._journal.flush()
 
@@ -273,7 +275,7 @@ class Recorder:
 
 
 def channels(hand: HandConfig) -> dict[str, str]:
-    """Return the log channel of each bus: its name if candump allows it, otherwise a numbered name."""
+    """Return the log channel of each bus: the bus's name if candump accepts it, otherwise a numbered name."""
     names = {}
     for number, bus in enumerate(hand.buses):
         plain = bus.name.isascii() and bus.name.isalnum() and not bus.name.isdigit() and len(bus.name) < 16

@@ -1,13 +1,13 @@
-"""Replay of a recording into fields, by the same code that decodes live frames.
+"""Replays a recording and solves its scans with the code that also decodes live frames.
 
-The dispatcher, assembler, decoder, stream, solver and publisher are those of the host. No threads are used:
-each scan is solved when its last frame is dispatched.
+The replay uses the host's dispatcher, assembler, decoder, stream, solver and publisher, but no threads: each
+scan is solved when its last frame is dispatched.
 
-**Same as live.** Scans that were solved live give bit-identical fields if the recording began before the host
-started and is complete, if the build and the processor are the same, and if no deadline cut a solve short.
-Times are on the recording host's clock, with the resolution of log files, 1 µs. If frames are missing or
-damaged, journal events are placed by time instead of by frame count, and the times of later frames determine
-when incomplete scans end.
+The fields of a replay are identical to the live fields, bit for bit, if three conditions are met. The
+recording began before the host started and is complete; software and processor are the same; and no deadline
+ended a live solve early. Times refer to the clock of the recording host and have the resolution of log files,
+1 µs. If frames are missing or damaged, events of the journal are ordered by time and not by frame count, and
+the times of later frames determine when incomplete scans end.
 """
 
 from __future__ import annotations
@@ -39,13 +39,14 @@ from skinnode.text.words import counted
 from skinnode.transport.frame_log_reader import FrameLogReader
 
 LONGEST_SILENCE_S: Final = 60.0
-"""Maximum duration of a replayed silence, s; a longer silence may be due to a damaged timestamp."""
+"""Maximum pause between replayed frames, s; longer pauses, perhaps due to damaged timestamps, are
+shortened."""
 
 _ROUNDING_NS: Final = 2_000
 """Maximum rounding error of a timestamp in a log, ns."""
 
 _SLICE_S: Final = 0.1
-"""Maximum delay of :meth:`Replay.stop`, s."""
+"""Maximum time until :meth:`Replay.stop` takes effect, s."""
 
 
 def _never() -> bool:
@@ -53,19 +54,20 @@ def _never() -> bool:
 
 
 def replay(path: Path | str, *, speed: float | None = None, cancelled: Callable[[], bool] = _never) -> Replay:
-    """Return the fields of a recording as an iterable.
+    """Open a recording and return an iterable of its fields.
 
     Example::
 
         for field in skinnode.record.replay("runs/hand-20260102-030405.log"):
             ...
 
-    Whatever its speed, a replay does not skip any scan that was solved live.
+    At any speed, the replay solves every scan that was solved live.
 
     Args:
         path: File ending in .log or .blf.
         speed: 1 for the speed of the recording, 2 for twice as fast; None for as fast as possible.
-        cancelled: Called repeatedly; returning True ends the iteration, as :meth:`Replay.stop` does.
+        cancelled: Function called before each frame; if it returns True, the iteration ends as after
+            :meth:`Replay.stop`.
 
     Raises:
         ConfigError: The recording cannot be read, or ``speed`` is not positive.
@@ -74,7 +76,7 @@ def replay(path: Path | str, *, speed: float | None = None, cancelled: Callable[
 
 
 class Replay:
-    """Replay of a recording; see :func:`replay`. Iterate once, then read the counters."""
+    """Replay of a recording, created by :func:`replay`; it can be iterated only once."""
 
     def __init__(self, path: Path, speed: float | None, cancelled: Callable[[], bool] = _never) -> None:
         if speed is not None and not 0 < speed < float("inf"):
@@ -82,22 +84,23 @@ class Replay:
         if not path.name:
             raise ConfigError("recording", str(path), "a file ending in .log or .blf")
         header, events, self.complaints = read_journal(path.with_suffix(SUFFIX))
-        """One line per unreadable part of the journal."""
+        """One line of text for each unreadable part of the journal."""
         self.hand, self.started = header.hand, header.started
         self._speed, self._offset_ns = speed, header.wall_minus_mono_ns
         self.log = FrameLogReader(path)
-        """The log; ``damaged`` and ``damages`` report what cannot be read."""
+        """Reader of the log; its attributes ``damaged`` and ``damages`` report unreadable parts."""
         ends = [event for event in events if event["event"] == "ended"]
         self.ended = bool(ends)
-        """Whether the recording was closed; False if its process was killed."""
+        """Whether the recording was closed properly; False if the recording process was killed."""
         self._recorded: int | None = ends[0].get("frames") if ends else None
         self._read = 0
         self._first_ns: int | None = None
         self._journal = path.with_suffix(SUFFIX).name
         self.incomplete: str | None = None
-        """After a complete iteration, one line that says what the log lacks; None if the log is complete."""
+        """Description of what is missing from the log, set after a full iteration; None if nothing is
+        missing."""
         self.dropped = sum(e["frames"] for e in events if e["event"] == "dropped")
-        """Frames that the recorder could not write."""
+        """Number of frames that the recorder could not write."""
         self._now_ns = 0
         self._stopped, self._cancelled = False, cancelled
         self._publisher = Publisher(tuple(patch.name for patch in self.hand.patches))
@@ -112,7 +115,7 @@ class Replay:
             for number, bus in enumerate(self.hand.buses)
         }
         self.strange = 0
-        """Frames on channels that do not belong to any bus of the hand."""
+        """Number of frames on channels that do not belong to any bus of the hand."""
 
     def __iter__(self) -> Iterator[FieldFrame]:
         fields = self._publisher.subscribe(64, None, None)
@@ -153,7 +156,7 @@ class Replay:
 
     @property
     def flaws(self) -> list[str]:
-        """Missing or unreadable parts of the recording, one line each; final after a complete iteration."""
+        """Lines of text about missing or unreadable parts; complete only after the iteration has ended."""
         found = [f"{self.log.path.name} {damage}" for damage in self.log.damages]
         if self.log.damaged > len(found):
             found.append(f"{self.log.damaged - len(found)} more damaged places")
@@ -168,16 +171,16 @@ class Replay:
         return found
 
     def stop(self) -> None:
-        """End the iteration soon; callable from any thread."""
+        """End the iteration within :data:`_SLICE_S`; any thread may call this method."""
         self._stopped = True
 
     @property
     def stopped(self) -> bool:
-        """Whether the iteration was stopped before the end of the recording."""
+        """Whether the iteration was or must be stopped before the end of the recording."""
         return self._stopped or self._cancelled()
 
     def health(self, patch: str) -> PatchHealth:
-        """Return the health of a patch at this point in the replay. Raises KeyError for an unknown patch."""
+        """Return the health of a patch at the current replay time. Raises KeyError for an unknown patch."""
         heard = self._buses[self.hand.patch(patch).bus].patches[patch]
         health = heard.monitor.health(self._now_ns, self.hand.bring_up.heartbeat_s, self.hand.sync.period_s)
         return replace(health, faults=faults_of(self._publisher.latest(patch)))
@@ -199,21 +202,21 @@ class Replay:
             clock.sleep(min(left_s, _SLICE_S))
 
     def complain(self, event: dict[str, Any], what: str) -> None:
-        """Report a malformed event in the journal."""
+        """Add a line about a malformed journal event to ``complaints``."""
         self.complaints.append(f"{self._journal} line {event['line']}: {what}")
 
     def clock(self) -> int:
-        """Return the current time in the recording on its host's monotonic clock, ns."""
+        """Return the current replay time on the recording host's monotonic clock, ns."""
         return self._now_ns
 
     @property
     def publisher(self) -> Publisher:
-        """Publisher of the fields."""
+        """Publisher that distributes the replayed fields."""
         return self._publisher
 
 
 class _Pace:
-    """Pacer that waits until a frame is due."""
+    """Delays frames so that they are replayed at the requested speed."""
 
     def __init__(self, speed: float | None, wait: Callable[[float], None]) -> None:
         self._speed, self._wait = speed, wait
@@ -232,14 +235,14 @@ class _Pace:
 
 
 class _PollerlessDispatcher(Dispatcher):
-    """Dispatcher that never polls streams: the journal, not the end of a batch, determines when to poll."""
+    """Dispatcher that does not poll streams after each batch, because the journal determines when to poll."""
 
     def poll_with(self, poller: Callable[[int], None], defects: Defects | None = None) -> None:
         pass
 
 
 class _Bus:
-    """A bus of the recording, with its patches."""
+    """Reception on one bus of the recording, with the streams of its patches."""
 
     def __init__(self, config: BusConfig, replay: Replay, events: list[dict[str, Any]]) -> None:
         self._config, self._replay = config, replay
@@ -263,10 +266,10 @@ class _Bus:
             od.heartbeat_cob_id(patch.node_id): self.patches[patch.name].monitor
             for patch in hand.patches_on(config.name)
         }
-        self._stood_by: set[int] = set()  # COB-IDs of the heartbeats of nodes that the host shut down
+        self._stood_by: set[int] = set()  # heartbeat COB-IDs of nodes that the host has shut down
 
     def take(self, frame: Any, *, sent: bool, whole: bool) -> None:
-        """Process the next frame of the log; ``whole`` means that the log is undamaged so far."""
+        """Process the next frame of the log; ``whole``: whether the log is undamaged so far."""
         if sent:
             self._sent += 1
             self._dispatcher.count_sent(frame.can_id, frame.data)
@@ -281,7 +284,7 @@ class _Bus:
         self._dispatcher.dispatch((frame,))
         if frame.can_id in self._stood_by:
             monitor = self._of_heartbeat[frame.can_id]
-            if monitor.nmt_state == NmtState.PRE_OPERATIONAL:  # as commanded, which is no fault
+            if monitor.nmt_state == NmtState.PRE_OPERATIONAL:  # commanded, so not a fault
                 monitor.nmt_state = NmtState.OPERATIONAL
         if not whole:
             for heard in self.patches.values():
@@ -289,7 +292,7 @@ class _Bus:
         self._dispatcher.measure(frame.t_ns)
 
     def _on_command(self, data: bytes) -> None:
-        """Process an NMT command of the host: it makes operational nodes pre-operational when it ends."""
+        """Process an NMT command from the host, which sets operational nodes pre-operational when it ends."""
         if len(data) != 2:
             return
         cob_id = od.heartbeat_cob_id(data[1])
@@ -300,7 +303,7 @@ class _Bus:
             self._stood_by.add(cob_id)
 
     def finish(self) -> None:
-        """Apply the events after the last frame."""
+        """Apply the journal events that follow the last frame."""
         while self._events:
             self._happen(self._events.popleft())
 
@@ -327,7 +330,7 @@ class _Bus:
                     stream.resume(solver, stream.withholdings, anew=bool(event.get("anew")))
 
     def _solver(self, event: dict[str, Any]) -> ScanSolver | None:
-        """Return the solver for an event; None if its facts are unknown."""
+        """Return the solver for an event; None if the node's facts are unknown or unusable."""
         name, replay = event["patch"], self._replay
         if "facts" in event:
             self._solvers[name] = None

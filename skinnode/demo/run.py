@@ -378,7 +378,8 @@ def print_report(console: Console, report: Report) -> None:
             soft_wrap=True,
         )
         console.print(
-            f"(RMS at most {EXCESS_LIMIT} times the reported RMS, largest error {worst:.1f} standard deviations)",
+            f"(RMS at most {EXCESS_LIMIT} times the reported RMS, "
+            f"largest error {worst:.1f} standard deviations)",
             soft_wrap=True,
         )
 

@@ -1,4 +1,4 @@
-"""Subcommands of ``skinnode``, one per file: each parses its options and returns text and an exit status.
+"""Subcommands of ``skinnode``, one per file: each parses options, prints its result and sets the exit status.
 
 A file imports its dependencies only when its command runs, so that ``--help`` responds at once. Files whose
 names begin with an underscore are shared by several commands.

@@ -28,7 +28,7 @@ from skinnode.cli import (
 
 app = typer.Typer(
     name="skinnode",
-    help="Robot skin on a CAN bus: pressed patches in, displacement fields out.",
+    help="Robot skin on a CAN bus: measures how pressed patches deform, and reports displacement fields.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},

@@ -1,4 +1,4 @@
-"""Finds a command's bus and node from options that name an interface, or a bus in a hand file."""
+"""Finds the bus and node of a command from options that name an interface, or a bus in a hand file."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ if TYPE_CHECKING:
 
 
 class Place(NamedTuple):
-    """A bus and the hand to which it belongs."""
+    """A bus and the hand to which it belongs; None if no hand file is given."""
 
     bus: BusConfig
     hand: HandConfig | None
@@ -81,7 +81,7 @@ def find_bus(
     hand: Path | None,
     bus: str | None,
 ) -> Place:
-    """Return the single bus that the options name; arguments as for :func:`find_buses`.
+    """Return the single bus that the options name. The arguments are those of :func:`find_buses`.
 
     Raises:
         ConfigError: The options are not valid, or they match several buses.
@@ -113,7 +113,7 @@ def _load(hand: Path, bitrate: int | None, fd: bool) -> HandConfig:
 
     for option, value in (("--bitrate", bitrate), ("--fd", Shown("yes") if fd else None)):
         if value is not None:
-            raise ConfigError(option, value, "only without a hand file, which sets it")
+            raise ConfigError(option, value, "only without a hand file, because the hand file sets it")
     return load_hand(hand)
 
 
@@ -128,7 +128,7 @@ def find_node(
 ) -> tuple[Place, int]:
     """Return the bus and node-ID for NODE: a node-ID, or the name of a patch on any bus of the hand.
 
-    The other arguments are as for :func:`find_buses`.
+    The other arguments are those of :func:`find_buses`.
 
     Raises:
         ConfigError: No patch has this name, or the bus of the node-ID is ambiguous.
@@ -143,7 +143,7 @@ def node_among(node: str, places: list[Place], key: str) -> tuple[Place, int]:
     Args:
         node: A node-ID or the name of a patch.
         places: Buses to search.
-        key: Name of the command-line argument that ``node`` comes from, for error messages.
+        key: Name of the command-line argument that holds ``node``, for error messages.
 
     Raises:
         ConfigError: No patch has this name, or the bus of the node-ID is ambiguous.

@@ -1,4 +1,4 @@
-"""Output of commands: tables and text on stdout, progress on stderr if it is a terminal."""
+"""Prints the output of commands: tables and text on stdout, progress on stderr if stderr is a terminal."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from rich.table import Table
 
 UNBOUNDED: Final = 10_000
-"""Console width for output to a pipe, in columns; no printed line is longer."""
+"""Console width for output to a pipe, in columns, which exceeds the length of every printed line."""
 
 
 def print_json(value: Any) -> None:
@@ -34,8 +34,8 @@ def console(*, stderr: bool = False, soft_wrap: bool = False) -> Console:
     """Return the console that all commands use.
 
     The console prints square brackets and colons literally, because names may contain them; styles are passed
-    as arguments to ``print``. The console is as wide as the terminal. Unless ``COLUMNS`` sets a width, output
-    to a pipe or file is not wrapped, so that programs can read whole lines.
+    as arguments to ``print``. The console has the width of the terminal. Unless ``COLUMNS`` sets a width,
+    output to a pipe or file is not wrapped, so that programs can read whole lines.
 
     Args:
         stderr: Print to stderr instead of stdout.
@@ -59,13 +59,13 @@ def _width(stream: TextIO) -> int | None:
 
 @functools.cache
 def _console_type() -> type[Console]:
-    """Define the console class. Imports rich late, so that ``--help`` responds at once."""
+    """Define the console class. Imports rich late, so that ``--help`` responds without delay."""
     from rich.console import Console, ConsoleOptions, RenderableType
     from rich.segment import Segment
     from rich.text import Text
 
     class PrintableConsole(Console):
-        """A console that escapes control characters; see :mod:`skinnode.text.printable`."""
+        """Console that escapes control characters; see :mod:`skinnode.text.printable`."""
 
         def render_str(self, text: str, **options: Any) -> Text:
             return super().render_str(printable_lines(text), **options)
@@ -80,7 +80,7 @@ def _console_type() -> type[Console]:
 
 
 def table(*columns: str, right: tuple[str, ...] = ()) -> Table:
-    """Make an empty table whose only rule is below the header; ``right`` names the right-aligned columns."""
+    """Create an empty table with a rule below the header; ``right`` names the right-aligned columns."""
     from rich.box import SIMPLE_HEAD
     from rich.table import Table
 
@@ -99,7 +99,7 @@ def indented(text: str, columns: int = 10) -> Padding:
 
 @contextmanager
 def progress(quiet: bool = False) -> Iterator[Callable[[str], None]]:
-    """Yield a function that shows the current step on one line of stderr; the line is erased at the end.
+    """Yield a function that shows the current step on one line of stderr, which is erased at the end.
 
     Nothing is shown if ``quiet`` is set or stderr is not a terminal.
     """

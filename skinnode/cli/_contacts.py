@@ -1,4 +1,4 @@
-"""JSON representation of a field's contacts."""
+"""Converts the contacts of a field to JSON-compatible data."""
 
 from __future__ import annotations
 

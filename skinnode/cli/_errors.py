@@ -12,7 +12,7 @@ from skinnode.cli._exit_status import COULD_NOT_RUN, FINE, closed_pipe
 from skinnode.errors import ConfigError, SkinError
 from skinnode.text.printable import PrintableStream
 
-_UsageError: type[Exception] = typer.BadParameter.__mro__[1]  # from click, or from typer's copy of click
+_UsageError: type[Exception] = typer.BadParameter.__mro__[1]  # typer uses click or its own copy of click
 
 
 def run(app: typer.Typer, argv: Sequence[str] | None = None) -> int:
@@ -61,10 +61,10 @@ def _refused(line: str) -> int:
 
 
 def _wants_help(error: Any) -> bool:
-    """Return whether a command group was called without a command, in which case its help is printed."""
+    """Return whether a command group was called without a command, which prints the help of the group."""
     if type(error).__name__ != "NoArgsIsHelpError":
         return False
-    text = error.ctx.get_help()  # rich prints the help and returns nothing
+    text = error.ctx.get_help()  # rich prints the help and returns no text
     if text:
         typer.echo(text, err=True)
     return True
@@ -73,7 +73,7 @@ def _wants_help(error: Any) -> bool:
 def usage_line(error: Any) -> str:
     """Return a usage error as one line, such as ``skinnode scan: --bitrate: got 'x', allowed: an integer``.
 
-    Typer's own text is kept except for missing and invalid values, for which it omits the argument's meaning,
+    Replaces Typer's own text for missing and invalid values, because that text omits the argument's meaning,
     the value given or the allowed range.
     """
     message = " ".join(error.format_message().split()).rstrip(".")
@@ -91,20 +91,20 @@ def usage_line(error: Any) -> str:
 
 
 def _name(param: Any) -> str:
-    """Return the parameter's name as the user knows it: the option, or the argument's name in the help."""
+    """Return the name of a parameter as shown to the user: the option, or the argument's name in the help."""
     if param.param_type_name == "option":
         return str(max(param.opts, key=len))
     return str(param.metavar or param.name.upper())
 
 
 def _meaning(param: Any) -> str:
-    """Return the first sentence of the parameter's help."""
+    """Return the first sentence of a parameter's help text."""
     help_text = str(getattr(param, "help", None) or "a value").split(". ")[0].rstrip(".")
     return help_text[:1].lower() + help_text[1:]
 
 
 def _values(param: Any) -> str:
-    """Return the allowed numbers or words, which Typer stores in two places; empty if there are none."""
+    """Return the allowed numbers or words of a parameter as text; empty if any value is allowed."""
     converter = getattr(param, "type", param)
     described = getattr(getattr(param, "type_descriptor", None), "annotation", None)
     if get_origin(described) is Literal:

@@ -1,4 +1,4 @@
-"""Exit statuses and the handling of signals and closed pipes, for every command.
+"""Sets exit statuses and handles signals and closed pipes, for every command.
 
 ======  ==============================================================================================
 status  meaning
@@ -6,14 +6,14 @@ status  meaning
 0       success; also when SIGINT (Ctrl-C), SIGTERM or SIGHUP ends a command that runs until it is stopped
         (host, node, record, replay, monitor, vcan-sim)
 1       a fault was found
-2       could not run; one line on stderr states the reason
+2       the command could not run; one line on stderr states the reason
 128+n   ended by signal n before its work was done: 129 SIGHUP, 130 SIGINT, 143 SIGTERM; 141 if the
         reader of its output closed the pipe (SIGPIPE)
 ======  ==============================================================================================
 
-Nothing is printed when a signal arrives, because its sender knows about it; open resources are closed before
-the process exits. SIGHUP remains ignored if it was ignored at the start, as under nohup. This module
-imports nothing slow, so its handlers are installed before anything else is loaded.
+A signal causes no output, because it was sent on purpose; open resources are closed before the process exits.
+SIGHUP remains ignored if it was ignored at the start, as under nohup. This module imports no slow modules, so
+that its handlers are installed before any other module is loaded.
 """
 
 from __future__ import annotations
@@ -44,8 +44,9 @@ class Stopped(SystemExit):
 def main_of(module: str, argv: Sequence[str] | None = None) -> NoReturn:
     """Run a typer application and exit with its status. From this call on, signals end the process.
 
-    BLAS libraries get one thread, unless the environment says otherwise: their threads wait by spinning, and
-    under a real-time policy (``chrt -f``) threads that spun on every processor stopped a host for good.
+    BLAS libraries are limited to one thread unless the environment specifies a number. BLAS threads wait by
+    spinning, and under a real-time policy (``chrt -f``), threads that spin on every processor block a host
+    permanently.
 
     Args:
         module: Name of the module that defines the application as ``app``.
@@ -69,7 +70,7 @@ def main_of(module: str, argv: Sequence[str] | None = None) -> NoReturn:
 
 
 def _handle(handler: Callable[[int, FrameType | None], object] | signal.Handlers) -> None:
-    """Install ``handler`` for the signals if this is the main thread; Python allows this only there."""
+    """Install ``handler`` for the signals if this is the main thread, as Python requires."""
     import threading
 
     if threading.current_thread() is threading.main_thread():
@@ -79,7 +80,7 @@ def _handle(handler: Callable[[int, FrameType | None], object] | signal.Handlers
 
 
 def _ignore_signals() -> None:
-    """Ignore signals once all threads have ended: Python's default handlers would change the exit status."""
+    """Ignore signals after all threads have ended, because Python's handlers would change the exit status."""
     _handle(signal.SIG_IGN)
 
 
@@ -90,8 +91,8 @@ def _exit_at_once(number: int, _frame: FrameType | None) -> None:
 def _stop(number: int, frame: FrameType | None) -> None:
     """Unwind the stack, or exit immediately if an import is in progress and there is no other thread.
 
-    During an import, some of Python's callbacks would swallow the exception or print it. As long as there is
-    only one thread, no resource has been opened.
+    During an import, some of Python's callbacks would swallow the exception or print it. No resource is open
+    while there is only one thread.
     """
     import threading
 

@@ -1,4 +1,4 @@
-"""Reports of ``skinnode host``: lines or a JSON object every second, and the faults at the end."""
+"""Prints the reports of ``skinnode host``: text or a JSON object every second, and faults at the end."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ if TYPE_CHECKING:
     from skinnode.model.frames import FieldFrame
 
 _OVERRUN_S, _OVERRUN_SYNCS = 1.0, 3
-"""Maximum wait at the end for overruns to clear: seconds or SYNC periods, whichever is longer."""
+"""Maximum wait at the end for overruns to clear, s and SYNC periods; the longer of the two applies."""
 
 _POLL_S = 0.01
 
 _FIRST_SCANS = 3
-"""Number of SYNCs after which a missing first scan is a fault."""
+"""Number of SYNCs after which a missing first scan counts as a fault."""
 
 _EXPLAINED_BY_SLOWNESS: Final = (
     "scans_torn",
@@ -32,11 +32,11 @@ _EXPLAINED_BY_SLOWNESS: Final = (
     "chunks_lost",
     "summaries_lost",
 )
-"""Counters of missing and late frames, which a slow computer can cause; wrong frames remain faults."""
+"""Counters of missing and late frames, which a slow computer can cause. Wrong frames are always faults."""
 
 
 def operational_text(running: Host) -> str:
-    """Return the number of operational patches and, for every other patch, its condition."""
+    """Return text with the number of operational patches and the condition of every other patch."""
     from skinnode.canopen.nmt import NmtState
 
     patches, name = running.hand.patches, running.hand.name
@@ -51,7 +51,7 @@ def operational_text(running: Host) -> str:
 
 
 def final_state_text(plan: HandConfig) -> str:
-    """Return the NMT state in which the host leaves the nodes on each bus."""
+    """Return text with the NMT state in which the host leaves the nodes on each bus."""
     ends = {"master": "pre-operational", "guest": "left to their master"}
     used = [bus for bus in plan.buses if plan.patches_on(bus.name)]
     if len({bus.role for bus in used}) == 1:
@@ -62,8 +62,8 @@ def final_state_text(plan: HandConfig) -> str:
 def faults_and_notes(running: Host) -> tuple[list[str], list[str]]:
     """Return the faults and the notes of the run, one line each.
 
-    A node that skips scans because the computer running it is too slow sends EMCY 0x8110. In this case
-    its missing and late frames, and the emergency if it is still active at the end, are reported as notes.
+    A node that skips scans because the computer running it is too slow sends EMCY 0x8110. The node's
+    missing and late frames are then reported as notes, as is the emergency if it is still active at the end.
     Wrong frames remain faults.
     """
     _let_overruns_end(running)
@@ -127,7 +127,7 @@ def _patch_faults_and_notes(
 
 
 def _noise(running: Host, name: str) -> str:
-    """Return how far the noise differs from the hand file, or an empty string."""
+    """Return text that compares the measured noise with the hand file; empty if the noise is as stated."""
     field = running.latest(name)
     if field is None or field.noise_factor == 1.0:
         return ""
@@ -136,7 +136,7 @@ def _noise(running: Host, name: str) -> str:
 
 
 def reason(health: PatchHealth, before: str = "") -> str:
-    """Return ``before`` and the reason why a patch is faulty or refused, or an empty string."""
+    """Return ``before`` and why a patch is faulty or refused; empty if it is neither."""
     if health.condition == "refused" and health.refusal:
         return f"{before}{health.refusal}"
     if health.condition == "faulty" and health.defect is not None:
@@ -162,7 +162,7 @@ def _let_overruns_end(running: Host) -> None:
 
 
 class Second:
-    """Figures for one second; the attribute names are the keys of the JSON object."""
+    """Values reported for one second. The attribute names are the keys of the JSON object."""
 
     def __init__(
         self,
@@ -219,7 +219,7 @@ def _patch(running: Host, name: str, before: HostStats, now: HostStats) -> dict[
 
 
 def _deepest(field: FieldFrame | None) -> dict[str, float | None]:
-    """Return the depth of the deepest electrode, positive towards −z, and the depth's standard deviation."""
+    """Return the depth (positive towards −z) of the deepest electrode and its standard deviation, m."""
     if field is None:
         return {"deepest_m": None, "deepest_std_m": None}
     z = field.displacement_m[..., 2]
@@ -228,18 +228,18 @@ def _deepest(field: FieldFrame | None) -> dict[str, float | None]:
 
 
 def _percentile(ordered: Sequence[float], share: float) -> float | None:
-    """Return the percentile in milliseconds, or None if there are no values."""
+    """Return a percentile of sorted values in seconds as milliseconds; None if there are no values."""
     return round(ordered[min(len(ordered) - 1, int(share * len(ordered)))] * 1e3, 3) if ordered else None
 
 
 class Report(Protocol):
-    """Format of the host's reports, for a person or for a program."""
+    """Interface of the host's reports, which are formatted for a person or for a program."""
 
     def note(self, text: str) -> None:
         """Report an event or a fault."""
 
     def second(self, second: Second) -> None:
-        """Report the figures for one second."""
+        """Report the values for one second."""
 
 
 class TextReport:
@@ -250,7 +250,7 @@ class TextReport:
         print(text, flush=True)
 
     def second(self, second: Second) -> None:
-        """Print the figures for one second."""
+        """Print the values for one second."""
         buses = "  ".join(
             f"{name} {facts['frames']} frames, load {facts['load']:.0%}, {facts['dropped']} dropped"
             for name, facts in second.buses.items()
@@ -281,7 +281,7 @@ def _patch_text(name: str, facts: Mapping[str, object]) -> str:
 
 
 def _doubts(facts: Mapping[str, object]) -> str:
-    """Return what a user of a trusted field should know: its precision, and the readings left out."""
+    """Return text about limits of a trusted field: low precision, and readings that were left out."""
     doubts, faults = "  imprecise" if facts["precise"] is False else "", facts["data_faults"]
     if isinstance(faults, list) and faults:
         doubts += f"  {counted(len(faults), 'fault')} of its readings left out"
@@ -289,12 +289,12 @@ def _doubts(facts: Mapping[str, object]) -> str:
 
 
 class JsonReport:
-    """Prints one JSON object per line: {"note": …} or the figures for one second."""
+    """Prints one JSON object per line: {"note": …} or the values for one second."""
 
     def note(self, text: str) -> None:
         """Print ``text`` as a note."""
         print(json.dumps({"note": text}), flush=True)
 
     def second(self, second: Second) -> None:
-        """Print the figures for one second."""
+        """Print the values for one second."""
         print(json.dumps(vars(second)), flush=True)

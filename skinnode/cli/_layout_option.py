@@ -1,4 +1,4 @@
-"""Option ``--layout``: the geometry of a patch, given as a preset, a file or a Python name."""
+"""Implements option ``--layout``: the geometry of a patch as a preset, a file or a Python name."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ def find_layout(text: str) -> PatchLayout:
     """Return the layout that ``text`` names.
 
     Args:
-        text: A preset, a file, or the MODULE:NAME of a PatchLayout or of a function that returns one; see
-            HELP.
+        text: A preset, a file, or the MODULE:NAME of a PatchLayout or of a function that returns a
+            PatchLayout; see HELP.
 
     Raises:
         ConfigError: There is no such layout.

@@ -1,4 +1,4 @@
-"""Options and arguments shared by several commands, with their shell completions."""
+"""Defines the options and arguments that several commands share, with their shell completions."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ if TYPE_CHECKING:
 def node_ids(ctx: typer.Context, incomplete: str) -> list[tuple[str, str]]:
     """Return shell completions for a node-ID, each with the name of its patch.
 
-    The completions are the node-IDs in the --hand file or, by default, in hand.toml; if that file yields
-    none, all node-IDs.
+    The completions are the node-IDs in the --hand file or, by default, in hand.toml. If the file contains no
+    node-IDs or cannot be read, they are all node-IDs.
     """
     patches = _patches(ctx)
     offered = [(str(patch.node_id), patch.name) for patch in patches]
@@ -26,7 +26,7 @@ def node_ids(ctx: typer.Context, incomplete: str) -> list[tuple[str, str]]:
 
 
 def nodes(ctx: typer.Context, incomplete: str) -> list[tuple[str, str]]:
-    """Return shell completions for a node: node-IDs, and the names of patches if --hand is given."""
+    """Return shell completions for NODE: node-IDs, and the names of patches if --hand is given."""
     named = _patches(ctx) if ctx.params.get("hand") is not None else []
     return node_ids(ctx, incomplete) + _beginning(incomplete, [(p.name, f"node {p.node_id}") for p in named])
 
@@ -37,7 +37,7 @@ def _patches(ctx: typer.Context) -> list[PatchConfig]:
     bus = ctx.params.get("bus")
     try:
         hand = load_hand(ctx.params.get("hand") or "hand.toml")
-    except (SkinError, OSError):  # shell completion cannot show a message
+    except (SkinError, OSError):  # shell completion cannot show an error message
         return []
     return [patch for patch in hand.patches if bus in (None, patch.bus)]
 
@@ -62,10 +62,10 @@ Interface = Annotated[
 Channel = Annotated[str | None, typer.Option(help="Channel of the interface; default can0.", metavar="NAME")]
 OtherInterface = Annotated[
     str | None,
-    typer.Option(help="python-can interface to use instead of the one in the file.", metavar="NAME"),
+    typer.Option(help="python-can interface to use instead of the interface in the file.", metavar="NAME"),
 ]
 OtherChannel = Annotated[
-    str | None, typer.Option(help="Channel to use instead of the one in the file.", metavar="NAME")
+    str | None, typer.Option(help="Channel to use instead of the channel in the file.", metavar="NAME")
 ]
 Bitrate = Annotated[int | None, typer.Option(help="Bits per second; default 1000000.", metavar="BPS")]
 Fd = Annotated[bool, typer.Option("--fd", help="Send PDOs in CAN FD frames.")]

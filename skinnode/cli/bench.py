@@ -20,12 +20,12 @@ JsonFile = Annotated[
 PlotFile = Annotated[
     Path | None, typer.Option("--plot", metavar="FILE", help="Plot the results to FILE (needs matplotlib).")
 ]
-Rounds = Annotated[int, typer.Option(min=1, help="Number of measurements per candidate.")]
+Rounds = Annotated[int, typer.Option(min=1, help="Number of measurements per implementation.")]
 
 
 @app.command()
 def kernel(json: JsonFile = None, plot: PlotFile = None, rounds: Rounds = 31) -> None:
-    """Time F + J and one step of each operator against NumPy, and the dense kernels against LAPACK."""
+    """Compare the speed of F + J and of each operator with NumPy, and of the dense kernels with LAPACK."""
     from skinnode.bench import kernel as bench
 
     _prepare(json, plot)
@@ -47,7 +47,7 @@ def kernel(json: JsonFile = None, plot: PlotFile = None, rounds: Rounds = 31) ->
 
 @app.command()
 def solve(json: JsonFile = None, plot: PlotFile = None, rounds: Rounds = 31) -> None:
-    """Solve one wire to 1e-9 with skinnode, SciPy and Ceres: same F and J, starting close to the solution."""
+    """Solve one wire to 1e-9 with skinnode, SciPy and Ceres: same F, J and start near the solution."""
     from skinnode.bench import solve as bench
 
     _prepare(json, plot)
@@ -76,7 +76,7 @@ def stability(
 ) -> None:
     """Solve every hard case with many seeds; report error, standard deviation, status and verdict.
 
-    Exit status 1 if any wire is CONVERGED but wrong.
+    The exit status is 1 if any wire is CONVERGED but wrong.
     """
     from skinnode.bench import stability as bench
     from skinnode.bench.verdict import named
@@ -112,7 +112,10 @@ def trust(
         bool, typer.Option("--short", help="Run one layout at two noises, and 20 pairs of faults.")
     ] = False,
     table: Annotated[
-        bool, typer.Option("--table", help="Measure only the scenes that used to be trusted and wrong.")
+        bool,
+        typer.Option(
+            "--table", help="Measure only the scenes that earlier versions solved wrongly but trusted."
+        ),
     ] = False,
     only: Annotated[
         list[str] | None,
@@ -127,9 +130,10 @@ def trust(
         bool, typer.Option("--resume", help="Continue an interrupted run with the same --json and --seed.")
     ] = False,
 ) -> None:
-    """Solve presses with and without faults: is what a field calls trusted right, and a sound patch trusted?
+    """Solve presses with and without faults; check that trusted fields are right and sound patches trusted.
 
-    Exit status 1 if a target is missed. Sections: healthy, single (faults), pair, hours, table, speed, road.
+    The exit status is 1 if a target is missed. Sections: healthy, single (faults), pair, hours, table, speed,
+    road.
     """
     from skinnode.bench import trust as bench
     from skinnode.bench.trust_report import lines
@@ -154,7 +158,7 @@ def trust(
     _print_machine(figures)
     _write(json, figures)
     if kept is not None:
-        kept.unlink(missing_ok=True)  # only now: also the parts that are not streams may be interrupted
+        kept.unlink(missing_ok=True)  # only now, because any part may be interrupted
     if not all(row["reached"] for row in figures["must"]):
         raise typer.Exit(1)
 
@@ -168,9 +172,9 @@ def accuracy(
     ] = 200,
     rounds: Rounds = 31,
 ) -> None:
-    """Measure error versus time, noise and code width; the coverage of intervals; and the time per frame.
+    """Measure the error versus time, noise and code width, the coverage of intervals, and the time per frame.
 
-    Exit status 1 if a requirement is not met; times are excluded, because they depend on the machine.
+    The exit status is 1 if a requirement is not met. Requirements exclude times, which depend on the machine.
     """
     from skinnode.bench import accuracy as bench
 
@@ -193,7 +197,7 @@ def path(
     plot: PlotFile = None,
     experiments: Annotated[int, typer.Option(min=1, help="Number of random presses per setting.")] = 10,
 ) -> None:
-    """Reproduce tables 2, 3 and 4 and figures 8 to 13 of the paper, and show the paper's values alongside."""
+    """Reproduce tables 2, 3 and 4 and figures 8 to 13 of the paper; print the paper's values alongside."""
     from skinnode.bench import path as bench
     from skinnode.text.json_values import plain
 
@@ -216,7 +220,7 @@ def node(
     ] = 10.0,
     rounds: Rounds = 31,
     interface: Annotated[
-        str, typer.Option(help="python-can interface; virtual stays within the process.")
+        str, typer.Option(help="python-can interface; virtual is a bus within the process.")
     ] = "virtual",
     channel: Annotated[
         str | None, typer.Option(help="Channel of the interface; default: an unused name.")
@@ -258,12 +262,13 @@ def pipeline(
     ] = "udp",
     channel: Annotated[str, typer.Option(help="Channel for socketcan.")] = "vcan0",
     all_cores: Annotated[
-        bool, typer.Option("--all-cores", help="Let host and load generator use all cores.")
+        bool, typer.Option("--all-cores", help="Allow the host and the load generator to use all cores.")
     ] = False,
 ) -> None:
-    """Feed a host from four full buses with sixteen patches; measure losses, latency and CPU load.
+    """Feed a host from four fully loaded buses with sixteen patches; measure losses, latency and CPU load.
 
-    Exit status 1 if a frame was lost or the frame counts do not add up. Times do not affect the exit status.
+    The exit status is 1 if a frame was lost or the frame counts do not add up. The measured times do not
+    affect the exit status.
     """
     from skinnode.bench import pipeline as bench
 
@@ -296,7 +301,9 @@ def pipeline(
 def soak(
     json: JsonFile = None,
     minutes: Annotated[float, typer.Option(min=0.1, help="Duration of the soak test in minutes.")] = 10.0,
-    seed: Annotated[int, typer.Option(help="Seed of the faults; the same seed gives the same rounds.")] = 1,
+    seed: Annotated[
+        int, typer.Option(help="Seed of the faults; the same seed reproduces the same rounds.")
+    ] = 1,
     own_cache: Annotated[
         bool, typer.Option(hidden=True, help="Run in this process, with the existing kernel cache.")
     ] = False,
@@ -305,7 +312,7 @@ def soak(
 
     Frames of every kind are dropped, other processes occupy the processors, and the kernel cache is damaged
     at the start. The host must survive, every patch must recover, all frame counts must add up, and memory,
-    threads and file descriptors must not grow. Exit status 1 if any of these requirements is not met.
+    threads and file descriptors must not grow. The exit status is 1 if any of these requirements is not met.
     """
     from skinnode.bench import soak as bench
 

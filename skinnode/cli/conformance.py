@@ -44,10 +44,10 @@ def conformance(
 
     The command RESETS the node many times, starts and stops it, remaps its PDOs, and stores and restores its
     parameters. The node's configuration is read first and restored at the end. The command addresses some
-    messages to all nodes, and sends frames that appear to come from other nodes: use a bus without another
+    messages to all nodes, and sends frames that appear to come from other nodes. Use a bus without another
     master and preferably without any other node, in a machine that can be stopped safely.
 
-    Exit status 0 if no case failed, 1 if any failed, 2 if the tests could not run.
+    The exit status is 0 if no case failed, 1 if any failed, 2 if the tests could not run.
     """
     from skinnode.cli._bus import find_bus
     from skinnode.conformance import connect, run_cases, select

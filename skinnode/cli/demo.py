@@ -16,7 +16,7 @@ __getattr__ = moved("skinnode.cli.demo", "skinnode.demo.hand")
 
 def demo(
     seconds: Annotated[
-        float, typer.Option(min=1.0, max=3600.0, help="Seconds to press and slide.", metavar="S")
+        float, typer.Option(min=1.0, max=3600.0, help="Duration of pressing and sliding, s.", metavar="S")
     ] = 8.0,
     patches: Annotated[
         int,
@@ -36,9 +36,9 @@ def demo(
     """Press simulated patches and decode their scans from real CANopen traffic.
 
     Each patch is a CANopen node on an embedded virtual bus. A spherical indenter presses and slides; the host
-    collects the PDOs and solves the scans. Exit status 1 if a scan was torn, a frame was lost, or errors
-    exceed the reported uncertainty: the RMS error over the run exceeds 1.15 times the reported RMS, or the
-    error of any coordinate exceeds 6 standard deviations.
+    collects the PDOs and solves the scans. The exit status is 1 if a scan was torn, a frame was lost, or
+    errors exceed the reported uncertainty: the RMS error over the run exceeds 1.15 times the reported RMS, or
+    the error of any coordinate exceeds 6 standard deviations.
     """
     import json
 

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 def doctor(
     hand: Annotated[
-        Path | None, typer.Argument(help="Hand file to check the buses against.", metavar="[HAND.toml]")
+        Path | None, typer.Argument(help="Hand file to compare with the buses.", metavar="[HAND.toml]")
     ] = None,
     interface: Interface = None,
     channel: Channel = None,
@@ -36,9 +36,10 @@ def doctor(
 ) -> None:
     """Examine buses, nodes, configuration, wires, noise, baseline, timing and losses.
 
-    The doctor only listens and reads, so a running hand is not disturbed. The skin is judged by its scans; a
-    hand that is not running sends scans only with --active. Do not touch the skin while the command runs.
-    Exit status 0 if no fault was found, 1 if any was found, 2 if the examination could not run.
+    The doctor only listens and reads, so a running hand is not disturbed. The skin is judged by its scans;
+    with --active, the doctor starts a hand that is not running, so that it sends scans. Do not touch the skin
+    while the command runs. The exit status is 0 if no fault was found, 1 if any was found, 2 if the
+    examination could not run.
     """
     from skinnode.cli._bus import find_buses
     from skinnode.cli._console import print_json, progress

@@ -22,16 +22,18 @@ _DEFAULT_SIZES = {
 
 def eds(
     upper_wires: Annotated[
-        int | None, typer.Option(min=1, max=254, help="Upper wires U, the rows of a frame; default 10.")
+        int | None,
+        typer.Option(min=1, max=254, help="Number of upper wires U, the rows of a frame; default 10."),
     ] = None,
     upper_electrodes: Annotated[
-        int | None, typer.Option(min=1, max=255, help="Electrodes N per upper wire; default 10.")
+        int | None, typer.Option(min=1, max=255, help="Number of electrodes N per upper wire; default 10.")
     ] = None,
     lower_wires: Annotated[
-        int | None, typer.Option(min=1, max=254, help="Lower wires K, the columns; default 30.")
+        int | None,
+        typer.Option(min=1, max=254, help="Number of lower wires K, the columns of a frame; default 30."),
     ] = None,
     lower_electrodes: Annotated[
-        int | None, typer.Option(min=1, max=255, help="Electrodes M per lower wire; default 10.")
+        int | None, typer.Option(min=1, max=255, help="Number of electrodes M per lower wire; default 10.")
     ] = None,
     layout: Annotated[
         str | None, typer.Option(help=f"Take the sizes from a layout: {LAYOUT_HELP}", metavar="LAYOUT")
@@ -72,7 +74,9 @@ def eds(
         raise ConfigError("--node-id", None, "1 to 127, for --dcf")
     for option, value in (("--node-id", node_id), ("--bitrate", bitrate)):
         if value is not None and not dcf:
-            raise ConfigError(option, value, "only with --dcf: an EDS does not describe a particular node")
+            raise ConfigError(
+                option, value, "only with --dcf, because an EDS does not describe a particular node"
+            )
     if output is not None:
         require_writable("--output", output)
     bitrate_bps = 1_000_000 if bitrate is None else bitrate

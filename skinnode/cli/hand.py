@@ -31,11 +31,11 @@ def check(
 ) -> None:
     """Validate a hand file and the files it names, compute the load of its buses, and list its limitations.
 
-    For each bus the command prints the planned load, once with every frame at its maximum length and once
-    with random data; the worst-case time from SYNC to the end of each patch's summary, also as a fraction of
-    the SYNC period; and the longest wait of each frame in `others`. Notes say what the hand will not
-    deliver, such as shear or positions in the frame of the hand. No bus is opened. Exit status 1 if the load
-    of a bus exceeds its max_load, 2 if the file cannot be used.
+    For each bus, the command prints the planned load with every frame at its maximum length and with random
+    data. It prints the worst-case time from SYNC to the end of each patch's summary, also as a fraction of
+    the SYNC period, and the longest wait of each frame in `others`. Notes list what the hand cannot deliver,
+    such as shear or positions in the frame of the hand. No bus is opened. The exit status is 1 if the load of
+    a bus exceeds its max_load, 2 if the file cannot be used.
     """
     from skinnode.bus_load.plan import plan_of, require_room
     from skinnode.config import load_hand
@@ -168,7 +168,7 @@ def _scan_table(plan: BusPlan) -> Table:
 
 
 def _frame_table(plan: BusPlan) -> Table:
-    """Return a table with one row per kind of frame, summed over all patches."""
+    """Return a table of bus load with one row per kind of frame, summed over all patches."""
     kinds: dict[str, list[float]] = {}
     for frame in plan.frames:
         sums = kinds.setdefault(frame.name.partition(" of ")[0], [0.0, 0.0, 0.0])
@@ -181,7 +181,7 @@ def _frame_table(plan: BusPlan) -> Table:
 
 
 def _other_table(plan: BusPlan) -> Table:
-    """Return a table of the longest time that each frame from another device waits to be sent."""
+    """Return a table with the longest time that each frame of another device waits for the bus."""
     table = _table("others", "bytes", "every ms", "queued to sent ms")
     for frame in plan.others:
         worst = "no bound" if frame.response_s is None else f"{frame.response_s * 1e3:.2f}"
@@ -260,7 +260,7 @@ period_ms = {period_ms}                    # each SYNC starts one scan of every 
 
 [solver]
 method = "auto"                   # every field has contacts with forces: field.contacts, HandFrame.contacts
-# max_std_m = 20e-6               # field.precise: largest standard deviation of a displacement, in metres,
+# max_std_m = 20e-6               # field.precise: maximum standard deviation of a displacement, in metres,
 # max_force_std_n = 0.1           # and of a contact's normal force; without them, what a sound patch reaches
 
 [stream]

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from skinnode.host import Host
 
 _LONGEST_WAIT_S = 0.1
-"""Maximum delay in reacting to Ctrl-C."""
+"""Maximum delay of the reaction to Ctrl-C, s."""
 
 
 def host(
@@ -29,12 +29,12 @@ def host(
 ) -> None:
     """Bring a hand's patches up as CANopen manager, solve their scans and report every second.
 
-    With --json each patch has `contacts` (null before the first field): centroid, area, normal and
+    With --json, each patch has `contacts` (null before the first field): centroid, area, normal and
     shear force with standard deviations, in m, m² and N. Ctrl-C ends the command and leaves the nodes
-    pre-operational. Exit status 1 if a patch was not operational at the end, a scan was torn or a frame lost
-    (unless its node reported that its computer was too slow), an interface failed or reported errors, or a
-    guest received no SYNC; 2 if the hand could not be run, or if a node sent frames whose content does not
-    match their identifier.
+    pre-operational. The exit status is 1 if a patch was not operational at the end, an interface failed or
+    reported errors, or a guest received no SYNC. It is also 1 if a scan was torn or a frame was lost, unless
+    the node reported that its computer was too slow. The exit status is 2 if the hand could not be run, or if
+    a node sent frames whose content does not match their identifier.
     """
     from skinnode.cli._host_report import JsonReport, TextReport
     from skinnode.compiled.jit import is_cold
@@ -46,7 +46,7 @@ def host(
     report = JsonReport() if as_json else TextReport()
     if is_cold():
         report.note("compiling the kernels once; this takes a few seconds")
-    for patch in plan.patches:  # compiles before anything is open, so Ctrl-C simply ends the program
+    for patch in plan.patches:  # no resource is open yet, so Ctrl-C can end the program
         check_solvable(patch, plan.solver)
     with stop_on_signal() as stop:
         status = _run(plan, seconds, report, stop)
@@ -55,7 +55,7 @@ def host(
 
 
 def _run(plan: HandConfig, seconds: float | None, report: Report, stop: threading.Event) -> int:
-    """Run the hand until the host is stopped or time is up, and return the exit status.
+    """Run the hand until the host is stopped or the duration has elapsed, and return the exit status.
 
     The host logs each frame whose content does not match its identifier; Python prints the log on stderr.
     """
@@ -82,7 +82,7 @@ def _run(plan: HandConfig, seconds: float | None, report: Report, stop: threadin
 
 
 def _watch(running: Host, stop: threading.Event, seconds: float | None, report: Report) -> None:
-    """Collect the fields and report every second until the host is stopped or time is up."""
+    """Collect the fields and report every second until the host is stopped or the duration has elapsed."""
     from skinnode.cli._host_report import Second
 
     start_s = time.monotonic()

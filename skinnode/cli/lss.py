@@ -1,4 +1,4 @@
-"""``skinnode lss``: sets the node-ID and bit rate of nodes that have no switches."""
+"""``skinnode lss``: sets the node-ID and bit rate of nodes by serial number, over the bus."""
 
 from __future__ import annotations
 
@@ -26,7 +26,10 @@ def list_nodes(
     bus: Bus = None,
     as_json: Json = False,
 ) -> None:
-    """Find nodes without a node-ID by LSS fastscan, on one bus or every bus of the hand. Changes nothing."""
+    """Find nodes without a node-ID by LSS fastscan, on one bus or every bus of the hand.
+
+    No node is changed.
+    """
     from skinnode.cli._bus import find_buses
     from skinnode.cli._console import console, print_json, progress, table
     from skinnode.diagnose.bus_connection import BusConnection
@@ -65,7 +68,7 @@ def set_node(
         typer.Option(
             min=0,
             max=0xFFFF_FFFF,
-            help="Serial number of the node; default: that of the only node without a node-ID.",
+            help="Serial number of the node; default: the only node without a node-ID.",
         ),
     ] = None,
     node_id: Annotated[
@@ -96,8 +99,8 @@ def set_node(
 ) -> None:
     """Set and store the node-ID, the bit rate or both in one node.
 
-    A node that already has a node-ID is reset so that the new one takes effect. Exit status 0 on success, 1
-    if the node did not store its settings or did not boot, 2 if nothing could be done.
+    A node that already has a node-ID is reset, so that the new node-ID takes effect. The exit status is 0 on
+    success, 1 if the node did not store its settings or did not boot, 2 if nothing could be done.
     """
     from skinnode.canopen import indices as od
     from skinnode.canopen.lss import BIT_RATES_BPS, LssAddress
@@ -145,7 +148,7 @@ def set_node(
 
 
 def _bus_of(places: list[Place], serial: int | None, node_id: int | None) -> Place:
-    """Return the bus of the patch with this serial number or, failing that, with this node-ID."""
+    """Return the bus of the patch that has the serial number or, failing that, the node-ID."""
     from skinnode.errors import NOTHING, ConfigError
 
     for number, key in ((serial, "serial"), (node_id, "node_id")):

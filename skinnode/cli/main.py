@@ -1,6 +1,6 @@
 """Entry point of ``skinnode``.
 
-This module imports nothing slow, so that its signal handlers are installed first. The subcommands are in
+This module imports no slow modules, so that its signal handlers are installed first. The subcommands are in
 :mod:`skinnode.cli._app`, the exit statuses in :mod:`skinnode.cli._exit_status`.
 """
 
@@ -18,7 +18,7 @@ def main(argv: Sequence[str] | None = None) -> NoReturn:
 
 
 def __getattr__(name: str) -> Any:
-    """Provide ``app``, the typer application."""
+    """Import ``app``, the typer application, on first access."""
     if name == "app":
         from skinnode.cli._app import app
 

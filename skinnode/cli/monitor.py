@@ -40,7 +40,7 @@ def monitor(
         bool,
         typer.Option(
             "--simulate",
-            help="Press simulated patches on a private bus: the hand's patches, or four if no hand is given.",
+            help="Simulate pressed patches on a private bus: the hand's patches, or four without a hand.",
         ),
     ] = False,
     output: Annotated[
@@ -57,12 +57,12 @@ def monitor(
         bool, typer.Option("--json", help="Print one JSON object per second instead of showing a screen.")
     ] = False,
 ) -> None:
-    """Show a hand on the terminal: height and shear, touches, health, rates, load, events.
+    """Show a hand on the terminal: depth and shear maps, touches, health, rates, load, events.
 
     The command runs the hand as `skinnode host` does, but waits for missing patches. Keys: 1-9 select a
-    patch, z shows it alone, t tares it, r records, space freezes the picture, ? shows help, q quits. The
-    screen needs the extra `tui`. Exit status 0 if there was no fault, 1 if there was one (printed at the
-    end), 2 if the monitor could not run.
+    patch, z shows only that patch, t tares it, r records, space freezes the picture, ? shows help, q quits.
+    The screen requires the optional packages of the extra `tui`. The exit status is 0 if there was no fault,
+    1 if there was one (printed at the end), 2 if the monitor could not run.
     """
     from skinnode.errors import NOTHING, ConfigError, Shown
 
@@ -108,7 +108,7 @@ def _require_used(
 
 
 def _require_screen() -> None:
-    """Raise ConfigError if there is no terminal or textual is not installed."""
+    """Raise ConfigError if there is no terminal or the package textual is not installed."""
     from importlib.util import find_spec
 
     from skinnode.errors import ConfigError, Shown
@@ -121,7 +121,7 @@ def _require_screen() -> None:
 
 
 def _plan(hand: Path | None, interface: str | None, channel: str | None, simulate: bool) -> HandConfig:
-    """Return the hand to run, set up so that its host waits for missing patches."""
+    """Return the hand to run, with its settings changed so that the host waits for missing patches."""
     from skinnode.config import load_hand
     from skinnode.demo.hand import demo_hand
 
@@ -129,7 +129,7 @@ def _plan(hand: Path | None, interface: str | None, channel: str | None, simulat
         plan = load_hand(hand).on(interface, channel)
     else:
         plan = demo_hand(_SIMULATED, seed=1)
-        # only the posterior provides forces
+        # only the posterior computes contact forces
         solver = plan.solver.model_copy(update={"method": "posterior"})
         plan = plan.model_copy(update={"name": "simulated hand", "solver": solver})
     if simulate:
@@ -143,7 +143,10 @@ def _plan(hand: Path | None, interface: str | None, channel: str | None, simulat
 def _running(
     stack: ExitStack, plan: HandConfig, stop: threading.Event, simulate: bool, quiet: bool
 ) -> Source:
-    """Return a source that runs a host; ``stack`` closes the source. Raises as :meth:`Host.from_config`."""
+    """Return a source that runs a host; ``stack`` closes the source.
+
+    Raises the errors of :meth:`Host.from_config`.
+    """
     from skinnode.cli._console import progress
     from skinnode.compiled.jit import is_cold
     from skinnode.host import Host
@@ -165,7 +168,7 @@ def _running(
             stack.enter_context(simulated(plan))
         tell(f"bringing up {counted(len(plan.patches), 'patch', 'patches')}")
         stack.enter_context(responsive_threads())
-        stack.enter_context(without_long_collections())  # collects garbage before the first SYNC
+        stack.enter_context(without_long_collections())  # runs garbage collection before the first SYNC
         host = stack.enter_context(Host.from_config(plan, cancelled=stop.is_set))
     return stack.enter_context(HostSource(host))
 
@@ -179,18 +182,21 @@ def _recording(stack: ExitStack, path: Path, speed: float) -> Source:
 
 
 def _show(source: Source, stop: threading.Event, seconds: float | None, output: Path) -> list[str]:
-    """Run the screen and return the faults. Raises the SkinError that stopped the source."""
+    """Show the screen until it is closed and return the faults.
+
+    Raises the SkinError that stopped the source.
+    """
     from skinnode.monitor.app import MonitorApp, terminal_colours
 
     app = MonitorApp(
         source, folder=output, colours=terminal_colours(os.environ), over=stop.is_set, seconds=seconds
     )
-    app.run(mouse=False)  # the terminal keeps the mouse, for selecting and copying text
+    app.run(mouse=False)  # without mouse capture, text can be selected and copied
     if app.failure is not None:
         raise app.failure
-    if app.return_code:  # a defect in the screen's code, which textual has reported
+    if app.return_code:  # textual has reported an internal error of the screen
         raise typer.Exit(2)
-    if app.terminal_is_deaf:  # output would not be visible
+    if app.terminal_is_deaf:  # output would be invisible while the screen is shown
         raise typer.Exit(1 if app.faults.lines else 0)
     return app.faults.lines
 

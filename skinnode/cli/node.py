@@ -1,4 +1,4 @@
-"""``skinnode node``: runs a Linux board with a converter as a patch of skin on a CAN bus."""
+"""``skinnode node``: runs a Linux board with a converter as a skin patch on a CAN bus."""
 
 from __future__ import annotations
 
@@ -58,17 +58,19 @@ def node(
     ] = None,
     strict_timing: Annotated[
         bool,
-        typer.Option("--strict-timing", help="Keep time to within 0.2 ms instead of 2 ms; uses more CPU."),
+        typer.Option(
+            "--strict-timing", help="Send frames on time to within 0.2 ms instead of 2 ms; uses more CPU."
+        ),
     ] = False,
     seconds: Seconds = None,
     as_json: JsonLines = False,
 ) -> None:
-    """Run one patch as a CANopen node; the resistances come from your source.
+    """Run one patch as a CANopen node that sends the resistances read from a source.
 
     A source is a class or function that takes the layout and returns an object whose read(t_ns) returns
     the (U, K) resistances in ohms. `--source simulated` needs no hardware. The command reports every second
-    until Ctrl-C. Exit status 1 if the source failed, scans were skipped, frames were not sent, another node
-    used its node-ID or the --store file could not be used; 2 if the node could not run.
+    until Ctrl-C. The exit status is 1 if the source failed, scans were skipped, frames were not sent, another
+    node used its node-ID or the --store file could not be used; 2 if the node could not run.
     """
     from skinnode.canopen.lss import NOT_CONFIGURED
     from skinnode.cli._layout_option import find_layout, import_from_here
@@ -84,7 +86,7 @@ def node(
     from skinnode.transport import CanPort
 
     if node_id is None and store is None:
-        raise ConfigError("--node-id", None, "1 to 127, or --store FILE and a node-ID that LSS stores there")
+        raise ConfigError("--node-id", None, "1 to 127, or --store FILE if LSS stores the node-ID")
     if store is not None:
         require_writable("--store", store)
     import_from_here()
@@ -126,7 +128,7 @@ def node(
 
 @contextmanager
 def _memory(store: Path | None) -> Iterator[FileMemory | None]:
-    """Yield the non-volatile memory in the file ``store``, locked for this process."""
+    """Yield the non-volatile memory in the file ``store``, which stays locked for this process."""
     from skinnode.errors import ConfigError
     from skinnode.files.file_lock import FileInUse, NotARegularFile
     from skinnode.node.memory_file import FileMemory
@@ -162,11 +164,11 @@ def _node_text(node_id: int, given: int | None) -> str:
 
 @dataclass(frozen=True, slots=True)
 class _Progress:
-    """Progress of the node; all counts are 0 when the node starts."""
+    """Counters of a running node, which are 0 when the node starts."""
 
     elapsed_s: float
     node_id: int | None
-    """None while the node has no node-ID."""
+    """Node-ID of the node; None while the node has none."""
     state: str
     scans: int
     frames: int
@@ -219,7 +221,7 @@ def _faults(end: _Progress) -> list[str]:
 def _watch(
     runner: NodeRunner, port: CanPort, stop: threading.Event, seconds: float | None, as_json: bool
 ) -> None:
-    """Print a line every second until the command is stopped, time is up, or the node's thread has ended."""
+    """Print a line every second until the command is stopped, the duration elapses or the node ends."""
     start_s = time.monotonic()
     end_s = float("inf") if seconds is None else start_s + seconds
     before, due_s = replace(_progress(runner, port, 0.0), scans=0, frames=0), start_s + 1.0

@@ -35,7 +35,7 @@ def od(
     write: Annotated[
         str | None,
         typer.Option(
-            help="Write this value as the type given in the EDS, and read it back.", metavar="VALUE"
+            help="Write this value with the data type in the EDS, and read it back.", metavar="VALUE"
         ),
     ] = None,
     as_hex: Annotated[
@@ -57,7 +57,7 @@ def od(
 ) -> None:
     """Read or write objects of a node. Indices are hexadecimal, with or without 0x.
 
-    Without INDEX the command dumps the whole dictionary. Exit status 0 on success, 1 if --diff
+    Without INDEX, the command dumps the whole dictionary. The exit status is 0 on success, 1 if --diff
     found differences, 2 if the node did not answer or refused the request.
     """
     from skinnode.cli._bus import find_node
@@ -99,19 +99,21 @@ def od(
 def _require_combination(
     where: tuple[int, int | None] | None, write: str | None, dcf: Path | None, diff: Path | None
 ) -> None:
-    """Raise ConfigError for options that exclude each other."""
+    """Raise ConfigError if the options exclude each other."""
     from skinnode.errors import ConfigError
 
     if write is not None and where is None:
         raise ConfigError("--write", write, "only with INDEX[:SUB]")
     if diff is not None and (where is not None or write is not None or dcf is not None):
-        raise ConfigError("--diff", str(diff), "only by itself, because it compares the whole dictionary")
+        raise ConfigError(
+            "--diff", str(diff), "only without these options, because it compares the whole dictionary"
+        )
     if dcf is not None and where is not None:
         raise ConfigError("--dcf", str(dcf), "only without INDEX, because it covers the whole dictionary")
 
 
 def _diff(place: Place, node_id: int, file: Path, as_json: bool) -> None:
-    """Compare the whole dictionary with ``file``; exit status 1 if they differ."""
+    """Compare the whole dictionary with ``file``; exit with status 1 if values differ."""
     from skinnode.cli._console import progress
     from skinnode.diagnose.bus_connection import BusConnection
     from skinnode.diagnose.data_sheet import load_data_sheet
@@ -130,7 +132,7 @@ def _diff(place: Place, node_id: int, file: Path, as_json: bool) -> None:
 
 
 def _dump(remote: RemoteOd, sheet: DataSheet, tell: Callable[[str], None]) -> list[Reading]:
-    """Read the whole dictionary: the objects in the EDS or, without an EDS, those of CiA 301."""
+    """Read the whole dictionary: the objects in the EDS or, without an EDS, the objects of CiA 301."""
     from skinnode.diagnose.object_dictionary import dump, dump_standard
 
     return list(dump(remote, sheet.eds, tell) if sheet.eds.entries else dump_standard(remote, tell))
@@ -144,7 +146,7 @@ def _access(
     as_hex: bool,
     node_id: int,
 ) -> list[Reading]:
-    """Write an object if ``write`` is given, then read it."""
+    """Write an object if ``write`` is given, then read the object."""
     from skinnode.diagnose.object_dictionary import entries_at
 
     entries = entries_at(sheet.eds, *where, lambda: int(remote.read(where[0], 0, "u8")))
@@ -180,7 +182,10 @@ def _sheet_if_any(remote: RemoteOd, eds: Path | None) -> DataSheet:
 
 
 def _read(remote: RemoteOd, entries: list[EdsEntry]) -> list[Reading]:
-    """Read the objects. A refusal raises SdoAbort if there is only one object, and is listed otherwise."""
+    """Read the objects.
+
+    A refused read raises SdoAbort if there is only one object; otherwise it is listed.
+    """
     from skinnode.diagnose.object_dictionary import read_entry
 
     if len(entries) == 1 and entries[0].access != "wo":

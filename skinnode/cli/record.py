@@ -42,7 +42,7 @@ def record(
     ] = "log",
     listen: Annotated[
         bool,
-        typer.Option("--listen", help="Do not send or solve anything; only record the frames received."),
+        typer.Option("--listen", help="Only record the frames received; do not send frames or solve scans."),
     ] = False,
     interface: OtherInterface = None,
     channel: OtherChannel = None,
@@ -52,9 +52,10 @@ def record(
     """Run a hand's patches as `skinnode host` does, and record every frame received or sent.
 
     Play the recording with `skinnode replay`; can-utils and python-can can read it too. If the command is
-    killed, at most the last second of the recording is lost. A recording made with --listen has no baselines
-    and thus no fields; it is for use with can-utils. Exit status 1 if frames could not be written, or for any
-    fault that `skinnode host` reports; 2 if the hand could not be run.
+    killed, at most the last second of the recording is lost. A recording made with --listen contains no
+    baselines and can therefore be used only with CAN tools, not to compute fields. The exit status is 1 if
+    frames could not be written, or for any fault that `skinnode host` reports; 2 if the hand could not be
+    run.
     """
     from skinnode.config import load_hand
     from skinnode.process.signals import stop_on_signal
@@ -75,7 +76,7 @@ def record(
 def _run(
     plan: HandConfig, recorder: Recorder, stop: threading.Event, seconds: float | None, as_json: bool
 ) -> list[str]:
-    """Run the hand and return its faults, one line each."""
+    """Run and record the hand; return its faults, one line each."""
     from skinnode.cli._host_report import faults_and_notes
     from skinnode.host import BringUpCancelled, Host
     from skinnode.host.scan_solver import check_solvable
@@ -124,7 +125,7 @@ def _follow(
     as_json: bool,
     check: Callable[[], object] = lambda: None,
 ) -> None:
-    """Print a line every second until stopped or until time is up; ``check`` may raise to stop early."""
+    """Print a line every second until stopped or the duration elapses; ``check`` may raise to stop early."""
     start_s = time.monotonic()
     end_s = float("inf") if seconds is None else start_s + seconds
     due_s = start_s + 1.0

@@ -31,11 +31,12 @@ def replay(
 ) -> None:
     """Decode and solve a recording made by `skinnode record`; results are bit-identical to the live run's.
 
-    With --json each field has `contacts`: centroid, area, normal and shear force with standard deviations, in
-    m, m² and N.
+    With --json, each field has `contacts`: centroid, area, normal and shear force with standard deviations,
+    in m, m² and N.
 
-    Exit status 1 if the recording is damaged, was not ended properly, lacks frames or contains error frames,
-    or if a scan was torn or missed, or a chunk or summary lost; 2 if the recording cannot be read at all.
+    The exit status is 1 if the recording is damaged, was not ended properly, lacks frames or contains error
+    frames, or if a scan was torn or missed, or a chunk or summary was lost. The exit status is 2 if the
+    recording cannot be read.
     """
     from skinnode.process.signals import stop_on_signal
     from skinnode.record import replay as play
@@ -44,7 +45,7 @@ def replay(
         run = play(recording, speed=None if fast else speed, cancelled=stop.is_set)
         deepest_m = {patch.name: 0.0 for patch in run.hand.patches}
         for field in run:
-            assert field.stamp is not None  # the host timestamps every field
+            assert field.stamp is not None  # always true, because the host timestamps every field
             if as_json:
                 print(json.dumps(field_table(field)), flush=not fast)
             depth_m = float(-field.displacement_m[..., 2].min())
@@ -64,7 +65,7 @@ def replay(
 
 
 def field_table(field: FieldFrame) -> dict[str, Any]:
-    """Return a field as JSON, with numbers at full precision."""
+    """Return a field as JSON-compatible data, with numbers at full precision."""
     from skinnode.cli._contacts import contact_tables
     from skinnode.host.trust_report import trust_table
 

@@ -24,9 +24,10 @@ def scan(
 ) -> None:
     """Find every node on a bus: by SDO, by heartbeat, and by LSS if it has no node-ID.
 
-    With --hand the command scans every bus of the hand. The command changes nothing in any node and takes two
-    seconds per bus. Exit status 0 if nodes were found and none has a fault; 1 if none was found, two share a
-    node-ID, or a node of the hand is missing or is a different device; 2 if the scan could not run.
+    With --hand, the command scans every bus of the hand. The command changes nothing in any node and takes
+    two seconds per bus. The exit status is 0 if nodes were found and none has a fault; 1 if none was found,
+    two share a node-ID, or a node of the hand is missing or is a different device; 2 if the scan could not
+    run.
     """
     from skinnode.cli._bus import find_buses
     from skinnode.cli._console import print_json, progress
@@ -53,7 +54,7 @@ def scan(
 
 
 def _faults(found: Discovery, place: Place) -> list[str]:
-    """Return the faults, one line each."""
+    """Return the faults found by the scan, one line each."""
     from skinnode.diagnose.bus_connection import no_answer
     from skinnode.text.words import known
 
@@ -85,7 +86,7 @@ def _faults(found: Discovery, place: Place) -> list[str]:
 
 
 def _as_json(scans: list[tuple[Place, Discovery]], faults: list[str]) -> dict[str, object]:
-    """Return the scans as JSON; each node names its bus, even if there is only one bus."""
+    """Return the scans as JSON-compatible data, in which each node names its bus."""
     from dataclasses import asdict
 
     first = scans[0][0].bus

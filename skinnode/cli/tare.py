@@ -19,7 +19,7 @@ def tare(
     patches: Annotated[
         list[str] | None,
         typer.Argument(
-            help="Names of patches in the --hand file, or node-IDs; default: all its patches.",
+            help="Names of patches in the --hand file, or node-IDs; default: all patches of the hand.",
             metavar="[PATCH]...",
             autocompletion=nodes,
             show_default=False,
@@ -37,10 +37,10 @@ def tare(
 
     Do not touch the skin while the command runs.
 
-    Taring uses SDO, with or without a host on the bus: a running host reads the new baselines and
-    continues. A baseline is lost at power-off unless it is stored (0x1010). A patch whose baseline
-    comes from a file named in hand.toml is refused. Exit status 0 if every patch was tared, 1 if any was not,
-    2 if the command could not run.
+    Taring uses SDO and works with or without a host on the bus; a running host reads the new baselines
+    and continues. A baseline is lost at power-off unless it is stored (0x1010). The command refuses a
+    patch whose baseline comes from a file named in hand.toml. The exit status is 0 if every patch was tared,
+    1 if any was not, 2 if the command could not run.
     """
     from skinnode.cli._bus import find_buses, node_among
     from skinnode.cli._console import print_json, progress
@@ -75,7 +75,7 @@ def tare(
 
 
 def _tare_on(place: Place, node_ids: list[int], tell: Callable[[str], None]) -> list[Tared]:
-    """Tare nodes on one bus. The bus is opened only if at least one node may be tared."""
+    """Tare the nodes on one bus. The bus is opened only if at least one node may be tared."""
     from skinnode.diagnose.bus_connection import BusConnection
     from skinnode.diagnose.tare import Tared, refusal, tare
 

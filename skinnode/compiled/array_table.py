@@ -1,8 +1,8 @@
 """Tables that pass many arrays and numbers to a kernel in one argument, with access by name.
 
-Numba checks and unpacks every argument of every call. For the fifty arrays of a patch, this takes 4 µs with
-warm caches and 40 µs with cold caches, as long as solving four wires. An :class:`ArrayTable` is one array of
-addresses and shapes. A subclass declares the fields once, for Python and for kernels:
+Numba checks and unpacks every argument of every call. For the fifty arrays of a patch, this overhead is 4 µs
+with warm caches and 40 µs with cold caches, as much as for solving four wires. An :class:`ArrayTable` is one
+array of addresses and shapes. A subclass declares the fields once, for Python and for kernels:
 
     class Scan(ArrayTable):
         ohm: Annotated[NDArray[np.float64], "U K"]     # element type and axes
@@ -60,7 +60,7 @@ _T = TypeVar("_T", bound="ArrayTable")
 
 @dataclass(frozen=True)
 class _Field:
-    """One array, or one number if ``axes`` is None."""
+    """Field of a table: an array, or a number if ``axes`` is None."""
 
     name: str
     dtype: str
@@ -137,8 +137,8 @@ class ArrayTable:
     Args:
         values: Value of every declared field, by name. Arrays are not copied; write to them in place.
 
-    Raises TypeError if a field is missing or unknown, or if an array differs from its declaration in element
-    type, number of axes or length, is not contiguous, or is read-only.
+    Raises TypeError if a field is missing or unknown, if an array is not contiguous or is read-only, or if
+    its element type, number of axes or length differs from the declaration.
     """
 
     table: NDArray[np.int64]
@@ -216,7 +216,7 @@ class _ViewModel(models.PrimitiveModel):  # type: ignore[misc]
 
 
 def reader(made_of: type[_T]) -> Callable[[NDArray[np.int64]], _T]:
-    """Return a kernel function that turns a ``made_of`` table into an object with the declared fields.
+    """Return a kernel function that converts a ``made_of`` table to an object with the declared fields.
 
     Only compiled code can call the function. Each use of a field name reads the table again, so read fields
     before loops. In kernels, bool arrays are uint8. The kernel raises TypeError if the table has a

@@ -1,10 +1,10 @@
 """Compilation of kernels: ``@njit`` with a cache that cannot go stale.
 
-A plain file cache notices edits to the file that defines a function, but not edits to other files whose
-functions it calls. Therefore the cache folder (:mod:`skinnode.compiled.kernel_cache`) is named after a digest
-of every file that contains kernels: an edit to any of these files recompiles all kernels. The folder is
-created under the first of these that is writable: ``$SKINNODE_CACHE_DIR``, the user's cache folder, the
-system's temporary folder. If no folder is writable, nothing is cached.
+A plain file cache detects edits to the file that defines a function, but not edits to other files whose
+functions the function calls. Therefore the cache folder (:mod:`skinnode.compiled.kernel_cache`) is named
+after a digest of every file that contains kernels: an edit to any of these files recompiles all kernels. The
+cache folder is created in the first writable location among ``$SKINNODE_CACHE_DIR``, the user's cache folder
+and the system's temporary folder. If no location is writable, kernels are not cached.
 
 ``error_model="numpy"`` makes a division by zero yield inf (reported by a status) instead of raising an
 exception, and ``nogil`` lets a thread pool solve several patches at the same time. ``fastmath`` stays off
@@ -71,7 +71,7 @@ def cache_dir() -> Path | None:
 def is_cold(kernel: str = "solve_patch") -> bool:
     """Return whether ``kernel`` still has to be compiled.
 
-    Commands use this to explain a slow start.
+    Commands use this function to explain a slow start.
     """
     folder = cache_dir()
     return folder is None or not any(folder.glob(f"*.{kernel}-*{SUFFIX}"))
@@ -83,7 +83,8 @@ _OPTIONS = {"nogil": True, "error_model": "numpy", "_nrt": False}
 def njit_part(function: _F) -> _F:
     """Compile ``function`` for calls from other kernels only; its code is cached with its callers' code.
 
-    Python cannot call it. Omitting the Python entry point saves a fifth of the compile time.
+    Python cannot call the compiled function. Omitting the Python entry point saves a fifth of the compile
+    time.
     """
     compiled: _F = numba.njit(no_cpython_wrapper=True, no_cfunc_wrapper=True, **_OPTIONS)(function)
     return compiled
@@ -106,8 +107,8 @@ def njit(function: _F) -> _F:
 def njit_brief(function: _F) -> _F:
     """Compile ``function`` as :func:`njit` does, but hold the interpreter lock while it runs.
 
-    Use this decorator for kernels that take about a microsecond: if the lock were released, another thread
-    could hold it for longer than the rest of the field takes to compute.
+    Use this decorator for kernels that take about a microsecond. If such a kernel released the lock, another
+    thread could hold the lock for longer than the rest of the field's computation takes.
     """
     return _kept(function, nogil=False)
 

@@ -1,15 +1,15 @@
 """File cache of compiled kernels that verifies each file before use.
 
-Numba's own file cache unpickles any file it finds: a truncated file causes an exception in the first call to
-a kernel on every run, and machine code with a flipped bit is executed. All signatures of a function share one
-index, so two processes that compile different signatures at the same time can store the code of one under the
-name of the other.
+Numba's own file cache unpickles any file that it finds. A truncated file therefore causes an exception in the
+first call to a kernel on every run, and machine code with a flipped bit is executed. All signatures of a
+function share one index. Two processes that compile different signatures at the same time can therefore store
+the code of one signature under the name of the other.
 
-Here each compiled signature has its own file, with a magic number, the SHA-256 of the payload, and the
-payload itself. The file name contains a digest of everything that the code depends on, so no index is needed.
-Files are written under a temporary name and renamed. If a file fails verification, it is removed, the kernel
-is recompiled, and one line is logged. One line is also logged if a kernel cannot be cached. Cache errors
-never reach the caller.
+In this cache, each compiled signature has its own file, which contains a magic number, the SHA-256 of the
+payload, and the payload itself. The file name contains a digest of everything on which the code depends, so
+no index is needed. Files are written under a temporary name and renamed. If a file fails verification, it is
+removed, the kernel is recompiled, and one line is logged. One line is also logged if a kernel cannot be
+cached. Cache errors never reach the caller.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ class KernelCache:
         file = inspect.getfile(function)
         self._folder = folder
         self._stem = f"{Path(file).stem}.{function.__qualname__}-{code.co_firstlineno}"
-        # not the path of the file: every installation of the same code shares the kernels
+        # the path of the file is excluded, so that all installations of the same code share the kernels
         self._source = (sys.implementation.cache_tag, _file_digest(file), code.co_code.hex())
 
     @property

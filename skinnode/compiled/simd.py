@@ -1,10 +1,10 @@
 """Explicit vectors of doubles for kernels in which automatic vectorisation is not good enough.
 
-LLVM prefers 256-bit vectors even where 512-bit vectors are twice as fast, does not vectorise unless it can
-prove that rows do not overlap, and may keep sums in memory. A kernel that calls ``load``, ``fma`` and
-``store`` gets exactly these instructions, and each lane accumulates its own sum in the order written. The
-result is therefore the same for any number of threads and any split of the columns. On processors with
-narrower vectors, each operation is split.
+LLVM prefers 256-bit vectors even if 512-bit vectors are twice as fast. It does not vectorise unless it can
+prove that rows do not overlap, and it may keep sums in memory instead of registers. A kernel that calls
+``load``, ``fma`` and ``store`` gets exactly these instructions, and each lane accumulates its own sum in the
+order written. The result is therefore the same for any number of threads and any split of the columns. On
+processors with narrower vectors, each operation is split.
 
 Vectors support +, − and *; a double in such an expression is broadcast to a vector.
 """
@@ -43,7 +43,7 @@ def _lanes() -> int:
 
 LANES: Final = _lanes()
 Lanes = Any
-"""Type of a vector of LANES doubles; exists in compiled code only."""
+"""Type of a vector of LANES doubles; the type exists only in compiled code."""
 
 _DOUBLE = ir.DoubleType()
 _INT = ir.IntType(64)

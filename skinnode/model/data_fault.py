@@ -17,7 +17,7 @@ class FaultyPart(enum.StrEnum):
 
 
 class FaultKind(enum.StrEnum):
-    """What is wrong with the readings."""
+    """Kind of error in the readings."""
 
     CONTRADICTS = "contradicts the other readings"
     CROSSED = "exchanged with another wire"
@@ -30,7 +30,7 @@ class FaultKind(enum.StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class DataFault:
-    """Readings that failed a test and were left out."""
+    """Fault in the data: readings that failed a test and were left out of a field."""
 
     part: FaultyPart
     kind: FaultKind
@@ -47,7 +47,7 @@ class DataFault:
 
     @property
     def place(self) -> str:
-        """The part and its numbers, such as ``crossing of upper wire 3 and lower wire 12``."""
+        """Faulty part with its wire numbers, such as ``crossing of upper wire 3 and lower wire 12``."""
         match self.part:
             case FaultyPart.CROSSING:
                 return f"crossing of upper wire {self.upper} and lower wire {self.lower}"

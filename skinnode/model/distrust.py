@@ -1,4 +1,4 @@
-"""Words for why a field is not trusted."""
+"""Explanation, as text, why a field is not trusted."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from skinnode.model.status import Status
 
 
 def why_not(field: FieldFrame) -> str:
-    """Return why a field is not trusted, in words; empty if it is trusted.
+    """Return the reason why a field is not trusted, as text; empty if the field is trusted.
 
-    For a field that has not been assessed, the reason is the statuses of its wires.
+    For a field that has not been assessed, the text lists the statuses of wires that are not CONVERGED.
     """
     if field.trusted:
         return ""

@@ -1,9 +1,9 @@
 """Rubber as an elastic half-space: surface displacements caused by surface loads.
 
-The body fills z < 0, its surface is z = 0, and z points outwards, as everywhere in this project; a press is a
-load with a negative z component. With the offset d = (x, y) from load to point, r = |d|, shear modulus G and
-Poisson's ratio ν, a point load f displaces the surface by (Boussinesq 1885, Cerruti 1882; Johnson, Contact
-Mechanics, 1985, eqs. 3.18 and 3.75 at z = 0, in our axes)
+The body fills z < 0, its surface is z = 0, and z points outwards, as everywhere in this project. A press is
+therefore a load with a negative z component. With the offset d = (x, y) from load to point, r = |d|, shear
+modulus G and Poisson's ratio ν, a point load f displaces the surface by (Boussinesq 1885, Cerruti 1882;
+Johnson, Contact Mechanics, 1985, eqs. 3.18 and 3.75 at z = 0, in our axes)
 
     ⎡ u_x ⎤      1   ⎡ (1−ν)/r + ν x²/r³    ν x y/r³              (½−ν) x/r² ⎤ ⎡ f_x ⎤
     ⎢ u_y ⎥  =  ───  ⎢ ν x y/r³             (1−ν)/r + ν y²/r³     (½−ν) y/r² ⎥ ⎢ f_y ⎥
@@ -67,8 +67,9 @@ def point_compliance(rubber: Rubber, offset_m: ArrayLike, *, softening_m: float 
     Args:
         rubber: The material.
         offset_m: (P, 2) offset of each point from the load, metres.
-        softening_m: ε in r → √(r² + ε²), metres; spreads the load over a spot of about that radius, so that
-            the displacement at the load stays finite. 0 gives an ideal point load.
+        softening_m: Softening length ε, metres; r is replaced with √(r² + ε²). This spreads the load over a
+            spot of about the radius ε, so that the displacement at the load stays finite. A value of 0 means
+            an ideal point load.
 
     Returns:
         (P, 3, 3) compliance, m/N. The last axis is the component of the load, the second-to-last axis that of
@@ -123,8 +124,8 @@ def _antiderivatives(x: Float, y: Float) -> Float:
     r = np.hypot(x, y)
     ax, ay = np.abs(x), np.abs(y)
     with np.errstate(divide="ignore", invalid="ignore"):
-        # asinh(x/|y|) = ln(x + r) − ln|y|: the second term cancels between the corners, and asinh avoids the
-        # loss of digits in x + r
+        # asinh(x/|y|) = ln(x + r) − ln|y|: the second term cancels in the sum over the corners, and asinh
+        # avoids the loss of digits in x + r
         xx = np.where(ay > 0, y * np.arcsinh(x / ay), 0.0)
         yy = np.where(ax > 0, x * np.arcsinh(y / ax), 0.0)
         log_r = np.where(r > 0, np.log(r), 0.0)

@@ -25,7 +25,7 @@ class ScanStamp:
     scan: int
     """Scan number since the stream started, unwrapped."""
     counter: int
-    """Scan number in the CAN frames, u8: the SYNC counter if the SYNC has one."""
+    """Scan number in the CAN frames, u8; equal to the SYNC counter if SYNC frames contain a counter."""
     device_time_us: int
     """Time on the node's own clock at the SYNC of the scan, µs, 0 to 2³² − 1 with wrap-around; 0 if the
     summary was lost. The resolution is 64 µs; the host derives the upper 10 bits (for the first scan, from
@@ -36,7 +36,7 @@ class ScanStamp:
     t_receive_ns: int
     """Time at which the last frame of the scan was received."""
     t_solved_ns: int = 0
-    """Time at which the field was ready; 0 until then."""
+    """Time at which the field was ready; 0 if it is not ready yet."""
 
     def solved_at(self, t_ns: int) -> ScanStamp:
         """Return the stamp of a field that was ready at ``t_ns``."""
@@ -58,7 +58,7 @@ class ResistanceFrame:
 
 @dataclass(frozen=True, slots=True)
 class SolveStats:
-    """Cost of a solve."""
+    """Computing cost of a solve."""
 
     evaluations: int
     """Number of evaluations of F."""
@@ -83,7 +83,8 @@ class Contact:
     centroid_std_m: Float
     """(3,) standard deviation of the centre, metres."""
     area_m2: float
-    """Contact area, assuming a smooth body (Hertz), m²; one cell's area if it is too small to resolve."""
+    """Contact area, assuming a smooth body (Hertz), m²; the area of one cell if the contact is too small to
+    resolve."""
     area_std_m2: float
     normal_force_n: float
     """Normal force, N; positive for a press."""
@@ -93,10 +94,11 @@ class Contact:
     shear_force_std_n: Float
     """(2,) standard deviation of the shear force, N."""
     force_calibrated: bool = False
-    """Whether the forces rest on a calibration of this patch (``force_calibrated`` of Tracker, of
-    ``[patches.calibration]``). Without one, five standard deviations of the normal force reach from the force
-    of a half-space to that of a layer as thick as the clearance, bonded to a rigid support: a bound on the
-    model, not noise. For the shear force there is no such bound."""
+    """Whether the forces are based on a calibration of this patch (``force_calibrated`` of Tracker or of
+    ``[patches.calibration]``). Without a calibration, five standard deviations of the normal force cover the
+    range from a half-space's force to the force of a layer as thick as the clearance, bonded to a rigid
+    support. This range is a bound on the model error, not noise. The standard deviation of the shear force
+    includes no such bound."""
     axes: Float = field(default_factory=lambda: _FLAT)
     """(3, 3) unit vectors as rows, in the frame of the layout, at the centre of the contact: along the wire,
     across the wires and out of the skin. On a flat patch these are x, y and z."""
@@ -130,30 +132,33 @@ class FieldFrame:
     alone."""
     contacts: tuple[Contact, ...] = ()
     """Contacts, strongest first; empty if nothing touches, if no wire could be solved, or if ``contacts`` was
-    switched off. Their number has a memory of one frame, so that noise does not split or drop a contact."""
+    switched off. The number of contacts depends on the previous frame too, so that noise does not split or
+    drop a contact."""
     gain: Float | None = None
     """(U,) estimated gain error of each wire's resistances, as a fraction; None if no drift is estimated."""
     noise_factor: float = 1.0
-    """Ratio of the estimated noise to the configured noise; exactly 1 while the stream does not contradict
-    the configured noise. With codes, the noise is that before the converter."""
+    """Ratio of the estimated noise to the configured noise; exactly 1 while the stream agrees with the
+    configured noise. If the resistances come from codes, the factor applies to the noise before the
+    converter."""
     held: NDArray[np.bool_] | None = None
-    """(U,) wires not solved because their movement did not exceed the noise of the frame."""
+    """(U,) wires that were not solved because their movement did not exceed the noise of the frame."""
     core_std_m: Float | None = None
     """(U, N, 3) standard deviation of the bulk of the errors, without the allowance for the tail, metres;
     None if equal to ``displacement_std_m``."""
 
     distrust: str | None = None
-    """Why the field is not trusted, in words; empty if it is trusted; None if it has not been assessed."""
+    """Reason why the field is not trusted, as text; empty if the field is trusted; None if not assessed."""
     wires_trusted: NDArray[np.bool_] | None = None
     """(U,) wires whose own readings passed every test and are complete enough; None if not assessed."""
     precise: bool = True
     """Whether the standard deviations are within the limits that the user set (``max_std_m`` and
     ``max_force_std_n`` of Tracker), or within their defaults."""
     data_share: Float | None = None
-    """(U, N, 3) how much of each displacement comes from the data of this frame, not from the prior: 1 minus
-    the ratio of the posterior's variance to the prior's; None if all of it does, as in an exact field."""
+    """(U, N, 3) share of each displacement that comes from the data of this frame, not from the prior: 1
+    minus the ratio of the posterior's variance to the prior's. None if all shares are 1, as in an exact
+    field."""
     faults: tuple[DataFault, ...] = ()
-    """Readings that failed a test and were left out."""
+    """Faults in the data: readings that failed a test and were left out of the field."""
 
     @property
     def half_width_95_m(self) -> Float:
@@ -164,7 +169,8 @@ class FieldFrame:
     def trusted(self) -> bool:
         """Whether data and solution pass every test, the data are complete enough, and the patch is alive.
 
-        ``distrust`` says why not. A field that has not been assessed is trusted if every wire converged.
+        ``distrust`` contains the reason if the field is not trusted. A field that has not been assessed is
+        trusted if every wire converged.
         """
         if self.distrust is None:
             return all(status is Status.CONVERGED for status in self.status)

@@ -2,7 +2,7 @@
 
 A contact on a patch acts with the force f on the skin at the point r. In the frame of a link, its wrench is
 the force f and the torque r × f about the origin of the link's frame. To first order, the covariance of the
-wrench follows from those of f and r, whose errors are taken as independent of each other.
+wrench follows from the covariances of f and r, whose errors are assumed to be independent of each other.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from skinnode.model.layout import Float
 from skinnode.model.pose import Pose
 
 HAND: Final = "hand"
-"""Name of the hand's own frame, and link of the patches that are fixed to the hand itself."""
+"""Name of the hand's own frame; also the link name of patches that are fixed to the hand itself."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,7 +41,7 @@ class HandContact:
     link: str
     """Link that carries the patch; :data:`HAND` for a patch that is fixed to the hand itself."""
     frame: str
-    """Frame of the vectors below: :data:`HAND` or the link."""
+    """Frame of the vectors of this contact: :data:`HAND` or the link."""
     position_m: Float
     """(3,) centre of the normal load on the skin at rest, metres."""
     position_covariance_m2: Float
@@ -59,7 +59,7 @@ class HandContact:
     """Contact area, m², as in :class:`~skinnode.Contact`."""
     area_std_m2: float
     force_calibrated: bool
-    """Whether the forces rest on a calibration of the patch."""
+    """Whether the forces are based on a calibration of the patch."""
     trusted: bool
     """Whether the field of the patch is trusted."""
 
@@ -143,9 +143,9 @@ class Wrench:
     contacts: int
     """Number of contacts."""
     force_calibrated: bool
-    """Whether every force rests on a calibration of its patch; True without contacts."""
+    """Whether every force is based on a calibration of its patch; True if there are no contacts."""
     trusted: bool
-    """Whether the fields of all patches that it covers are present and trusted."""
+    """Whether the fields of all patches that the wrench covers are present and trusted."""
 
     @property
     def force_std_n(self) -> Float:
@@ -182,8 +182,9 @@ def wrench_of(contacts: Iterable[HandContact], frame: str, *, trusted: bool) -> 
     """Return the wrench of contacts that are given in the same frame.
 
     Contacts on different patches have independent errors. The errors of contacts on one patch may be
-    correlated in any way (noise exchanges load between neighbours; the stiffness of the layer scales all of
-    them), so their covariances are combined to a bound that holds for every correlation.
+    correlated in any way: noise shifts load between neighbouring contacts, and an error in the layer's
+    stiffness scales all forces. The covariances of these contacts are therefore combined into a bound that is
+    valid for any correlation.
 
     Args:
         contacts: The contacts, all in ``frame``.
@@ -197,7 +198,8 @@ def wrench_of(contacts: Iterable[HandContact], frame: str, *, trusted: bool) -> 
         force_n += contact.force_n
         torque_nm += np.cross(contact.position_m, contact.force_n)
     for group in of_patch.values():
-        # (Σ e)(Σ e)ᵀ ≤ Σ e eᵀ / w for weights with Σ w = 1; weights ∝ σ make it exact for a common factor
+        # (Σ e)(Σ e)ᵀ ≤ Σ e eᵀ / w for weights with Σ w = 1; weights ∝ σ make the bound exact for fully
+        # correlated errors
         stds = [math.sqrt(float(np.trace(contact.force_covariance_n2))) for contact in group]
         total = sum(stds)
         for contact, std in zip(group, stds, strict=True):

@@ -1,9 +1,9 @@
 """Compiled forward model of one wire, with arrays in structure-of-arrays layout.
 
-Lower electrodes are stored as (3, M, K) and the Jacobian as its transpose (3N, K), so vectors of neighbouring
-lower wires k are contiguous in memory, and their sums stay in registers. Computing distances is the main
-cost: a square root and a division per pair would saturate one slow execution unit of the processor, so 1/√ is
-computed from multiplications instead. Lengths may be in any unit; F has the inverse unit.
+Lower electrodes are stored as (3, M, K) and the Jacobian as its transpose (3N, K). Vectors of neighbouring
+lower wires k are therefore contiguous in memory, and their sums stay in registers. Most of the time is spent
+on distances: a square root and a division per pair would saturate one slow execution unit of the processor,
+so 1/√ is computed by multiplications instead. Lengths may be in any unit; F has the inverse unit.
 """
 
 from __future__ import annotations
@@ -52,7 +52,8 @@ def _inverse_root(square: Lanes) -> Lanes:
 def potential(x: Float, lower: Float, f: Float) -> None:
     """Write F of one wire into ``f`` (K,).
 
-    ``x`` (3N,) holds the electrodes of the wire as x₁ y₁ z₁ x₂ …, ``lower`` (3, M, K) the lower electrodes.
+    ``x`` (3N,) contains the electrodes of the wire as x₁ y₁ z₁ x₂ …; ``lower`` (3, M, K), the lower
+    electrodes.
     """
     charges, wires = lower.shape[1], lower.shape[2]
     for k in range(0, wires, LANES):
@@ -98,8 +99,9 @@ def potential_jacobian(x: Float, lower: Float, f: Float, jt: Float) -> None:
 def surface_laplacian(x: Float, lower: Float, normal: Float, out: Float, slope_t: Float) -> None:
     """Write the Laplacian of F within the surface, −∂²F/∂n², of one wire into ``out`` (K,).
 
-    ``normal`` (3N,) holds the unit normal at each electrode; ``x`` and ``lower`` are as in :func:`potential`.
-    ``slope_t`` (3N, K) receives the transposed derivative of the Laplacian with respect to ``x``.
+    ``normal`` (3N,) contains the unit normal at each electrode; ``x`` and ``lower`` are as in
+    :func:`potential`. ``slope_t`` (3N, K) receives the transposed derivative of the Laplacian with respect to
+    ``x``.
     """
     charges, wires = lower.shape[1], lower.shape[2]
     for k in range(0, wires, LANES):

@@ -42,8 +42,8 @@ def require_array(name: str, value: ArrayLike, shape: tuple[int | str, ...], *, 
         finite: Whether every number must be finite.
 
     Raises:
-        ValueError: If the value cannot be converted. The message gives the argument, its value and the
-            requirement.
+        ValueError: If the value cannot be converted. The message contains the argument's name, its value and
+            the requirement.
     """
     if (  # fast path: a host passes such an array with every frame
         type(value) is np.ndarray
@@ -55,7 +55,7 @@ def require_array(name: str, value: ArrayLike, shape: tuple[int | str, ...], *, 
         return value
     try:
         kind = np.asarray(value).dtype.kind
-        if kind not in "biufO":  # a cast would drop the imaginary part, or read dates as numbers
+        if kind not in "biufO":  # a cast would discard the imaginary part, or convert dates to numbers
             raise TypeError(f"of {np.asarray(value).dtype}")
         array = np.ascontiguousarray(value, dtype=np.float64)
     except (TypeError, ValueError) as error:

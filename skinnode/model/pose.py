@@ -1,4 +1,4 @@
-"""Poses of frames, such as a patch on a link and a link on the hand, and conversion between the frames."""
+"""Poses of frames, such as a patch on a link or a link on the hand, and conversion between frames."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ class Pose:
         return points
 
     def __matmul__(self, inner: Pose) -> Pose:
-        """Return the pose in this frame's parent of a frame whose pose in this frame is ``inner``."""
+        """Return ``inner``, a pose in this frame, as a pose in this frame's parent."""
         x, y, z, w = self._unit()
         a, b, c, d = inner._unit()
         x_m, y_m, z_m = self.points_m(inner.position_m).tolist()

@@ -1,4 +1,4 @@
-"""Tolerances to which a patch was made: how far its geometry may differ from its layout."""
+"""Manufacturing tolerances of a patch: how far its geometry may differ from its layout."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class Tolerances:
     thickness: float = 0.0
     """Thickness of the layer between the electrodes, as a fraction of the clearance."""
     electrode_radius: float = 0.0
-    """Radius of the electrodes, which the forward model takes for points, pitches."""
+    """Radius of the electrodes, which the forward model treats as points, pitches."""
     gain: float = 0.0
     """Gain of the front end, as a fraction of the change in each resistance."""
 
@@ -37,6 +37,6 @@ class Tolerances:
 
 
 EXACT: Final = Tolerances()
-"""The patch equals its layout, as a simulated patch does."""
+"""Tolerances of a patch that equals its layout exactly, such as a simulated patch."""
 ORDINARY: Final = Tolerances(placement=0.02, thickness=0.05, electrode_radius=0.05, gain=0.02)
-"""A patch made in a good workshop."""
+"""Tolerances of a patch that was made in a good workshop."""

@@ -1,8 +1,8 @@
 """Corrector for a path tracker: solves wires at positions on a path and logs the cost of each call.
 
 Positions count samples from 0; the rest position is −1. Between two samples, ``a`` is interpolated linearly.
-(Interpolating 1/a or log a makes no difference: with layers 0.3 to 1 pitch apart and presses of up to 70 %,
-the numbers of lost wires differ by no more than their scatter.)
+Interpolating 1/a or log a instead makes no significant difference: with layers 0.3 to 1 pitch apart and
+presses of up to 70 %, the numbers of lost wires differ by no more than their statistical scatter.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ class Accuracy:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PathLog:
-    """Cost of each call to a corrector, in S rows; NaN or 0 if the call skipped the wire."""
+    """Cost of each of S calls to a corrector; NaN or 0 for a wire that the call skipped."""
 
     position: Float
     """(S, U) position on the path."""
@@ -52,7 +52,7 @@ class PathLog:
 
 
 class Corrector:
-    """Solver for one patch's wires at positions on its path. Do not share an instance between owners.
+    """Solver for a patch's wires at positions on a path; each path needs its own instance.
 
     Args:
         problem: The patch.
@@ -73,7 +73,7 @@ class Corrector:
 
     @property
     def last(self) -> float:
-        """Position of the last sample."""
+        """Position of the last sample on the path."""
         return self.samples - 1.0
 
     @property

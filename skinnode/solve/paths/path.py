@@ -1,7 +1,7 @@
 """Path following as in the paper: solves the last sample of a press via the earlier samples.
 
-H(X, t) = F(X) − ρ / R(t); X(0) is the grid at rest, and each sample is solved from the solution of the
-previous sample (Lahaye; Xu et al. 2018, section 3.2). Step control
+The path is the solution of H(X, t) = F(X) − ρ / R(t) = 0, where X(0) is the grid at rest. Each sample is
+solved from the solution of the previous sample (Lahaye; Xu et al. 2018, section 3.2). Step control
 (:mod:`skinnode.solve.paths.step_control`) chooses the samples, their tolerance and any points between
 samples.
 """
@@ -36,19 +36,20 @@ from skinnode.solve.posterior.frame_estimator import FrameEstimator
 from skinnode.solve.wires.problem import PatchProblem
 
 SELECTION: Final = Accuracy(tolerance=1e-12, max_steps=100)
-"""Accuracy of a solve started from the posterior: the paper's final tolerance, but the maximum number of
-steps of its intermediate samples."""
+"""Accuracy of a solve that starts from the posterior: the paper's final tolerance, with the paper's maximum
+number of steps for intermediate samples."""
 STARTS: Final = 12
-"""Number of random starting points in the search for other roots on a layout with folds. They are drawn from
-the posterior with a fixed seed."""
+"""Number of random starting points in the search for other roots on a layout with folds. The points are
+random samples of the posterior, with a fixed seed."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PathResult:
-    """Result at the end of a path, and the cost of each point on it.
+    """Solution at the end of a path, and cost of each point on the path.
 
-    Row s of the last four arrays describes solver call s. A wire that the call skipped has a position and an
-    optimality of NaN. Rows after the first row at the last sample are second attempts and checks.
+    Row s of ``position``, ``steps``, ``evaluations`` and ``optimality`` describes solver call s. If the call
+    skipped a wire, the wire's position and optimality are NaN. Rows after the first row at the last sample
+    describe second attempts and checks.
     """
 
     upper_m: Float
@@ -63,9 +64,9 @@ class PathResult:
     residual: Float
     """(U,) RMS of F/b − 1 at the end."""
     cycle: int | None
-    """Number of samples from one solve to the next, if step control found or was given a cycle."""
+    """Number of samples from one solve to the next; None if step control uses no cycle."""
     searched: int
-    """Number of leading rows spent on the search for the cycle; the path itself follows."""
+    """Number of leading rows that describe the search for the cycle; the rows of the path follow."""
     position: Float
     """(S, U) sample solved, from 0; 1.5 is halfway between samples 1 and 2, and −1 is the rest position."""
     steps: NDArray[np.int64]
@@ -89,10 +90,11 @@ def solve_path(
     """Follow a press from the rest position to its last sample.
 
     A wire is ILL_CONDITIONED instead of CONVERGED if it may have ended on a branch of F = b other than the
-    skin's: the determinant of its Jacobian changed sign on the way, its electrodes crossed to the other side
-    of the lower layer, an equally smooth root lies across a nearby fold, or the samples led smoothly to
-    another root, in which case the wire stays at that root. The skin itself can cross a fold. A root across a
-    fold is accepted if the path led there and the posterior of the patch finds the same root.
+    skin's. The possible reasons are that the determinant of its Jacobian changed sign on the way, that its
+    electrodes crossed to the other side of the lower layer, that an equally smooth root is across a nearby
+    fold, or that the samples led smoothly to another root. In the last case, the wire stays at that other
+    root. Since the skin itself can cross a fold, a root across a fold is accepted if the path led there and
+    the posterior of the patch finds the same root.
 
     Args:
         layout: The patch, with at least as many lower wires as unknowns per wire (K ≥ 3N).

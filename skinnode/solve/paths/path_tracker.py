@@ -65,7 +65,7 @@ class PathEnd:
 
 
 class PathTracker:
-    """Tracker that follows the wires along the samples of one press. Do not share an instance between owners.
+    """Tracker that follows the wires along the samples of one press; each press needs its own instance.
 
     Args:
         problem: The patch.
@@ -74,8 +74,8 @@ class PathTracker:
 
     Attributes:
         end: Outcome at the last sample, after :meth:`finish`.
-        cycle: Number of samples from one solve to the next, if step control found or was given a cycle.
-        searched: Number of leading log rows spent on the search for the cycle.
+        cycle: Number of samples from one solve to the next; None if step control uses no cycle.
+        searched: Number of leading log rows that describe the search for the cycle.
         second_tries: Whether a wire may move away from the end of its path; if not, only its status may
             change.
         stumbled: (U,) wires on which at least one step was undone.
@@ -161,10 +161,10 @@ class PathTracker:
         self.end.doubt(self._crossed)
 
     def walk(self, todo: Mask, samples: list[int], accuracy: Accuracy) -> None:
-        """Follow these wires (U,) from rest along ``samples``, only to learn where the path ends.
+        """Follow these wires (U,) from rest along ``samples``, only to find the end of their path.
 
-        The samples are in time order and end with the last sample. Neither the positions of the wires nor
-        :attr:`end` change.
+        The samples are in time order and include the last sample of the press. The method does not change the
+        positions of the wires or :attr:`end`.
         """
         x = self.solver.x.copy()
         call = np.where(todo, wires.SOLVE, wires.LEAVE).astype(np.uint8)
@@ -179,7 +179,7 @@ class PathTracker:
         self.solver.x[:] = x
 
     def _arrive(self, todo: Mask) -> None:
-        """Store the end of the path of the wires in ``todo`` (U,), from their solve of the last sample."""
+        """Store the path end of the wires in ``todo`` (U,), after their solve of the last sample."""
         self._path_end[todo] = self.solver.x[todo]
         residual = self.solver.measure[:, wires.RESIDUAL]
         self.reached[todo] = (residual <= roots.ROOT_RESIDUAL)[todo]
@@ -254,7 +254,8 @@ class PathTracker:
         """Return the wires (U,) that are not at the root to which the samples led along a smooth path.
 
         On a smooth path, the secant through two solutions predicts the next one, and the first solution is
-        close to rest (:data:`skinnode.solve.roots.SMOOTH_PATH`). Of a long path, only the second half counts.
+        close to rest (:data:`skinnode.solve.roots.SMOOTH_PATH`). On a long path, only the second half must be
+        smooth.
         """
         size = roots.distance(self._path_end, self.problem.rest)
         elsewhere = roots.distance(self.solver.x, self._path_end) > roots.SAME_ROOT * size

@@ -23,10 +23,11 @@ from skinnode.solve.starts import guided_start, near_twin
 from skinnode.solve.wires import arrays as wires
 
 GUIDED_STEPS: Final = 100
-"""Maximum steps from a guided start: a solve that starts near a root takes 1 to 20 steps; one that starts
-elsewhere never converges."""
+"""Maximum number of steps from a guided start. A solve that starts near a root takes 1 to 20 steps; a solve
+that starts elsewhere never converges."""
 TWIN: Final = Accuracy(tolerance=1e-9, max_steps=30)
-"""Accuracy of a root that is only compared with another: distinct roots differ by far more than this."""
+"""Accuracy of a root that is only compared with another root; distinct roots differ by far more than this
+tolerance."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -130,7 +131,7 @@ def keep_likeliest(
 ) -> None:
     """Search for other roots, starting from the twins and from ``starts``; keep the likeliest root.
 
-    A root is CONVERGED only if no other root comes within ``unlikely`` of its energy.
+    A wire is CONVERGED only if the energies of all its other roots differ by at least ``unlikely``.
 
     Args:
         tracker: Tracker at the end of its path.
@@ -177,7 +178,7 @@ def doubt_twins(tracker: PathTracker, estimate: PatchEstimate | None) -> None:
     """
     layout = tracker.problem.layout
     if layout.shape[1] != layout.unknowns:
-        return  # more equations than unknowns: a fold leaves no second root
+        return  # with more equations than unknowns, a fold has no second root
     solver, end, smoothness = tracker.solver, tracker.end, tracker.smoothness
     root, twins = solver.x.copy(), _twins(tracker)
     size = roots.distance(root, tracker.problem.rest)
@@ -197,10 +198,10 @@ def doubt_twins(tracker: PathTracker, estimate: PatchEstimate | None) -> None:
 def heed_samples(tracker: PathTracker, accuracy: Accuracy) -> None:
     """Reject each root to which the samples do not lead, and return its wire to the end of its path.
 
-    Where the skin itself crosses a fold, the root on the branch of the rest position can be the smoother and
-    the likelier root, and yet be wrong: a start from the smoothest displacement and the posterior both find
-    it. The samples are the only evidence against it. Where they refute the estimate of the patch, the roots
-    that its other wires owe to the estimate are rejected with it.
+    If the skin itself crosses a fold, the root on the branch of the rest position can be wrong although it is
+    smoother and likelier than the true root. A start from the smoothest displacement and the posterior then
+    both find the wrong root, and only the samples contradict it. If the samples refute the patch estimate on
+    one wire, the roots that other wires took from the estimate are rejected too.
     """
     if not tracker.second_tries:
         return  # a plain path moves no wire away from its end

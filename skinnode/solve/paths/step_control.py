@@ -29,14 +29,14 @@ SHRINK: Final = 0.5
 GROW: Final = 4.0
 """Largest growth factor of the step length per step (Allgower & Georg 1990, section 6.1, use 2 to 4)."""
 SHORTEST: Final = 1 / 64
-"""Shortest step as a fraction of the path; at a fold, halving would otherwise never end."""
+"""Minimum step as a fraction of the path; without a minimum, the halving at a fold would never end."""
 ADAPTIVE_POINT: Final = Accuracy(tolerance=1e-9, max_steps=6)
-"""Accuracy of an intermediate point: below √eps, a root is accurate enough for its ∂X/∂R to be kept, and
-Newton's method takes 5 steps from a contraction ratio of 1/2 to 1e-9."""
+"""Accuracy of an intermediate point. With a tolerance below √eps, a root is accurate enough for its ∂X/∂R to
+be kept. From a contraction ratio of 1/2, Newton's method takes 5 steps to 1e-9."""
 
 ADAPTIVE_WALK: Final = Accuracy(tolerance=1e-9, max_steps=100)
-"""Accuracy of a sample that is solved only to learn where the samples lead; the maximum number of steps is
-the paper's."""
+"""Accuracy of a sample that is solved only to find the root to which the samples lead. The maximum number of
+steps is the paper's."""
 
 
 class Schedule(Protocol):
@@ -54,13 +54,13 @@ class Uniform:
     The default tolerances and step limits follow the paper's protocol (section 4).
 
     Args:
-        steps: Number of samples to solve; by default, or if there are fewer samples, all are solved.
+        steps: Number of samples to solve; by default, or if there are fewer samples, all samples are solved.
         plain: Whether to start each sample at the last solution, as the paper does (Lahaye), and to leave
             each wire at the outcome of the last sample. Otherwise each sample starts on the secant through
             the last two solutions, and a wire with no root or a rough root is solved again from the smoothest
-            displacement that explains the last sample. On the staggered layout, h = 1, with 10 samples of
-            each of 21 presses of 50 %, starting on the secant alone reduces the number of lost wires from
-            7 of 197 to none, and the evaluations per sample from 4 to 2.9.
+            displacement that explains the last sample. In 21 presses of 50 % with 10 samples each (staggered
+            layout, h = 1), starting on the secant alone reduces the number of lost wires from 7 of 197 to
+            none. It also reduces the evaluations per sample from 4 to 2.9.
         intermediate_tolerance: Tolerance of r, and of x in pitches, at all samples except the last.
         final_tolerance: Tolerance at the last sample.
         intermediate_steps: Maximum operator steps at all samples except the last.
@@ -106,13 +106,15 @@ class Periodic:
     the solves have a period, T is the median number of samples from one solve to the next, on the wire that
     needs the most solves. The path then starts again and solves every T-th sample at that tolerance, and
     always the last sample. If no tolerance shows a cycle of at least two samples that occurs at least twice,
-    every sample is solved at 1e-6.
+    every sample is solved with a tolerance of 1e-6.
 
-    The paper's tolerance applies to MATLAB's unscaled problem, in which ‖Jᵀr‖∞ is F² times its value here,
-    where r = a F − 1 in pitches. F depends on the unit of length, which the paper does not state.
+    The paper's tolerance applies to MATLAB's unscaled problem, in which ‖Jᵀr‖∞ is F² times its value in this
+    project, where r = a F − 1 and lengths are in pitches. The value of F depends on the unit of length, which
+    the paper does not state.
 
     Args:
-        cycle: T, if known from an earlier press of the same size and rate; skips the search.
+        cycle: Cycle T in samples, if known from an earlier press of the same size and rate; None to search
+            for the cycle.
         plain: As in :class:`Uniform`. The search is always plain, since the cycle is a property of Lahaye's
             starting points.
         intermediate_tolerance: Tolerance if ``cycle`` is given; the default is the paper's 1e-4.
@@ -182,26 +184,26 @@ def shortest_cycle(solved: NDArray[np.bool_]) -> int | None:
 
 @dataclass(frozen=True)
 class Adaptive:
-    """Schedule that solves as few points per wire as it can, interpolating R between samples.
+    """Schedule that solves as few points per wire as possible, interpolating R between samples.
 
-    Each wire has its own step length and takes an Euler step along ∂X/∂R from the factors of the last
-    Jacobian, then operator steps. The next step length is chosen to maintain the contraction ratio of
-    Newton's method: the error of an Euler step grows with the square of its length (Deuflhard 2004, section
-    5.1.3), and F is smooth on the scale of the clearance between the layers. A step that does not reach a
-    root on the branch of the rest position is undone and halved.
+    Each wire has its own step length. From each point, the wire takes an Euler step along ∂X/∂R, computed
+    from the factors of the last Jacobian, and then operator steps. The next step length is chosen to maintain
+    the contraction ratio of Newton's method. The error of an Euler step grows with the square of its length
+    (Deuflhard 2004, section 5.1.3), and F is smooth on the scale of the clearance between the layers. A step
+    that does not reach a root on the branch of the rest position is undone and halved.
 
     A straight line in R is not a deformation of rubber and can meet a fold that the press itself does not
-    meet. If a wire gets stuck at such a fold, or its root is too rough to be a press, it is solved again by
-    Levenberg-Marquardt, whatever the operator. That solve starts from the smoothest displacement that
-    explains the last sample (:func:`skinnode.solve.starts.guided_start`). If this yields a second root, the
-    smoother root is kept.
+    meet. If a wire gets stuck at such a fold, or its root is too rough to be a press, the wire is solved
+    again by Levenberg-Marquardt, regardless of the operator. That solve starts from the smoothest
+    displacement that explains the last sample (:func:`skinnode.solve.starts.guided_start`). If this solve
+    yields a second root, the smoother root is kept.
 
-    Two samples are enough: the patch at rest and the frame to solve. If there are more, they are solved one
-    by one for each doubtful wire, and for each wire of a folded layout that moved far enough to have crossed
-    a fold: the smooth root can be wrong, and only the samples show it.
+    Two samples are enough: the patch at rest and the frame to solve. If there are more samples, they are
+    solved one by one for each doubtful wire, and for each wire of a folded layout that moved far enough to
+    have crossed a fold. For such a wire, the smooth root can be wrong, and only the samples reveal the error.
 
     Args:
-        points: Maximum number of path points that a wire may try.
+        points: Maximum number of path points to attempt per wire.
         final_tolerance: Tolerance of r, and of x in pitches, at the last sample.
         final_steps: Maximum operator steps at the last sample.
 
@@ -218,7 +220,7 @@ class Adaptive:
         _require(self, "final_tolerance", "final_steps")
 
     def follow(self, tracker: PathTracker) -> None:
-        """Predict, correct and choose step lengths; then finish the wires that arrived and guide the rest."""
+        """Predict, correct and choose step lengths; then finish arrived wires and guide doubtful wires."""
         end = tracker.samples - 1.0
         reach = tracker.problem.step_limit
         position = np.full(tracker.wires, REST)

@@ -1,10 +1,10 @@
-"""Traffic plan of a hand's buses: all frames, their load, and their worst-case delay.
+"""Plans the traffic on a hand's buses: all frames, their load, and their worst-case delay.
 
-Each bus carries the SYNC, the host's heartbeat if enabled, the frames of other devices listed in the hand
-file, and a sequence of SDO transfers that uses the fraction :data:`SDO_SHARE` of the bandwidth. For each
-patch, the bus also carries all chunks and the summary of a scan in every SYNC period, and a heartbeat and one
-EMCY in every heartbeat period. The SDO transfers that configure a returning node are not counted: they have a
-lower priority than any PDO and therefore use only spare bandwidth.
+On each bus, the plan includes SYNC, the host's heartbeat if enabled, and the frames of other devices listed
+in the hand file. SDO transfers occupy the fraction :data:`SDO_SHARE` of the bandwidth. For each patch, the
+plan includes all chunks and the summary of a scan in every SYNC period, and a heartbeat and one EMCY in every
+heartbeat period. The SDO transfers that configure a returning node are not included. They have a lower
+priority than any PDO and therefore use only spare bandwidth.
 """
 
 from __future__ import annotations
@@ -24,19 +24,19 @@ from skinnode.errors import BusLoadError, ConfigError, Shown
 from skinnode.protocol.profile import PatchProfile
 
 SCAN_SHARE: Final = 0.8
-"""Fraction of the SYNC period for a node's scan; the rest is left for SDO, EMCY and late frames."""
+"""Fraction of the SYNC period reserved for scans; the remainder is for SDO, EMCY and late frames."""
 
 SDO_SHARE: Final = 0.01
-"""Fraction of the bus bandwidth reserved for SDO; at 1 Mbit/s, one request and its response every 27 ms."""
+"""Fraction of the bandwidth reserved for SDO; at 1 Mbit/s, one request and one response every 27 ms."""
 
 NODE_LATENCY_S: Final = 2e-3
-"""Maximum time from a SYNC to the first chunk, s, as specified for a patch on an idle machine."""
+"""Maximum time from SYNC to the first chunk, s, as specified for a node on an otherwise idle machine."""
 
 PACE_JITTER_S: Final = 0.2e-3
-"""Maximum deviation of a chunk from its scheduled time, s, as specified for a patch on an idle machine."""
+"""Maximum deviation of a chunk from its scheduled time, s, as specified for an otherwise idle machine."""
 
 _SAMPLES: Final = 512
-"""Number of random-data frames averaged to estimate the typical length with a standard error of 0.1 bits."""
+"""Number of frames with random data whose lengths are averaged; the standard error is 0.1 bits."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,25 +48,25 @@ class PlannedFrame:
     length: int
     """Data length, bytes."""
     period_s: float
-    """Period, s."""
+    """Period of the frames, s."""
     count: int
     """Number of frames per period."""
     spacing_s: float
-    """Minimum time between consecutive frames in a period, s."""
+    """Minimum time between consecutive frames of a period, s."""
     jitter_s: float
-    """Maximum deviation from this spacing, s."""
+    """Maximum deviation of a frame from its scheduled time, s."""
     worst_s: float
-    """Duration of a frame with the maximum number of stuff bits, s."""
+    """Duration of a frame that has the maximum number of stuff bits, s."""
     typical_s: float
-    """Mean duration of a frame with random data, s."""
+    """Mean duration of a frame that carries random data, s."""
     scans: bool = False
-    """Whether the period is the SYNC period."""
+    """Whether the frames repeat with the SYNC period."""
     response_s: float | None = None
-    """Worst-case time from queueing to the end of the frame, s; None if it is unbounded."""
+    """Worst-case time from queueing a frame to its end, s; None if there is no bound."""
 
     @property
     def frames_per_s(self) -> float:
-        """Frames per second."""
+        """Mean number of frames per second."""
         return self.count / self.period_s
 
     @property
@@ -82,15 +82,15 @@ class PlannedFrame:
 
 @dataclass(frozen=True, slots=True)
 class ScanTime:
-    """Duration of a patch's scan."""
+    """Nominal and worst-case duration of a patch's scan."""
 
     patch: str
     node_id: int
     chunks: int
     paced_s: float
-    """Time from the first chunk to the last, as paced by the inhibit time, s."""
+    """Time from the first chunk to the last chunk, determined by the inhibit time, s."""
     worst_s: float | None
-    """Worst-case time from queueing the SYNC to the end of the summary, s; None if it is unbounded."""
+    """Worst-case time from queueing the SYNC to the end of the summary, s; None if there is no bound."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,20 +120,20 @@ class BusPlan:
 
     @property
     def others(self) -> tuple[PlannedFrame, ...]:
-        """Frames of other devices, as listed in the hand file."""
+        """Planned frames of other devices, which the hand file lists."""
         named = {other.can_id for other in self.bus.others}
         return tuple(frame for frame in self.frames if frame.can_id in named)
 
     @property
     def shortest_period_ms(self) -> int | None:
-        """Shortest SYNC period at which the plan fits the bus, ms; None if no period is long enough."""
+        """Shortest SYNC period at which the load is within ``max_load``, ms; None if no period suffices."""
         free = self.bus.max_load - sum(frame.load for frame in self.frames if not frame.scans)
         scan_s = sum(frame.count * frame.worst_s for frame in self.frames if frame.scans)
         return int(-(-scan_s * 1e3 // free)) if free > 0 else None
 
 
 def check_plan(hand: HandConfig) -> tuple[BusPlan, ...]:
-    """Return the plan of each bus that has patches, and check the bus loads.
+    """Plan the traffic of each bus that has patches, and check the bus loads.
 
     Args:
         hand: the hand.
@@ -149,11 +149,11 @@ def check_plan(hand: HandConfig) -> tuple[BusPlan, ...]:
 
 
 def require_room(hand: HandConfig, plan: BusPlan) -> None:
-    """Check the bus load of a plan.
+    """Check that the load of a plan does not exceed the limit of its bus.
 
     Args:
         hand: the hand.
-        plan: the plan of one of its buses.
+        plan: the traffic plan of one of the hand's buses.
 
     Raises:
         BusLoadError: if the load exceeds the ``max_load`` of the bus.
@@ -185,7 +185,7 @@ def _rate(bus: BusConfig) -> str:
 
 
 def plan_of(hand: HandConfig) -> tuple[BusPlan, ...]:
-    """Return the plan of each bus that has patches, without checking its load.
+    """Plan the traffic of each bus that has patches, without checking the bus loads.
 
     Args:
         hand: the hand.
@@ -201,11 +201,11 @@ def plan_of(hand: HandConfig) -> tuple[BusPlan, ...]:
 
 
 def inhibit_time_100us(period_ms: int, frames: int) -> int:
-    """Return the inhibit time (0x1800:3), in units of 100 µs, to spread frames over SCAN_SHARE of a period.
+    """Return the inhibit time (0x1800:3), in units of 100 µs, to spread a scan over SCAN_SHARE of a period.
 
     Args:
         period_ms: SYNC period, ms.
-        frames: number of frames.
+        frames: number of frames in a scan.
     """
     return int(period_ms * 10 * SCAN_SHARE / frames)
 
@@ -225,7 +225,9 @@ def _plan_of_bus(hand: HandConfig, i: int, bus: BusConfig, profiles: dict[str, P
     for patch in patches:
         frames += _of_a_patch(hand, bus, patch, profiles[patch.name])
     ours = {frame.can_id: frame.name for frame in frames}
-    for patch in patches:  # the plan counts SDO only once, but the identifiers of every node are in use
+    for (
+        patch
+    ) in patches:  # the plan contains one SDO channel per bus, but every node occupies SDO identifiers
         ours |= {
             od.command_cob_id(patch.node_id): f"commands to {patch.name}",
             od.sdo_response_cob_id(patch.node_id): f"SDO answers of {patch.name}",
@@ -307,7 +309,7 @@ def _typical_fd_bits(can_id: int, length: int) -> tuple[float, float]:
 
 
 def _responses_s(frames: tuple[PlannedFrame, ...], bus: BusConfig) -> dict[int, float | None]:
-    """Return the worst-case response time of each frame, s, by identifier."""
+    """Compute the worst-case response time of each frame, s, by identifier; None if there is no bound."""
     messages = [
         Message(
             frame.can_id,
@@ -334,7 +336,7 @@ def _ceil_ns(time_s: float) -> int:
 def _scan_time(
     patch: PatchConfig, profile: PatchProfile, hand: HandConfig, answers: dict[int, float | None]
 ) -> ScanTime:
-    """Return the scan time; its worst case adds up SYNC, node latency, pacing, last chunk and summary."""
+    """Compute a patch's scan time; the worst case adds SYNC, latency, pacing, last chunk and summary."""
     spacing_s = inhibit_time_100us(hand.sync.period_ms, profile.n_chunks + 1) * 1e-4
     paced_s = (profile.n_chunks - 1) * spacing_s
     parts = [

@@ -1,15 +1,18 @@
-"""Worst-case response times on a CAN bus, from queueing a frame to its last bit.
+"""Computes worst-case response times on a CAN bus, from queueing a frame to the end of its last bit.
 
 The analysis follows Davis, Burns, Bril, Lukkien, "Controller Area Network (CAN) schedulability analysis:
 Refuted, revisited and revised", Real-Time Systems 35, 2007, section 3. The lowest identifier wins
-arbitration, and a frame being sent is not interrupted. Every instance in the longest busy period of a
-priority level is examined, because the first instance does not always have the longest response time.
+arbitration, and the transmission of a frame is never interrupted. The analysis examines every instance of a
+message in the longest busy period of its priority, because the first instance does not always have the
+longest response time.
 
-Extension: frames may come in bursts of ``count`` frames ``spacing_ns`` apart in each period, as the chunks of
-a scan do. A window that starts with a burst contains the maximum number of frames, so the analysis holds with
-that number instead of the paper's ⌈(t + J) / T⌉.
+This module extends the analysis to messages that are sent in bursts, such as the chunks of a scan: each
+period begins with ``count`` frames that are ``spacing_ns`` apart. A window that starts with a burst contains
+the maximum number of frames. The analysis therefore remains valid if this number replaces the paper's ⌈(t +
+J) / T⌉.
 
-Retransmission after an error, and controllers that may send a lower-priority frame first, are not covered.
+The analysis covers neither retransmission after errors nor controllers that may send a frame of lower
+priority first.
 """
 
 from __future__ import annotations
@@ -20,16 +23,16 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True, slots=True)
 class Message:
-    """Frames with the same identifier on a bus. Times are whole nanoseconds.
+    """Message of the analysis: all frames with the same identifier. Times are integers in nanoseconds.
 
     Raises:
         ValueError: if a burst is longer than its period, or a time is not positive.
     """
 
     can_id: int
-    """Identifier, which is also the priority (the lowest wins) and unique on the bus."""
+    """Identifier, unique on the bus; it is also the priority, and the lowest identifier wins."""
     time_ns: int
-    """Maximum duration of a frame including the inter-frame space, ns."""
+    """Maximum duration of a frame, including the inter-frame space, ns."""
     period_ns: int
     """Minimum time from the start of one burst to the start of the next, ns."""
     count: int = 1
@@ -54,7 +57,7 @@ class Message:
             raise ValueError(f"spacing_ns: got {burst}, must fit {self.period_ns} ns")
 
     def due_ns(self, instance: int) -> int:
-        """Return the time from instance 0 to the time at which an instance is due, ns."""
+        """Return the time at which an instance is due, relative to instance 0, ns."""
         burst, number = divmod(instance, self.count)
         return burst * self.period_ns + number * self.spacing_ns
 
@@ -70,16 +73,16 @@ class Message:
 
 
 def response_time_ns(message: Message, others: Sequence[Message], bit_ns: int) -> int | None:
-    """Return the maximum time from when a message is due until its last bit has been sent, ns.
+    """Return the maximum time from a message's due time to the end of its last bit, ns.
 
     Args:
         message: the message.
         others: the other messages on the bus.
-        bit_ns: bit time, ns; a frame queued up to one bit time after arbitration starts still takes part in
-            it.
+        bit_ns: bit time, ns; a frame that is queued up to one bit time after the start of arbitration still
+            competes.
 
     Returns:
-        The time, or None if it is unbounded because the message and all higher-priority messages together
+        The response time; None if there is no bound, because the message and all messages of higher priority
         need the whole bandwidth.
     """
     higher = [other for other in others if other.can_id < message.can_id]
@@ -94,7 +97,7 @@ def response_time_ns(message: Message, others: Sequence[Message], bit_ns: int) -
     longest_ns, wait_ns = 0, blocking_ns
     for instance in range(message.most_in(busy_ns)):
         own_ns = blocking_ns + instance * message.time_ns
-        wait_ns = max(wait_ns, own_ns)  # the previous instance's wait is a lower bound to start from
+        wait_ns = max(wait_ns, own_ns)  # the waiting time of the previous instance is a lower bound
         while (longer_ns := own_ns + _work_ns(higher, wait_ns + bit_ns)) > wait_ns:
             wait_ns = longer_ns
         passed_ns = wait_ns - message.due_ns(instance) + message.time_ns

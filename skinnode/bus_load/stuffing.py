@@ -1,6 +1,7 @@
-"""Compiled kernels of :mod:`skinnode.bus_load.timing` that count the bits of frames on the bus.
+"""Compiled kernels for :mod:`skinnode.bus_load.timing`, which count the bits of frames, including stuff bits.
 
-The kernels operate on arrays: uint32 identifiers, uint8 lengths and payloads, int64 bit counts.
+The kernels operate on arrays with identifiers of type uint32, lengths and payloads of type uint8, and bit
+counts of type int64.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from skinnode.compiled.jit import njit_brief
 HEAD_BITS: Final = 19  # SOF, 11-bit identifier, RTR, IDE, r0, 4-bit DLC
 CRC_BITS: Final = 15
 TAIL_BITS: Final = 13
-"""Total length of CRC delimiter, ACK slot and delimiter, end of frame (7) and inter-frame space (3), bits."""
+"""Length of CRC delimiter, ACK slot, ACK delimiter, end of frame (7) and inter-frame space (3), bits."""
 FD_NOMINAL_BITS: Final = 17 + 12  # SOF, 11-bit identifier, RRS, IDE, FDF, res, BRS; then the tail
 _CRC_POLYNOMIAL: Final = 0x4599
 _RUN: Final = 5
@@ -28,7 +29,7 @@ _Bytes = NDArray[np.uint8]
 
 @functools.cache
 def tables() -> tuple[tuple[int, ...], tuple[int, ...], tuple[int, ...]]:
-    """Return tables of the CRC by byte, and of the next run and the stuff bits by ``run << 8 | byte``.
+    """Return the CRC by byte, and the next run and the number of stuff bits by ``run << 8 | byte``.
 
     A run is encoded as 0 before the first bit, otherwise as (value << 2 | length − 1) + 1 with a length of 1
     to 4. After the fifth equal bit, a stuff bit is inserted, which begins a new run.
@@ -58,7 +59,7 @@ def tables() -> tuple[tuple[int, ...], tuple[int, ...], tuple[int, ...]]:
 
 @functools.cache
 def _arrays() -> tuple[NDArray[np.uint16], NDArray[np.uint16]]:
-    """Return the CRC table and a table of ``next run << 8 | number of stuff bits`` as arrays."""
+    """Return two arrays: the CRC table, and a table of ``next run << 8 | number of stuff bits``."""
     crc, next_run, stuffed = (np.array(table, np.uint16) for table in tables())
     return crc, np.asarray(next_run << 8 | stuffed, np.uint16)
 
@@ -72,10 +73,10 @@ def are_loaded() -> bool:
 
 
 def load_kernels() -> None:
-    """Compile the kernels, or read them from the cache.
+    """Compile the kernels, or load them from the cache.
 
-    This takes half a second, during which a receiving thread cannot answer requests, so call this function in
-    advance.
+    Call this function in advance. It takes half a second, during which a receiving thread cannot answer
+    requests.
     """
     global _loaded
     _loaded = True
@@ -91,8 +92,8 @@ def classic_bits(ids: NDArray[np.uint32], lengths: _Bytes, payload: _Bytes, stri
         ids: (n,) identifiers.
         lengths: (n,) data lengths, bytes.
         payload: the data of all frames, concatenated.
-        stride: number of bytes from the start of one frame's data to the start of the next frame's; 0 if
-            there are no gaps.
+        stride: distance in ``payload`` between the starts of consecutive frames, bytes; 0 if there are no
+            gaps.
         bits: (n,) output, number of bits in each frame.
 
     Returns:

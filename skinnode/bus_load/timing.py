@@ -1,13 +1,13 @@
-"""Exact duration of CAN frames on the bus (ISO 11898-1:2015), and the resulting load.
+"""Computes the exact duration of CAN frames on the bus (ISO 11898-1:2015), and the resulting bus load.
 
 Classic frames. From start of frame to the end of the CRC sequence, a stuff bit of the opposite value follows
 every five equal bits, and stuff bits count towards the five. The 13-bit tail is not stuffed: CRC delimiter,
 ACK slot, ACK delimiter, 7-bit end of frame and 3-bit inter-frame space. CRC: polynomial 0x4599, 15 bits,
 initial value 0.
 
-CRC and stuffing are computed bytewise with tables. The head of a frame is padded on the left to whole bytes.
-For the CRC, the padding consists of zeros, which leave the CRC at 0. For stuffing, it consists of alternating
-bits that end in a 1, so the dominant start of frame begins a new run.
+Tables are used to compute CRC and stuffing byte by byte. The head of a frame is padded on the left to whole
+bytes. For the CRC, the padding consists of zeros, which leave the CRC at 0. For stuffing, it consists of
+alternating bits that end in a 1, so the dominant start of frame begins a new run.
 
 The CAN FD frames of a hand have an 11-bit identifier and switch the bit rate; only :func:`exact_fd_bits`
 counts other CAN FD frames. Bit stuffing follows the same rule up to the end of the data. The CRC field holds
@@ -59,9 +59,9 @@ def nominal_bits(dlc: int, *, extended: bool = False) -> int:
 
 
 def worst_case_bits(dlc: int, *, extended: bool = False) -> int:
-    """Return the maximum number of bits in a frame, with a stuff bit after 5 bits and every 4 thereafter.
+    """Return the maximum length of a frame, bits: one stuff bit after 5 bits and after every 4 thereafter.
 
-    Davis, Burns, Bril, Lukkien, "Controller Area Network (CAN) schedulability analysis", 2007, eq. 1.
+    Source: Davis, Burns, Bril, Lukkien, "Controller Area Network (CAN) schedulability analysis", 2007, eq. 1.
     """
     nominal = nominal_bits(dlc, extended=extended)
     return nominal + (nominal - TAIL_BITS - 1) // (_RUN - 1)
@@ -128,7 +128,7 @@ def exact_fd_bits(
         esi: whether the error state indicator is recessive, as sent by an error-passive node.
 
     Returns:
-        Bits at the nominal and at the data bit rate.
+        The numbers of bits at the nominal bit rate and at the data bit rate.
 
     Raises:
         ValueError: if the identifier does not fit, or the length is not valid in CAN FD.
@@ -203,16 +203,16 @@ def fd_worst_case_bits(length: int) -> tuple[int, int]:
         length: number of data bytes.
 
     Returns:
-        Bits at the nominal and at the data bit rate, as in :func:`fd_bits`.
+        The numbers of bits at the nominal bit rate and at the data bit rate, as in :func:`fd_bits`.
 
     Raises:
         ValueError: if the length is not valid in CAN FD.
     """
     if length not in FD_LENGTHS:
         raise ValueError(f"length: got {length}, must be one of {FD_LENGTHS}")
-    # In the 14 bits from SOF to IDE a stuff bit may follow the first 5 bits and every 4 further bits. FDF,
-    # res and BRS alternate, ESI is 0 and the length code is known. For the data, the worst case is assumed.
-    # The first run is one recessive bit, BRS.
+    # In the 14 bits from SOF to IDE, a stuff bit may follow the first 5 bits and every 4 thereafter. FDF, res
+    # and BRS alternate, ESI is 0, and the length code is known. The data are those of the worst case. The
+    # initial run is a single recessive bit, BRS.
     stuff = {(1 << 2) + 1: 0}
     code = FD_LENGTHS.index(length)
     choices: list[tuple[int, ...]] = [(0,), *((code >> shift & 1,) for shift in (3, 2, 1, 0))]
@@ -225,7 +225,7 @@ def fd_worst_case_bits(length: int) -> tuple[int, int]:
                 equal = equal + 1 if bit == value else 1
                 stuffed = equal == _RUN
                 state = ((1 - bit) << 2) + 1 if stuffed else (bit << 2 | equal - 1) + 1
-                # A stuff bit due after the last bit is not sent: the first fixed stuff bit takes its place.
+                # The first fixed stuff bit replaces a stuff bit that is due after the last bit.
                 total = count + (stuffed and number < len(choices))
                 after[state] = max(after.get(state, 0), total)
         stuff = after
@@ -265,9 +265,9 @@ def exact_bits_batch(can_id: ArrayLike, dlc: ArrayLike, data: ArrayLike) -> _Int
 
 
 class BusLoad:
-    """Counter of frames and of their exact total length in bits.
+    """Counts frames and their exact total length in bits.
 
-    Adding a frame is cheap, because bits are counted in batches. The counter is not thread-safe.
+    Adding a frame is fast, because bits are counted in batches. An instance is not thread-safe.
 
     Args:
         bitrate_bps: nominal bit rate, bit/s.
@@ -330,12 +330,12 @@ class BusLoad:
 
     @property
     def bits(self) -> int:
-        """Number of bits counted so far; a bit at the data bit rate counts as a fraction of a nominal bit."""
+        """Number of bits counted so far, in nominal bit times; bits of the data phase are shorter."""
         self._work_off()
         return self._bits + round(self._fast_bits * self._data_bit)
 
     def load(self, time_s: float) -> float:
-        """Return the fraction of a time interval that the counted frames occupy; above 1 if they do not fit.
+        """Return the fraction of a time interval that the counted frames occupy; it can exceed 1.
 
         Args:
             time_s: length of the interval, s.
@@ -345,7 +345,9 @@ class BusLoad:
     def _work_off(self) -> None:
         ids, data = self._classic
         self._frames += len(ids)
-        if not stuffing.are_loaded():  # loading the kernels would delay a command that listens for 1 or 2 s
+        if (
+            not stuffing.are_loaded()
+        ):  # loading the kernels would noticeably delay a command that runs for 1 or 2 s
             self._bits += sum(map(exact_bits, ids, data))
         elif ids:
             self._bits += stuffing.classic_bits(*_packed(ids, data), 0, np.empty(len(ids), np.int64))
@@ -365,9 +367,9 @@ class BusLoad:
 def _packed(
     ids: list[int], data: list[bytes]
 ) -> tuple[NDArray[np.uint32], NDArray[np.uint8], NDArray[np.uint8]]:
-    """Return (n,) identifiers, (n,) lengths and the concatenated data, in writable memory.
+    """Return (n,) identifiers, (n,) lengths and the concatenated data, in writable arrays.
 
-    A kernel is compiled separately for writable and read-only memory, hence the copies.
+    The data are copied, because numba would compile a kernel a second time for read-only arrays.
     """
     lengths, joined = bytearray(map(len, data)), bytearray().join(data)
     return np.array(array("I", ids)), np.frombuffer(lengths, np.uint8), np.array(joined, np.uint8)

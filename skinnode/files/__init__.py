@@ -1,1 +1,1 @@
-"""Safe file access: locks, atomic writes and one-line errors."""
+"""File access with locks, atomic writes and one-line error messages."""

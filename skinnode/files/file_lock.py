@@ -1,4 +1,4 @@
-"""Lock file that contains its owner's process ID, cannot become stale, and is removed on release."""
+"""Implements a lock file that contains the owner's process ID and never becomes stale."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from pathlib import Path
 from typing import Final
 
 _TRIES: Final = 100
-"""Maximum number of locking attempts; one fails only if the previous owner removes the file just opened."""
+"""Maximum number of locking attempts; an attempt fails if the previous owner removes the opened file."""
 
 
 class FileInUse(BlockingIOError):
-    """Error raised if the lock is taken; ``process`` is the owner's process ID, or None if unknown."""
+    """Raised if the lock is held; ``process`` is the owner's process ID, or None if unknown."""
 
     def __init__(self, path: Path, process: int | None) -> None:
         self.process = process
@@ -25,7 +25,7 @@ class FileInUse(BlockingIOError):
 
 
 class NotARegularFile(OSError):
-    """Error raised if the path is a symbolic link, a folder, a pipe or a device, not a regular file."""
+    """Raised if the path of a lock file is a symbolic link, a folder, a pipe or a device."""
 
     def __init__(self, path: Path, what: str) -> None:
         allowed = "allowed: a regular file, or a name that does not exist"
@@ -34,14 +34,14 @@ class NotARegularFile(OSError):
 
 @dataclass(frozen=True, slots=True)
 class FileLock:
-    """Acquired lock. The kernel releases the lock when the process ends, even if the process is killed."""
+    """Acquired lock. The kernel releases the lock when its process ends, even if the process is killed."""
 
     path: Path
     descriptor: int
     process: int
 
     def release(self) -> None:
-        """Release the lock; call only once. A forked child that inherited the lock keeps the file locked."""
+        """Release the lock; call once. A forked child that inherited the lock still keeps the file locked."""
         if self.process == os.getpid():
             with contextlib.suppress(OSError):
                 self.path.unlink()
@@ -55,9 +55,9 @@ def lock_file(path: Path) -> FileLock:
         The lock, which the caller must release.
 
     Raises:
-        FileInUse: This or another process owns the lock.
+        FileInUse: This process or another process already holds the lock.
         NotARegularFile: ``path`` exists and is not a regular file.
-        OSError: The file cannot be created.
+        OSError: The lock file cannot be created.
     """
     flags = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC | os.O_NONBLOCK | os.O_NOCTTY
     for _ in range(_TRIES):
@@ -84,12 +84,12 @@ def lock_file(path: Path) -> FileLock:
         except BaseException:
             os.close(descriptor)
             raise
-        os.close(descriptor)  # the previous owner removed the file after it was opened here
+        os.close(descriptor)  # the previous owner removed the file between open and lock
     raise FileInUse(path, None)
 
 
 def _is_at(path: Path, descriptor: int) -> bool:
-    """Return whether ``path`` still names the open file."""
+    """Return whether ``path`` still refers to the open file."""
     try:
         return os.path.samestat(os.fstat(descriptor), os.lstat(path))
     except FileNotFoundError:

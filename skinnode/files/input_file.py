@@ -1,4 +1,4 @@
-"""Reads files named by the user, up to a size limit and without blocking indefinitely."""
+"""Reads files that the user specifies, up to a size limit and without blocking indefinitely."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ from typing import Final
 from skinnode.errors import ConfigError
 
 MOST_BYTES: Final = 1 << 20
-"""Maximum size of a text file: ten times the size of the largest known hand file, layout or baseline. Parsers
-need about a hundred times as much memory as the text."""
+"""Maximum size of a text file, bytes: ten times the size of the largest known hand file, layout or baseline.
+The limit is needed because parsers use about a hundred times as much memory as the text."""
 
 
 def read_input(key: str, path: Path, most_bytes: int = MOST_BYTES) -> bytes:
-    """Read a whole file that the user named, or a pipe that has a writer, as in ``<(command)``.
+    """Read the whole content of a user-specified file, or of a pipe with a writer, as in ``<(command)``.
 
     Args:
-        key: Option or key that named the file, for error messages.
+        key: Option or key that specifies the file, for error messages.
         path: The file.
-        most_bytes: Maximum size.
+        most_bytes: Maximum size of the file.
 
     Raises:
         ConfigError: ``path`` is not a file, cannot be read, or is larger than ``most_bytes``.
@@ -30,11 +30,13 @@ def read_input(key: str, path: Path, most_bytes: int = MOST_BYTES) -> bytes:
         with open(descriptor, "rb") as file:
             if stat.S_ISDIR(os.fstat(descriptor).st_mode):
                 raise ConfigError(key, str(path), "a file that can be read (Is a directory)")
-            os.set_blocking(descriptor, True)  # only open() must not block: a pipe may have no writer
+            os.set_blocking(
+                descriptor, True
+            )  # non-blocking mode is needed only for open(): a pipe may have no writer
             data = file.read(most_bytes + 1)
     except OSError as error:
         raise ConfigError(key, str(path), f"a file that can be read ({error.strerror})") from None
-    except ValueError as error:  # NUL in the name
+    except ValueError as error:  # the path contains a NUL character
         raise ConfigError(key, str(path), f"a file that can be read ({error})") from None
     if len(data) > most_bytes:
         raise ConfigError(key, str(path), f"a file of at most {most_bytes >> 20} MiB")

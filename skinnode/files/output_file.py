@@ -11,10 +11,10 @@ from skinnode.files.whole_file import replace_file
 
 
 def require_writable(option: str, file: Path) -> None:
-    """Check that a file can be written, before its content is computed.
+    """Check that a file can be written; call this function before computing the content.
 
     Args:
-        option: Option that named the file, for error messages.
+        option: Option that specifies the file, for error messages.
         file: The file.
 
     Raises:
@@ -31,7 +31,7 @@ def require_writable(option: str, file: Path) -> None:
 
 
 def write_text(option: str, file: Path, text: str) -> None:
-    """Write ``text`` in UTF-8 to ``file``, the value of ``option``.
+    """Encode ``text`` in UTF-8 and write it to ``file``, which ``option`` specifies.
 
     Raises:
         ConfigError: The text could not be written completely; a regular file then keeps its old content.
@@ -40,16 +40,16 @@ def write_text(option: str, file: Path, text: str) -> None:
 
 
 def write_bytes(option: str, file: Path, data: bytes) -> None:
-    """Write ``data`` to ``file``, the value of ``option``.
+    """Write ``data`` to ``file``, which ``option`` specifies.
 
-    A regular file is replaced only when all data has been written, and keeps its permissions. Any other
-    target, such as a pipe, is written to directly.
+    A regular file is replaced atomically after all data has been written, and keeps its permissions. Data for
+    any other target, such as a pipe, is written directly to the target.
 
     Raises:
         ConfigError: The data could not be written completely; a regular file then keeps its old content.
     """
     try:
-        target = Path(os.path.realpath(file))  # /dev/stdout resolves to a name that does not exist
+        target = Path(os.path.realpath(file))  # for /dev/stdout, the resolved path may not exist
         if file.exists() and not (file.is_file() and os.access(target.parent, os.W_OK)):
             file.write_bytes(data)
         else:

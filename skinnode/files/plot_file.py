@@ -1,4 +1,4 @@
-"""Writes plots with matplotlib, an optional dependency whose absence is reported before any work is done."""
+"""Writes plots with matplotlib, and checks in advance that this optional dependency is installed."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def save_figure(option: str, file: Path, figure: Any, dpi: int) -> None:
     """Write a matplotlib figure atomically to a file, in the format given by the file's suffix.
 
     Args:
-        option: Option that named the file, for error messages.
+        option: Option that specifies the file, for error messages.
         file: The file.
         figure: A ``matplotlib.figure.Figure``.
         dpi: Resolution in dots per inch.

@@ -1,8 +1,9 @@
 """Writes files atomically.
 
-The new content is written to a file with a random name in the same folder. This file is created exclusively,
-never through a symbolic link, and renamed once it is complete. Readers always see either the old or the new
-content, complete; after an error the old content remains.
+The new content is first written to a temporary file with a random name in the same folder. The temporary file
+is created exclusively, never through a symbolic link, and is renamed when it is complete. Readers therefore
+always see either the complete old content or the complete new content. After an error, the old content
+remains.
 """
 
 from __future__ import annotations
@@ -14,20 +15,20 @@ from pathlib import Path
 from typing import Final
 
 SUFFIX: Final = ".new"
-"""Suffix of incomplete files."""
+"""Suffix of temporary files."""
 
 
 def replace_file(path: Path, data: bytes, *, mode: int = 0o600, durable: bool = False) -> None:
-    """Replace the content of ``path`` with ``data``; a symbolic link is replaced, not followed.
+    """Atomically replace the content of ``path`` with ``data``; a symbolic link is replaced, not followed.
 
     Args:
-        path: The file; it need not exist.
+        path: The file to write; it need not exist.
         data: New content.
         mode: Permissions, reduced by the umask.
-        durable: Whether to return only once the file and its name are on the storage medium.
+        durable: Whether to return only after the file and its name are on the storage medium.
 
     Raises:
-        OSError: The file cannot be written and keeps its old content.
+        OSError: The file cannot be written; it keeps its old content.
     """
     beside = create_beside(path, data, mode=mode, durable=durable)
     try:
@@ -40,19 +41,19 @@ def replace_file(path: Path, data: bytes, *, mode: int = 0o600, durable: bool = 
 
 
 def create_beside(path: Path, data: bytes, *, mode: int = 0o600, durable: bool = False) -> Path:
-    """Write ``data`` to a new file beside ``path``; the caller must rename or discard the new file.
+    """Write ``data`` to a temporary file in the folder of ``path``; the caller must rename or discard it.
 
     Args:
-        path: The file to be replaced by the new file.
-        data: Content of the new file.
+        path: File that the temporary file will replace.
+        data: Content of the temporary file.
         mode: Permissions, reduced by the umask.
-        durable: Whether to return only once the data is on the storage medium.
+        durable: Whether to return only after the data is on the storage medium.
 
     Returns:
-        The path of the new file.
+        The path of the temporary file.
 
     Raises:
-        OSError: The new file cannot be written; no file is left behind.
+        OSError: The temporary file cannot be written and has been removed.
     """
     beside = path.with_name(f".{path.name[:200]}.{secrets.token_hex(8)}{SUFFIX}")
     flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
@@ -70,15 +71,15 @@ def create_beside(path: Path, data: bytes, *, mode: int = 0o600, durable: bool =
 
 
 def discard(path: Path) -> None:
-    """Remove ``path`` if possible."""
+    """Remove the file ``path``; ignore errors."""
     with contextlib.suppress(OSError):
         os.unlink(path)
 
 
 def discard_leftovers(path: Path) -> None:
-    """Remove incomplete files left by processes that were killed while writing ``path``.
+    """Remove temporary files left behind by processes that were killed while writing ``path``.
 
-    Only the sole writer of ``path`` may call this.
+    Call this function only if no other process writes ``path``.
     """
     start = f".{path.name[:200]}."
     with contextlib.suppress(OSError), os.scandir(path.parent) as entries:
@@ -89,7 +90,7 @@ def discard_leftovers(path: Path) -> None:
 
 
 def flush_folder(folder: Path) -> None:
-    """Flush the directory entries of ``folder`` to the storage medium, to make renames durable."""
+    """Flush the directory entries of ``folder`` to the storage medium, so that renames are durable."""
     descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
     try:
         os.fsync(descriptor)

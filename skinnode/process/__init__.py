@@ -1,1 +1,1 @@
-"""The clock, signal handling, child processes and garbage collection of a running program."""
+"""Clock, signal handling, child processes and garbage collection of a running program."""

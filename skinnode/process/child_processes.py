@@ -1,9 +1,9 @@
-"""Starts child processes that survive signals from the command's terminal.
+"""Starts child processes that are protected from the terminal's signals.
 
-A terminal sends SIGINT (Ctrl-C) and SIGHUP not only to a command but also to its children. On SIGINT, a child
-that is still importing modules would print a traceback, and SIGHUP would end the resource tracker of
-``multiprocessing`` before it has cleaned up. Children therefore start with both signals blocked and keep them
-blocked; the command itself ends the children.
+A terminal sends SIGINT (Ctrl-C) and SIGHUP to a command and also to its child processes. On SIGINT, a child
+that is still importing modules would print a traceback. SIGHUP would terminate the resource tracker of
+``multiprocessing`` before the tracker has cleaned up. Child processes therefore run with both signals
+blocked, and the command itself ends its child processes.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ _TERMINAL_SIGNALS: Final = (signal.SIGINT, signal.SIGHUP)
 def starting_children() -> Iterator[None]:
     """Block the terminal's signals for child processes started in this ``with`` block.
 
-    A signal that arrives during the block is handled at the end of the block, because a child interrupted
+    A signal that arrives during the block is handled at the end of the block. A child process interrupted
     during its start would print a traceback.
     """
     with _signals_deferred():
@@ -40,8 +40,9 @@ def starting_children() -> Iterator[None]:
 def _signals_deferred() -> Iterator[None]:
     """Defer the handling of signals to the end of the ``with`` block.
 
-    A signal mask is not enough: another thread can receive the signal, and Python still calls the handler on
-    the main thread. Other threads are never interrupted, so they need no deferral.
+    Blocking the signals in the main thread is not sufficient: another thread can receive a signal, and Python
+    then calls the handler on the main thread. Python never interrupts other threads to handle a signal, so on
+    another thread this function does nothing.
     """
     if threading.current_thread() is not threading.main_thread():
         yield

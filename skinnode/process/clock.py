@@ -1,8 +1,8 @@
-"""Time, waiting and threads: the system's, or those of a virtual clock that a simulation sets.
+"""Functions that read the time, wait and start threads, with the system clock or with a virtual clock.
 
-Code that reads the time, waits or starts threads calls these functions. A thread runs by the clock of the
-thread that made it; :func:`use` sets the clock of the current thread. Without a virtual clock, the functions
-are those of the standard library.
+Code that reads the time, waits or starts threads must call these functions. A new thread uses the clock of
+the thread that created it, and :func:`use` sets the clock of the current thread. Without a virtual clock,
+these functions call those of the standard library.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from typing import Any, Protocol
 
 
 class Clock(Protocol):
-    """Source of time and of the objects on which threads wait."""
+    """Source of time, and factory for threads and for the objects on which threads wait."""
 
     def monotonic_ns(self) -> int:
         """Return the monotonic time, ns."""
@@ -26,7 +26,7 @@ class Clock(Protocol):
         """Return the time since 1970, ns."""
 
     def sleep(self, seconds: float, /) -> None:
-        """Suspend the current thread."""
+        """Suspend the current thread for ``seconds``."""
 
     def event(self) -> threading.Event:
         """Return an event that is not set."""
@@ -48,7 +48,7 @@ class Clock(Protocol):
 
 
 class SystemClock:
-    """The clocks and threads of the operating system."""
+    """Clock and threads of the operating system."""
 
     monotonic_ns = staticmethod(system_time.monotonic_ns)
     time_ns = staticmethod(system_time.time_ns)
@@ -82,7 +82,7 @@ _here = _Here()
 
 @contextmanager
 def use(clock: Clock) -> Iterator[None]:
-    """Let the current thread, and the threads that it starts in this ``with`` block, run by ``clock``."""
+    """Use ``clock`` for the current thread and for all threads that it starts in this ``with`` block."""
     before, _here.clock = _here.clock, clock
     try:
         yield
@@ -106,7 +106,7 @@ def monotonic() -> float:
 
 
 def perf_counter() -> float:
-    """Return the time for measuring durations, s. In virtual time, computing takes none."""
+    """Return a time for measuring durations, s; in virtual time, computation takes no time."""
     clock = _here.clock
     return system_time.perf_counter() if clock is _SYSTEM else clock.monotonic_ns() * 1e-9
 
@@ -122,7 +122,7 @@ def time() -> float:
 
 
 def sleep(seconds: float) -> None:
-    """Suspend the current thread."""
+    """Suspend the current thread for ``seconds``."""
     _here.clock.sleep(seconds)
 
 
@@ -154,8 +154,8 @@ def thread(target: Callable[..., object], name: str, args: tuple[Any, ...] = ())
 def pool(threads: int, name: str) -> Executor:
     """Return a :class:`concurrent.futures.ThreadPoolExecutor`.
 
-    Wait for its jobs with :meth:`concurrent.futures.Future.add_done_callback`; the other methods that wait
-    know no virtual time.
+    To wait for a job, use :meth:`concurrent.futures.Future.add_done_callback`. Other waiting methods ignore
+    virtual time.
     """
     return _here.clock.pool(threads, name)
 

@@ -12,9 +12,9 @@ from contextlib import contextmanager
 def without_long_collections() -> Iterator[None]:
     """Exclude objects that exist on entry from garbage collection for the duration of the block.
 
-    With numba and canopen loaded, a full collection stops every thread for 30 ms on a small computer, long
-    enough for a node to skip a scan or a host to delay a SYNC. Enter the block after all setup is done.
-    Objects that exist on entry and become cyclic garbage are freed after the block.
+    If numba and canopen are loaded, a full collection on a small computer stops every thread for 30 ms. A
+    node could then miss a scan, or a host could delay a SYNC. Enter the block after all setup has been
+    completed. Objects that exist on entry and become cyclic garbage are freed only after the block.
     """
     gc.collect()
     gc.freeze()
@@ -26,9 +26,10 @@ def without_long_collections() -> Iterator[None]:
 
 @contextmanager
 def responsive_threads() -> Iterator[None]:
-    """Make computing threads yield after 0.5 ms, not Python's default of 5 ms, for the duration of the block.
+    """Set Python's thread switch interval to 0.5 ms for the duration of the block; the default is 5 ms.
 
-    With 5 ms, a thread that receives or draws could delay a scan by more than the time needed to solve it.
+    With the default, a thread that receives frames or updates the screen could delay a scan for longer than
+    its solution takes.
     """
     kept = sys.getswitchinterval()
     sys.setswitchinterval(5e-4)

@@ -1,4 +1,4 @@
-"""Orderly termination of programs that run until Ctrl-C."""
+"""Terminates programs that run until Ctrl-C in an orderly way."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from types import FrameType
 
 
 class SignalEvent(threading.Event):
-    """Event that a signal handler may set.
+    """Event that a signal handler can safely set.
 
-    ``threading.Event.set`` takes a lock. If the interrupted thread holds that lock, in ``wait``, a handler
-    that sets the event waits forever. ``SimpleQueue.put`` is made for handlers.
+    ``threading.Event.set`` acquires a lock. If the interrupted thread already holds this lock in ``wait``, a
+    handler that calls ``set`` blocks forever. ``SimpleQueue.put``, in contrast, is reentrant.
     """
 
     def __init__(self) -> None:
@@ -23,32 +23,32 @@ class SignalEvent(threading.Event):
         self._wake: SimpleQueue[None] = SimpleQueue()
 
     def is_set(self) -> bool:
-        """Return whether the event was set."""
+        """Return whether the event has been set."""
         return self._is_set
 
     def set(self) -> None:
-        """Set the event for good."""
+        """Set the event permanently."""
         self._is_set = True
         self._wake.put(None)
 
     def wait(self, timeout: float | None = None) -> bool:
-        """Wait until the event is set, or ``timeout`` seconds; return whether it is set."""
+        """Wait for the event for at most ``timeout`` seconds; return whether the event is set."""
         if not self._is_set:
             with suppress(Empty):
                 self._wake.get(timeout=None if timeout is None else max(0.0, timeout))
-                self._wake.put(None)  # for other threads that wait
+                self._wake.put(None)  # wakes the next waiting thread
         return self._is_set
 
 
 @contextmanager
 def stop_on_signal() -> Iterator[threading.Event]:
-    """Yield an event that is set by a stop signal, and restore the previous handlers after the block.
+    """Yield an event that stop signals set, and restore the previous signal handlers after the block.
 
-    The stop signals are SIGINT (Ctrl-C), SIGTERM and SIGHUP (terminal closed). SIGHUP stays ignored if it was
-    ignored before, as under nohup.
+    The stop signals are SIGINT (Ctrl-C), SIGTERM and SIGHUP (terminal closed). If SIGHUP was already ignored,
+    as under nohup, it remains ignored.
 
     Raises:
-        ValueError: if not called from the main thread, because no other thread can set signal handlers.
+        ValueError: if called from a thread other than the main thread, which cannot set signal handlers.
     """
     stop = SignalEvent()
 

@@ -1,1 +1,1 @@
-"""Text output: plural forms, printable characters, HTML pages and JSON values."""
+"""Helpers for text output: plural forms, printable characters, HTML pages and JSON values."""

@@ -1,4 +1,4 @@
-"""Skeleton for all HTML pages of this project, and escaping of untrusted text in them."""
+"""Creates the skeleton of this project's HTML pages, and escapes untrusted text in pages."""
 
 from __future__ import annotations
 
@@ -29,9 +29,9 @@ def page(title: str, style: str, body: Iterable[str]) -> str:
     """Return a self-contained HTML page.
 
     Args:
-        title: Untrusted text.
-        style: CSS.
-        body: HTML elements; untrusted text in them must already be escaped by :func:`escaped`.
+        title: Title of the page; may be untrusted text.
+        style: CSS rules.
+        body: HTML elements; the caller must escape untrusted text in them with :func:`escaped`.
     """
     return _PAGE.substitute(title=escaped(title), style=style, body="\n".join(body))
 

@@ -1,17 +1,17 @@
-r"""Makes untrusted text printable; only this module decides what may reach a terminal, a log or a page.
+r"""Makes untrusted text printable; only this module defines which characters output may contain.
 
 Text from a device, a file, a recording or the command line is untrusted. The rules are:
 
-* Text from a bus or an EDS is made printable, on one line and of limited length, where it is decoded
-  (:func:`printable`). The bytes themselves are preserved in ``od --json``, in a DCF and in comparisons.
-* Names in hand.toml are rejected unless they are printable (``skinnode.config``).
-* The output of every command passes through :class:`PrintableStream`, and rich output through the console of
-  ``skinnode.cli``. Both are a safety net for echoed text such as file names and arguments.
-* Pages also escape HTML, and untrusted text is never interpreted as markup.
+* Text from a bus or an EDS is made printable when it is decoded (:func:`printable`); its length is limited to
+  one line. The original bytes are preserved in ``od --json``, in a DCF and in comparisons.
+* A name in hand.toml that is not printable is rejected (``skinnode.config``).
+* The output of every command passes through :class:`PrintableStream`, and output from rich passes through the
+  console of ``skinnode.cli``. Both are safety nets for echoed text such as file names and arguments.
+* In HTML pages, text is also escaped, and untrusted text is never interpreted as markup.
 
-Printable is defined by :meth:`str.isprintable`: no control characters (C0, DEL, C1), no format characters
-(some of which reverse the direction of text or have no width) and no surrogates. Other characters are shown
-as Python escapes: ``\x1b``, ``\u202e``.
+Text is printable according to :meth:`str.isprintable` if it contains no control characters (C0, DEL, C1), no
+format characters (some of which reverse the text direction or have no width) and no surrogates. Such
+characters are replaced by Python escapes: ``\x1b``, ``\u202e``.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ import re
 from typing import Any, Final, TextIO
 
 MOST: Final = 200
-"""Maximum number of characters shown of any untrusted text; longer than any name, but short enough for one
-line."""
+"""Maximum number of characters of an untrusted text that are shown: longer than any name, but short enough
+for one line."""
 
 _SUSPECT: Final = re.compile(r"[^ -~]")
 _SUSPECT_IN_LINES: Final = re.compile(r"[^\n\t -~]")
@@ -31,7 +31,7 @@ def printable(text: str | bytes, most: int = MOST) -> str:
     """Return ``text`` on one line, without control sequences.
 
     Args:
-        text: The text. Bytes are read as a VISIBLE_STRING: one character per byte; trailing NULs are dropped.
+        text: The text. Bytes are decoded as a VISIBLE_STRING: one character per byte, without trailing NULs.
         most: Maximum number of characters; longer text is truncated and ends in ``…``.
     """
     if isinstance(text, bytes):
@@ -42,9 +42,9 @@ def printable(text: str | bytes, most: int = MOST) -> str:
 
 
 def printable_lines(text: str) -> str:
-    """Return ``text`` without control sequences but at full length, with line ends and tabs.
+    """Return ``text`` at full length without control sequences, but with its line ends and tabs.
 
-    Use this for messages that contain untrusted parts.
+    Use this function for messages that contain untrusted parts.
     """
     return text if text.isprintable() else _SUSPECT_IN_LINES.sub(_escaped, text)
 
@@ -57,7 +57,7 @@ def _escaped(found: re.Match[str]) -> str:
 class PrintableStream:
     """Wrapper for a text stream, such as stdout, that escapes control characters.
 
-    Output from rich must bypass the wrapper, and does so through the attribute ``rich_proxied_file``.
+    The attribute ``rich_proxied_file`` lets output from rich bypass the wrapper.
     """
 
     def __init__(self, stream: TextIO) -> None:

@@ -1,7 +1,7 @@
-"""Object dictionary and PDO contents of a patch, as pure code that needs no bus or clock.
+"""Object dictionary and PDO payloads of a patch, in pure functions that need neither a bus nor a clock.
 
 Node:  resistances → ``codes`` → codes → ``chunk``, ``summary`` → PDO payloads, mapped as ``profile`` defines.
 Host:  PDO payloads → ``chunk``, ``summary`` → ``assembler`` → one complete scan → ``codes`` → resistances.
 
-``codec`` only re-exports the public names of these modules.
+The module ``codec`` only re-exports the public names of these modules.
 """

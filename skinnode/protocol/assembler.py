@@ -1,34 +1,36 @@
-"""Assembly of one patch's received chunks and summaries into scans; not thread-safe; uses no clock.
+"""Assembly of one patch's received chunks and summaries into scans; not thread-safe, and without a clock.
 
-**Scans are never mixed.** A scan holds only frames with its own counter that arrived within the *timeout* of
-its first frame, and it is closed permanently when a frame of a newer scan arrives. Frames of two scans can
-therefore share a scan only if they carry the same counter and arrive within the timeout of each other. Such
-mixing cannot happen as long as counter range × period is longer than the timeout plus the age of the oldest
-frame, measured from the SYNC of its scan to its arrival. The timeout is three periods (less if the counter
-range is shorter), so with the usual range of 240 scans a frame may be 237 periods old.
+**Scans are never mixed.** A scan contains only frames with the scan's own counter that arrived within the
+*timeout* after its first frame. The scan is closed permanently as soon as a frame of a newer scan arrives.
+Frames of two scans can therefore be mixed only if both scans have the same counter and the frames arrive
+within the timeout. Mixing is impossible if counter range × period is longer than the timeout plus the maximum
+age of a frame, which is the time from its scan's SYNC to its arrival. The timeout is three periods, or less
+if the counter range is short. With the usual range of 240 scans, a frame may therefore be 237 periods old.
 
-**Two scans with the same counter**, from a node that did not increment it or from two nodes with the same
-node-ID, are detected when a frame is received twice with different content. The other frames then cannot be
-assigned to either scan, so the whole scan is discarded. The same applies to a scan with missing frames whose
-chunks are more than two periods apart: it began with a chunk that carried the counter of a later scan, and
-the later scan's own chunk arrives after the timeout. If the frames of the two scans do not overlap, only the
-check reveals that the frames belong to different scans.
+**Two scans with the same counter.** Two scans have the same counter if a node did not increment it, or if two
+nodes have the same node-ID. The assembler detects this if two frames with the same index and different
+content arrive. The other frames then cannot be assigned to either scan, so the assembler discards the whole
+scan. The assembler also discards a scan with missing frames if its chunks arrived more than two periods
+apart: the first chunk then carried the counter of a later scan, whose own chunks may arrive after the
+timeout. If two mixed scans have no chunk index in common, only the check detects the mixing.
 
 **The check.** A summary with :attr:`~skinnode.protocol.summary.SummaryFlag.CHECKED` carries a CRC over all
-codes that the receiver must hold (:mod:`skinnode.protocol.scan_check`). If the check fails, the wrong chunk
-cannot be identified, so the whole scan is discarded, together with the codes held for chunks that were not
-sent. A stream is *checked* from the first check that passes, or from a :meth:`ScanAssembler.reset` with
-``checked``. In a checked stream no scan is complete without its check. A scan whose summary was lost, or that
-lacks codes of chunks that were not sent again, is published as *unchecked*, and a summary without a check is
-rejected. Patches of revision 1.0 send no checks; their scans are complete when all chunks have been received.
+codes that the receiver must have after the scan (:mod:`skinnode.protocol.scan_check`). A failed check does
+not show which chunk is wrong. The assembler therefore discards the whole scan and the codes kept for chunks
+that were not sent. A stream is *checked* from the first check that passes, or from a
+:meth:`ScanAssembler.reset` with ``checked``. In a checked stream, a scan is complete only if its check
+passed, and a summary without a check is rejected. A scan is published as *unchecked* if its summary was lost,
+or if the codes of chunks that were not sent are unknown. Patches of revision 1.0 send no checks, so their
+scans are complete as soon as all chunks have been received.
 
-**Order of counters.** A frame whose counter is up to half the counter range ahead is newer; a frame with any
-other counter is late and is dropped. After a timeout without an accepted frame, a frame with any counter
-starts a new stream, because the node or the SYNC producer may have been restarted.
+**Order of counters.** A frame whose counter is ahead of the last scan's counter by at most half the counter
+range belongs to a newer scan. A frame with any other counter is late and is dropped. If no frame has been
+accepted for the timeout, the next frame is accepted with any counter, because the node or the SYNC producer
+may have restarted.
 
 **Chunks that were not sent.** If the summary indicates that only changed chunks were sent, the other chunks
-keep their last codes (:mod:`skinnode.protocol.partial_scan`). If a scan has since been lost, torn or overrun,
-or a silence was long enough to hide such a scan, these codes may have changed and are invalid until their
+keep their last codes (:mod:`skinnode.protocol.partial_scan`). A lost, torn or overrun scan may have changed
+these codes, and so may a scan lost during a long silence. In either case the codes are invalid until their
 chunks are sent again.
 """
 
@@ -51,8 +53,9 @@ from skinnode.text.words import counted
 
 _CHUNK_INDICES: Final = 256
 _NOT_EXPECTED: Final = b""
-"""Placeholder for chunk numbers that a patch does not have, so that the hot path needs no bounds check."""
-_NONE_OPEN: Final = -1  # no scan counter is negative
+"""Placeholder payload for chunk numbers that the patch does not have; it saves a bounds check for each chunk
+received."""
+_NONE_OPEN: Final = -1  # a negative number, so that no scan counter equals it
 _NEVER: Final = -1
 # Testing an enum flag takes as long as processing a whole chunk; testing an int takes a tenth of that.
 _CHANGED_ONLY, _OVERRUN = int(SummaryFlag.CHANGED_ONLY), int(SummaryFlag.OVERRUN)
@@ -60,23 +63,25 @@ _BASELINE_CHANGED: Final = int(SummaryFlag.BASELINE_CHANGED)
 
 
 class ScanAssembler:
-    """Assembler of one patch's scans. Every method returns at most one scan, and scans are returned in order.
+    """Assembler of one patch's scans. Each method call returns at most one scan; scans are returned in order.
 
-    Call :meth:`poll` after each batch of frames and at :meth:`next_deadline_ns`. ``poll`` returns a scan
-    whose missing frames have timed out, or a scan that ended in the same call as the scan before it.
+    Call :meth:`poll` after each batch of frames and at :meth:`next_deadline_ns`. The method ``poll`` returns
+    a scan whose missing frames have timed out. If a single frame ended two scans, ``poll`` returns the second
+    of them.
 
     Args:
         profile: sizes of the patch.
-        counter_overflow: value of 0x1019; scan counters run from 1 to this number with the SYNC, or freely
-            from 0 to 255 if this value is 0.
-        period_ns: time between two scans, ns; determines the timeout.
-        grace_ns: time to wait for late frames after the summary or all chunks have arrived, ns.
+        counter_overflow: value of 0x1019. If it is nonzero, the SYNC counter numbers the scans from 1 to this
+            value; if it is 0, the patch numbers its scans from 0 to 255.
+        period_ns: time from one scan to the next, ns; determines the timeout.
+        grace_ns: maximum wait for late frames after the summary or all chunks have arrived, ns.
         node_id: node-ID shown in the errors passed to ``on_reject``.
-        on_reject: called with a CodecError for each frame of the wrong length or form.
-        under_way: whether the node may already be sending; see :meth:`reset`.
+        on_reject: called with a CodecError for each frame with a wrong length, and for each summary that
+            lacks a check.
+        under_way: whether the node may already be sending scans; see :meth:`reset`.
 
     Raises:
-        ConfigError: if the counter overflow is not 0 or 2 to 240, or a time is not positive.
+        ConfigError: if the counter overflow is not 0 or 2 to 240, or if a time is not positive.
     """
 
     def __init__(  # noqa: PLR0913 - keywords with defaults, each given alone by some caller
@@ -107,9 +112,9 @@ class ScanAssembler:
         self._node_id = node_id
         self._on_reject = on_reject
         self.on_discarded: Callable[[], None] | None = None
-        """Callback for a discarded scan that may have been the first scan with a new baseline."""
+        """Callback for a discarded scan that may have announced a new baseline; None for no callback."""
 
-        # the open scan, or the last scan while none is open
+        # The following attributes describe the open scan or, if no scan is open, the last scan.
         self._counter = _NONE_OPEN
         self._last_counter = _NEVER
         self._scan = _NEVER
@@ -119,11 +124,11 @@ class ScanAssembler:
         self._received = 0
         self._sent = _NEVER
         self._summary: Summary | None = None
-        self._head = b""  # bytes of the summary that its check covers
+        self._head = b""  # the bytes of the summary that the check covers
         self._checked = False
         self._device_time = DeviceTimeTracker()
         self._expires_ns = self._t_first_ns = self._t_last_ns = 0
-        self._t_chunk_ns = self._t_summary_ns = 0  # time of the frame before the summary, and of the summary
+        self._t_chunk_ns = self._t_summary_ns = 0  # times of reception: frame before the summary, and summary
 
         self._held = HeldChunks(profile)
         self._follows = False  # whether the open scan follows the last scan without a gap
@@ -141,11 +146,11 @@ class ScanAssembler:
         """Process a chunk.
 
         Args:
-            data: payload of TPDO1; kept, not copied.
+            data: payload of TPDO1; the assembler keeps a reference to it.
             t_ns: time of reception, ns.
 
         Returns:
-            The scan ended by the chunk; None if it did not end a scan.
+            The scan that the chunk ended; None if the chunk did not end a scan.
         """
         if len(data) != self._chunk_bytes:
             self._reject_length(chunk_cob_id(self._node_id), data, self._chunk_bytes, "chunk")
@@ -171,7 +176,7 @@ class ScanAssembler:
             t_ns: time of reception, ns.
 
         Returns:
-            The scan ended by the summary; None if it did not end a scan.
+            The scan that the summary ended; None if the summary did not end a scan.
         """
         if len(data) != PDO_BYTES:
             self._reject_length(summary_cob_id(self._node_id), data, PDO_BYTES, "scan summary")
@@ -202,7 +207,7 @@ class ScanAssembler:
         return closed
 
     def poll(self, t_ns: int) -> Scan | None:
-        """Return the open scan if its missing frames have timed out.
+        """Close and return the open scan if the wait for its missing frames is over.
 
         Args:
             t_ns: current time, ns.
@@ -213,7 +218,7 @@ class ScanAssembler:
     def next_deadline_ns(self) -> int | None:
         """Return the time at which :meth:`poll` will close the open scan, ns; None if no scan is open.
 
-        The time applies if no further frame arrives.
+        If another frame arrives first, this time may change.
         """
         if self._counter == _NONE_OPEN:
             return None
@@ -224,13 +229,13 @@ class ScanAssembler:
         return self._expires_ns
 
     def reset(self, *, under_way: bool = False, checked: bool = False) -> None:
-        """Discard the open scan, the last codes and the counter, as after a boot-up; keep the statistics.
+        """Discard the open scan, the last codes and the scan counter, as after a boot-up of the node.
 
         Args:
-            under_way: whether the node may already be sending; chunks missing at the start of the first scan
-                then count as not received rather than lost.
-            checked: whether the node is known to send a check with every summary; if false, checks are
-                required after the first check that passes.
+            under_way: whether the node may already be sending scans. The first scan may then lack its first
+                chunks, which count as not received rather than lost.
+            checked: whether the node is known to send a check in every summary. If false, checks are required
+                only after the first check that passes.
         """
         if self._counter != _NONE_OPEN:
             self._discarded += 1
@@ -242,7 +247,7 @@ class ScanAssembler:
         self._device_time.reset()
 
     def expect_check(self) -> None:
-        """Require a check with every summary from now on."""
+        """Require a check in every summary from now on."""
         self._checked = True
 
     @property
@@ -272,7 +277,7 @@ class ScanAssembler:
             resyncs=self._resyncs,
         )
 
-    # --- frames that do not simply continue the open scan
+    # --- frames that start a new scan, repeat an earlier frame, or are rejected
 
     def _on_chunk_of_another_scan(self, data: bytes, t_ns: int) -> Scan | None:
         index = self._index_of(data)
@@ -309,9 +314,9 @@ class ScanAssembler:
             self._on_reject(CodecError(cob_id, data, allowed))
 
     def _is_news(self, counter: int, t_ns: int, *, known: bool) -> bool:
-        """Return whether a frame outside the open scan begins a new scan; if not, count the frame.
+        """Return whether a frame that does not fit the open scan starts a new scan; if not, count it.
 
-        ``known``: whether the last scan already contains an identical frame.
+        The argument ``known`` tells whether the last scan contains an identical frame.
         """
         if not self._lowest <= counter < self._lowest + self._range:
             self._bad_counter += 1
@@ -339,7 +344,7 @@ class ScanAssembler:
     def _open(self, counter: int, t_ns: int, *, from_its_begin: bool) -> None:
         self._follows = False
         self._joined_late, self._may_join = self._may_join and not from_its_begin, False
-        if self._last_counter == _NEVER:  # the first scan, or the first after a reset
+        if self._last_counter == _NEVER:  # this is the first scan, or the first after a reset
             self._scan = counter if self._scan == _NEVER else self._scan + self._steps_to(counter, self._scan)
         else:
             ahead = self._steps_to(counter, self._last_counter)
@@ -359,16 +364,16 @@ class ScanAssembler:
         self._expires_ns = t_ns + self._timeout_ns
 
     def _steps_to(self, counter: int, last: int) -> int:
-        """Return the number of scans, at least 1, from ``last`` to the next scan with this counter."""
+        """Return the number of scans, at least 1, from scan counter ``last`` to the next ``counter``."""
         return (counter - last) % self._range or self._range
 
     def _book(self) -> None:
-        """Count the frames of the open scan."""
+        """Add the open scan's frames to the statistics."""
         self._chunks += self._received
         self._summaries += self._summary is not None
 
     def _close(self) -> Scan | None:
-        """Publish the open scan, or discard it."""
+        """Close the open scan; return it, or None if it must be discarded."""
         self._book()
         self._counter = _NONE_OPEN
         summary = self._summary
@@ -425,9 +430,9 @@ class ScanAssembler:
         )
 
     def _discard(self, *, doubt: bool = True) -> None:
-        """Discard a scan, and prevent later scans from inheriting its codes.
+        """Discard a scan and all codes kept for later scans.
 
-        ``doubt``: whether the scan may have been the first scan with a new baseline.
+        The argument ``doubt`` tells whether the scan may have announced a new baseline.
         """
         self._held.forget()
         if doubt and self.on_discarded is not None:

@@ -1,4 +1,4 @@
-"""Chunks: the parts in which TPDO1 carries the codes of a scan."""
+"""Packing and unpacking of chunks, the parts of a scan that TPDO1 carries."""
 
 from __future__ import annotations
 
@@ -21,10 +21,11 @@ _COB_ID: Final = od.chunk_cob_id(0)
 
 
 class Chunk(NamedTuple):
-    """Chunk of a scan, as sent on the bus."""
+    """Contents of a chunk, as sent on a classic CAN bus."""
 
     chunk: int
-    """Chunk index; the chunk's first code is code number ``chunk · codes_per_chunk`` of the scan."""
+    """Chunk index; the chunk starts with code number ``chunk · codes_per_chunk`` of the scan, counted from
+    0."""
     scan: int
     """Scan counter, u8."""
     codes: tuple[int, ...]
@@ -36,11 +37,11 @@ def pack_chunk(chunk: int, scan: int, codes: Sequence[int], bits: int = 16) -> b
     Args:
         chunk: chunk index, 0 to 255.
         scan: scan counter, 0 to 255.
-        codes: up to 3 codes of 16 bits or 2 codes of 24 bits; the rest of the payload is 0.
+        codes: up to 3 codes of 16 bits or 2 codes of 24 bits; unused bytes are set to 0.
         bits: width of a code, 16 or 24.
 
     Raises:
-        ValueError: if a number does not fit its field.
+        ValueError: if a number does not fit its field, or if there are too many codes.
     """
     width = bits // 8
     if not (0 <= chunk <= 255 and 0 <= scan <= 255):
@@ -72,7 +73,7 @@ def unpack_chunk(data: bytes, bits: int = 16, *, cob_id: int = _COB_ID) -> Chunk
 
 
 def pack_scan(codes: ArrayLike, scan: int, profile: PatchProfile) -> list[bytes]:
-    """Pack the payloads of all chunks of a scan, in order.
+    """Pack the codes of a scan into the payloads of its chunks, in order.
 
     Args:
         codes: (U, K) codes.
@@ -80,7 +81,7 @@ def pack_scan(codes: ArrayLike, scan: int, profile: PatchProfile) -> list[bytes]
         profile: sizes of the patch.
 
     Raises:
-        ValueError: if the codes have the wrong shape, or a code is wider than the profile allows.
+        ValueError: if the codes have the wrong shape, or if a code is wider than ``profile`` allows.
     """
     array = np.asarray(codes, dtype=np.uint32)
     if array.shape != (profile.rows, profile.columns):
@@ -111,7 +112,7 @@ def pack_scan(codes: ArrayLike, scan: int, profile: PatchProfile) -> list[bytes]
 
 
 def unpack_scan(frames: bytes, profile: PatchProfile) -> Codes:
-    """Unpack the (U, K) codes of a scan.
+    """Unpack the (U, K) codes of a scan from the payloads of its chunks.
 
     Args:
         frames: payloads of all chunks in ascending order, concatenated.
@@ -121,7 +122,7 @@ def unpack_scan(frames: bytes, profile: PatchProfile) -> Codes:
 
 
 def unpack_scan_with_check(frames: bytes, profile: PatchProfile) -> tuple[Codes, int]:
-    """Unpack the codes as :func:`unpack_scan` does, and compute their CRC.
+    """Unpack the codes of a scan as :func:`unpack_scan` does, and compute their CRC.
 
     Args:
         frames: payloads of all chunks in ascending order, concatenated.
@@ -141,10 +142,10 @@ def unpack_scan_with_check(frames: bytes, profile: PatchProfile) -> tuple[Codes,
 
 @functools.lru_cache(maxsize=64)
 def _places_of_codes(profile: PatchProfile) -> NDArray[np.intp]:
-    """Return the position of each code in the payloads of a scan.
+    """Return the position of each code in the concatenated payloads of a scan.
 
-    The shape is (U, K) for codes as 16-bit words, or (U, K, 4) for 24-bit codes as bytes; the fourth byte is
-    a zero appended to the payloads.
+    For 16-bit codes the result has shape (U, K) and counts 16-bit words. For 24-bit codes the result has
+    shape (U, K, 4) and counts bytes; the fourth position is that of a zero byte appended to the payloads.
     """
     width, per, head = profile.code_bits // 8, profile.codes_per_chunk, profile.chunk_head_bytes
     lines, shape = profile.lines, (profile.rows, profile.columns)
@@ -158,7 +159,7 @@ def _places_of_codes(profile: PatchProfile) -> NDArray[np.intp]:
 
 @functools.lru_cache(maxsize=64)
 def chunk_of_code(profile: PatchProfile) -> NDArray[np.intp]:
-    """Return the (U, K) numbers of the chunks that carry the codes, counted from 0 in the order sent."""
+    """Return, for each of the (U, K) codes, the number of its chunk, counted from 0 in sending order."""
     lines, per_line = profile.lines, profile.n_codes // profile.lines
     within = np.arange(per_line) // profile.codes_per_chunk
     chunks = np.arange(lines)[:, None] * profile.chunks_per_line + within
@@ -168,10 +169,10 @@ def chunk_of_code(profile: PatchProfile) -> NDArray[np.intp]:
 
 
 def chunk_indexer(profile: PatchProfile) -> Callable[[bytes], int]:
-    """Return a function that maps a chunk's payload to its number, counted as in :func:`chunk_of_code`.
+    """Return a function that takes a chunk's payload and returns the chunk's number (:func:`chunk_of_code`).
 
-    Numbers of ``n_chunks`` and above belong to chunks that the patch does not have. The function does not
-    check the length of the payload.
+    If the patch has no such chunk, the function returns ``n_chunks`` or more. The function does not check the
+    length of the payload.
     """
     if profile.bus == "classic":
         return operator.itemgetter(0)
@@ -180,7 +181,8 @@ def chunk_indexer(profile: PatchProfile) -> Callable[[bytes], int]:
 
     def index(data: bytes) -> int:
         column = data[2]
-        if data[0] >= rows or data[3] or column >= columns or column % per:  # no patch has 256 columns
+        # A patch has fewer than 256 columns.
+        if data[0] >= rows or data[3] or column >= columns or column % per:
             return n
         return data[0] * per_line + column // per
 

@@ -1,8 +1,8 @@
-"""Wire format of a patch, collected in one module.
+"""Public names of the modules that define a patch's wire format.
 
-``codes`` converts resistances to codes, ``chunk`` and ``summary`` pack the PDOs, ``scan_check`` and
-``device_time`` compute two fields of the summary, ``command`` packs the host's commands, and ``self_test``
-the record 0x2023. All functions are pure and need neither a bus nor a clock.
+The module ``codes`` converts resistances to codes. The modules ``chunk`` and ``summary`` pack and unpack PDO
+payloads, and ``command`` those of the host's commands. The modules ``scan_check`` and ``device_time`` compute
+two fields of the summary, and ``self_test`` packs the record 0x2023. No function needs a bus or a clock.
 """
 
 from skinnode.protocol.chunk import (

@@ -1,8 +1,8 @@
-"""Conversion of resistances to the codes sent on the wire, and back.
+"""Conversion of resistances to the codes that are sent on the bus, and back.
 
-code = round((R/R0 − lo) / (hi − lo) · (2ⁿ − 4)). The codes 0 … 2ⁿ − 4 are measurements. The three codes above
-them are reserved; in ascending order they are over-range, short and open. Live streams decode by a compiled
-copy of this formula, ``skinnode.solve.wires.decode``.
+A resistance R has the n-bit code round((R/R0 − lo) / (hi − lo) · (2ⁿ − 4)). Codes from 0 to 2ⁿ − 4 are
+measurements. The three codes above are reserved: in ascending order, they mean over-range, short and open.
+Live streams use a compiled version of the decoder, ``skinnode.solve.wires.decode``.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from skinnode.protocol.objects import DEFAULT_CODE_HI, DEFAULT_CODE_LO
 Codes = NDArray[np.uint32]
 
 MISSING: Final = 0xFFFF_FFFF
-"""Marker for a code that was not received; it is wider than any code, so it is never sent or decoded."""
+"""Marker for a code that was not received; it exceeds every valid code."""
 
 CODE_BITS: Final = (16, 24)
 """Allowed code widths, bits."""
@@ -30,10 +30,10 @@ CODE_BITS: Final = (16, 24)
 
 @dataclass(frozen=True)
 class CodeScale:
-    """Mapping of R/R0 to codes. ``lo`` and ``hi`` are rounded to REAL32, as in the object dictionary.
+    """Mapping of R/R0 to codes. Its limits ``lo`` and ``hi`` have REAL32 precision, as in the dictionary.
 
     Raises:
-        ConfigError: if the width is not 16 or 24 bits, or the range is not 0 ≤ lo < hi < ∞.
+        ConfigError: if the code width is not 16 or 24 bits, or if 0 ≤ lo < hi < ∞ is not true.
     """
 
     bits: int = 16
@@ -54,43 +54,43 @@ class CodeScale:
 
     @functools.cached_property
     def steps(self) -> int:
-        """Highest measurement code, at ``hi``."""
+        """Highest measurement code, which represents R/R0 = ``hi``."""
         return (1 << self.bits) - 4
 
     @property
     def over_range(self) -> int:
-        """Reserved code for R/R0 outside lo … hi, or for a crossing without a baseline."""
+        """Reserved code for R/R0 outside ``lo`` to ``hi``, and for a measurement without a baseline."""
         return self.steps + 1
 
     @property
     def short(self) -> int:
-        """Reserved code for zero resistance between the wires."""
+        """Reserved code for zero resistance between upper and lower wire."""
         return self.steps + 2
 
     @property
     def open(self) -> int:
-        """Reserved code for no connection between the wires."""
+        """Reserved code for no connection between upper and lower wire."""
         return self.steps + 3
 
     @functools.cached_property
     def step(self) -> float:
-        """Step from one code to the next, relative to R0."""
+        """Resistance step between successive codes, relative to R0."""
         return (self.hi - self.lo) / self.steps
 
     @property
     def relative_std(self) -> float:
-        """RMS rounding error relative to R0: step / √12, for an error uniformly distributed over one step."""
+        """Standard deviation of the rounding error relative to R0: step / √12, for a uniform distribution."""
         return self.step / math.sqrt(12.0)
 
 
 def as_baseline(baseline_ohm: ArrayLike) -> Float:
-    """Round R0 to REAL32, the precision that both node and host use.
+    """Round R0 to REAL32, the precision that node and host use.
 
     Args:
-        baseline_ohm: any shape, ohm.
+        baseline_ohm: R0, ohm; any shape.
 
     Returns:
-        float64 of the same shape, ohm.
+        Rounded R0, ohm; float64 of the same shape.
     """
     return np.asarray(baseline_ohm, dtype=np.float32).astype(np.float64)
 
@@ -98,12 +98,13 @@ def as_baseline(baseline_ohm: ArrayLike) -> Float:
 def encode(resistance_ohm: ArrayLike, baseline_ohm: ArrayLike, scale: CodeScale) -> Codes:
     """Encode resistances.
 
-    +inf and NaN become the code for open; zero and negative values become the code for short. R/R0 outside lo
-    … hi becomes the over-range code, as does a measurement without a baseline (R0 not positive and finite). A
-    value up to half a step outside the range counts as inside.
+    +inf and NaN become the code for open, and zero and negative resistances the code for short. R/R0 outside
+    ``lo`` to ``hi`` becomes the over-range code, but a value up to half a step outside is rounded to the
+    nearest limit. A measurement without a baseline (R0 not positive and finite) also becomes the over-range
+    code.
 
     Args:
-        resistance_ohm: any shape, ohm.
+        resistance_ohm: resistances, ohm; any shape.
         baseline_ohm: R0 in ohm, with the same shape or broadcastable to it.
         scale: the mapping of R/R0 to codes.
 
@@ -117,7 +118,7 @@ def encode(resistance_ohm: ArrayLike, baseline_ohm: ArrayLike, scale: CodeScale)
         measured = (code >= 0) & (code <= scale.steps) & (baseline > 0) & (baseline < np.inf)
         codes = np.where(measured, code, scale.over_range)
         codes = np.where(resistance <= 0, scale.short, codes)
-        codes = np.where(resistance < np.inf, codes, scale.open)  # NaN also fails this comparison
+        codes = np.where(resistance < np.inf, codes, scale.open)  # false for NaN too
     return codes.astype(np.uint32)
 
 
@@ -125,19 +126,20 @@ def decode(codes: ArrayLike, baseline_ohm: ArrayLike, scale: CodeScale) -> tuple
     """Decode codes into resistances.
 
     Args:
-        codes: any shape.
+        codes: codes of any shape; :data:`MISSING` is allowed.
         baseline_ohm: R0 in ohm, with the same shape or broadcastable to it.
         scale: the mapping of R/R0 to codes.
 
     Returns:
-        Resistances in ohm and a mask of the measurements, both with the same shape as ``codes``. A reserved
-        code, :data:`MISSING` or a baseline that is not positive and finite gives NaN and False.
+        Resistances in ohm and a mask of the measurements, both with the same shape as ``codes``. The
+        resistance is NaN and the mask False for reserved codes, for :data:`MISSING`, and where R0 is not
+        positive and finite.
     """
     return Decoder(baseline_ohm, scale).decode(codes)
 
 
 class Decoder:
-    """Decoder equivalent to :func:`decode`, for many scans with the same baseline.
+    """Decoder for many scans with the same baseline; equivalent to :func:`decode`.
 
     Args:
         baseline_ohm: R0 in ohm, with the shape of the codes or broadcastable to it.
@@ -153,10 +155,10 @@ class Decoder:
         """Decode codes as :func:`decode` does.
 
         Args:
-            codes: any shape.
+            codes: codes of any shape that broadcasts with the baseline.
 
         Returns:
-            Resistances in ohm and the mask of measurements.
+            Resistances in ohm, and a mask of the measurements.
         """
         code, scale = np.asarray(codes), self._scale
         valid: NDArray[np.bool_] = code <= scale.steps

@@ -1,4 +1,4 @@
-"""Host commands, sent in RPDO1."""
+"""Packing and unpacking of the commands that a host sends to a patch in RPDO1."""
 
 from __future__ import annotations
 
@@ -13,21 +13,22 @@ _COB_ID: Final = od.command_cob_id(0)
 
 
 class SendMode(enum.IntEnum):
-    """Selection of the chunks that are sent in each scan, 0x2020:1."""
+    """Send mode of a patch (0x2020:1): all chunks of each scan, or changed chunks only."""
 
     FULL = 0
     CHANGED = 1
 
 
 class Command(NamedTuple):
-    """Command, as sent on the bus."""
+    """Contents of a command, as sent on the bus."""
 
     tare: int
-    """:data:`~skinnode.canopen.indices.TARE_SIGNATURE` to tare; any other number has no effect."""
+    """Tare command: :data:`~skinnode.canopen.indices.TARE_SIGNATURE` to tare; any other number has no
+    effect."""
     single_scan: int
-    """1 to take one scan now."""
+    """Single-scan command: 1 to take one scan immediately; 0 for no scan."""
     send_mode: int
-    """Value of :class:`SendMode`."""
+    """Send mode, a value of :class:`SendMode`."""
 
 
 _COMMAND: Final = struct.Struct("<IBB")
@@ -40,8 +41,8 @@ def pack_command(
 
     Args:
         tare: whether to make the current resistances the baseline.
-        single_scan: whether to take one scan now.
-        send_mode: send mode, which every command carries and the node keeps until the next command.
+        single_scan: whether to take one scan immediately.
+        send_mode: send mode; every command sets it, and the node keeps it until the next command.
     """
     return _COMMAND.pack(od.TARE_SIGNATURE if tare else 0, single_scan, send_mode)
 

@@ -1,8 +1,8 @@
-"""Object 0x2300, which holds the electrode coordinates as bytes.
+"""Packing and unpacking of object 0x2300, which contains a patch's electrode coordinates.
 
-Coordinates are signed 32-bit nanometres, little-endian: x y z of every upper electrode, wire by wire, then of
-every lower electrode. The layout hash is also computed from coordinates in nanometres, so the received layout
-has the same hash as the layout that was sent.
+Coordinates are signed 32-bit integers in nanometres, little-endian: x, y, z of every upper electrode, wire by
+wire, then x, y, z of every lower electrode. The layout hash is also computed from coordinates rounded to
+nanometres, so a layout keeps its hash when it is packed and unpacked.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ _BYTES = 12  # per electrode
 
 
 def pack_coordinates(layout: PatchLayout) -> bytes:
-    """Return the bytes of 0x2300. Raises ConfigError if a coordinate exceeds 2.1 m."""
+    """Pack a layout into the bytes of 0x2300. Raises ConfigError if a coordinate exceeds 2.1 m."""
     nanometres = np.rint(np.concatenate([a.ravel() for a in (layout.upper_m, layout.lower_m)]) / _NANOMETRE_M)
     farthest = float(np.abs(nanometres).max())
     if farthest >= 2**31:
@@ -30,9 +30,10 @@ def pack_coordinates(layout: PatchLayout) -> bytes:
 def unpack_coordinates(
     data: bytes, profile: PatchProfile, resistivity_ohm_per_m: float, name: str = "custom"
 ) -> PatchLayout:
-    """Return the layout encoded in the bytes of 0x2300, for a patch with the sizes in ``profile``.
+    """Unpack the layout of a patch with the sizes in ``profile`` from the bytes of 0x2300.
 
-    Raises ConfigError if the number of bytes is wrong, ValueError if the coordinates do not form a layout.
+    Raises ConfigError if the number of bytes is wrong, and ValueError if the coordinates do not form a valid
+    layout.
     """
     upper, lower = profile.rows * profile.upper_electrodes, profile.columns * profile.lower_electrodes
     if len(data) != (upper + lower) * _BYTES:

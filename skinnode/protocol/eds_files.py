@@ -1,4 +1,4 @@
-"""EDS and DCF files (CiA 306) of patches, and the reference files in ``eds/``."""
+"""Generation of EDS and DCF files (CiA 306) for patches, and of the reference files in ``eds/``."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from skinnode.protocol.profile import PatchProfile
 
 
 def eds_name(profile: PatchProfile) -> str:
-    """Return the file name of the reference EDS for this wire format."""
+    """Return the file name of the EDS for a patch with this wire format."""
     variant = "-fd" if profile.bus == "fd" else ""
     return f"skinnode-{profile.rows}x{profile.columns}-u{profile.code_bits}{variant}.eds"
 
 
 def eds_text(profile: PatchProfile) -> str:
-    """Return the electronic data sheet (CiA 306) of a patch. The same profile always gives the same bytes."""
+    """Return the text of a patch's electronic data sheet (EDS, CiA 306); equal profiles give equal text."""
     return render_eds(_device_info(profile, eds_name(profile)), profile.objects())
 
 
 def dcf_text(profile: PatchProfile, node_id: int, bitrate_bps: int) -> str:
-    """Return the device configuration file (CiA 306) of a patch; equal arguments give equal bytes.
+    """Return the text of a patch's device configuration file (DCF, CiA 306); equal arguments give equal text.
 
     Args:
         profile: sizes of the patch.
@@ -31,7 +31,7 @@ def dcf_text(profile: PatchProfile, node_id: int, bitrate_bps: int) -> str:
         bitrate_bps: bit rate of the bus, bit/s.
 
     Raises:
-        ConfigError: if the node-ID is not 1 to 127, or a patch does not support the bit rate.
+        ConfigError: if the node-ID is not 1 to 127, or if patches do not support the bit rate.
     """
     if not 1 <= node_id <= od.MAX_NODE_ID:
         raise ConfigError("node_id", node_id, "1 to 127")
@@ -65,11 +65,11 @@ REFERENCE_PROFILES: Final = (
     PatchProfile(10, 30, 10, 10, 16, bus="fd"),
     PatchProfile(10, 30, 10, 10, 24, bus="fd"),
 )
-"""Reference profiles, one per wire format; their EDS files are in ``eds/``."""
+"""Profiles whose EDS files are in ``eds/``: a 10 × 30 patch, one profile per wire format."""
 
 
 def write_reference_files(folder: Path) -> None:
-    """Write the EDS file of every reference profile.
+    """Write the EDS file of every reference profile into a folder.
 
     Args:
         folder: an existing folder.

@@ -1,7 +1,7 @@
 """Object dictionary of a patch.
 
-Declares the manufacturer objects (0x2000 to 0x2301) and the default PDO mappings. A value that a patch
-measures, counts or sends is not a setting and has no default.
+This module declares the manufacturer objects (0x2000 to 0x2301) and the default PDO mappings. Only settings
+and constants have a default value; values that a patch measures, counts or sends have none.
 """
 
 from __future__ import annotations
@@ -18,16 +18,18 @@ if TYPE_CHECKING:
 _U8, _U16, _U32, _REAL32 = DataType.UNSIGNED8, DataType.UNSIGNED16, DataType.UNSIGNED32, DataType.REAL32
 
 DEFAULT_CODE_LO: Final = 0.25
-"""R/R0 at code 0."""
+"""Default R/R0 at code 0."""
 DEFAULT_CODE_HI: Final = 1.25
-"""R/R0 at the highest code; pressing moves electrodes together and lowers R, but sliding moves some apart."""
+"""Default R/R0 at the highest measurement code. A press moves electrodes together and reduces R, but sliding
+moves some electrodes apart and increases R."""
 DEFAULT_REFRESH_SCANS: Final = 10
-"""Number of scans from one full scan to the next; lost codes are sent again within 0.8 s, with a tenth of the
-traffic of full scans."""
+"""Default number of scans from one full scan to the next, if only changed chunks are sent. At the default
+period, lost codes are sent again within 0.8 s, and the full scans cause a tenth of the traffic that
+continuous full scans would cause."""
 
 
 def patch_objects(profile: PatchProfile) -> tuple[Object, ...]:
-    """Return the whole object dictionary of a patch in ascending order of index.
+    """Return all objects in a patch's object dictionary, in ascending order of index.
 
     Args:
         profile: sizes of the patch.

@@ -1,4 +1,4 @@
-"""Partial scans: codes held for chunks that were not sent, and decoding of sent and held chunks together."""
+"""Decoding of partial scans, in which chunks that were not sent keep their last codes."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from skinnode.protocol.profile import PatchProfile
 
 
 class HeldChunks:
-    """Last known payloads of all chunks of a patch.
+    """Store of the last known payload of each chunk of a patch.
 
     Args:
         profile: sizes of the patch.
@@ -26,15 +26,15 @@ class HeldChunks:
         self.forget()
 
     def forget(self) -> None:
-        """Forget all payloads, because a scan that was not received may have changed them."""
+        """Discard all payloads, because a scan that was not received may have changed them."""
         self._payloads = [None] * self._profile.n_chunks
 
     def update(self, received: Sequence[bytes | None], *, carry: bool) -> None:
-        """Store the payloads of a scan that has ended.
+        """Store the payloads of a scan after its last frame.
 
         Args:
-            received: payload of each chunk; None where none arrived.
-            carry: whether to keep the payloads of chunks that did not arrive, because they are unchanged.
+            received: payload of each chunk; None for a chunk that did not arrive.
+            carry: whether a chunk that did not arrive is unchanged and keeps its last payload.
         """
         if carry and None in received:
             held = self._payloads
@@ -42,11 +42,11 @@ class HeldChunks:
         self._payloads = received
 
     def decode(self) -> tuple[Codes, NDArray[np.bool_], int | None]:
-        """Decode the payloads.
+        """Decode all stored payloads.
 
         Returns:
-            (U, K) codes, a (U, K) mask of measurements, and the CRC over the codes
-            (:func:`~skinnode.protocol.scan_check.check_of_codes`), which is None unless all codes are known.
+            (U, K) codes, a (U, K) mask of the measurements, and the CRC over the codes
+            (:func:`~skinnode.protocol.scan_check.check_of_codes`). The CRC is None if any payload is unknown.
         """
         profile = self._profile
         known = [payload for payload in self._payloads if payload is not None]

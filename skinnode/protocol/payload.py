@@ -1,4 +1,4 @@
-"""Payload length shared by the PDOs of a patch, and its check. All payloads are little-endian."""
+"""Length of PDO payloads, and a function that checks it. All payloads are little-endian."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from skinnode.errors import CodecError
 from skinnode.text.words import counted
 
 PDO_BYTES: Final = 8
-"""Length of a classic chunk and of every summary, bytes."""
+"""Length of every summary, and of a chunk on a classic CAN bus, bytes."""
 
 
 def require_length(data: bytes, length: int, cob_id: int, what: str) -> None:
@@ -21,7 +21,7 @@ def require_length(data: bytes, length: int, cob_id: int, what: str) -> None:
         what: name of the message, shown in the error.
 
     Raises:
-        CodecError: if the payload does not have that length.
+        CodecError: if the payload does not have the required length.
     """
     if len(data) != length:
         raise CodecError(cob_id, data, f"{counted(length, 'byte')} ({what})")

@@ -1,15 +1,16 @@
 """Patch sizes that determine the wire format.
 
-A patch with U×K codes sends them in *chunks*: TPDO1 carries a u8 chunk index, a u8 scan counter and 3 codes
-of 16 bits (or 2 of 24 bits). Codes are in row-major order, upper wire first. TPDO2, the *summary*, ends each
-scan and carries a check over all codes of the matrix (:mod:`skinnode.protocol.scan_check`).
+A patch sends its U×K codes in *chunks*: TPDO1 carries a u8 chunk index, a u8 scan counter and 3 codes of 16
+bits (or 2 codes of 24 bits). The codes are in row-major order: all codes of upper wire 0 first, then those of
+upper wire 1, and so on. TPDO2, the *summary*, ends each scan and carries a check over all codes of the matrix
+(:mod:`skinnode.protocol.scan_check`).
 
-Over CAN FD a chunk carries part of one upper wire: u8 wire, u8 scan counter, u16 first column and up to 30
-codes of 16 bits (or 20 of 24 bits). All chunks of a patch have the same length, the length of the mapping
-padded to the next valid CAN FD length. If a patch has more columns than fit into a chunk, the codes of each
-upper wire are split into several chunks, as equal in size as possible.
+Over CAN FD, a chunk carries codes of a single upper wire: u8 wire, u8 scan counter, u16 first column and up
+to 30 codes of 16 bits (or 20 codes of 24 bits). All chunks of a patch have the same length: the length of the
+PDO mapping, padded to the next valid CAN FD length. If a patch has more columns than a chunk can carry, the
+codes of each upper wire are split evenly into several chunks.
 
-``python -m skinnode.protocol.profile eds/`` regenerates the reference EDS files
+The command ``python -m skinnode.protocol.profile eds/`` regenerates the reference EDS files
 (:mod:`skinnode.protocol.eds_files`).
 """
 
@@ -31,12 +32,13 @@ if TYPE_CHECKING:
     from skinnode.config import BusConfig, PatchConfig
 
 DEFAULT_PERIOD_MS: Final = 80
-"""SYNC period on which the defaults are based, ms; four 10×30 patches then use about 2/3 of 1 Mbit/s."""
+"""SYNC period for which the default settings are chosen, ms; at this period, the bus load of four 10×30
+patches at 1 Mbit/s is about 2/3."""
 
 BusType = Literal["classic", "fd"]
-"""Type of frame that carries PDOs: CAN 2.0 with up to 8 bytes, or CAN FD with up to 64 bytes."""
+"""Type of the frames that carry PDOs: classic CAN with up to 8 bytes, or CAN FD with up to 64 bytes."""
 
-_MOST_SUBINDICES: Final = 254  # CiA 301: sub-index 255 is reserved
+_MOST_SUBINDICES: Final = 254  # CiA 301 reserves sub-index 255
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,29 +46,30 @@ class PatchProfile:
     """Patch sizes that determine the wire format.
 
     Raises:
-        ConfigError: if a size does not fit an array of the object dictionary (254) or the chunk index (256
-            chunks), the code width is not 16 or 24 bits, or there are more PDOs than CANopen allows.
+        ConfigError: if a number of wires exceeds 254, the size of an array in the object dictionary; if a
+            scan has more than 256 chunks (classic CAN); if the code width is not 16 or 24 bits; or if a
+            number of electrodes or PDOs is out of range.
     """
 
     rows: int
-    """Upper wires, U."""
+    """Number of upper wires, U."""
     columns: int
-    """Lower wires, K."""
+    """Number of lower wires, K."""
     upper_electrodes: int
-    """Electrodes per upper wire, N."""
+    """Number of electrodes per upper wire, N."""
     lower_electrodes: int
-    """Electrodes per lower wire, M."""
+    """Number of electrodes per lower wire, M."""
     code_bits: int = 16
-    """Width of a code in bits, 16 or 24."""
+    """Width of a code, bits: 16 or 24."""
     rpdos: int = 4
-    """Number of RPDOs: RPDO1 carries commands; the others are spare."""
+    """Number of RPDOs; RPDO1 carries commands, and all others are spare."""
     tpdos: int = 4
-    """Number of TPDOs: TPDO1 carries chunks and TPDO2 summaries; the others are spare."""
+    """Number of TPDOs; TPDO1 carries chunks, TPDO2 carries summaries, and all others are spare."""
     bus: BusType = "classic"
-    """Type of frame that carries PDOs."""
+    """Type of the frames that carry PDOs: classic CAN or CAN FD."""
     checked: bool = True
-    """Whether summaries carry a check over the scan; False for a patch of revision 1.0, whose summaries carry
-    32 bits of device time instead."""
+    """Whether summaries carry a check of the scan; false for a patch of revision 1.0, whose summaries carry
+    the 32-bit device time instead."""
 
     def __post_init__(self) -> None:
         for name, least, most in (
@@ -98,7 +101,7 @@ class PatchProfile:
         Args:
             layout: electrodes of the patch.
             code_bits: width of a code in bits, 16 or 24.
-            bus: type of frame that carries PDOs.
+            bus: type of the frames that carry PDOs.
         """
         rows, upper_electrodes = layout.upper_m.shape[:2]
         columns, lower_electrodes = layout.lower_m.shape[:2]
@@ -106,7 +109,7 @@ class PatchProfile:
 
     @classmethod
     def from_config(cls, patch: PatchConfig, bus: BusConfig) -> PatchProfile:
-        """Return the profile of a patch on ``bus``, both as configured in the hand file."""
+        """Return the profile of a patch from the hand file's configuration of the patch and its bus."""
         return cls.from_layout(patch.layout.build(), patch.code_bits, "fd" if bus.fd else "classic")
 
     @property
@@ -116,12 +119,12 @@ class PatchProfile:
 
     @property
     def pdo_bytes(self) -> int:
-        """Maximum number of bytes in a PDO, and of mapped objects, which are at least one byte each."""
+        """Maximum length of a PDO, bytes; also the maximum number of objects mapped into it."""
         return 8 if self.bus == "classic" else 64
 
     @property
     def chunk_head_bytes(self) -> int:
-        """Number of bytes before the codes in a chunk."""
+        """Number of bytes before the first code in a chunk."""
         return 2 if self.bus == "classic" else 4
 
     @property
@@ -130,17 +133,17 @@ class PatchProfile:
 
     @property
     def lines(self) -> int:
-        """Number of runs of codes that are split into chunks: 1 or, over CAN FD, one per upper wire."""
+        """Number of code sequences that are split into chunks: one or, over CAN FD, one per upper wire."""
         return 1 if self.bus == "classic" else self.rows
 
     @property
     def chunks_per_line(self) -> int:
-        """Number of chunks per run. Unused codes in the last chunk are sent as 0 and ignored."""
+        """Number of chunks per code sequence. Unused codes in the last chunk are sent as 0 and ignored."""
         return -(-self.n_codes // self.lines // self._most_codes)
 
     @property
     def codes_per_chunk(self) -> int:
-        """Number of codes per chunk: 3 of 16 bits or 2 of 24 bits; over CAN FD, up to 30 or 20."""
+        """Number of codes per chunk: 3 (16-bit) or 2 (24-bit); over CAN FD, up to 30 or 20."""
         return self._most_codes if self.bus == "classic" else -(-self.columns // self.chunks_per_line)
 
     @property
@@ -157,7 +160,7 @@ class PatchProfile:
 
     @property
     def revision_number(self) -> int:
-        """Value of 0x1018:3."""
+        """Revision number of the patch (0x1018:3)."""
         return od.REVISION_NUMBER if self.checked else od.UNCHECKED_REVISION_NUMBER
 
     @property
@@ -169,12 +172,13 @@ class PatchProfile:
     def default_inhibit_100us(self) -> int:
         """Default inhibit time of TPDO1 (0x1800:3), in units of 100 µs.
 
-        A full scan takes nine tenths of the default period, and the inhibit time is at most 1 ms.
+        With this inhibit time, the chunks of a full scan take at most nine tenths of the default period. The
+        inhibit time is at most 1 ms.
         """
         return max(1, min(10, 9 * DEFAULT_PERIOD_MS // self.n_chunks))
 
     def objects(self) -> tuple[Object, ...]:
-        """Return the whole object dictionary in ascending order of index."""
+        """Return all objects in the patch's object dictionary, in ascending order of index."""
         return patch_objects(self)
 
 

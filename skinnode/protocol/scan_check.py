@@ -1,4 +1,4 @@
-"""Scan check, a CRC over the codes that the receiver must hold and over the summary."""
+"""Scan check: a CRC over all codes of a scan and the beginning of its summary."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ CRC_INITIAL: Final = 0xFFFF
 
 
 def check_of_codes(codes: Codes, profile: PatchProfile) -> int:
-    """Return the CRC over the codes alone, from which :func:`scan_check` continues.
+    """Return the CRC over the codes only; :func:`scan_check` adds the summary.
 
     Args:
-        codes: (U, K) codes that the receiver must hold.
+        codes: (U, K) codes that a receiver must have after the scan.
         profile: sizes of the patch.
     """
     if profile.code_bits == 16:
@@ -28,21 +28,21 @@ def check_of_codes(codes: Codes, profile: PatchProfile) -> int:
 
 
 def scan_check(check_of_codes: int, head: bytes) -> int:
-    """Return the scan check, a CRC over the codes that the receiver must hold and over the summary.
+    """Return the scan check, a CRC over all codes of a scan and the beginning of its summary.
 
-    CRC-16/IBM-3740: polynomial x¹⁶ + x¹² + x⁵ + 1 (0x1021), initial value 0xFFFF, most significant bit first,
-    not inverted; check value 0x29B1 for the ASCII digits ``123456789``. The CRC covers, in this order:
+    The algorithm is CRC-16/IBM-3740: polynomial x¹⁶ + x¹² + x⁵ + 1 (0x1021), initial value 0xFFFF, most
+    significant bit first, not inverted. The CRC of the ASCII digits ``123456789`` is 0x29B1. The CRC covers,
+    in this order:
 
-    1. All U·K codes, one upper wire after another, little-endian: 2 bytes each, or 3 for 24-bit codes.
-       These are the codes that a receiver holds after this scan. If only changed chunks are sent, they are
-       the codes last sent in every chunk, which may differ from the newest reading by up to the delta
-       threshold.
-    2. ``head``, the first 6 bytes of the summary: scan counter, flags, chunks sent, device time. The matrix
-       of a different scan therefore fails the check.
+    1. All U·K codes that a receiver must have after this scan, upper wire by upper wire, little-endian, with
+       2 bytes per 16-bit code or 3 bytes per 24-bit code. If only changed chunks are sent, the CRC covers the
+       codes last sent in each chunk, which may differ from the newest codes by up to the delta threshold.
+    2. The argument ``head``, the first 6 bytes of the summary: scan counter, flags, number of chunks sent,
+       device time. Codes of a different scan therefore fail the check.
 
-    The check always detects changes within a span of 16 bits, such as a change of one 16-bit code, and any
-    odd number of wrong bits. In matrices of up to 4,087 bytes it also detects any two wrong bits. Of all
-    other errors, the check misses one in 65,536.
+    The check detects every error within a span of 16 bits, such as one wrong 16-bit code, and every odd
+    number of wrong bits. In up to 4,087 bytes of codes, the check also detects any two wrong bits. Of all
+    other errors, it misses one in 65,536.
 
     Args:
         check_of_codes: result of :func:`check_of_codes`.

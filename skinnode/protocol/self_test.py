@@ -1,4 +1,4 @@
-"""Result of a self-test, the record 0x2023."""
+"""Result of a patch's self-test, which object 0x2023 contains."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Final, NamedTuple
 
 
 class SelfTestStatus(enum.IntEnum):
-    """Verdict of the self-test, 0x2023:1."""
+    """Verdict of a self-test (0x2023:1)."""
 
     NEVER_RUN = 0
     PASSED = 1
@@ -16,25 +16,26 @@ class SelfTestStatus(enum.IntEnum):
 
 
 class SelfTestFault(enum.IntFlag):
-    """Faults found by a self-test, 0x2023:2."""
+    """Faults found by a self-test (0x2023:2), as flags."""
 
     SOURCE = 0x01
-    """At least once, the converter returned no valid reading."""
+    """The converter failed to return a valid reading at least once."""
     NOISE = 0x02
     OPEN_WIRE = 0x04
     SHORTED_WIRE = 0x08
     OUT_OF_RANGE = 0x10
-    """Crossings with a baseline gave no measurement, because they are open, shorted or outside lo … hi."""
+    """At least one crossing with a baseline gave no measurement, because it is open, shorted or out of
+    range."""
     NO_BASELINE = 0x20
 
 
 class SelfTest(NamedTuple):
-    """Findings of a self-test, in the order of 0x2023 from sub-index 2."""
+    """Findings of a self-test, in the order of the sub-indices of 0x2023 from 2 on."""
 
     faults: SelfTestFault
     readings: int
     noise: float
-    """RMS of the relative standard deviations of all crossings."""
+    """Relative noise of the readings: RMS of the relative standard deviations of all crossings."""
     open_wires: int
     shorted_wires: int
     out_of_range: int
@@ -43,13 +44,13 @@ class SelfTest(NamedTuple):
 
 _SELF_TEST: Final = struct.Struct("<BHBfHHII")
 SELF_TEST_NEVER_RUN: Final = bytes(_SELF_TEST.size)
-"""Value of the record before the first self-test."""
+"""Content of record 0x2023 before the first self-test."""
 
 
 def pack_self_test(test: SelfTest) -> bytes:
-    """Pack the sub-objects of the record 0x2023.
+    """Pack the findings of a self-test into the content of record 0x2023.
 
     Args:
-        test: the findings; the test has passed if there are no faults.
+        test: findings of the self-test, which has passed if there are no faults.
     """
     return _SELF_TEST.pack(SelfTestStatus.FAILED if test.faults else SelfTestStatus.PASSED, *test)

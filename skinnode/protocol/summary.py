@@ -1,4 +1,4 @@
-"""Scan summary, sent in TPDO2 at the end of each scan."""
+"""Packing and unpacking of the scan summary, which TPDO2 carries at the end of each scan."""
 
 from __future__ import annotations
 
@@ -16,33 +16,35 @@ _SUMMARY: Final = struct.Struct("<BBHI")
 _HEAD: Final = struct.Struct("<BBHH")
 
 HEAD_BYTES: Final = _HEAD.size
-"""Number of summary bytes that the check covers."""
+"""Number of bytes at the beginning of a summary that the scan check covers."""
 
 
 class SummaryFlag(enum.IntFlag):
-    """Flags of a scan summary. Bits without a name are sent as 0 and ignored."""
+    """Flags of a scan summary. Undefined bits are sent as 0 and ignored on reception."""
 
     CHANGED_ONLY = 0x01
     """Only changed chunks were sent; all other chunks are the same as in the previous scan."""
     OVERRUN = 0x02
-    """Some chunks were not sent before the next SYNC, and their codes are unknown."""
+    """Some chunks of the scan were not sent, so their codes are unknown."""
     WIRE_FAULT = 0x04
-    """A wire is open or shorted; see 0x2030 and 0x2031."""
+    """At least one wire is open or shorted; see 0x2030 and 0x2031."""
     BASELINE_CHANGED = 0x08
-    """This scan is the first with a new baseline; read the baseline (0x2200 and above) again."""
+    """This scan is the first with a new baseline; the host must read the baseline (0x2200 and above)
+    again."""
     SOURCE_FAILED = 0x10
-    """The converter returned no valid reading, so no chunk was sent and this scan's codes are unknown."""
+    """The converter returned no valid reading, so no chunks were sent and the codes of this scan are
+    unknown."""
     CHECKED = 0x20
-    """Bytes 4 to 7 are u16 device time in steps of 64 µs and u16 scan check. Without this flag, as in patches
-    of revision 1.0, these bytes are u32 device time in µs."""
+    """Bytes 4 to 7 of the summary contain the u16 device time in steps of 64 µs and the u16 scan check.
+    Without this flag, as in patches of revision 1.0, bytes 4 to 7 contain the u32 device time in µs."""
     CONVERSIONS = 0xC0
-    """Conversion phase, a number of two bits. 0: not supplied. 1, 2, 3: steps from 1 to 2 to 3 to 1 in each
-    scan for which the converter has completed a conversion of the whole matrix since the previous scan. Two
-    successive scans with the same phase therefore hold the same conversion."""
+    """Conversion phase, a two-bit number. The phase is 0 if the patch does not supply it. Otherwise, it
+    advances cyclically from 1 to 3 with each scan before which the converter has completed a new conversion
+    of all crossings. Two successive scans with the same phase therefore contain the same conversion."""
 
 
 class Summary(NamedTuple):
-    """Scan summary, as sent on the bus."""
+    """Contents of a scan summary, as sent on the bus."""
 
     scan: int
     """Scan counter, u8."""
@@ -51,42 +53,41 @@ class Summary(NamedTuple):
     chunks: int
     """Number of chunks sent in this scan."""
     device_time_us: int
-    """Device time, µs, 0 to 2³² − 1; with a ``check``, a multiple of 64 from 0 to 2²² − 64. See
-    :mod:`skinnode.protocol.device_time`."""
+    """Device time, µs, 0 to 2³² − 1. In a summary with a ``check``, the device time is a multiple of 64 from
+    0 to 2²² − 64; see :mod:`skinnode.protocol.device_time`."""
     check: int | None = None
-    """Scan check (:mod:`skinnode.protocol.scan_check`); None in a summary without
-    :attr:`SummaryFlag.CHECKED`."""
+    """Scan check (:mod:`skinnode.protocol.scan_check`); None if :attr:`SummaryFlag.CHECKED` is not set."""
 
 
 PHASES: Final = 3
-"""Number of conversion phases. A receiver that missed scans learns nothing from the phase of the next scan,
-because the phase may have passed through all its values."""
+"""Number of conversion phases. After missed scans, the phase of the next scan is meaningless, because the
+phase may have advanced by any number of steps."""
 _PHASE_SHIFT: Final = 6
 
-_CHECKED: Final = int(SummaryFlag.CHECKED)  # testing an int takes a tenth as long as testing an enum flag
+_CHECKED: Final = int(SummaryFlag.CHECKED)  # testing an int is ten times as fast as testing an enum flag
 
 
 def conversion_phase(flags: int) -> int:
-    """Return the conversion phase in the flags of a summary; 0 if the patch does not supply it."""
+    """Return the conversion phase from a summary's flags; 0 if the patch does not supply the phase."""
     return flags >> _PHASE_SHIFT & 3
 
 
 def conversion_flags(phase: int) -> SummaryFlag:
-    """Return the flags that carry a conversion phase, 0 to 3."""
+    """Return the summary flags that encode a conversion phase, 0 to 3."""
     return SummaryFlag(phase << _PHASE_SHIFT)
 
 
 def pack_summary(scan: int, flags: int, chunks: int, device_time_us: int) -> bytes:
-    """Pack the payload of TPDO2 for a patch of revision 1.0, whose summaries carry no check.
+    """Pack a summary without a check into the payload of TPDO2, for a patch of revision 1.0.
 
     Args:
         scan: scan counter, 0 to 255.
         flags: bits of :class:`SummaryFlag` without ``CHECKED``.
-        chunks: chunks sent in this scan.
-        device_time_us: clock of the node, µs; wraps at 2³².
+        chunks: number of chunks sent in this scan.
+        device_time_us: time on the node's clock, µs; wraps at 2³².
 
     Raises:
-        ValueError: if a number other than the time does not fit its field.
+        ValueError: if the scan counter, the flags or the number of chunks do not fit their fields.
     """
     try:
         return _SUMMARY.pack(scan, flags, chunks, device_time_us & 0xFFFF_FFFF)
@@ -97,18 +98,18 @@ def pack_summary(scan: int, flags: int, chunks: int, device_time_us: int) -> byt
 def pack_checked_summary(
     scan: int, flags: int, chunks: int, device_time_us: int, check_of_codes: int
 ) -> bytes:
-    """Pack the payload of TPDO2 with a check, and set :attr:`SummaryFlag.CHECKED`.
+    """Pack a summary with a check into the payload of TPDO2, and set :attr:`SummaryFlag.CHECKED`.
 
     Args:
         scan: scan counter, 0 to 255.
         flags: bits of :class:`SummaryFlag`.
-        chunks: chunks sent in this scan.
-        device_time_us: clock of the node, µs; wraps at 2³².
-        check_of_codes: result of :func:`~skinnode.protocol.scan_check.check_of_codes` for the codes that the
-            receiver must hold.
+        chunks: number of chunks sent in this scan.
+        device_time_us: time on the node's clock, µs; wraps at 2³².
+        check_of_codes: result of :func:`~skinnode.protocol.scan_check.check_of_codes` for the codes that a
+            receiver must have after this scan.
 
     Raises:
-        ValueError: if a number other than the time does not fit its field.
+        ValueError: if the scan counter, the flags or the number of chunks do not fit their fields.
     """
     steps = device_time_us >> TIME_SHIFT & 0xFFFF
     try:
@@ -119,11 +120,11 @@ def pack_checked_summary(
 
 
 def pack_summary_record(payload: bytes, device_time_us: int) -> bytes:
-    """Return the concatenated sub-objects of the record 0x2011 for a summary.
+    """Return the content of record 0x2011 that corresponds to a summary.
 
     Args:
         payload: the payload of TPDO2.
-        device_time_us: clock of the node, µs; wraps at 2³².
+        device_time_us: time on the node's clock, µs; wraps at 2³².
     """
     if not payload[1] & _CHECKED:
         return payload

@@ -3,11 +3,11 @@
 If two wires were already crossed when the readings at rest were measured, the error stays invisible until the
 skin moves. The displacements of each wire are then attributed to the other wire. Exchanging the readings of
 two wires changes the log evidence of a frame by −αᵀδ − ½ δᵀPδ, with the precision P, α = P z and the change δ
-of the readings z. The test fits no parameter, so a difference of a few nats is significant.
+of the readings z. The test has no fitted parameters, so a difference of a few nats is significant.
 
-In 108 healthy frames with six kinds of presses (staggered layout, h = 0.5, noise 1e-4), the largest change
-was 2.8 nats. The median change was 125 nats with two upper wires crossed, and 43 nats with two lower wires
-crossed.
+In 108 healthy frames with six kinds of presses (staggered layout, h = 0.5, noise 1e-4), the log evidence
+changed by at most 2.8 nats. The median change was 125 nats with two upper wires crossed, and 43 nats with two
+lower wires crossed.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ def exchanged(z: Float, present: Mask, pair: WirePair) -> tuple[Float, Mask]:
 def likeliest(
     p: Float, alpha: Float, z: Float, present: Mask, *, far: bool = False
 ) -> tuple[float, WirePair]:
-    """Return the largest gain in log evidence from exchanging two wires, in nats, and these wires.
+    """Return the largest gain in log evidence from exchanging two wires, in nats, and the two wires.
 
     Args:
         p: (m, m) precision of the readings.
@@ -72,10 +72,10 @@ def likeliest(
 def best_exchange(  # noqa: PLR0913 - a kernel: arrays by name
     p: Float, alpha: Float, z: Float, present: Mask, upper: int, lower: int, reach: int, delta: Float
 ) -> tuple[float, bool, int, int]:
-    """Return the largest gain in log evidence, whether the two wires are upper wires, and their numbers.
+    """Return the largest gain from exchanging two wires, whether these are upper wires, and their numbers.
 
-    Compares wires whose numbers differ by up to ``reach``. The choice among n pairs reduces the gain by ln n.
-    ``delta`` (max(U, K),) is a work array.
+    The gain in log evidence is in nats. The search covers wires whose numbers differ by up to ``reach``. The
+    choice among n pairs reduces the gain by ln n. ``delta`` (max(U, K),) is a work array.
     """
     best, is_upper, one, other, pairs = -math.inf, True, 0, 0, 0
     for apart in range(1, reach + 1):
@@ -107,9 +107,9 @@ def _gain(  # noqa: PLR0913 - a kernel: arrays by name
 ) -> float:
     """Return the gain in log evidence from exchanging the ``count`` readings of two wires.
 
-    The first wire has the readings start, start + step, …; the indices of the second wire are larger by
-    ``across``. The upper bound −αᵀδ is computed first. If the bound does not exceed ``enough``, it is
-    returned instead of the gain.
+    The readings of the first wire have the indices ``start``, ``start + step``, …; the indices of the second
+    wire are larger by ``across``. The upper bound −αᵀδ is computed first. If the bound does not exceed
+    ``enough``, it is returned instead of the gain.
     """
     linear, both = 0.0, 0
     for i in range(count):

@@ -1,4 +1,4 @@
-"""Data check of a frame: finds readings that contradict the others, solves without them, and assesses trust.
+"""Data check: find readings of a frame that contradict the others, solve without them, and assess trust.
 
 Each frame is first solved with all readings except those with confirmed faults. The field is converted to
 readings linearised at rest, which are tested by the model in :mod:`skinnode.solve.checks.reading_model`. If a
@@ -41,23 +41,23 @@ would change by only 2 nats."""
 SUSPICIOUS: Final = 5.0
 """Gain in log evidence from a fault above which a frame is suspicious and explanations are sought, nats."""
 OFFSETS: Final = (0, 1, 3, 5)
-"""Offsets of the κ indices at which single readings are tested, below the index that fits the frame best."""
+"""Offsets below the best-fitting κ index at which single readings are tested."""
 CLEAR: Final = -30.0
-"""Log evidence of faults minus that of loads, nats, below which loads explain a frame clearly. Similar frames
-that follow are then not examined."""
+"""Difference between the log evidence of faults and that of loads, nats, below which loads clearly explain a
+frame. The next frames are then not examined if they resemble this frame."""
 EXCUSED: Final = 10.0
 """Increase of the gain after an examined frame that makes a similar frame suspicious again, nats."""
 EXCUSED_FRAMES: Final = 8
 """Number of frames after an examined frame in which similar frames need no new examination; an examination
 takes 9 ms."""
 PATIENCE: Final = 4
-"""Number of suspicious frames without time for an examination after which a frame is examined despite its
-deadline. Frames with a fault remain suspicious; frames of a press seldom do."""
+"""Interval, in suspicious frames without time for an examination, at which a frame is examined despite its
+deadline. A fault makes all following frames suspicious; a press seldom does."""
 EXAMINATION_S: Final = 3e-3
 """Expected duration of the first examination, s. Later examinations use measured durations."""
 CROSSED_FRAMES: Final = 5
-"""Number of frames after two crossed wires were found in which a finding for one of these wires is reported
-for both."""
+"""Number of frames after the detection of two crossed wires in which detecting one of them counts as
+detecting both."""
 NOISE_RATIOS: Final = (2.0, 4.0, 8.0, 16.0)
 """Ratios of actual to stated noise that are tested as explanations of a suspicious frame."""
 COARSE: Final = 0.1
@@ -67,10 +67,10 @@ COARSE_GROUPS: Final = 3
 """Maximum number of groups of readings that are left out at once if several upper wires have no solution. If
 more groups are found, only the first is left out."""
 UNSOLVED: Final = 1
-"""Maximum number of upper wires without a solution that are reported as faults of these wires. If more upper
-wires have no solution, a lower wire may be the cause."""
+"""Maximum number of upper wires without a solution for which these wires are reported as faulty. If more
+upper wires have no solution, a lower wire may be the cause."""
 SPARED: Final = 3
-"""Maximum number of upper wires left out by the solver that are reported as faults of these wires."""
+"""Maximum number of upper wires left out by the solver for which these wires are reported as faulty."""
 
 Mask = NDArray[np.bool_]
 
@@ -164,8 +164,8 @@ class DataCheck:
                 in :attr:`left_out`.
             until: Deadline as a value of :func:`skinnode.process.clock.perf_counter`, s; −inf if some wires
                 were not solved for lack of time, which is no sign of a fault. A suspicious frame that cannot
-                be examined before the deadline is not trusted. After :data:`PATIENCE` such frames, one frame
-                is examined despite its deadline.
+                be examined before the deadline is not trusted. Every :data:`PATIENCE`-th such frame is
+                examined despite its deadline.
         """
         self._frame += 1
         last = self._last
@@ -239,9 +239,9 @@ class DataCheck:
     def _needs_no_explanation(self, gain: float) -> bool:
         """Return whether a frame with this gain in log evidence from a fault needs no explanation.
 
-        It needs none if the gain is small, or if loads clearly explained a recent frame with a similar gain
-        and the same suspected reading; under a press, a different reading may be wrong. After a noisy frame,
-        every frame needs an explanation.
+        No explanation is needed if the gain is small, or if loads clearly explained a recent frame with a
+        similar gain and the same suspected reading. A different suspected reading needs an explanation,
+        because a reading may be wrong under a press. After a noisy frame, every frame needs an explanation.
         """
         excused = (
             self._frame < self._excused_until
@@ -314,7 +314,8 @@ class DataCheck:
     def _in_time(self, seconds: float, until: float) -> bool:
         """Return whether a suspicious frame may take ``seconds``.
 
-        It may if the deadline permits it, or if :data:`PATIENCE` suspicious frames were not examined.
+        The frame may take this time if the deadline permits, or if it is the :data:`PATIENCE`-th suspicious
+        frame without time for an examination.
         """
         if self._overdue or perf_counter() + seconds <= until:
             return True
@@ -325,10 +326,10 @@ class DataCheck:
         return self._overdue
 
     def _noisier(self) -> float:
-        """Return the log evidence of the frame for noise above the stated level in all its readings.
+        """Return the log evidence of the frame, assuming that all its readings are noisier than stated.
 
-        For each ratio of actual to stated noise, the log evidence is that of z divided by the ratio, minus ln
-        of the ratio for each reading.
+        For each ratio of actual to stated noise, the result is the log evidence of z / ratio, minus ln(ratio)
+        for each reading.
         """
         model, z = self._model, self._z.ravel()
         most = -math.inf
@@ -449,11 +450,11 @@ class DataCheck:
         return groups if len(groups) <= COARSE_GROUPS else groups[:1]
 
     def _follow(self, solved: Solved) -> None:
-        """Compare the readings with confirmed faults with the field, and update the fault list."""
+        """Compare the readings that have confirmed faults with the field, and update the fault list."""
         self._list.follow(*self._deviations(solved))
 
     def _deviations(self, solved: Solved) -> tuple[Float, Mask]:
-        """Return the readings' deviations (U, K) from the field, in standard deviations, and a valid mask."""
+        """Return the readings' standardised deviations (U, K) from the field, and a mask of valid values."""
         layout = self._problem.layout
         moved = solved.field.displacement_m.reshape(layout.shape[0], -1) / layout.pitch_m
         residual = self._residuals(moved, solved.a, np.ones(len(moved), bool))
@@ -465,7 +466,7 @@ class DataCheck:
         return np.where(known, deviation, np.inf), known
 
     def _contradicting(self, groups: list[Group], solved: Solved) -> list[Group]:
-        """Return the groups, except those found by the coarse search that agree with the field."""
+        """Return the groups without those that were found by the coarse search but agree with the field."""
         if not self._coarse:
             return groups
         deviation, known = self._deviations(solved)

@@ -32,21 +32,22 @@ MARGIN: Final = 20.0
 margin, no fault was falsely reported in 6,800 frames of deep slides at a noise of 3e-6, nor in 270 frames
 with six kinds of presses at a noise of 1e-5."""
 MARGIN_OF_READING: Final = 50.0
-"""Log evidence by which a single wrong reading, tested at every prior scale, must explain a frame better than
-loads alone to be reported, nats. Under a narrow load at the edge of a patch, a correct reading reached 29
-nats in 36,000 frames (``bench trust --seed 1 --only hours``)."""
+"""Log evidence by which a single wrong reading must explain a frame better than loads alone to be reported,
+nats. The reading is tested at every prior scale. Under a narrow load at the edge of a patch, the difference
+for a correct reading reached 29 nats in 36,000 frames (``bench trust --seed 1 --only hours``)."""
 DOUBT: Final = 5.0
 """Log evidence by which faults must explain a frame better than loads alone for the frame to be doubtful,
-nats. In 144 healthy frames, it was at most 0 nats, with up to 8 loads in the explanation by loads."""
+nats. In 144 healthy frames, the difference was at most 0 nats, with up to 8 loads in the explanation by
+loads."""
 SCALES: Final = 4
-"""Number of prior scales at which explanations are sought: the scale that fits the frame best, and smaller
-scales. A wrong reading inflates the best-fitting scale by up to 2⁴, a narrow contact by up to 2³."""
+"""Number of prior scales at which explanations are sought: the best-fitting scale and smaller scales. A wrong
+reading inflates the best-fitting scale by up to 2⁴, a narrow contact by up to 2³."""
 STRIDE: Final = 2
 """Step in log2 κ between the prior scales at which explanations are sought."""
 HOPELESS: Final = 150.0
-"""Limit of the log evidence by which loads alone explain a frame better than faults at one prior scale, nats.
-If the limit is reached, faults are not sought at smaller scales. In 163 frames with a fault, the largest
-difference was 114 nats."""
+"""Log evidence by which loads alone must explain a frame better than faults at one prior scale, nats, for the
+search for faults to stop at this scale. In 163 frames with a fault, the log evidence of loads exceeded that
+of faults by at most 114 nats."""
 
 _PARTS: Final = {CROSSING: FaultyPart.CROSSING, LOWER: FaultyPart.LOWER, UPPER: FaultyPart.UPPER}
 
@@ -73,7 +74,7 @@ class Group:
 
 
 class Explainer:
-    """Search for the likeliest explanation of a frame. Do not share an instance between owners.
+    """Search for the most likely explanation of a frame. Do not share an instance between owners.
 
     Args:
         model: Distribution of the readings.
@@ -169,7 +170,7 @@ class Explainer:
     def _by_reading(
         self, z: Float, present: Mask, evidence: Float, best: int, cost: float
     ) -> tuple[float, int]:
-        """Return the log evidence of the best explanation by loads and one wrong reading, and its number.
+        """Return the log evidence of the best explanation by loads and one wrong reading, and the reading.
 
         This case needs its own search: at small prior scales, the greedy search would first leave out the
         whole wire of the reading.

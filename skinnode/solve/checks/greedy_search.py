@@ -107,7 +107,7 @@ def crossing_gain(d: Float, alpha: Float, present: Mask, cost: float) -> tuple[f
 def _group_gain(  # noqa: PLR0913 - a kernel: arrays by name
     p: Float, alpha: Float, present: Mask, first: int, step: int, cost: float, block: Float, right: Float
 ) -> float:
-    """Return the gain in log evidence from treating the readings first, first + step, … as wrong.
+    """Return the gain in log evidence from treating readings ``first``, ``first + step``, … as wrong.
 
     The gain is ½ α_Gᵀ P_GG⁻¹ α_G − ½ ln det P_GG minus the cost of each reading, or −inf if fewer than two
     readings are available. ``p`` is the readings' block of P; ``block`` and ``right`` are work arrays.

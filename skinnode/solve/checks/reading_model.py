@@ -26,11 +26,12 @@ from skinnode.solve.posterior.elastic_prior import ElasticPrior
 USUAL: Final = (-17, -3)
 """Range of log2 s, with the prior scale s in pitches, for which load tables are computed in advance."""
 MOST_USUAL: Final = 9
-"""Number of prior scales computed in advance for a large patch: the largest scales within :data:`USUAL`."""
+"""Number of prior scales whose tables are computed in advance for a large patch. These are the largest scales
+within :data:`USUAL`."""
 STORED: Final = 10**8
 """Maximum size of tables computed in advance, in bytes. Computing the tables during the stream would delay
-the first touch by up to 0.1 s. The tables of the reference patch take 85 MB. Larger patches compute products
-with loads when they are needed."""
+the first touch by up to 0.1 s. The tables of the reference patch take 85 MB. For larger patches, products
+with loads are computed when they are needed."""
 OCTAVES: Final = (-7, 21)
 """Range of log2 κ, which covers noise from 1e-6 to 1e-2 and prior scales from 1e-4 to 1 pitch."""
 
@@ -60,7 +61,9 @@ class LoadTables:
 
 
 class ReadingModel:
-    """Joint distribution of the readings of one layout. Immutable; shared by all patches with that layout.
+    """Joint distribution of the readings of one layout.
+
+    The model is immutable and shared by all patches with this layout.
 
     Args:
         layout: The patch.
@@ -127,7 +130,7 @@ class ReadingModel:
     def prepare(self, sigma: float) -> None:
         """Compute the tables that a stream with the relative noise ``sigma`` usually needs.
 
-        Other tables are computed on first use. The reference patch takes 0.25 s.
+        Other tables are computed on first use. The computation takes 0.25 s for the reference patch.
         """
         octaves = np.log2(self.kappa * sigma)
         usual: list[int] = np.flatnonzero((octaves >= USUAL[0]) & (octaves <= USUAL[1])).tolist()

@@ -1,4 +1,4 @@
-"""Trust in a field: decides whether a field is trusted, and if not, states the reason.
+"""Trust in a field: decide whether a field is trusted, and state the reason if not.
 
 A field is trusted if every upper wire that was not left out converged, if enough readings and upper wires
 remain, and if the readings do not contradict each other. The host also requires that the patch is alive.
@@ -17,12 +17,14 @@ from skinnode.model.data_fault import DataFault
 from skinnode.model.status import Status
 
 OF_PATCH: Final = 0.75
-"""Minimum share of a patch's readings that must be usable for its field to be trusted, and of its upper wires
-that must be trusted. The reference patch can spare two upper wires and a lower wire (share 0.77), but not
-three upper wires (0.7)."""
+"""Minimum share of usable readings, and minimum share of trusted upper wires, for a field to be trusted. On
+the reference patch, two upper wires and one lower wire may be missing (share 0.77), but not three upper wires
+(0.7)."""
 OF_WIRE: Final = 0.8
 """Minimum share of usable readings for an upper wire to be trusted."""
-CONTRADICTION: Final = "the readings contradict each other, and no wire or crossing explains it"
+CONTRADICTION: Final = (
+    "the readings contradict each other, and no faulty wire or crossing explains the contradiction"
+)
 UNEXAMINED: Final = (
     "the readings seem to contradict each other, and the deadline left no time to examine them"
 )

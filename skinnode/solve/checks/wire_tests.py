@@ -1,14 +1,14 @@
-"""Tests of whole wires: whether the readings of a wire are consistent with the other wires, and its gain.
+"""Tests of whole wires: whether a wire's readings fit the other wires, and whether its gain is correct.
 
 If the readings of a wire lag behind or belong to another wire, each of them deviates only slightly from the
 prediction by the other wires. A test of single readings does not detect such a fault. Let G be the readings
-of a wire, P the precision, S = P⁻¹ the covariance and α = P z. Two hypotheses are tested against that of a
-healthy wire:
+of a wire, P the precision, S = P⁻¹ the covariance and α = P z. Two hypotheses are compared with the
+hypothesis of a healthy wire:
 
-unrelated  z_G has its own distribution N(0, S_GG), independent of the other wires. The log evidence changes
-           by ½ α_Gᵀ P_GG⁻¹ α_G − ½ z_Gᵀ S_GG⁻¹ z_G − ½ ln det P_GG S_GG
-gain       all readings of the wire are wrong by the same factor 1 + c, c ~ N(0, τ²). The log evidence changes
-           by ½ (1ᵀα_G)² / (q + τ⁻²) − ½ ln(1 + τ² q) with q = 1ᵀ P_GG 1
+- Unrelated: z_G has its own distribution N(0, S_GG), independent of the other wires. The log evidence changes
+  by ½ α_Gᵀ P_GG⁻¹ α_G − ½ z_Gᵀ S_GG⁻¹ z_G − ½ ln det P_GG S_GG.
+- Gain: all readings of the wire are wrong by the same factor 1 + c, c ~ N(0, τ²). The log evidence changes by
+  ½ (1ᵀα_G)² / (q + τ⁻²) − ½ ln(1 + τ² q) with q = 1ᵀ P_GG 1.
 
 Both changes follow from the rules for conditioning a normal distribution.
 """
@@ -26,7 +26,8 @@ from skinnode.compiled.jit import njit, njit_part
 from skinnode.model.layout import Float
 
 GAIN_STD: Final = 0.02
-"""Standard deviation of a wire's relative gain error; equal to that assumed for gain drift. Not tuned."""
+"""Standard deviation of a wire's relative gain error, equal to the value assumed for gain drift. Not
+tuned."""
 LEAST: Final = 1e-9
 """Minimum precision of a reading, in units of 1 / noise²; smaller values are rounding errors."""
 
@@ -47,11 +48,11 @@ class WireTables:
     lower_p: Float
     lower_s: Float
     log_det_p: Float
-    """(U + K,) ½ ln det P_GG."""
+    """(U + K,) half the log determinant of each wire's block of P, ½ ln det P_GG."""
     log_det_s: Float
-    """(U + K,) ½ ln det S_GG."""
+    """(U + K,) half the log determinant of each wire's block of S, ½ ln det S_GG."""
     sums: Float
-    """(U + K,) 1ᵀ P_GG 1."""
+    """(U + K,) sum of the elements of each wire's block of P, 1ᵀ P_GG 1."""
 
     @classmethod
     def of(cls, p: Float, s: Float, shape: tuple[int, int]) -> WireTables:
@@ -81,7 +82,8 @@ class WireFinding:
     wire: int
     """Number of the upper wire, or U plus the number of the lower wire."""
     factor: float
-    """Common error of the wire's readings, in units of their noise; nan for the hypothesis *unrelated*."""
+    """Common error of the wire's readings, in units of their noise; nan if the wire is unrelated to the
+    others."""
 
 
 def least_fitting(  # noqa: PLR0913 - the frame, its tables and scratch
@@ -146,7 +148,7 @@ def _least_fitting(  # noqa: PLR0913 - a kernel: arrays by name
 
 @njit_part
 def _square(factor: Float, values: Float, first: int, step: int, work: Float) -> float:
-    """Return xᵀ (L Lᵀ)⁻¹ x for the values first, first + step, … and the Cholesky factor L."""
+    """Return xᵀ (L Lᵀ)⁻¹ x with the Cholesky factor L, for the values at ``first``, ``first + step``, …."""
     square = 0.0
     for i in range(factor.shape[0]):
         value = values[first + i * step]

@@ -3,10 +3,10 @@
 The entry point is ``posterior``, which estimates a field from each frame of a stream and tests the readings.
 ``frame_estimator`` solves a frame without testing its readings.
 
-``observation`` converts each frame to residuals with weights. ``gating`` finds the wires that moved with χ²
-tests. ``map_estimate`` computes the maximum a posteriori (MAP) displacement; ``measurement_update`` contains
-the linear algebra of one of its steps. ``geometry_error`` models the manufacturing errors of a patch within
-its tolerances.
+``observation`` converts each frame to residuals with weights. ``gating`` uses χ² tests to find the wires that
+moved. ``map_estimate`` computes the maximum a posteriori (MAP) displacement; ``measurement_update`` contains
+the linear algebra of one step. ``geometry_error`` models the manufacturing errors of a patch within its
+tolerances.
 
 The prior combines the elasticity of the rubber (``elastic_prior``) with the expected loads (``load_prior``).
 ``hyperparameters`` sets the scale of the prior and the noise from the evidence. ``load_posterior`` estimates

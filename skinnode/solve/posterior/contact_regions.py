@@ -1,4 +1,4 @@
-"""Contact regions: assigns the loaded cells of a patch to contacts.
+"""Contact regions: assign the loaded cells of a patch to contacts.
 
 The load sum of a cell is the sum of the pressing loads of its 3 × 3 neighbourhood. The cells are visited in
 order of decreasing load sum, and each cell joins the area of a neighbouring peak. Where the areas of two
@@ -7,7 +7,7 @@ and the difference is significant (topological persistence).
 
 A peak is a contact if one of three tests is significant: the load sum of its 3 × 3 cells, the χ² of the loads
 of these cells, or the sum of the loads over its area. The strongest peak is also a contact if the skin under
-it is significantly pressed in. The patch is then touched, even if the loads cannot be located.
+it is significantly pressed in. In this case, the patch is touched even though the loads cannot be located.
 
 Only cells with an electrode are tested: beyond the outermost electrodes, loads of different sizes at
 different distances cause nearly the same displacement. Cells beyond these electrodes are added to the
@@ -44,10 +44,10 @@ PRESSED_STILL: Final = 5.0
 contact."""
 RELEVANT: Final = 0.2
 """Minimum ratio of a peak's load sum to that of the strongest contact for the peak to be another contact.
-Ringing next to a contact reaches a tenth."""
+Ringing next to a contact reaches a tenth of the contact's load sum."""
 RELEVANT_STILL: Final = 0.15
 """Minimum ratio of a peak's load sum to that of the strongest contact for a contact of the last frame to
-remain."""
+remain a contact."""
 PART: Final = 0.1
 """Minimum ratio of a cell's load sum to the peak's load sum for the cell to belong to the contact."""
 PART_SIGNIFICANT: Final = 3.0
@@ -63,9 +63,9 @@ plates, ridges, dents, large areas; ``tests/solve/test_contact_number.py``): wit
 body was split. With 0.75, plates at the edge were split because of ringing. Two spheres are separated if they
 are at least 5 pitches apart."""
 GAP_ONE: Final = 0.4
-"""Ratio of load sums like :data:`GAP`, for two peaks that were one contact in the last frame."""
+"""Value of :data:`GAP` for two peaks that were one contact in the last frame."""
 GAP_TWO: Final = 0.6
-"""Ratio of load sums like :data:`GAP`, for two peaks that were two contacts in the last frame."""
+"""Value of :data:`GAP` for two peaks that were two contacts in the last frame."""
 GAP_SIGNIFICANT: Final = 3.0
 """Minimum difference between the load sum of the smaller peak and the load sum between two peaks for the
 peaks to be two contacts, in standard deviations."""
@@ -176,7 +176,7 @@ def _apart(  # noqa: PLR0913 - a kernel: loads and their posterior by name
     cells: Index,
     signs: Float,
 ) -> bool:
-    """Return whether ``peak`` and the smaller peak ``other``, with the cell ``between``, are two contacts.
+    """Return whether ``peak`` and the smaller peak ``other``, separated by ``between``, are two contacts.
 
     ``cells`` (27,) and ``signs`` (18,) are work arrays.
     """

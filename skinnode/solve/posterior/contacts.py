@@ -36,8 +36,8 @@ metal, 0.15 for 8 mm, and about 0 for 4 mm or less. On a half-space, the ratio i
 if the contact is much smaller than a cell."""
 PULLED_OFF: Final = 0.1
 """Standard deviation of a contact's centre along the surface if pulling loads were left out, in cell widths.
-Measured RMS errors on layers of 2, 4 and 8 mm were 0.11, 0.08 and 0.05; the maximum was 0.25. The standard
-deviation of the contact's area is then as large as the area."""
+Measured RMS errors on layers of 2, 4 and 8 mm were 0.11, 0.08 and 0.05; the maximum was 0.25. If pulling
+loads are left out, the standard deviation of the contact's area is at least as large as the area."""
 BEYOND: Final = 1.0
 """Standard deviation of the loads in the outermost ring of cells, relative to these loads. The ring
 represents all loads beyond the patch. With a value of 0.5, the force errors of plates larger than the patch
@@ -61,7 +61,7 @@ class LoadEstimate:
 
 
 class ContactFinder:
-    """Finder of the contacts on one patch, frame by frame. Do not share an instance between owners.
+    """Contact finder of one patch for a stream of frames. Do not share an instance between owners.
 
     The number of contacts depends on the contacts of the last frame
     (:mod:`skinnode.solve.posterior.contact_regions`), which :meth:`reset` discards.
@@ -71,7 +71,8 @@ class ContactFinder:
         layout: The patch.
         rubber: Material of the skin.
         calibrated: Whether the forces are calibrated. If not, the standard deviation of a normal force
-            includes the difference to a layer as thick as the clearance, bonded to a rigid support.
+            includes the difference from a layer that is as thick as the clearance and bonded to a rigid
+            support.
         thickness: Tolerance of the thickness, as a fraction of the clearance.
         outermost: Whether to add the loads of the outermost ring of cells to an adjacent contact. Use False
             if the prior expects equal loads everywhere, because it spreads the loads too far.

@@ -1,14 +1,14 @@
 """Elastic prior: the displacement of the rubber expected before any resistance is measured.
 
-Each electrode site lies in a cell one pitch wide. Independent surface loads on the cells displace the
-electrodes by the response G of an elastic half-space (Boussinesq, Cerruti;
+Each electrode site is in the centre of a cell one pitch wide. Independent surface loads on the cells displace
+the electrodes by the response G of an elastic half-space (Boussinesq, Cerruti;
 :func:`skinnode.model.elastic.rectangle_compliance`). The prior of the displacement u is
 
     u ~ N(0, s² C),   C = G diag(q) Gᵀ + ε² I
 
-The data set one scale s for the whole patch. The cells extend beyond the outermost electrodes, because the
-skin can also be pressed there. The term with ε allows for small independent deviations of each electrode from
-the half-space.
+One scale s for the whole patch is estimated from the data. The cells extend beyond the outermost electrodes,
+because the skin can also be pressed there. The term with ε allows for small independent deviations of each
+electrode from the half-space.
 
 Curved skin is unrolled: distances are chords, and the response to a load is expressed in the tangent frame
 of each electrode.

@@ -1,12 +1,12 @@
 """Posterior of a patch, tracked through a stream of frames without testing their readings for faults.
 
-gate      use only the equations of wires whose resistances differ from those at rest by more than the noise
-hold      keep the last field if it explains the whole frame within the noise
-track     take chord or Gauss-Newton steps from the last field; after a jump, anneal from rest
-          (``map_estimate``)
-adapt     set the prior's scale, the expected load locations and, on request, the noise from the evidence
-reject    mark a wire as INCONSISTENT if no deformation explains its residual, leave the wire out, and solve
-          the other wires again
+- Gate: use only the equations of wires whose resistances differ from those at rest by more than the noise.
+- Hold: keep the last field if it explains the whole frame within the noise.
+- Track: take chord or Gauss-Newton steps from the last field; after a jump, anneal from rest
+  (``map_estimate``).
+- Adapt: set the prior's scale, the expected load locations and, on request, the noise from the evidence.
+- Reject: mark a wire as INCONSISTENT if no deformation explains its residual, leave the wire out, and solve
+  the other wires again.
 """
 
 from __future__ import annotations
@@ -46,7 +46,8 @@ LEFT_OUT: Final = 3
 """Maximum number of wires left out of a frame, one at a time, before the whole frame is INCONSISTENT."""
 LEAST_STEPS: Final = 3.0
 """Minimum duration of a solve from rest, as a multiple of the time to factorise all wires and compute their
-standard deviations. Measured solves of presses on 1 to 10 wires took 11 to 20 times as long."""
+standard deviations. In measurements, solves of presses on 1 to 10 wires took 11 to 20 times this
+time."""
 
 Mask = NDArray[np.bool_]
 
@@ -119,7 +120,7 @@ class FrameEstimator:
     def warm_up(self) -> None:
         """Solve a touched frame so that the first touch in a stream does not wait for the compiler.
 
-        With a deadline, this also measures :attr:`from_rest_s`.
+        With a deadline, this method also measures :attr:`from_rest_s`.
         """
         touched = self.layout.upper_m.copy()
         touched[0, 0, 2] -= 0.1 * self._problem.clearance[0, 0] * self.layout.pitch_m
@@ -196,7 +197,7 @@ class FrameEstimator:
             except TimeoutError:
                 known = self._known
                 status, held = self._give_up(Status.DEADLINE)
-                self._known = known  # the next frame starts where this frame did
+                self._known = known  # the next frame starts from the same field as this frame
             observation = self._observe(readings)
         return self._field(observation, status, held, start)
 

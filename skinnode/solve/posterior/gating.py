@@ -59,7 +59,7 @@ class Gate:
         self._kept -= self._kept > 0
 
     def keep(self, wires: Index) -> None:
-        """Keep these wires in the estimate for :data:`KEPT` frames."""
+        """Keep the given wires in the estimate for :data:`KEPT` frames."""
         self._kept[wires] = KEPT
 
     def moved(self, fit: Fit, count: Index, noises: float | Float = 1.0) -> NDArray[np.bool_]:

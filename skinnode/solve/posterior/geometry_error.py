@@ -1,19 +1,19 @@
-"""Nuisances of a patch that was made to tolerances: what each error does to the residuals.
+"""Geometry errors: nuisances that model a patch's manufacturing errors, and their effects on residuals.
 
-The rest resistances are measured (R₀), so an error θ of the geometry changes no resistance at rest: what
-remains is θ times the difference between ∂ ln F/∂θ at the displacement and at rest, which grows with the
-press. The errors are nuisances with a variance of 1, in units of their tolerance:
+The resistances at rest (R₀) are measured, so a geometry error θ does not affect the residuals at rest. Away
+from rest, the effect is θ times the difference between ∂ ln F/∂θ at the displacement and at rest. This effect
+grows with the press. The errors are nuisances with a variance of 1, in units of their tolerance.
 
-thickness        all upper electrodes move along their normals, in proportion to the clearance
-radius           the mean of F over the rims of electrodes of radius ρ is F + (ρ²/2) ∇²F within the surface,
-                 ρ²/4 from each layer; the nuisance is ρ² in units of the squared tolerance
-gain             the change in each resistance has a factor e^γ: half of the variance of γ is common to the
-                 patch, half independent in each upper wire
-placement        each upper and each lower wire moves along x, y and z
+- Thickness: all upper electrodes are shifted along their normals, in proportion to the clearance.
+- Radius: the mean of F over the rims of electrodes of radius ρ is F + (ρ²/2) ∇²F within the surface, with
+  ρ²/4 from each layer. The nuisance is ρ² in units of the squared tolerance.
+- Gain: the change in each resistance is multiplied by e^γ. Half of the variance of γ is common to the patch;
+  the other half is independent in each upper wire.
+- Placement: each upper and each lower wire is shifted along x, y and z.
 
-The errors enter the residuals themselves, not their linearisation, because at a noise of 1e-5 the second
-order of an error of 0.02 pitch is a hundred standard deviations. A residual depends on ten of the nuisances;
-the other elements of H are zero and are not stored.
+The residuals are computed from the shifted geometry without linearising the errors. At a noise of 1e-5, the
+second-order effect of an error of 0.02 pitch is a hundred standard deviations. Each residual depends on ten
+of the nuisances; the other elements of H are zero and are not stored.
 """
 
 from __future__ import annotations
@@ -35,20 +35,21 @@ THICKNESS: Final = 0
 RADIUS: Final = 1
 GAIN: Final = 2
 COMMON: Final = 3
-"""Number of nuisances of the whole patch; they come first: thickness, radius, gain."""
+"""Number of nuisances common to the whole patch, which come first: thickness, radius and gain."""
 UPPER: Final = 4
-"""Number of nuisances of an upper wire: shifts along x, y and z, gain."""
+"""Number of nuisances of each upper wire: shifts along x, y and z, and gain."""
 LOWER: Final = 3
-"""Number of nuisances of a lower wire: shifts along x, y and z."""
+"""Number of nuisances of each lower wire: shifts along x, y and z."""
 EFFECTS: Final = COMMON + UPPER + LOWER
-"""Number of nuisances on which a residual depends."""
+"""Number of geometry nuisances on which each residual depends."""
 GAIN_SHARE: Final = math.sqrt(0.5)
-"""Standard deviation of the common gain error, and of that of each upper wire, in tolerances: a converter
-that serves all wires has the first, a converter for each wire the second."""
+"""Standard deviation of the gain error common to all wires, and of the additional gain error of each upper
+wire, in tolerances. A converter shared by all wires causes the common error; a converter per wire causes the
+additional error."""
 
 
 def nuisances(wires: int, equations: int) -> int:
-    """Return the number of nuisances of a patch of U upper and K lower wires."""
+    """Return the number of geometry nuisances of a patch with U upper and K lower wires."""
     return COMMON + UPPER * wires + LOWER * equations
 
 
@@ -57,8 +58,8 @@ class GeometryError:
 
     Args:
         problem: The patch.
-        elastic: Elastic prior of the patch, which knows the normals of its surface.
-        tolerances: Standard deviations of the errors.
+        elastic: Elastic prior of the patch, which contains the surface normals.
+        tolerances: Manufacturing tolerances of the patch, which are the standard deviations of the errors.
     """
 
     def __init__(self, problem: PatchProblem, elastic: ElasticPrior, tolerances: Tolerances) -> None:
@@ -82,14 +83,14 @@ class GeometryError:
         self, members: Index, moved: Float, a: Float, weight: Float, g: Float, r: Float, jt: Float,
         effect: Float,
     ) -> None:  # fmt: skip
-        """Write the residuals, the transposed Jacobian and H at a displacement for the wires ``members``.
+        """Compute the residuals, the transposed Jacobian and H at a displacement for the wires ``members``.
 
         Args:
-            members: (P,) wires.
+            members: (P,) numbers of the wires.
             moved: (U, 3N) displacement, pitches.
-            a: (U, K) R · gain.
-            weight: (U, K) 1/σ.
-            g: Nuisances, as :func:`nuisances` counts them.
+            a: (U, K) resistances times gain, R · gain.
+            weight: (U, K) weights 1/σ of the resistances.
+            g: Nuisances of the geometry; :func:`nuisances` returns their number.
             r: (U, K) receives the residuals, which depend on ``g``.
             jt: (U, 3N, K) receives ∂r/∂xᵀ.
             effect: (U, K, EFFECTS) receives H = −∂r/∂g.
@@ -105,9 +106,10 @@ class GeometryError:
     def residuals(  # noqa: PLR0913 - arrays by name
         self, members: Index, moved: Float, a: Float, weight: Float, h: Float, own: Float, g: Float, r: Float
     ) -> float:
-        """Write r − H g for the wires ``members`` into ``r`` (U, K); return its Σ r².
+        """Write the residuals of the wires ``members`` into ``r`` (U, K), and return their sum of squares.
 
-        ``h`` (U, K, p) and ``own`` (p,) are the nuisances other than those of the geometry.
+        The residuals are r − H g, where ``h`` (U, K, p) and ``own`` (p,) contain the nuisances other than
+        those of the geometry.
         """
         shift, lower = self._shifts(g)
         problem = self._problem
@@ -117,7 +119,7 @@ class GeometryError:
         )  # fmt: skip
 
     def _shifts(self, g: Float) -> tuple[Float, Float]:
-        """Return the shifts of the upper electrodes (U, 3N) and the lower electrodes (3, M, K), pitches."""
+        """Return the upper electrodes' shifts (U, 3N) and the shifted lower electrodes (3, M, K), pitches."""
         wires, coordinates = self._problem.rest.shape
         upper = g[COMMON : COMMON + UPPER * wires].reshape(wires, UPPER)[:, :3]
         lower = g[COMMON + UPPER * wires :].reshape(-1, LOWER)
@@ -129,7 +131,7 @@ class GeometryError:
 def _bend(  # noqa: PLR0913 - a kernel: arrays by name
     x: Float, lower: Float, normal: Float, square: float, out: Float, slope_t: Float
 ) -> None:
-    """Write the effect of the electrodes' radius on F and its derivative; 0 for points."""
+    """Write the effect of the electrodes' radius on F, and its derivative; 0 for point electrodes."""
     if square > 0.0:
         surface_laplacian(x, lower, normal, out, slope_t)
     else:
@@ -145,7 +147,7 @@ def _linearise(  # noqa: PLR0913 - a kernel: arrays by name
 ) -> None:  # fmt: skip
     """Write residuals, Jacobians and effects at the shifted positions ``x``, ``rest`` and ``lower``.
 
-    ``rows`` (4, K) and ``slopes`` (3, 3N, K) are scratch.
+    ``rows`` (4, K) and ``slopes`` (3, 3N, K) are work arrays.
     """
     f, bend, rest_bend, rims = rows[0], rows[1], rows[2], rows[3]
     rest_jt, bend_jt, rest_bend_jt = slopes[0], slopes[1], slopes[2]
@@ -166,7 +168,7 @@ def _linearise(  # noqa: PLR0913 - a kernel: arrays by name
             h_u[k, GAIN] = w * gain * change * own / before
             h_u[k, COMMON + 3] = h_u[k, GAIN]
             r_u[k] = scale * own - w + rim * g[RADIUS]
-            # factors of the derivatives of F and of the rims, at the displacement and at rest
+            # the work arrays now receive factors of the derivatives of F and of the rims, here and at rest
             rims[k] = w * square * g[RADIUS] / own
             bend[k] = scale - rims[k] * bend[k] / own
             at_rest = w * square * g[RADIUS] / before
@@ -182,7 +184,7 @@ def _linearise(  # noqa: PLR0913 - a kernel: arrays by name
 def _slopes(  # noqa: PLR0913 - a kernel: arrays by name
     square: float, outward: Float, placement: float, rows: Float, slopes: Float, jt: Float, effect: Float
 ) -> None:
-    """Turn the derivatives of F of one wire into those of its residuals, and write the effects of shifts."""
+    """Convert the derivatives of one wire's F to those of its residuals, and write the effects of shifts."""
     f, bend, rest_bend, rims = rows[0], rows[1], rows[2], rows[3]
     for j in range(jt.shape[0]):
         row, before, along, t = jt[j], slopes[0, j], outward[j], COMMON + j % 3
@@ -206,7 +208,7 @@ def _residuals(  # noqa: PLR0913 - a kernel: arrays by name
     normal: Float, square: float, gain: float, h: Float, own: Float, g: Float, rows: Float, slopes: Float,
     r: Float,
 ) -> float:  # fmt: skip
-    """Write the residuals of :func:`_linearise` less H g of the other nuisances; return their Σ r²."""
+    """Write the residuals minus H g of the other nuisances into ``r``, and return their sum of squares."""
     f, bend, rest_bend = rows[0], rows[1], rows[2]
     total = 0.0
     for i in range(members.size):
@@ -231,7 +233,7 @@ def _residuals(  # noqa: PLR0913 - a kernel: arrays by name
 def effect_on(  # noqa: PLR0913 - a kernel
     effect: Float, u: int, k: int, g: Float, first: int, wires: int
 ) -> float:
-    """Return H g of one residual; the nuisances of the geometry begin at ``g[first]``."""
+    """Return the effect H g on one residual; the nuisances of the geometry start at ``g[first]``."""
     total, row = 0.0, effect[u, k]
     upper, lower = first + COMMON + UPPER * u, first + COMMON + UPPER * wires + LOWER * k
     for q in range(COMMON):
@@ -247,7 +249,7 @@ def effect_on(  # noqa: PLR0913 - a kernel
 def add_effect(  # noqa: PLR0913 - a kernel
     effect: Float, u: int, k: int, value: float, g: Float, first: int, wires: int
 ) -> None:
-    """Add Hᵀ times ``value`` of one residual to ``g``, in which they begin at ``g[first]``."""
+    """Add Hᵀ times ``value`` of one residual to ``g``, where geometry nuisances start at ``g[first]``."""
     row = effect[u, k]
     upper, lower = first + COMMON + UPPER * u, first + COMMON + UPPER * wires + LOWER * k
     for q in range(COMMON):
@@ -260,7 +262,7 @@ def add_effect(  # noqa: PLR0913 - a kernel
 
 @njit_part
 def _product(first: Float, second: Float, start: int, stop: int) -> float:
-    """Return the sum of products of two residuals' effects from ``start`` to ``stop``."""
+    """Return the dot product of two residuals' effects with indices from ``start`` to ``stop`` − 1."""
     total = 0.0
     for q in range(start, stop):
         total += first[q] * second[q]
@@ -271,8 +273,8 @@ def _product(first: Float, second: Float, start: int, stop: int) -> float:
 def add_covariance(members: Index, effect: Float, g: Float, y: Float, s: Float) -> None:
     """Add H Hᵀ of the wires ``members`` to the upper triangle of ``s``, and −H g to ``y``.
 
-    ``g`` holds the nuisances of the geometry only. Two residuals of one upper wire share its nuisances, two
-    of one lower wire the latter's, and all share the common nuisances.
+    ``g`` contains only the nuisances of the geometry. Two residuals of the same upper wire share its
+    nuisances, as do two residuals of the same lower wire. All residuals share the common nuisances.
     """
     wires, equations = effect.shape[0], effect.shape[1]
     for j in range(members.size):
@@ -291,7 +293,7 @@ def add_covariance(members: Index, effect: Float, g: Float, y: Float, s: Float) 
 
 @njit
 def estimate(members: Index, effect: Float, v: Float, g: Float) -> None:
-    """Write −Hᵀ ``v`` into ``g``, the nuisances of the geometry, given v = S⁻¹ y."""
+    """Write −Hᵀ v with v = S⁻¹ y into ``g``, the nuisances of the geometry."""
     wires, equations = effect.shape[0], effect.shape[1]
     for q in range(g.size):
         g[q] = 0.0
@@ -304,7 +306,7 @@ def estimate(members: Index, effect: Float, v: Float, g: Float) -> None:
 def add_variance(  # noqa: C901 - a kernel: sums as loops
     members: Index, effect: Float, gain_t: Float, work: Float, out: Float
 ) -> None:
-    """Add diag(K H Hᵀ Kᵀ) to ``out`` (n,), given Kᵀ as ``gain_t`` (m, n); ``work`` (EFFECTS, n) is free."""
+    """Add diag(K H Hᵀ Kᵀ) to ``out`` (n,), with ``gain_t`` (m, n) = Kᵀ and a work array (EFFECTS, n)."""
     equations, n = effect.shape[1], out.size
     for j in range(COMMON * n):
         work[j // n, j % n] = 0.0

@@ -24,20 +24,21 @@ SCALE_REST: Final = 0.005
 SCALE_MOST: Final = 1.0
 """Maximum prior scale s, in clearances; with a larger scale, the surface could be below the lower layer."""
 SCALE_STEP: Final = math.log(1.25)
-"""Logarithm of the change of the prior scale above which it is updated. Smaller changes of the scale change
-the standard deviations by even less."""
+"""Logarithm of the minimum change of the prior scale that triggers an update. The standard deviations change
+by a smaller factor than the scale."""
 SCALE_LEAST: Final = 1.0
 """Minimum prior scale, relative to the scale of a field whose mean change of the resistances equals their
-noise. A smaller field cannot be detected, so the standard deviations of an untouched patch must include
-it."""
+noise. A smaller field cannot be detected, so the standard deviations of an untouched patch must allow for
+such a field."""
 ADAPTIONS: Final = 5
 """Maximum number of updates of the prior or the noise per frame."""
 REFINEMENTS: Final = 3
-"""Maximum number of updates of the expected load locations per frame; each costs as much as two solves."""
+"""Maximum number of updates of the expected load locations per frame; each update costs as much as two
+solves."""
 NOISE_WORTH: Final = 20.0
 """Weight of the configured noise in the noise estimate, as a number of resistances."""
 NOISE_STEP: Final = math.log(1.1)
-"""Logarithm of the change of the estimated noise above which the noise is updated."""
+"""Logarithm of the minimum change of the estimated noise that triggers an update."""
 
 Observe = Callable[[float], Observation]
 """Function that returns the observation of a frame for a given noise factor."""

@@ -29,8 +29,8 @@ LOCAL_SPREAD: Final = 0.7
 smaller value relies on single cells; the estimate is then better if the rubber matches the prior, but
 overconfident if it does not. With a value of 1, a quarter of the improvement is lost."""
 LOCAL_FLOOR: Final = 0.05
-"""Mean square load expected in cells without a found load, relative to the mean over the patch. It allows for
-light touches near a press."""
+"""Mean square load expected in cells without a found load, relative to the mean over the patch. This minimum
+allows for light touches near a press."""
 LOCAL_CHANGE: Final = 0.35
 """Fraction of the expected loads that must move elsewhere before the prior is rebuilt. With a value of
 0.5, errors in a slow press reach 6 standard deviations; with 0.25, twice as many frames need a rebuild."""
@@ -43,7 +43,7 @@ limit."""
 
 
 class LoadPrior:
-    """Prior u ~ N(0, s² C) of a patch's free coordinates, which loads of unequal variance displace.
+    """Prior u ~ N(0, s² C) of a patch's free coordinates, displaced by loads of unequal variance.
 
     Args:
         elastic: Elasticity of the patch.
@@ -151,7 +151,7 @@ class LoadPrior:
 
 
 def _blur(shape: tuple[int, int]) -> Float:
-    """Return Gaussian weights (Q, Q) around each cell, :data:`LOCAL_SPREAD` cells wide; rows sum to 1."""
+    """Return Gaussian weights (Q, Q) with standard deviation :data:`LOCAL_SPREAD` cells; rows sum to 1."""
     cell = np.indices(shape).reshape(2, -1)
     square = ((cell[:, :, None] - cell[:, None, :]) ** 2).sum(axis=0)
     weight = np.exp(-0.5 * square / LOCAL_SPREAD**2)

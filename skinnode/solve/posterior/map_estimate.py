@@ -1,13 +1,13 @@
-"""MAP estimate of one frame: Gauss-Newton, chord steps, and annealing for large jumps.
+"""MAP estimate of one frame: Gauss-Newton steps, chord steps, and annealing for large jumps.
 
-chord     starts at the last field with the factors of an older frame; typically needs two evaluations of F
-          and J
-newton    refactorises at the current field, then takes chord steps
-anneal    starts at the rest position with an assumed noise of 3 %, which is divided by four until it reaches
-          its true value. At high noise, the posterior has a single maximum, near that of the prior; following
-          this maximum as the noise decreases leads to the correct one. Annealing solves presses of 70 % of
-          the layer between two frames, on layouts where the exact inverse fails even when it follows the
-          press sample by sample.
+- Chord: start at the last field with the factors of an older frame. A typical solve needs two evaluations of
+  F and J.
+- Newton: refactorise at the current field, then take chord steps.
+- Anneal: start at the rest position with an assumed noise of 3 %, which is divided by four until it reaches
+  the true noise. At high noise, the posterior has a single maximum, close to the maximum of the prior.
+  Tracking this maximum while the noise decreases leads to the correct maximum. Annealing solves presses of
+  70 % of the layer between two frames, even on layouts where the exact inverse fails when it tracks the press
+  sample by sample.
 """
 
 from __future__ import annotations
@@ -33,68 +33,74 @@ from skinnode.solve.posterior.observation import Observation, eased
 from skinnode.solve.wires.problem import PatchProblem
 
 ANNEAL_NOISE: Final = 0.03
-"""Initial relative noise for annealing: one Gauss-Newton step from rest gets close to the maximum."""
+"""Initial relative noise for annealing; at this noise, one Gauss-Newton step from rest ends near the
+maximum."""
 ANNEAL_RATIO: Final = 4.0
-"""Ratio of the noise of one annealing step to that of the next. For presses of up to 70 % from rest on
-the staggered and aligned layouts, h = 0.5 and 1, a ratio of 3 leads to the correct maximum in 80 of 80 cases,
-a ratio of 5 in 79."""
+"""Ratio of the noise of one annealing step to that of the next. In 80 presses of up to 70 % from rest on the
+staggered and aligned layouts, h = 0.5 and 1, a ratio of 3 leads to the correct maximum in 80 cases, a ratio
+of 5 in 79."""
 SETTLED: Final = 0.02
-"""RMS of a correction, relative to the RMS standard deviation, at which chord steps stop."""
+"""RMS of a chord step, relative to the RMS standard deviation, below which chord steps stop."""
 CHORDS: Final = 4
 """Maximum number of chord steps per factorisation."""
 CHORD_RATE: Final = 0.35
-"""Contraction ratio of chord steps above which refactorising is cheaper; a factorisation costs as much as ten
-chord steps."""
+"""Ratio of the sizes of successive chord steps above which refactorising is cheaper. A factorisation costs as
+much as ten chord steps."""
 NEWTONS: Final = 12
-"""Maximum number of factorisations of a solve that starts near the maximum; such a solve typically needs one
-or two, but more if full steps would cycle."""
+"""Maximum number of factorisations in a solve that starts near the maximum. Such a solve typically needs one
+or two factorisations, but more if full steps would cycle."""
 NEWTONS_MADE: Final = 40
-"""The same with errors of the geometry, whose maximum lies at the end of a curved valley. On the aligned
-layout, h = 0.5, with ordinary tolerances, 12 factorisations were too few for one press of 30 % in three."""
+"""Maximum number of factorisations in a solve with geometry errors, whose maximum is at the end of a curved
+ridge. On the aligned layout, h = 0.5, with ordinary tolerances, 12 factorisations were too few for one in
+three presses of 30 %."""
 FLAT: Final = 0.1
-"""Decrease in −2 log posterior over :data:`FLAT_STEPS` factorisations below which such a valley counts as
-followed to its end."""
+"""Decrease in −2 log posterior over :data:`FLAT_STEPS` factorisations below which a solve with geometry
+errors counts as converged."""
 FLAT_STEPS: Final = 4
-"""Number of factorisations over which the decrease is taken."""
+"""Number of factorisations over which the decrease in −2 log posterior is compared with :data:`FLAT`."""
 EFFECT_STEP: Final = 0.2
-"""Relative change in the effects of errors in the geometry, as a root sum of squares, above which the factors
-and thus the standard deviations are computed again: standard deviations change by less."""
+"""Relative change in the effects of the geometry errors, as a root sum of squares, above which the factors
+and standard deviations are computed again. Smaller changes of the effects change the standard deviations by
+less than this ratio."""
 HALVINGS: Final = 6
 """Maximum number of halvings of a Gauss-Newton step."""
 PRIOR_DOUBT: Final = 3.0
-"""Factor on the standard deviation of the component that only the prior determines, because the expected load
-at a location is known only roughly. At 1, the hidden part of a first touch is 5 to 7 standard
-deviations off on one wire in 20 000, and so are dents that a half-space cannot form. At 2, one coordinate in
-12 000 in such dents is 5.6 standard deviations off, and no coordinate of the hard cases exceeds 5."""
+"""Factor applied to the part of the variance that only the prior determines, because the expected load at a
+location is known only roughly. With a factor of 1, the errors on one wire in 20 000 were 5 to 7 standard
+deviations at a first touch and in dents that a half-space cannot form. With a factor of 2, the error was 5.6
+standard deviations on one coordinate in 12 000 in such dents, and at most 5 in the hard cases."""
 SMOOTH_SHARE: Final = 0.25
-"""Factor applied, in the 95 % interval, to the part of σ² that only the prior determines. Independent loads
-on cells are rougher than real bodies: the measured errors contain 0.0 to 0.13 of that variance for spheres
-and 0.02 to 0.5 for Gaussian dents. The tail of the error distribution determines the standard deviation, and
-its centre determines the interval."""
+"""Factor applied, for the 95 % interval, to the part of the variance that only the prior determines.
+Independent loads on cells are rougher than the loads of real bodies. The measured errors contain a fraction
+of 0.0 to 0.13 of this variance for spheres, and 0.02 to 0.5 for Gaussian dents. The standard deviation covers
+the tail of the error distribution; the 95 % interval covers its centre."""
 
 
 class MapEstimator:
-    """Displacement, nuisances and last factors of one patch's MAP estimate; not to be shared.
+    """MAP estimator of one patch, with its displacement, nuisances and last factors.
+
+    Do not share an instance between owners.
 
     Args:
         problem: The patch.
         elastic: Elastic prior of the patch.
-        free: (f,) free coordinates of a wire.
-        nuisances: Number of nuisances other than errors of the geometry, p.
-        tolerances: Tolerances to which the patch was made.
+        free: (f,) indices of the free coordinates of a wire.
+        nuisances: Number p of nuisances, excluding those of the geometry errors.
+        tolerances: Manufacturing tolerances of the patch.
 
     Attributes:
         load_prior: Prior of the loads and of the displacement.
-        moved: (U, 3N) displacement, pitches; fixed coordinates stay 0.
-        g: Nuisances; errors of the geometry follow the p others.
+        moved: (U, 3N) displacement, pitches; 0 for fixed coordinates.
+        g: Nuisances: p nuisances, followed by those of the geometry errors.
         std: (U, f) standard deviations from the last factors, pitches.
         core: (U, f) standard deviations for the 95 % interval, which assume smooth bodies, pitches.
         noise_variance: (U f,) variance of the displacement due to noise and nuisances, pitch².
         members: Wires whose equations are in the factors.
         factors: Serial number of the current factors.
-        evaluations: Number of evaluations of F and J since the owner set it to 0.
-        factorisations: Number of factorisations since the owner set it to 0.
-        until: Value of :func:`skinnode.process.clock.perf_counter` after which a solve raises TimeoutError.
+        evaluations: Number of evaluations of F and J, per wire, since the counter was set to 0.
+        factorisations: Number of factorisations since the counter was set to 0.
+        until: Deadline as a value of :func:`skinnode.process.clock.perf_counter`, s, after which a solve
+            raises TimeoutError.
     """
 
     def __init__(
@@ -115,7 +121,7 @@ class MapEstimator:
         self._b = kernels.make_buffers(wires, equations, coordinates, free.size, nuisances, effects)
         self._rows = len(self._b.v) // wires
         self._reach = roots.NEAR * float(problem.clearance.min())
-        self._enough = math.inf  # RMS of a correction that is small compared with the standard deviation
+        self._enough = math.inf  # RMS of a chord step below which chord steps stop
         self._at_rest = np.zeros((wires, equations)), np.zeros((wires, coordinates, equations))
         kernels.potentials(np.arange(wires), problem.rest.copy(), problem.lower, *self._at_rest)
         self.g = np.zeros(nuisances + (geometry_error.nuisances(wires, equations) if effects else 0))
@@ -146,7 +152,7 @@ class MapEstimator:
         return self.members.size * self._rows
 
     def reset(self, scale2: float) -> None:
-        """Go back to rest, discard the factors, and reset the prior to equal loads at scale s², pitch²."""
+        """Return to rest without factors, and reset the prior to equal loads with s² = ``scale2``, pitch²."""
         self.moved[:] = 0.0
         self.g[:] = 0.0
         self.forget_factors()
@@ -165,7 +171,7 @@ class MapEstimator:
         """Solve from the current displacement, using the equations of the wires ``members`` (P,).
 
         Returns:
-            False if there is no maximum nearby.
+            Whether the solve converged; False if no maximum was found nearby.
         """
         if self._fits(observation, members) and self._settle(observation) and self._effects_fit():
             return True
@@ -189,7 +195,7 @@ class MapEstimator:
         """Solve from rest, lowering the noise from :data:`ANNEAL_NOISE` to its true value.
 
         Returns:
-            False if a step failed.
+            Whether the solve converged; False if a step failed.
         """
         self.moved[:] = 0.0
         self.g[:] = 0.0
@@ -205,9 +211,9 @@ class MapEstimator:
         return self._settle(observation) or self.track(observation, members)
 
     def step_s(self, observation: Observation) -> float:
-        """Return the time to factorise all wires and compute their standard deviations, s.
+        """Measure the time to factorise all wires and compute their standard deviations, s.
 
-        Discards the factors.
+        This method discards the factors.
         """
         self.until = least = math.inf
         for _ in range(3):  # the first run may include memory allocation
@@ -221,12 +227,12 @@ class MapEstimator:
     # -- properties of the current field ---------------------------------------------------------------
 
     def residuals(self, observation: Observation, moved: Float | None = None) -> Float:
-        """Return r − H g (U, K), whose noise has variance 1, at the current or another displacement."""
+        """Return the residuals r − H g (U, K), in units of their noise, at the current or a given field."""
         self._square(observation, self._every, self.moved if moved is None else moved, self.g)
         return self._b.r.copy()
 
     def fit(self, observation: Observation, moved: Float | None) -> Fit:
-        """Return the misfit between a displacement (U, 3N) in pitches (None: rest) and a frame."""
+        """Return the misfit between a frame and a displacement (U, 3N) in pitches; None means rest."""
         if moved is None:
             self._linearise_at_rest(observation)
         else:
@@ -239,7 +245,7 @@ class MapEstimator:
     def objective(
         self, observation: Observation, moved: Float | None = None, g: Float | None = None
     ) -> float:
-        """Return −2 log posterior of the current or another field, up to a constant set by the factors."""
+        """Return −2 log posterior of the current or a given field, up to a constant set by the factors."""
         moved, g = (self.moved if moved is None else moved), (self.g if g is None else g)
         square = self._square(observation, self.members, moved, g)
         prior = self.roughness(moved) / self.load_prior.scale2
@@ -250,7 +256,7 @@ class MapEstimator:
         return self.load_prior.roughness(np.ascontiguousarray(moved[:, self._free]).ravel())
 
     def free_displacement(self) -> Float:
-        """Return the free coordinates (U f,), pitches."""
+        """Return the free coordinates (U f,) of the current displacement, pitches."""
         return np.ascontiguousarray(self.moved[:, self._free]).ravel()
 
     def covariance(self) -> Float:
@@ -271,7 +277,7 @@ class MapEstimator:
     # -- evidence --------------------------------------------------------------------------------------
 
     def signal(self) -> Float:
-        """Return the variance (U, K) in pitch⁻² of each relative change in R at rest for s = 1."""
+        """Return the prior variance (U, K) of each relative change in R, in pitch⁻², at rest for s = 1."""
         wires, f, a = len(self.moved), self._free.size, self._problem.a_rest
         plain = Observation(a, np.ones_like(a), np.zeros((*a.shape, 0)), np.zeros(0))
         self._linearise_at_rest(plain)
@@ -280,7 +286,7 @@ class MapEstimator:
         return np.asarray(np.einsum("uik,uij,ujk->uk", slopes, own, slopes))
 
     def guess_scale(self, observation: Observation, members: Index) -> float:
-        """Return the s² in pitch² at which the expected deviation of R from rest matches the measured one."""
+        """Return the s² in pitch² for which the expected deviation of R from rest equals the measured one."""
         self._linearise_at_rest(observation)
         trace = self._assemble(observation, members, 1.0, np.zeros_like(self.moved))
         square = float((self._b.r[members] ** 2).sum())
@@ -299,15 +305,15 @@ class MapEstimator:
         """Return the next s² in pitch² by MacKay's fixed-point iteration (Neural Computation 4, 415, 1992).
 
         Args:
-            weight: Weight of the prior on s², in directions.
-            scale2: s² that the prior expects, pitch².
+            weight: Weight of the prior on s², as a number of directions in data space.
+            scale2: Expected value of s² in its prior, pitch².
         """
         return (self.roughness(self.moved) + weight * scale2) / (self.gamma() + weight)
 
     # -- steps -----------------------------------------------------------------------------------------
 
     def _square(self, observation: Observation, members: Index, moved: Float, g: Float) -> float:
-        """Return Σ (r − H g)² over these wires."""
+        """Return Σ (r − H g)² over the wires ``members``."""
         o = observation
         if self._geometry is not None:
             own, geometry = g[: self._fixed], g[self._fixed :]
@@ -316,7 +322,7 @@ class MapEstimator:
         return kernels.residuals(members, x, self._problem.lower, o.a, o.weight, o.h, g, self._b.r)
 
     def _fits(self, observation: Observation, members: Index) -> bool:
-        """Return whether the current factors were computed for these wires, noise and prior."""
+        """Return whether the current factors were computed for these wires, this prior and similar noise."""
         if self._factored is None:
             return False
         weight, scale2, version = self._factored
@@ -327,7 +333,7 @@ class MapEstimator:
         return bool((np.abs(new - old) <= 0.1 * old).all())  # False if a resistance was lost or regained
 
     def _effects_fit(self) -> bool:
-        """Return whether the errors of the geometry have much the same effects as in the factors."""
+        """Return whether the effects of the geometry errors are still similar to those in the factors."""
         if self._geometry is None:
             return True
         now, then = self._b.effect[self.members], self._b.factored_effect[self.members]
@@ -352,7 +358,7 @@ class MapEstimator:
         b = self._b
         b.r[:], b.jt[:] = self._at_rest
         kernels.weigh(self._every, observation.a, observation.weight, b.r, b.jt)
-        b.effect[:] = 0.0  # the rest resistances are measured
+        b.effect[:] = 0.0  # geometry errors have no effect at rest
 
     def _assemble(self, observation: Observation, members: Index, scale2: float, moved: Float) -> float:
         covariance, o, b = self.load_prior.covariance, observation, self._b
@@ -386,10 +392,10 @@ class MapEstimator:
         return size
 
     def _shorten(self, observation: Observation, moved: Float, g: Float) -> None:
-        """Search from ``moved`` and ``g`` towards the current field for the minimum of a fitted parabola.
+        """Shorten the last step, which began at ``moved`` and ``g``, to the minimum of a fitted parabola.
 
-        Gauss-Newton neglects the curvature of F. If the data determine little, full steps can alternate
-        forever between the two sides of the minimum.
+        Gauss-Newton neglects the curvature of F. If the data determine few directions, full steps can
+        alternate forever between the two sides of the minimum.
         """
         way = self.moved - moved, self.g - g
 
@@ -424,7 +430,7 @@ class MapEstimator:
         self._enough = SETTLED * math.sqrt(float(np.mean(self.core**2)))
 
     def _settle(self, observation: Observation) -> bool:
-        """Take chord steps to the maximum; without convergence, keep the better of the old and new fields."""
+        """Take chord steps; if they do not converge, keep the better of the old and the new field."""
         moved, g = self.moved.copy(), self.g.copy()
         if self._chord(observation):
             return True
@@ -433,7 +439,7 @@ class MapEstimator:
         return False
 
     def _chord(self, observation: Observation) -> bool:
-        """Take chord steps until the correction is small compared with the standard deviation."""
+        """Take chord steps until one is small relative to the standard deviation; return whether one was."""
         b, wires, prior, step = self._b, len(self.moved), self.load_prior, self._correction
         before = math.inf
         for _ in range(CHORDS):

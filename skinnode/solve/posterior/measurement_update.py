@@ -1,9 +1,9 @@
 """Measurement update: the linear algebra of one Gauss-Newton step of the posterior.
 
-The update works in data space, like that of a Kalman filter.
+The update is computed in data space, like the update of a Kalman filter.
 
 The unknowns are the free coordinates x of all electrodes, with the prior x ~ N(0, s² C), and a few nuisances
-g ~ N(0, diag(d)). A wire's residual is r = w (a F(x) − 1) with w = 1/σ, and its model is
+g ~ N(0, diag(d)). The residual of a wire is r = w (a F(x) − 1) with w = 1/σ, and its model is
 
     r(x) − H g = noise of variance 1,      H = effect of a unit of each nuisance on r
 
@@ -11,23 +11,24 @@ With J = ∂r/∂x, block-diagonal over wires, one Gauss-Newton step from x is
 
     x⁺ = s² C Jᵀ S⁻¹ y,   g⁺ = −d Hᵀ S⁻¹ y,   y = J x − r,   S = I + s² J C Jᵀ + H d Hᵀ
 
-with S the innovation covariance, s² J C the cross-covariance and K = s² C Jᵀ S⁻¹ the Kalman gain,
-
-and the covariance at x⁺ is s² C − Vᵀ V with V = L⁻¹ (s² J C), L Lᵀ = S (Tarantola, Inverse Problem Theory,
-2005, 3.4). No eigenvalue of S is below 1, so rounding errors are at most ε ‖S‖ standard deviations, i.e. one
-thousandth for signals of 10⁶ σ, regardless of the condition number of J.
+S is the innovation covariance, s² J C the cross-covariance and K = s² C Jᵀ S⁻¹ the Kalman gain. The posterior
+covariance at x⁺ is s² C − Vᵀ V with V = L⁻¹ (s² J C) and L Lᵀ = S (Tarantola, Inverse Problem Theory, 2005,
+3.4). All eigenvalues of S are at least 1. Rounding errors are therefore at most ε ‖S‖ standard deviations, or
+one thousandth of a standard deviation for signals of 10⁶ σ, regardless of the condition number of J.
 
 Steps with the factors of an older J converge to the same point. At the maximum of the posterior,
-e_x = −s² C Jᵀ (r − H g) − x and e_g = d Hᵀ (r − H g) − g vanish. With the old J, H and S,
+e_x = −s² C Jᵀ (r − H g) − x and e_g = d Hᵀ (r − H g) − g vanish. With the old J, H and S, the Newton
+correction is
 
     δ = e − (s² C Jᵀ; −d Hᵀ) S⁻¹ (J e_x − H e_g)
 
-is the Newton correction, here called a chord step, which costs two triangular solves.
+This correction is called a chord step; it costs two triangular solves.
 
-A wire with more equations than unknowns is first reduced, by a QR decomposition of [J H], to one equation per
-unknown without loss of information. This is not possible with errors of the geometry
-(:mod:`skinnode.solve.posterior.geometry_error`), because each lower wire has its own. These nuisances follow
-the p others in g; their H is sparse and stored as the effects of a residual.
+If a wire has more equations than unknowns, a QR decomposition of [J H] first reduces them to one equation per
+unknown without loss of information. This reduction is not possible with geometry errors
+(:mod:`skinnode.solve.posterior.geometry_error`), because each lower wire has its own nuisances. In g, the
+geometry errors follow the other p nuisances. Their H is sparse; only the non-zero effects on each residual
+are stored.
 """
 
 from __future__ import annotations
@@ -52,10 +53,10 @@ from skinnode.solve.posterior.geometry_error import add_effect, effect_on
 
 
 class Buffers(NamedTuple):
-    """Arrays written by a step for one patch.
+    """Arrays that a step writes for one patch.
 
-    A patch has U wires with K equations and f free coordinates each, p nuisances, and R = min(K, f + p) rows
-    per wire after reduction, or R = K with errors of the geometry.
+    A patch has U wires with K equations and f free coordinates each, and p nuisances. Each wire has
+    R = min(K, f + p) rows after reduction, or R = K with geometry errors.
     """
 
     r: Float
@@ -63,49 +64,49 @@ class Buffers(NamedTuple):
     jt: Float
     """(U, 3N, K) transposed Jacobians."""
     free_jt: Float
-    """(f + p, K) free rows of one wire's Jᵀ, followed by its Hᵀ."""
+    """(f + p, K) rows of one wire's Jᵀ for its free coordinates, followed by its Hᵀ."""
     jacobian: Float
-    """(U R, f) J of the wires in the step, stacked."""
+    """(U R, f) stacked matrices J of the wires in the step."""
     nuisance: Float
-    """(U R, p) H of the wires in the step, stacked."""
+    """(U R, p) stacked matrices H of the wires in the step."""
     y: Float
-    """(U R,) J x − r."""
+    """(U R,) right-hand side y = J x − r."""
     cross_covariance: Float
-    """(U R, U f) s² J C, the covariance of the data with the displacement."""
+    """(U R, U f) cross-covariance s² J C of the data and the displacement."""
     innovation_covariance: Float
-    """(U R, U R) S, then its Cholesky factor L."""
+    """(U R, U R) innovation covariance S, later replaced by its Cholesky factor L."""
     whitened: Float
-    """(U R, U f) V = L⁻¹ (s² J C)."""
+    """(U R, U f) whitened cross-covariance V = L⁻¹ (s² J C)."""
     kalman_gain_t: Float
-    """(U R, U f) Kᵀ, effect of a unit of noise in each equation on the estimate."""
+    """(U R, U f) transposed Kalman gain Kᵀ, effect of a unit of noise in each equation on the estimate."""
     work: Float
-    """(U R, U R) scratch."""
+    """(U R, U R) work array."""
     gradient: Float
-    """(U f,) Jᵀ (r − H g)."""
+    """(U f,) gradient Jᵀ (r − H g)."""
     v: Float
-    """(U R,) scratch."""
+    """(U R,) work array."""
     block: Float
-    """(f, R) contiguous copy of Jᵀ of one wire."""
+    """(f, R) contiguous copy of one wire's Jᵀ."""
     qr: Float
-    """(K, f + p) QR of [J H] of one wire."""
+    """(K, f + p) QR decomposition of one wire's [J H]."""
     diagonal: Float
-    """(f + p,) diagonal of the triangular factor."""
+    """(f + p,) diagonal of the triangular factor of the QR decomposition."""
     beta: Float
-    """(f + p,) scale factors of the Householder vectors."""
+    """(f + p,) scale factors of the Householder vectors of the QR decomposition."""
     scratch: Float
-    """(f + p,) scratch."""
+    """(f + p,) work array."""
     e: Float
-    """(K,) scratch."""
+    """(K,) work array."""
     effect: Float
-    """(U, K, E) non-zero elements of H of the geometry; E = 0 if the geometry is exact."""
+    """(U, K, E) non-zero elements of H for the geometry errors; E = 0 if the geometry is exact."""
     factored_effect: Float
-    """(U, K, E) the same, as they are in the factors."""
+    """(U, K, E) copy of ``effect`` from which the current factors were computed."""
 
 
 def make_buffers(  # noqa: PLR0913 - the sizes of a patch
     wires: int, equations: int, coordinates: int, free: int, nuisances: int, effects: int = 0
 ) -> Buffers:
-    """Return zeroed buffers for a patch; all sizes except ``wires`` and ``nuisances`` are per wire."""
+    """Return zeroed buffers for a patch; the sizes other than ``wires`` and ``nuisances`` are per wire."""
     columns = free + nuisances
     rows = equations if effects else min(equations, columns)
     m, n = wires * rows, wires * free
@@ -156,7 +157,7 @@ def weigh(members: Index, a: Float, weight: Float, r: Float, jt: Float) -> None:
 def residuals(  # noqa: PLR0913 - a kernel: arrays by name
     members: Index, x: Float, lower: Float, a: Float, weight: Float, h: Float, g: Float, r: Float
 ) -> float:
-    """Write r − H g, r = w (a F − 1), for the wires ``members`` (P,) into ``r`` (U, K); return its Σ r²."""
+    """Write w (a F − 1) − H g for the wires ``members`` (P,) into ``r`` (U, K); return the sum of squares."""
     square = 0.0
     for i in range(members.size):
         u = members[i]
@@ -177,9 +178,9 @@ def measure_fit(  # noqa: PLR0913 - a kernel: arrays by name
 ) -> None:
     """Measure the misfit of the residuals ``r`` (U, K), and replace ``r`` with r − H g.
 
-    Writes χ² of each wire into ``square_sum`` (U,), the error of each coordinate on its own,
-    |Jᵢᵀ r| / ‖Jᵢ‖², into ``move`` (U, f), and the largest such error of each wire in standard deviations,
-    |Jᵢᵀ r| / ‖Jᵢ‖, into ``top`` (U,).
+    Writes χ² of each wire into ``square_sum`` (U,). Writes the error |Jᵢᵀ r| / ‖Jᵢ‖² of each coordinate, if
+    only this coordinate moves, into ``move`` (U, f). Writes the largest error of each wire in standard
+    deviations, |Jᵢᵀ r| / ‖Jᵢ‖, into ``top`` (U,).
     """
     for u in range(jt.shape[0]):
         r_u = r[u]
@@ -202,7 +203,7 @@ def measure_fit(  # noqa: PLR0913 - a kernel: arrays by name
 def _reduce(  # noqa: PLR0913, C901 - a kernel: arrays by name, sums as loops
     u: int, top: int, free: Index, h: Float, x: Float, b: Buffers
 ) -> None:
-    """Write J, H and y of wire ``u``, reduced to at most f + p rows, into the rows from ``top`` on."""
+    """Write J, H and y of wire ``u``, reduced to at most f + p rows, into ``b``, starting at row ``top``."""
     f, p = free.size, h.shape[2]
     equations = h.shape[1]
     y = b.e
@@ -244,8 +245,9 @@ def assemble(  # noqa: PLR0913, C901 - a kernel: arrays by name, sums as loops
 ) -> float:
     """Write J, H, y, s² J C and S of the wires ``members`` (P,) from the r and Jᵀ in ``b``.
 
-    ``free`` (f,) lists the free coordinates of a wire, ``c`` (U f, U f) is C, and ``h`` (U, K, p) and
-    ``d`` (p,) describe the nuisances. Writes only the upper triangle of S. Returns the trace of s² J C Jᵀ.
+    ``free`` (f,) contains the indices of a wire's free coordinates, and ``c`` (U f, U f) is C. The array
+    ``h`` (U, K, p) contains the effects of the nuisances and ``d`` (p,) their variances. Writes only the
+    upper triangle of S. Returns the trace of s² J C Jᵀ.
     """
     f, p = free.size, h.shape[2]
     rows = b.jacobian.shape[0] // x.shape[0]
@@ -286,7 +288,7 @@ def assemble(  # noqa: PLR0913, C901 - a kernel: arrays by name, sums as loops
 def gauss_newton_step(  # noqa: PLR0913 - a kernel: arrays by name
     members: Index, free: Index, d: Float, x: Float, g: Float, b: Buffers
 ) -> None:
-    """Write the result of a Gauss-Newton step to ``x`` (U, 3N) and ``g`` (p,); S must have been factored."""
+    """Write the result of a Gauss-Newton step into ``x`` (U, 3N) and ``g`` (p,); S must be factorised."""
     f = free.size
     rows = b.jacobian.shape[0] // x.shape[0]
     m = members.size * rows
@@ -345,10 +347,10 @@ def noise_variance(  # noqa: C901 - a kernel: sums as loops
 def standard_deviations(  # noqa: PLR0913 - a kernel: arrays by name
     m: int, c: Float, s2: float, noise: Float, doubt: float, share: float, std: Float, core: Float, b: Buffers
 ) -> None:
-    """Write standard deviations (U, f) of the posterior from its covariance s² C − Vᵀ V; reads V from ``b``.
+    """Compute the posterior's standard deviations (U, f) from its covariance s² C − Vᵀ V, with V from ``b``.
 
-    The variance due to ``noise`` (U f,) counts in full. The rest, which only the prior determines, is
-    multiplied by ``doubt`` for ``std`` and by ``share`` for ``core``.
+    The variance due to noise, ``noise`` (U f,), is included in full. The remaining variance, which only the
+    prior determines, is multiplied by ``doubt`` for ``std`` and by ``share`` for ``core``.
     """
     n, f = noise.size, std.shape[1]
     explained = b.gradient
@@ -377,10 +379,10 @@ def chord_step(  # noqa: PLR0913, C901 - a kernel: arrays by name, sums as loops
     step: Float,
     b: Buffers,
 ) -> tuple[float, float]:
-    """Write the chord step with the current factors into ``step``, first U f coordinates, then the nuisances.
+    """Compute a chord step with the current factors: U f coordinates, followed by the nuisances.
 
-    Reads r, Jᵀ and the effects at ``x`` (U, 3N) from ``b``. Returns the RMS and the largest absolute value of
-    the U f displacements, pitches.
+    Writes the step into ``step``. Reads r, Jᵀ and the effects at ``x`` (U, 3N) from ``b``. Returns the RMS
+    and the largest absolute value of the U f coordinate changes, pitches.
     """
     f, p = free.size, h.shape[2]
     wires, equations = b.r.shape

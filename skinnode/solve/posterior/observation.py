@@ -76,7 +76,7 @@ class ObservationModel:
 
     Attributes:
         gains: Number of gain errors, which are the first nuisances.
-        fixed: Number of nuisances whose H does not depend on the displacement, p.
+        fixed: Number p of nuisances whose H does not depend on the displacement.
         variance: Prior variances of the nuisances: p variances, followed by those of the geometry errors.
     """
 

@@ -1,4 +1,4 @@
-"""Posterior of a patch: fields estimated from a stream of frames, with tests of their readings.
+"""Posterior of a patch: fields estimated from a stream of frames whose readings are tested.
 
 Each frame is solved by ``frame_estimator``. :mod:`skinnode.solve.checks.data_check` then tests the readings
 for consistency with the field; if it finds wrong readings, the frame is solved again without them.

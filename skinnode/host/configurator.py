@@ -1,9 +1,10 @@
 """Configure a node: wait for it, check its identity and layout, write its parameters, read its baseline.
 
-Nothing is written before identity and layout are known to match the hand file, because the node could be a
-drive. Every written value is read back. On a bus that another master runs, the host does not send NMT
-commands, leaves the SYNC parameters alone, and writes patch-specific parameters only if they differ. If the
-host must not send anything (``guest_sends = "nothing"``), all information about the node comes from files.
+Nothing is written before the node's identity and layout have been found to match the hand file, because the
+node could be a different device, such as a motor drive. Every written value is read back. On a bus that
+another master runs, the host sends no NMT commands, does not change the SYNC parameters, and writes
+patch-specific parameters only if they differ. If the host is not allowed to send any frame (``guest_sends =
+"nothing"``), all information about the node comes from files.
 """
 
 from __future__ import annotations
@@ -31,19 +32,19 @@ from skinnode.protocol.profile import PatchProfile
 from skinnode.text.words import counted
 
 BOOT_DEADLINE_S: Final = 3.0
-"""Maximum time until the first response from a node, s; controllers boot and tare within a second."""
+"""Maximum time until the first response from a node, s. Nodes boot and tare themselves within a second."""
 
 HEARTBEATS_WATCHED: Final = 3
-"""Number of consecutive heartbeats from the host that a node may miss before it stops sending."""
+"""Number of consecutive heartbeats from the host that a node may miss before the node stops sending."""
 
 _POLL_S: Final = 0.02
 
 
 @dataclass(frozen=True, slots=True)
 class Configurator:
-    """Configuration of the nodes on one bus, one after another or in parallel.
+    """Configurator for the nodes on one bus.
 
-    Threads: one thread per node at a time.
+    Threads: several nodes may be configured in parallel, each by one thread.
     """
 
     send: Callable[[int, bytes], None]
@@ -51,11 +52,11 @@ class Configurator:
     bus: BusConfig
     boot_deadline_s: float
     abandoned: Callable[[], bool]
-    """Called repeatedly; once it returns True, configuration raises Abandoned."""
+    """Function called repeatedly. If it returns True, configuration raises Abandoned."""
     on_answer: Callable[[PatchConfig], None]
-    """Called for each node once it has answered."""
+    """Function called for each node after the node's first response."""
     search: Callable[[PatchConfig], object]
-    """Searches for a node that does not answer, by its serial number."""
+    """Function that searches for a silent node by its serial number."""
 
     def configure(self, patch: PatchConfig, profile: PatchProfile, remote: RemoteOd) -> NodeFacts:
         """Wait for the node, check its identity and configure it.
@@ -63,15 +64,15 @@ class Configurator:
         On a bus where the host is the master, the node is pre-operational afterwards.
 
         Args:
-            patch: The patch as described in the hand file.
-            profile: Its wire format.
-            remote: The object dictionary of its node.
+            patch: Configuration of the patch from the hand file.
+            profile: Wire format of the patch.
+            remote: Object dictionary of the patch's node.
 
         Raises:
-            NodeTimeout: if the node does not answer in time.
+            NodeTimeout: if the node does not respond in time.
             NodeError: if the node is not the patch in the hand file, or does not keep its configuration.
             SdoAbort: if the node refuses a transfer.
-            ConfigError: if the baseline file does not fit the patch.
+            ConfigError: if the baseline file does not match the patch.
             Abandoned: if ``abandoned`` returned True.
         """
         if not (self.bus.role == "master" or self.bus.guest_sends == "sdo"):
@@ -98,7 +99,7 @@ class Configurator:
         )
 
     def _from_files(self, patch: PatchConfig, profile: PatchProfile) -> NodeFacts:
-        assert patch.baseline is not None  # ensured when the hand file is checked
+        assert patch.baseline is not None  # ensured by the check of the hand file
         baseline_ohm = load_baseline(patch.baseline, profile)
         scale, heartbeat_s = CodeScale(patch.code_bits), self.hand.bring_up.heartbeat_s
         return NodeFacts(patch, patch.layout.build(), profile, scale, baseline_ohm, None, heartbeat_s)
@@ -119,7 +120,7 @@ class Configurator:
                 )
 
     def _identify(self, patch: PatchConfig, remote: RemoteOd) -> tuple[int, int]:
-        """Check the identity of the node. Returns its serial number and revision number."""
+        """Check the node's identity. Returns the serial number and the revision number."""
         for subindex, what, expected in (
             (od.IDENTITY_VENDOR, "vendor-ID", od.VENDOR_ID),
             (od.IDENTITY_PRODUCT, "product code", od.PRODUCT_CODE),
@@ -128,7 +129,7 @@ class Configurator:
             if got != expected:
                 raise _mismatch(patch, what, f"0x{got:08X}", f"0x{expected:08X} (a skinnode patch)")
         revision = int(remote.read(od.IDENTITY, od.IDENTITY_REVISION, "u32"))
-        if revision >> 16 != od.REVISION_NUMBER >> 16:  # the major revision identifies the CANopen behaviour
+        if revision >> 16 != od.REVISION_NUMBER >> 16:  # the major revision defines the CANopen behaviour
             allowed = f"{od.REVISION_NUMBER >> 16}.x"
             raise _mismatch(patch, "revision", f"{revision >> 16}.{revision & 0xFFFF}", allowed)
         serial = int(remote.read(od.IDENTITY, od.IDENTITY_SERIAL, "u32"))
@@ -158,17 +159,17 @@ class Configurator:
         return layout
 
     def _read_layout(self, patch: PatchConfig, profile: PatchProfile, remote: RemoteOd) -> PatchLayout:
-        """Return the layout given by the electrode coordinates stored in the node."""
+        """Return the layout that is defined by the electrode coordinates stored in the node."""
         self._go_on()
         data = remote.read_block(od.COORDINATES)
         resistivity = remote.read(od.DESCRIPTOR, od.RESISTIVITY, "f32")
         try:
             return unpack_coordinates(data, profile, resistivity)
-        except ValueError as error:  # includes ConfigError
+        except ValueError as error:  # ConfigError is a ValueError
             raise _mismatch(patch, "electrode coordinates", counted(len(data), "byte"), str(error)) from None
 
     def _configure_communication(self, remote: RemoteOd) -> None:
-        """Write the parameters that only a master may set: SYNC, and the heartbeat that the node monitors."""
+        """Write the parameters that only a master may set: SYNC, and the monitored heartbeat."""
         self._go_on()
         sync = self.hand.sync
         remote.write_checked(od.COB_ID_SYNC, 0, "u32", od.SYNC_COB_ID)
@@ -184,7 +185,7 @@ class Configurator:
         _watch_master(remote, watched)
 
     def _configure_heartbeat(self, remote: RemoteOd, *, master: bool) -> float:
-        """Set the heartbeat period; on another master's bus, only if unset. Returns the period, s."""
+        """Set the heartbeat period, on another master's bus only if unset. Returns the period, s."""
         heartbeat_ms = self.hand.bring_up.heartbeat_ms
         if not master:
             present_ms = int(remote.read(od.HEARTBEAT_PRODUCER, 0, "u16"))
@@ -196,7 +197,7 @@ class Configurator:
     def _configure_patch(
         self, patch: PatchConfig, profile: PatchProfile, remote: RemoteOd, *, master: bool
     ) -> None:
-        """Write the patch-specific parameters: when the patch scans and how it sends."""
+        """Write the patch-specific parameters, which define when the patch scans and how it sends."""
         sync = self.hand.sync
         if not master:
             overflow = remote.read(od.SYNC_COUNTER_OVERFLOW, 0, "u8")
@@ -226,7 +227,7 @@ class Configurator:
                 remote.write_checked(index, sub, size, value)
 
     def _check_mapping(self, patch: PatchConfig, profile: PatchProfile, remote: RemoteOd) -> None:
-        """Check that the PDO mapping matches the node's revision, as the decoder requires."""
+        """Check that the PDO mapping is the mapping that the decoder expects for the node's revision."""
         expected = {item.index: item for item in profile.objects()}
         for index in (od.TPDO1_MAPPING, od.TPDO2_MAPPING):
             count = int(expected[index][0].default or 0)
@@ -240,16 +241,16 @@ class Configurator:
                     raise _mismatch(patch, what, f"0x{mapped:08X}", f"0x{entry:08X}")
 
     def settle_baseline(self, patch: PatchConfig, profile: PatchProfile, remote: RemoteOd) -> Float:
-        """Return the node's baseline; first write the file's baseline if it differs.
+        """Return the node's baseline, after writing the baseline from the hand's baseline file if it differs.
 
-        A node that is still taring itself returns zeros; it has until the boot deadline to finish.
+        A node that is still taring itself returns zeros, and must finish before the boot deadline.
 
         Returns:
-            (U, K) resistances at rest, ohm.
+            (U, K) ohm: resistances at rest.
 
         Raises:
             NodeError: if the node does not keep the baseline, or a value is not positive.
-            SkinError: as raised by :meth:`configure`.
+            SkinError: for the reasons listed under :meth:`configure`.
         """
         expected = None if patch.baseline is None else load_baseline(patch.baseline, profile)
         end_s = clock.monotonic() + self.boot_deadline_s
@@ -277,9 +278,9 @@ class Configurator:
     def _read_baseline(self, patch: PatchConfig, profile: PatchProfile, remote: RemoteOd) -> Float:
         """Read the baseline as one block, or value by value if the node does not support block transfer.
 
-        For 300 values, a block transfer takes 176 frames and single reads take 600. At 1 Mbit/s, the block
-        transfer takes 86 ms at the node's own pace, and the single reads take 75 ms plus 300 response times;
-        single reads never occupy the whole bus.
+        For 300 values, a block transfer requires 176 frames, and single reads require 600 frames. At 1
+        Mbit/s, the block transfer takes 86 ms at the node's own pace, and the single reads take 75 ms plus
+        300 response times. Single reads never occupy the whole bus.
         """
         try:
             data = remote.read_block(od.BASELINE_DOMAIN, 4 * profile.n_codes)
@@ -303,15 +304,16 @@ class Configurator:
 
 
 def is_configured(patch: PatchConfig, hand: HandConfig, remote: RemoteOd) -> bool:
-    """Read back the values that determine whether the node sends scans.
+    """Return whether a node still has the parameters without which it does not send scans.
 
-    The values differ if the node was reset unnoticed during bring-up, or if another master configured it.
+    The parameters are wrong if the node was reset unnoticed during bring-up, or if another master configured
+    the node.
 
     Returns:
-        Whether the node has the values that a master writes.
+        Whether the node has the values that the host writes as a master.
 
     Raises:
-        NodeError: as raised by :class:`RemoteOd`.
+        NodeError: if reading fails; see :class:`RemoteOd`.
     """
     expected = (
         (od.SYNC_COUNTER_OVERFLOW, 0, "u8", hand.sync.counter_overflow),
@@ -324,7 +326,7 @@ def is_configured(patch: PatchConfig, hand: HandConfig, remote: RemoteOd) -> boo
 def _open_window(remote: RemoteOd) -> None:
     """Disable the synchronous window (0x1007), because a summary is sent only after its whole scan.
 
-    A node without this object has no window.
+    A node without object 0x1007 has no synchronous window.
     """
     try:
         remote.write_checked(od.SYNC_WINDOW, 0, "u32", 0)
@@ -334,10 +336,10 @@ def _open_window(remote: RemoteOd) -> None:
 
 
 def _watch_master(remote: RemoteOd, watched: int) -> None:
-    """Write entry 1 of 0x1016, which makes the node monitor the host's heartbeat.
+    """Make the node monitor the host's heartbeat, using entry 1 of object 0x1016.
 
-    Other entries stay unchanged, but an entry that also monitors the host is cleared, because a node-ID may
-    occur only once.
+    The other entries stay unchanged, except that another entry with the host's node-ID is cleared, because a
+    node-ID may occur only once.
     """
     try:
         remote.write_checked(od.HEARTBEAT_CONSUMER, 1, "u32", watched)

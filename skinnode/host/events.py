@@ -1,4 +1,4 @@
-"""Events: changes in the health of a hand, for subscribers and for the log."""
+"""Publish changes in the health of a hand as events, to subscribers and to the log."""
 
 from __future__ import annotations
 
@@ -17,23 +17,23 @@ from skinnode.process import clock
 _log = logging.getLogger(__name__)
 
 CAPACITY_EVENTS: Final = 1024
-"""Default number of events by which a subscriber may lag before losing the oldest."""
+"""Default maximum number of events waiting for a subscriber, beyond which the oldest event is dropped."""
 
 
 @dataclass(frozen=True, slots=True)
 class HealthEvent:
-    """A change of health."""
+    """Change in the health of a patch, a bus or the host."""
 
     t_ns: int
-    """Monotonic time."""
+    """Monotonic time of the change, ns."""
     subject: str
-    """Name of a patch or a bus, or ``host``."""
+    """Name of the patch or bus, or ``host``."""
     what: str
-    """The new condition, the counter of :class:`PatchHealth` or :class:`BusHealth` that increased, or
+    """New condition, name of the increased counter of :class:`PatchHealth` or :class:`BusHealth`, or
     ``defects``.
     """
     text: str
-    """Human-readable description, without the subject."""
+    """Human-readable description of the change, without the subject."""
 
     def __str__(self) -> str:
         return f"{self.subject}: {self.text}"
@@ -42,8 +42,8 @@ class HealthEvent:
 class EventSubscription:
     """Subscription to a running host's events.
 
-    Iterate over the subscription until the host closes, or use :meth:`get`. When the queue is full, its
-    oldest event is dropped and counted in ``dropped``. Any thread may read.
+    Iterate over the subscription until the host closes, or use :meth:`get`. If the subscription's queue is
+    full, the oldest event is dropped and counted in ``dropped``. Any thread may read.
     """
 
     def __init__(self, capacity: int) -> None:
@@ -51,13 +51,13 @@ class EventSubscription:
         self.dropped = 0
 
     def get(self, timeout_s: float | None = None) -> HealthEvent | None:
-        """Return the next event, or None.
+        """Return the next event, or None if no event occurs.
 
         Args:
-            timeout_s: Maximum wait, s; None: no limit.
+            timeout_s: Maximum wait for an event, s; None for no limit.
 
         Returns:
-            The event; None if no event arrived in time, or immediately if the host has closed.
+            The event; None if no event occurred in time or the host has closed.
         """
         try:
             event = self._queue.get(timeout_s)
@@ -70,21 +70,21 @@ class EventSubscription:
             yield event
 
     def offer(self, event: HealthEvent | End) -> None:
-        """Queue an event. Never blocks; any thread."""
+        """Queue an event or an end marker. Never blocks. Any thread."""
         self.dropped += self._queue.put(event)
 
 
 class Events:
-    """All subscriptions to events. One thread publishes; any thread may subscribe."""
+    """All subscriptions to a host's events. Only one thread may publish; any thread may subscribe."""
 
     def __init__(self, defects: Defects | None = None) -> None:
         self._defects = Defects("host") if defects is None else defects
         self._subscriptions: weakref.WeakSet[EventSubscription] = weakref.WeakSet()
-        self._lock = clock.lock()  # the set must not change while it is iterated over
+        self._lock = clock.lock()  # the set must not change while it is copied
         self._ended = False
 
     def subscribe(self, capacity: int) -> EventSubscription:
-        """Create a subscription.
+        """Create a subscription to all events.
 
         Raises:
             ValueError: if ``capacity`` is below 1.
@@ -106,7 +106,7 @@ class Events:
         self._offer(event)
 
     def end(self) -> None:
-        """End all subscriptions: the host has closed."""
+        """End all subscriptions, because the host has closed."""
         self._ended = True
         self._offer(End())
 

@@ -1,6 +1,6 @@
-"""Health of patches and buses: conditions, and the rules that derive them from facts.
+"""Define the health of patches and buses, and derive a patch's condition from facts.
 
-:class:`~skinnode.host.node_monitor.NodeMonitor` collects the facts on the mainline.
+The facts are collected on the mainline by :class:`~skinnode.host.node_monitor.NodeMonitor`.
 """
 
 from __future__ import annotations
@@ -21,55 +21,55 @@ from skinnode.transport.bus_state import BusState
 _log = logging.getLogger(__name__)
 
 HEARTBEATS_MISSED: Final = 3
-"""Number of heartbeat periods without a heartbeat after which a node is considered lost. CiA 301 leaves this
-number to the integrator; a burst of frames may delay one heartbeat and a bus error may destroy another."""
+"""Number of heartbeat periods without a heartbeat after which a node counts as lost. CiA 301 does not specify
+this number. A burst of frames may delay one heartbeat, and a bus error may destroy another."""
 
 SCANS_MISSED: Final = 3
-"""Number of SYNC periods without a scan after which a patch is considered stale."""
+"""Number of SYNC periods without a scan after which a patch counts as stale."""
 
 SYNCS_MISSED: Final = 5
-"""Number of SYNC periods without SYNC after which another master's bus is reported as lacking SYNC; its
-patches are stale by then."""
+"""Number of SYNC periods without SYNC after which a bus that another master runs is reported as lacking SYNC.
+The bus's patches are already stale by then."""
 
 
 class Condition(enum.StrEnum):
-    """The state of a patch in one word."""
+    """Condition of a patch, the most serious of its states."""
 
     NEVER_SEEN = "never seen"
     BOOTING = "booting"
-    """The node is sending frames, but is not operational yet."""
+    """The node sends frames, but is not operational yet."""
     OPERATIONAL = "operational"
     STALE = "stale"
-    """Operational according to the node's heartbeat, but no scans arrive, or all scans are withheld."""
+    """The node is operational according to its heartbeat, but no scans arrive, or all scans are withheld."""
     RESTARTING = "restarting"
-    """The node restarts by itself in a loop: see :data:`~skinnode.host.node_monitor.LOOP_RESTARTS`. A node
-    that restarted once, or that is operational again and has not restarted for 0.5 s, is given the condition
-    that fits its current state."""
+    """The node restarts repeatedly without a command: see :data:`~skinnode.host.node_monitor.LOOP_RESTARTS`.
+    This condition does not apply to a node that has restarted only once, or that is operational again and has
+    not restarted for 0.5 s."""
     FROZEN = "frozen"
-    """Scans arrive, but their converter has stopped: see :mod:`skinnode.host.converter_liveness`."""
+    """Scans arrive, but the patch's converter has stopped: see :mod:`skinnode.host.converter_liveness`."""
     FAULTY = "faulty"
     """The node's error register is not zero, or serving the patch raised an exception
     (:attr:`PatchHealth.defect`)."""
     REFUSED = "refused"
-    """The node answers, but does not match the hand file or does not keep its configuration."""
+    """The node responds, but does not match the hand file or does not keep its configuration."""
     LOST = "lost"
     """The node's heartbeat has stopped."""
 
 
 @dataclass(frozen=True, slots=True)
 class PatchHealth:
-    """Health of a patch at one instant. An age is None if the event has never occurred."""
+    """Health of a patch at one instant. An age is None if no such frame has been received."""
 
     patch: str
     node_id: int
     condition: Condition
     nmt_state: int | None
-    """NMT state as in the heartbeat: 5 operational, 127 pre-operational, 4 stopped, 0 just booted."""
+    """NMT state from the newest heartbeat: 5 operational, 127 pre-operational, 4 stopped, 0 just booted."""
     heartbeat_age_s: float | None
     scan_age_s: float | None
     boot_ups: int
     emergencies: int
-    """Number of EMCY messages reporting an error since the host started."""
+    """Number of EMCY messages that have reported an error since the host started."""
     last_emergency: int | None
     """Error code of the newest EMCY message that reported an error; None before the first."""
     emergency_text: str
@@ -78,38 +78,41 @@ class PatchHealth:
     rejoins: int = 0
     """Number of times the node has come back and been brought up again since the host started."""
     refusal: str | None = None
-    """Why a node that answers is not used: wrong identity or layout, or configuration not kept."""
+    """Reason why a responding node is not used: wrong identity or layout, or configuration not kept."""
     restarts_in_a_loop: bool = False
-    """Whether the node restarted by itself three times within ten seconds, the last time within the past 5
-    s."""
+    """Whether the node restarted without a command three times within ten seconds, most recently within the
+    past 5 s."""
     duplicate_id: bool = False
-    """Whether heartbeats arrive more often than a single node would send them."""
+    """Whether heartbeats arrive more often than a single node would send them, so that two nodes share the
+    node-ID."""
     conflicts: int = 0
-    """Number of frames that contradict other frames of the same scan: the node's counter is wrong, or two
-    nodes share a node-ID."""
+    """Number of frames that contradict other frames of the same scan, because the node's counter is wrong or
+    two nodes share a node-ID."""
     wires: tuple[WireFault, ...] = ()
-    """Wires that are open, shorted, noisy or drifting."""
+    """Faults of open, shorted, noisy and drifting wires."""
     alive: Alive = Alive.CANNOT_TELL
-    """Whether the converter is running. No means that the condition is frozen."""
+    """Whether the patch's converter is running. If it is not running, the condition is ``frozen``."""
     life: str = ""
-    """Why the converter is not known to be running, in words; empty if it is."""
+    """Reason why the converter may not be running, in words; empty if it is running."""
     faults: tuple[DataFault, ...] = ()
-    """Faults in the data of the newest field: which parts, since when, how sure."""
+    """Faults in the data of the newest field, with the affected parts, first scans and certainty."""
     defect: str | None = None
-    """The host's failed operation and its exception, until the patch has been brought up again."""
+    """Most recent failed operation of the host for this patch, with its exception; None after the next
+    bring-up."""
     slow_overruns: int = 0
-    """Number of EMCY messages 0x8110 reporting that the computer or bus is too slow for the node's scans."""
+    """Number of EMCY messages 0x8110, which report that the computer or bus is too slow for the node's
+    scans."""
     baselines: int = 0
-    """Number of times a changed baseline was read, for example after a tare."""
+    """Number of times that a changed baseline has been read, for example after a tare."""
     complaint: str | None = None
-    """Why the last bring-up failed; None once a bring-up has succeeded."""
+    """Reason why the last bring-up failed; None if it succeeded."""
     withheld: bool = False
-    """Whether arriving scans cannot be decoded yet because the node is being brought up or its baseline is
+    """Whether arriving scans are not yet decoded, because the node is being brought up or its baseline is
     being read."""
 
     @property
     def reason(self) -> str:
-        """Why the patch is not operational, or not known to be alive, in one line; empty if it is both."""
+        """Reason why the patch is not operational, or may not be converting; empty if there is none."""
         match self.condition:
             case Condition.OPERATIONAL:
                 return self.life
@@ -151,43 +154,43 @@ class PatchHealth:
 
 
 def faults_of(field: FieldFrame | None) -> tuple[DataFault, ...]:
-    """Return the faults in the data of a field; none if there is no field."""
+    """Return the faults in the data of a field; an empty tuple if there is no field."""
     return () if field is None else field.faults
 
 
 @dataclass(frozen=True, slots=True)
 class BusHealth:
-    """Health of a bus at one instant; events are counted from the start of the host."""
+    """Health of a bus at one instant. All counters start at 0 when the host starts."""
 
     bus: str
     away: str | None
-    """Why the interface is unavailable; None while it works."""
+    """Reason why the interface is unavailable; None while the interface works."""
     load: float
-    """Fraction of the last second during which frames occupied the bus."""
+    """Bus load over the last second, as a fraction of the capacity."""
     error_frames: int
     bus_offs: int
     outages: int
     kernel_dropped: int
     dropped: int
-    """Frames dropped because the host's own queue was full."""
+    """Number of frames dropped because the host's receive queue was full."""
     malformed: int
     foreign: int
-    """Frames with COB-IDs not used anywhere in the hand file; ``foreign_ids`` lists the COB-IDs."""
+    """Number of frames with a COB-ID that the host does not expect; ``foreign_ids`` lists these COB-IDs."""
     foreign_ids: tuple[int, ...]
     other_syncs: int
-    """SYNC messages from another producer on a bus where the host is the master."""
+    """Number of SYNC messages from another producer on a bus whose master is the host."""
     other_masters: int
-    """NMT commands, SDO requests to the hand's nodes, and heartbeats with the host's node-ID, from other
-    senders."""
+    """Number of NMT commands, SDO requests to the hand's nodes, and heartbeats with the host's node-ID, from
+    other senders."""
     controller: BusState | None = None
-    """Newest reported state of the controller; None if none was reported."""
+    """Most recently reported state of the CAN controller; None if no state has been reported."""
     no_sync: bool = False
-    """Whether another master runs the bus and its SYNC has been absent for :data:`SYNCS_MISSED` periods."""
+    """Whether another master runs the bus, and no SYNC has arrived for :data:`SYNCS_MISSED` periods."""
 
 
 @dataclass(frozen=True, slots=True)
 class Evidence:
-    """Facts about a patch that determine its condition. Ages are in periods; None if never received."""
+    """Facts that determine a patch's condition. Ages are in periods, and None before the first frame."""
 
     nmt_state: int | None
     late_heartbeats: float | None

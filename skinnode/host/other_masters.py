@@ -1,6 +1,6 @@
-"""Detect other masters on a bus by frames that only masters send.
+"""Detect other masters on a bus by the frames that only masters send.
 
-The host does not receive its own frames.
+The host does not receive its own frames, so any such frame comes from another master.
 """
 
 from __future__ import annotations
@@ -16,31 +16,31 @@ from skinnode.config import BusConfig
 _log = logging.getLogger(__name__)
 
 QUIET_NS: Final = 10_000_000_000
-"""Duration of silence after which new frames from another master are logged again, ns."""
+"""Minimum silence after which frames of the same type from another master are logged again, ns."""
 
 SYNC, NMT, SDO, HEARTBEAT = "SYNC", "NMT commands", "SDO requests to our nodes", "our own heartbeat"
 
 
 @dataclass(frozen=True, slots=True)
 class OtherMasterStats:
-    """Frames that only a master sends, from senders other than this host.
+    """Counters of frames that only masters send, from senders other than this host.
 
-    On a bus that another master runs, the first two counters stay 0: SYNC and NMT commands are not counted
-    there.
+    On a bus that another master runs, SYNC and NMT commands are not counted, so ``syncs`` and
+    ``nmt_commands`` stay 0.
     """
 
     syncs: int
     nmt_commands: int
     sdo_requests: int
-    """SDO requests to the hand's nodes, from a second host or a technician's tool."""
+    """Number of SDO requests to the hand's nodes, from a second host or a technician's tool."""
     heartbeats: int
-    """Heartbeats with the host's node-ID."""
+    """Number of heartbeats with the host's node-ID."""
     last_ns: int | None
-    """Monotonic time of the newest frame from another master; None before the first."""
+    """Monotonic time of the newest frame from another master, ns; None before the first such frame."""
 
 
 class OtherMasters:
-    """Counter of other masters' frames on one bus; logs the first frame of each kind. Mainline only."""
+    """Counter of other masters' frames on one bus. Logs the first frame of each type. Mainline only."""
 
     def __init__(self, bus: BusConfig) -> None:
         self._bus = bus
@@ -48,7 +48,7 @@ class OtherMasters:
         self._last_ns: dict[str, int] = {}
 
     def handlers(self, node_ids: list[int]) -> dict[int, Callable[[bytes, int], None]]:
-        """Return handlers for frames that only a master sends.
+        """Return the handlers, by COB-ID, that count frames only a master sends.
 
         If another master runs the bus, there are no handlers for SYNC or NMT commands.
 

@@ -1,4 +1,4 @@
-"""Places of the patches on a robot: each on its link, and each link in the frame of the hand."""
+"""Store where patches are: each patch's pose on its link, and each link's pose in the hand's frame."""
 
 from __future__ import annotations
 
@@ -12,23 +12,23 @@ from skinnode.model.pose import Pose
 
 @dataclass(frozen=True, slots=True)
 class Skeleton:
-    """Places of a hand's patches: where each sits on its link, and where the links are."""
+    """Poses of a hand's patches on their links, and of the links in the hand's coordinate frame."""
 
     mounts: Mapping[str, Mount] = field(default_factory=dict)
-    """Place by patch name; a patch that is not listed is fixed to the hand, at its origin."""
+    """Link and pose by patch name; a patch that is not listed is at the origin of the hand's frame."""
     link_poses: Mapping[str, Pose] = field(default_factory=dict)
-    """Pose in the hand by link name; the frame of a link that is not listed is that of the hand."""
+    """Pose in the hand's frame by link name; the frame of a link that is not listed is the hand's frame."""
 
     @classmethod
     def of(cls, hand: HandConfig) -> Skeleton:
-        """Return the places that a hand file gives."""
+        """Return the poses defined in a hand file."""
         mounts = {each.name: Mount(each.link or HAND, each.pose.build()) for each in hand.patches}
         return cls(mounts, {link.name: link.pose.build() for link in hand.links})
 
     def mount(self, patch: str) -> Mount:
-        """Return the place of a patch."""
+        """Return the link and the pose of a patch."""
         return self.mounts.get(patch, Mount())
 
     def link_pose(self, link: str) -> Pose:
-        """Return the pose of a link in the frame of the hand."""
+        """Return the pose of a link in the hand's coordinate frame."""
         return self.link_poses.get(link, Pose())

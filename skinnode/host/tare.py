@@ -1,4 +1,4 @@
-"""Tare a patch: the node adopts a new baseline, which the host reads and uses to solve scans."""
+"""Tare a patch: the node measures a new baseline, which the host reads and uses to solve scans."""
 
 from __future__ import annotations
 
@@ -11,12 +11,13 @@ from skinnode.host.remote_node import RemoteNode
 from skinnode.process import clock
 
 TARE_DEADLINE_S: Final = 5.0
-"""Default deadline for a tare in s, excluding the SYNC periods below: 16 readings take milliseconds, reading
-a baseline takes 0.1 to 0.3 s, and the supervisor may pause for 2 s after the previous reading."""
+"""Default deadline for a tare, s, to which :data:`TARE_DEADLINE_SYNCS` periods are added. The node's 16
+readings take milliseconds, reading the baseline takes 0.1 to 0.3 s, and the supervisor may pause for 2 s
+after the previous reading."""
 
 TARE_DEADLINE_SYNCS: Final = 3
-"""Number of SYNC periods added to the deadline, because the summary of the next scan announces the new
-baseline."""
+"""Number of SYNC periods added to the deadline for a tare, because the summary of the next scan announces the
+new baseline."""
 
 _POLL_S: Final = 0.005
 
@@ -24,17 +25,17 @@ _POLL_S: Final = 0.005
 def tare(
     node: RemoteNode, baselines: Callable[[], int], health: Callable[[], PatchHealth], deadline_s: float
 ) -> None:
-    """Tare a patch and return once its scans are solved with the new baseline.
+    """Tare a patch, and return when its scans are solved with the new baseline.
 
     Args:
-        node: The node of the patch.
-        baselines: Returns how many baselines have been read.
-        health: Returns the health of the patch.
-        deadline_s: Maximum wait, s.
+        node: Node of the patch.
+        baselines: Function that returns the number of new baselines read so far.
+        health: Function that returns the health of the patch.
+        deadline_s: Maximum wait for the new baseline, s.
 
     Raises:
-        NodeTimeout: after ``deadline_s``.
-        SkinError: as raised by :meth:`RemoteNode.tare`.
+        NodeTimeout: if no new baseline is in use after ``deadline_s``.
+        SkinError: if :meth:`RemoteNode.tare` raises it.
     """
     before, emergencies = baselines(), health().emergencies
     node.tare()

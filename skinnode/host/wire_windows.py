@@ -1,14 +1,18 @@
-"""Find noisy and drifting wires in windows of scans, and measure the noise that the codes show.
+"""Detect noisy and drifting wires in windows of successive scans, and measure the noise of the codes.
 
-Noise and drift are evaluated over windows of ``WINDOW`` scans, and their criteria must be met in ``WINDOWS``
-consecutive windows. Taking the second difference of a code over time removes steady movement; a wire is noisy
-if the mean square of this difference exceeds ``NOISY`` times the value for the median wire on its side, and
-``NOISY`` times the value for the expected noise. A wire drifts if the resistances of all its crossings have
-changed by the same fraction of R0, if this change exceeds ``DRIFT`` relative to both the median wire and the
-rest state, and if its neighbours have not followed. A touch, in contrast, changes the crossings of a wire
-unevenly, and the rubber spreads the change to the adjacent wires. Simulated touches (spheres of 2 mm to 0.3 m
-pressed in by 10 to 60 %) changed a wire by more than ``DRIFT`` at 780,000 instants; none was mistaken for
-drift. Consequently, two neighbours that drift alike are not reported, nor is a wire while it is touched.
+Noise and drift are evaluated over windows of ``WINDOW`` scans, and a wire is reported if its criterion is met
+in ``WINDOWS`` consecutive windows.
+
+A wire is noisy if the mean square of its codes' second differences over time exceeds ``NOISY`` times the
+value for the median wire on its side, and ``NOISY`` times the value for the expected noise. Second
+differences are used because they do not depend on steady movement.
+
+A wire drifts if the resistances of all its crossings have changed by the same fraction of R0, while its
+neighbours have not changed in the same way. The change must exceed ``DRIFT`` relative to both the median wire
+and the rest state. A touch, in contrast, changes the crossings of a wire unevenly, and the rubber spreads the
+change to the adjacent wires. In simulated touches (spheres of 2 mm to 0.3 m with indentations of 10 to 60 %),
+a wire changed by more than ``DRIFT`` at 780,000 instants, and no change was mistaken for drift. The criterion
+has a cost: two neighbours that drift alike are not reported, and neither is a touched wire.
 """
 
 from __future__ import annotations
@@ -29,21 +33,22 @@ WINDOW: Final = 16
 WINDOWS: Final = 3
 """Number of consecutive windows in which a wire must be noisy or drift before it is reported."""
 NOISY: Final = 25.0
-"""Minimum ratio of a noisy wire's noise power to the median wire's: five times the amplitude."""
+"""Minimum ratio of a noisy wire's noise power to the median wire's noise power, or five times the
+amplitude."""
 DRIFT: Final = 1e-3
-"""Minimum drift as a fraction of R0: a tenth of the change that a light touch causes in the wire pairs below
-it."""
+"""Minimum drift of a drifting wire, as a fraction of R0: a tenth of the change that a light touch causes in
+the crossings below it."""
 UNEVEN: Final = 0.05
-"""Maximum deviation of a crossing from the median of its wire, as a fraction of the drift."""
+"""Maximum deviation of a crossing from the median of its drifting wire, as a fraction of the drift."""
 APART: Final = 0.3
-"""Minimum difference in R / R0 between a wire and the more similar of its neighbours, as a fraction of the
-drift."""
+"""Minimum difference in R / R0 between a drifting wire and the more similar of its two neighbours, as a
+fraction of the drift."""
 _SHOWN: Final = 8
-"""Number of recent windows in which noise must show."""
+"""Number of most recent windows that determine the measured noise."""
 
 
 class WireWindows:
-    """Noise and drift of the wires of one patch. Owned by the mainline.
+    """Detector of noise and drift in the wires of one patch. Owned by the mainline.
 
     Args:
         scale: Scale of the codes.
@@ -53,21 +58,22 @@ class WireWindows:
     def __init__(self, scale: CodeScale, relative_noise: float) -> None:
         self._scale, self._relative_noise = scale, relative_noise
         self.wires: tuple[WireFault, ...] = ()
-        """Wires that are noisy or drift."""
+        """Faults of the noisy and the drifting wires."""
         self.windows = 0
-        """Number of windows evaluated."""
-        self._odd: dict[WireFault, int] = {}  # consecutive windows in which a wire was noisy or drifted
+        """Number of windows evaluated so far."""
+        self._odd: dict[WireFault, int] = {}  # number of consecutive windows with each fault
         self._window: list[Codes] = []
-        self._measured: NDArray[np.bool_] | None = None  # codes present in all scans of the window; None: all
+        # crossings measured in all scans of the window; None if all
+        self._measured: NDArray[np.bool_] | None = None
         self._shown: deque[float] = deque(maxlen=_SHOWN)
 
     @property
     def shown_noise(self) -> float:
-        """Noise that each of the recent windows has shown, codes; 0 if one of them showed none."""
+        """Minimum noise over the most recent windows, codes; 0 if a window had no measurable noise."""
         return min(self._shown) if len(self._shown) == _SHOWN else 0.0
 
     def on_scan(self, scan: Scan) -> None:
-        """Evaluate the next complete scan in which every code was sent."""
+        """Evaluate the next scan, which must be complete and contain every code."""
         if not scan.valid.all():
             self._measured = scan.valid if self._measured is None else self._measured & scan.valid
         self._window.append(scan.codes)
@@ -85,7 +91,7 @@ class WireWindows:
             return
         codes = np.array(self._window, dtype=np.float64)
         ratio = np.where(measured, scale.lo + codes.mean(axis=0) * scale.step, np.nan)
-        # A second difference has six times the variance of a value: 1 + 4 + 1.
+        # The variance of a second difference is six times (1 + 4 + 1) the variance of a value.
         roughness = (np.diff(codes, 2, axis=0) ** 2).sum(axis=0)
         noise = np.where(measured, roughness / (6.0 * (WINDOW - 2)), np.nan)
         self._shown.append(_shown_noise(codes, noise))
@@ -98,7 +104,7 @@ class WireWindows:
             off = np.abs(ratio - (gain[:, None] if axis else gain))
             spread = _of_wires(off, axis, whole, np.max, np.nanmax)
             quiet = max(expected, _median_of_known(level))
-            # The distance from rest also matters: if a touch moved the median wire, the untouched wires
+            # The change from rest is also required: if a touch changed the median wire, the untouched wires
             # deviate from the median.
             away = np.minimum(np.abs(gain - _median_of_known(gain)), np.abs(gain - 1.0))
             step = np.concatenate(([np.inf], np.abs(np.diff(gain)), [np.inf]))
@@ -113,14 +119,14 @@ class WireWindows:
 
 
 def _shown_noise(codes: NDArray[np.float64], power: NDArray[np.float64]) -> float:
-    """Return the noise that at least three quarters of the crossings show, codes; 0 if they show none.
+    """Return the noise that three quarters of the crossings exceed, codes; 0 if it is not measurable.
 
-    Only a crossing that has visited three codes without moving away shows noise: a quiet one whose value lies
-    on the edge of a step alternates between two.
+    Only crossings that have taken at least three different codes without a lasting change are measured. Even
+    a crossing without noise alternates between two codes if its value is at the edge of a quantization step.
 
     Args:
-        codes: (WINDOW, U, K) codes.
-        power: (U, K) mean square of the noise, codes²; NaN where a code is not a measurement.
+        codes: (WINDOW, U, K) codes of a window.
+        power: (U, K) codes²: mean square of the noise; NaN where a code is not a measurement.
     """
     half = WINDOW // 2
     moved = np.abs(codes[half:].mean(axis=0) - codes[:half].mean(axis=0))
@@ -130,14 +136,14 @@ def _shown_noise(codes: NDArray[np.float64], power: NDArray[np.float64]) -> floa
 
 
 def _median(values: NDArray[np.float64], axis: int) -> NDArray[np.float64]:
-    """Return the median of values that contain no NaN; for a patch, three times as fast as ``np.median``."""
+    """Return the median of values without NaN; three times as fast as ``np.median`` for a patch."""
     ordered, count = np.sort(values, axis=axis), values.shape[axis]
     middle: NDArray[np.float64] = ordered.take([(count - 1) // 2, count // 2], axis=axis).sum(axis=axis)
     return 0.5 * middle
 
 
 def _median_of_known(values: NDArray[np.float64]) -> float:
-    """Return the median of the values that are not NaN; NaN if all are NaN."""
+    """Return the median of the values that are not NaN; NaN if all values are NaN."""
     known = values[~np.isnan(values)]
     return float(_median(known, 0)) if known.size else math.nan
 
@@ -145,9 +151,9 @@ def _median_of_known(values: NDArray[np.float64]) -> float:
 def _of_wires(
     values: NDArray[np.float64], axis: int, whole: NDArray[np.bool_], plain: Any, without_nan: Any
 ) -> NDArray[np.float64]:
-    """Reduce each wire's crossings to one number, ignoring NaN (not measured); NaN if all are NaN.
+    """Reduce each wire's crossings to one number, ignoring NaN; NaN if all crossings are NaN.
 
-    The branch for patches without faults is ten times as fast as the other branch.
+    NaN denotes a crossing that was not measured. Without NaN, the function is ten times as fast.
     """
     if not np.isnan(values).any():
         return np.asarray(plain(values, axis=axis))

@@ -1,9 +1,10 @@
-"""LSS master (CiA 305 v3.0): finds nodes without a node-ID, and sets a node's node-ID and bit rate.
+"""Find nodes without a node-ID, and set node-IDs and bit rates, as an LSS master (CiA 305 v3.0).
 
-A slave that does not match stays silent, so every negative result costs a timeout. Responses are not
-numbered: a late response to an earlier request looks like a response to the current request. Therefore a node
-counts as found or selected only once it has sent its own address, which is unlike any other response; and
-after a service without a response, the master waits until a late response can no longer arrive.
+A slave that does not match a request stays silent, so every negative result takes a full timeout. LSS
+responses are not numbered, so a late response to an earlier request looks like a response to the current
+request. A node therefore counts as found or selected only if it has sent its own address, which differs from
+any other response. After a service without a response, the master waits until a late response can no longer
+arrive.
 """
 
 from __future__ import annotations
@@ -29,42 +30,42 @@ from skinnode.errors import BusError
 from skinnode.process import clock
 
 ANSWER_S: Final = 0.1
-"""Maximum wait for a response, s; LSS frames have the lowest priority of all CANopen frames."""
+"""Maximum wait for an LSS response, s. LSS frames have a low priority on the bus."""
 
 STORE_ANSWER_S: Final = 2.0
-"""Maximum wait for the response to the store command, s: the node writes to flash memory, or to a file that
-it synchronises to disk. CANopenNode's LSS master waits 1 s for any response."""
+"""Maximum wait for the response to the store command, s. The node writes to flash memory or to a file that it
+synchronises to disk. For comparison, CANopenNode's LSS master waits 1 s for every response."""
 
 _SCAN_ANSWERS_S: Final = (0.03, 0.15)
-"""Timeouts for the requests in a fastscan, s; every negative result costs one timeout, and the longer timeout
-is used if the first attempt found no node."""
+"""Timeouts for the requests of a fastscan, s. Every negative result takes one timeout, so the longer timeout
+is used only if the first attempt found no node."""
 
 _TRIES: Final = 2
-"""Number of requests without a response after which a node is assumed not to exist; a busy computer may miss
-a response."""
+"""Number of requests without a response after which a node is assumed not to exist. A single request is not
+enough, because a busy computer may miss a response."""
 
 _SETTLE: Final = 0.2
-"""Maximum spread in time of several slaves' responses to one request, as a fraction of the timeout."""
+"""Maximum time between several slaves' responses to one request, as a fraction of the timeout."""
 
 _UNDER_WAY_S: Final = 0.4
-"""Time after which a missing response can no longer arrive, s."""
+"""Time after a timeout at which a late response can no longer arrive, s."""
 
 _PARTS: Final = 4
 _REVISIONS: Final = od.REVISION_NUMBER, od.UNCHECKED_REVISION_NUMBER
 _LIKELY: Final = (od.VENDOR_ID,), (od.PRODUCT_CODE,), _REVISIONS
-"""Values of the address parts in skinnode patches; fastscan tries them first, and the search then takes three
-or four requests instead of 96."""
+"""Values of the first address parts of skinnode patches: vendor-ID, product code and revision. A fastscan
+tries these values first and then needs three or four requests for these parts instead of 96."""
 
 
 class LssFailed(BusError):
-    """A slave refused a service, or did not respond."""
+    """Failed LSS service: the slave refused the service or did not respond."""
 
 
 class LssMaster:
-    """LSS master on one bus. Sends with ``send``; :meth:`on_response` takes the frames with COB-ID 0x7E4.
+    """LSS master on one bus. ``send`` sends its frames; :meth:`on_response` receives frames with COB-ID 0x7E4.
 
-    Threads: only one thread at a time may use it, but concurrent calls to :meth:`give_node_id` are
-    serialised; the mainline calls :meth:`on_response`.
+    Threads: only one thread at a time may use the master, except that concurrent calls to
+    :meth:`give_node_id` are serialised. The mainline calls :meth:`on_response`.
     """
 
     def __init__(self, send: Callable[[int, bytes], None]) -> None:
@@ -73,17 +74,18 @@ class LssMaster:
         self._dialogue = clock.lock()
 
     def on_response(self, data: bytes, t_ns: int) -> None:
-        """Process a slave's response; as the standard requires, ignore it unless it is 8 bytes long."""
+        """Process a slave's response. As CiA 305 requires, ignore responses that are not 8 bytes long."""
         if len(data) == 8:
             self._answers.put(data)
 
     def give_node_id(self, serial: int, node_id: int) -> bool:
         """Make the patch with this serial number boot with ``node_id``, without storing the node-ID.
 
-        Storing is left to technicians. A patch that already has the node-ID stays unchanged.
+        The decision to store a node-ID is left to technicians. A patch that already has the node-ID stays
+        unchanged.
 
         Returns:
-            Whether there is such a patch and it accepted the node-ID.
+            Whether the patch was found and accepted the node-ID.
 
         Raises:
             BusError: if a frame cannot be sent.
@@ -97,7 +99,7 @@ class LssMaster:
                     self.set_node_id(node_id)
             except LssFailed:
                 return False
-            finally:  # a slave without a node-ID boots when it is released
+            finally:  # on release, a slave that has received its first node-ID boots
                 self.release()
             if active not in (None, node_id):
                 self._send(od.NMT_COB_ID, nmt.encode(nmt.NmtCommand.RESET_COMMUNICATION, active))
@@ -106,10 +108,10 @@ class LssMaster:
     # --- nodes without a node-ID
 
     def any_unconfigured(self) -> bool:
-        """Return whether there is a node without a node-ID.
+        """Return whether any node on the bus lacks a node-ID.
 
-        Sends *identify non-configured remote slave* and the first request of fastscan, because some stacks
-        (CANopenNode) support only fastscan.
+        The master sends the service *identify non-configured remote slave* and the first request of a
+        fastscan, because some stacks (CANopenNode) support only fastscan.
         """
         expected = bytes((LssCommand.IDENTIFIED_NOT_CONFIGURED,))
         if any(self._ask(LssCommand.IDENTIFY_NOT_CONFIGURED, expected=expected) for _ in range(_TRIES)):
@@ -119,10 +121,10 @@ class LssMaster:
     def find_unconfigured(self) -> LssAddress | None:
         """Find a node without a node-ID by fastscan.
 
-        The node stays in configuration state until :meth:`release`.
+        The node found stays in configuration state until :meth:`release`.
 
         Returns:
-            Its address, or None if no node was found.
+            LSS address of the node, or None if no node was found.
         """
         for answer_s in _SCAN_ANSWERS_S:
             if self._scan(0, RESET_SCAN, 0, 0, ANSWER_S) is None:
@@ -140,7 +142,7 @@ class LssMaster:
         return None
 
     def _scan_part(self, part: int, answer_s: float) -> int | None:
-        """Return one part of the address of a node still in the fastscan; None if no node remains."""
+        """Return one part of an LSS address found by fastscan; None if no node responds any more."""
         following = (part + 1) % _PARTS
         for likely in _LIKELY[part] if part < len(_LIKELY) else ():
             if self._scan(likely, 0, part, following, answer_s) is not None:
@@ -154,14 +156,15 @@ class LssMaster:
     def _scan(self, value: int, bit: int, part: int, following: int, answer_s: float) -> bytes | None:
         data = value.to_bytes(4, "little") + bytes((bit, part, following))
         answer = self._ask(LssCommand.FASTSCAN, data, bytes((LssCommand.IDENTIFIED,)), answer_s)
-        if answer is not None:  # other slaves may respond a little later; wait before the next request
+        # wait before the next request, because other slaves may respond a little later
+        if answer is not None:
             clock.sleep(answer_s * _SETTLE)
         return answer
 
     # --- one node
 
     def select(self, address: LssAddress) -> bool:
-        """Switch the node with this address to configuration state. Returns whether there is such a node."""
+        """Switch the node with this address to configuration state. Returns whether the node was found."""
         self.release()
         for command, value in enumerate(address[:3], LssCommand.SELECT_VENDOR):
             self._request(command, value.to_bytes(4, "little"))
@@ -174,10 +177,10 @@ class LssMaster:
         return False
 
     def select_patch(self, serial: int) -> LssAddress | None:
-        """Switch the patch with this serial number, whatever its revision, to configuration state.
+        """Switch the patch with this serial number and any revision to configuration state.
 
         Returns:
-            Its address, or None if there is no such patch.
+            LSS address of the patch, or None if the patch was not found.
         """
         for revision in _REVISIONS:
             address = LssAddress(od.VENDOR_ID, od.PRODUCT_CODE, revision, serial)
@@ -186,17 +189,17 @@ class LssMaster:
         return None
 
     def _is_in_configuration(self, address: LssAddress) -> bool:
-        """Return whether the node in configuration state reports this address."""
+        """Return whether the node in configuration state reports this LSS address."""
         return all(
             self._ask(command, b"", bytes((command,)) + value.to_bytes(4, "little")) is not None
             for command, value in enumerate(address, LssCommand.INQUIRE_VENDOR)
         )
 
     def node_id(self) -> int | None:
-        """Return the node-ID of the node in configuration state; None if it has no node-ID.
+        """Return the node-ID of the node in configuration state, or None if the node has no node-ID.
 
         Raises:
-            LssFailed: if the node does not answer.
+            LssFailed: if the node does not respond.
         """
         answer = self._must(LssCommand.INQUIRE_NODE_ID, b"", "the node-ID inquiry")
         return None if answer[1] == NOT_CONFIGURED else answer[1]
@@ -205,17 +208,17 @@ class LssMaster:
         """Set the node-ID that the node uses after its next communication reset.
 
         Raises:
-            LssFailed: if the node refuses or does not answer.
+            LssFailed: if the node refuses the node-ID or does not respond.
         """
         answer = self._must(LssCommand.CONFIGURE_NODE_ID, bytes((node_id,)), f"node-ID {node_id}")
         _require_done(answer, f"node-ID {node_id}")
 
     def set_bit_rate(self, bitrate_bps: int) -> None:
-        """Set the bit rate that the node uses after its next power-on, provided the bit rate is stored.
+        """Set the bit rate that the node uses after its next power-on, provided that the bit rate is stored.
 
         Raises:
-            LssFailed: if the node refuses or does not answer.
-            ValueError: if CiA 301 does not define the bit rate.
+            LssFailed: if the node refuses the bit rate or does not respond.
+            ValueError: if the bit rate is not one of those defined by CiA 301.
         """
         codes = {rate: code for code, rate in BIT_RATES_BPS.items()}
         if bitrate_bps not in codes:
@@ -225,16 +228,16 @@ class LssMaster:
         _require_done(self._must(LssCommand.CONFIGURE_BIT_TIMING, request, what), what)
 
     def store(self) -> None:
-        """Make the node store its node-ID and bit rate, so that it keeps them across a power cycle.
+        """Make the node store its node-ID and bit rate, so that they survive a power cycle.
 
         Raises:
-            LssFailed: if the node refuses or does not answer.
+            LssFailed: if the node refuses the command or does not respond.
         """
         answer = self._must(LssCommand.STORE, b"", "the store command", STORE_ANSWER_S)
         _require_done(answer, "the store command")
 
     def release(self) -> None:
-        """Switch all nodes to waiting state; a node that has just received its first node-ID boots."""
+        """Switch all nodes to waiting state, in which a node that has just received its first node-ID boots."""
         self._request(LssCommand.SWITCH_GLOBAL, bytes((LssState.WAITING,)))
 
     # --- frames
@@ -251,8 +254,8 @@ class LssMaster:
     ) -> bytes | None:
         """Send a request and return the first response that starts with ``expected``.
 
-        ``expected`` is the command by default. Other responses belong to earlier requests and are discarded.
-        Returns None if no such response arrives in time.
+        The default for ``expected`` is the command itself. Other responses belong to earlier requests and are
+        discarded. Returns None if no expected response arrives in time.
         """
         expected = bytes((command,)) if expected is None else expected
         while not self._answers.empty():

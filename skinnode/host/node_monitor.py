@@ -1,4 +1,4 @@
-"""Collect a node's messages other than scans, and derive the health of its patch from them."""
+"""Process a node's heartbeats and emergency messages, and derive the health of its patch."""
 
 from __future__ import annotations
 
@@ -25,31 +25,31 @@ from skinnode.host.health import (
 _log = logging.getLogger(__name__)
 
 RESTART_MEMORY_NS: Final = 5_000_000_000
-"""Time after the last restart during which a node counts as restarting in a loop, ns."""
+"""Time after the last restart of a loop during which the loop is still reported, ns."""
 
 SETTLED_NS: Final = 500_000_000
-"""Time for which a node still counts as restarting after the last restart of a loop, even if it is
-operational again, ns."""
+"""Time after the last restart of a loop during which a node counts as restarting even if it is operational
+again, ns."""
 
 LOOP_RESTARTS: Final = 3
 LOOP_NS: Final = 10_000_000_000
-"""Number of spontaneous restarts of a node, and the time within which they count as a loop."""
+"""Minimum number of spontaneous restarts in a loop, and the maximum duration of these restarts, ns."""
 
 BEATS: Final = 12
 BEATS_TOO_OFTEN: Final = 0.7
-"""Number of heartbeats observed, and the fraction of their expected duration below which two nodes must be
-sending them. Two nodes with the same node-ID send a heartbeat every half period on average; a single node
-that catches up after a delay stays well above this fraction."""
+"""Number of heartbeats examined, and the maximum ratio of their actual to their expected duration that proves
+a second node. Two nodes with the same node-ID together send two heartbeats per period. A single node that
+catches up after a delay stays well above this ratio."""
 
 
 class NodeMonitor:
-    """Facts about one node. Written on the mainline; :meth:`health` may be called from any thread.
+    """Collector of facts about one node. Mainline only, except :meth:`health` (any thread).
 
     Args:
         patch: Name of the patch.
-        node_id: Node-ID of its node.
-        on_reject: Called with each malformed heartbeat or EMCY.
-        watch: Evaluates the codes of the patch.
+        node_id: Node-ID of the patch's node.
+        on_reject: Called with each malformed heartbeat or EMCY message.
+        watch: Fault detector for the codes of the patch.
     """
 
     def __init__(
@@ -64,45 +64,45 @@ class NodeMonitor:
         self._beats: deque[int] = deque(maxlen=BEATS)
         self._restarts: deque[int] = deque(maxlen=LOOP_RESTARTS)
         self.on_reject = on_reject
-        """Called with each malformed heartbeat or EMCY."""
+        """Function called with each malformed heartbeat or EMCY message."""
         self.nmt_state: int | None = None
         self._t_heartbeat_ns: int | None = None
         self._t_scan_ns: int | None = None
         self._boot_ups = self._emergencies = self._slow_overruns = self._error_register = 0
         self._registers_said = 0
-        self._last_emergency: tuple[int, bytes] | None = None  # code and detail
+        self._last_emergency: tuple[int, bytes] | None = None  # error code and manufacturer-specific bytes
         self.running = False
-        """Whether the node has been started; from then on, a boot-up counts as a restart."""
+        """Whether the node has been started, so that further boot-ups count as spontaneous restarts."""
         self.rejoins = self.baselines = 0
         self.refusal: str | None = None
         self.defect: str | None = None
         self.complaint: str | None = None
-        """Set by the supervisor, as are ``refusal`` and ``defect``."""
+        """Reason why the last bring-up failed; set by the supervisor, like ``refusal`` and ``defect``."""
 
     @property
     def boot_ups(self) -> int:
-        """Number of boot-up messages."""
+        """Number of boot-up messages received from the node."""
         return self._boot_ups
 
     @property
     def t_heartbeat_ns(self) -> int | None:
-        """Monotonic time of the newest heartbeat or boot-up; None before the first."""
+        """Monotonic time of the newest heartbeat or boot-up message, ns; None before the first."""
         return self._t_heartbeat_ns
 
     @property
     def t_scan_ns(self) -> int | None:
-        """Monotonic time of the last frame of the newest scan; None before the first."""
+        """Monotonic time of the newest scan's last frame, ns; None before the first scan."""
         return self._t_scan_ns
 
     def on_heartbeat(self, data: bytes, t_ns: int) -> None:
-        """Process a heartbeat or boot-up; reject it if it is not one byte long."""
+        """Process a heartbeat or boot-up message. Messages that are not one byte long are rejected."""
         if len(data) != 1:
             self.on_reject(CodecError(heartbeat_cob_id(self.node_id), data, "1 byte (heartbeat)"))
             return
         state = data[0] & STATE_MASK  # bit 7 is the toggle bit of node guarding
         if state == NmtState.INITIALISING:
             self._boot_ups += 1
-            self._on_register(0)  # as after any reset; an error that persists is reported again
+            self._on_register(0)  # a reset clears the register, and persistent errors are reported again
             if self.running:
                 self._restarts.append(t_ns)
                 _log.warning("node %d (%s) restarted by itself", self.node_id, self.patch)
@@ -112,9 +112,10 @@ class NodeMonitor:
         self._t_heartbeat_ns = t_ns
 
     def on_emergency(self, data: bytes, t_ns: int) -> None:
-        """Process an EMCY: u16 code, u8 error register, five manufacturer-specific bytes.
+        """Process an EMCY message.
 
-        Code 0 means that the error has been cleared.
+        The message contains an error code (u16), the error register (u8) and five manufacturer-specific
+        bytes. Error code 0 means that the error has been cleared.
         """
         if len(data) != 8:
             self.on_reject(CodecError(emcy_cob_id(self.node_id), data, "8 bytes (EMCY)"))
@@ -128,19 +129,19 @@ class NodeMonitor:
 
     @property
     def error_register(self) -> int:
-        """Error register as last reported."""
+        """Most recently reported error register of the node."""
         return self._error_register
 
     @property
     def registers_said(self) -> int:
-        """Number of times the error register was reported."""
+        """Number of times that the node's error register has been reported."""
         return self._registers_said
 
     def on_register_read(self, register: int, said: int) -> None:
-        """Use an error register read by SDO, unless a newer report has arrived since the request.
+        """Store an error register read by SDO, unless a report has arrived since the request.
 
         Args:
-            register: The value read.
+            register: Value of the error register.
             said: :attr:`registers_said` at the time of the request.
         """
         if said == self._registers_said:
@@ -170,12 +171,12 @@ class NodeMonitor:
         """Return the health of the patch.
 
         Args:
-            now_ns: Monotonic time.
+            now_ns: Current monotonic time, ns.
             heartbeat_s: Heartbeat period of the node, s.
             scan_s: Scan period, s.
             conflicts: Number of frames that contradict other frames of the same scan.
-            t_passed_ns: Monotonic time at which the newest scan that was not withheld was received; 0 before
-                the first, None if scans are never withheld.
+            t_passed_ns: Monotonic arrival time of the newest scan that was not withheld, ns; 0 before the
+                first such scan, None if scans are never withheld.
         """
 
         def age_s(t_ns: int | None) -> float | None:
@@ -233,9 +234,9 @@ class NodeMonitor:
         )
 
     def _emergency_text(self, code: int, detail: bytes) -> str:
-        """Return the text of an emergency, using skinnode's error texts unless the node is refused.
+        """Return the text of an emergency message.
 
-        A refused node may be a different kind of device.
+        skinnode's error texts are not used for a refused node, which may be a different type of device.
         """
         return error_text(code, detail, ours=self.refusal is None)
 
@@ -246,7 +247,7 @@ class NodeMonitor:
         return restarts[-1] - restarts[0] < LOOP_NS
 
     def _beats_too_often(self, now_ns: int, heartbeat_s: float) -> bool:
-        """Return whether heartbeats arrive so often that two nodes must be sending them."""
+        """Return whether heartbeats arrive so often that two nodes must be sending them under one node-ID."""
         beats, period_ns = list(self._beats), heartbeat_s * 1e9
         if len(beats) < BEATS or now_ns - beats[-1] > HEARTBEATS_MISSED * period_ns:
             return False

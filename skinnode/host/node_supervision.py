@@ -1,4 +1,4 @@
-"""Phases of a supervised node: the actions in each phase, and the transitions between phases."""
+"""Run the state machine of supervised nodes: the actions in each phase, and the phase transitions."""
 
 from __future__ import annotations
 
@@ -20,28 +20,28 @@ from skinnode.text.words import known
 _log = logging.getLogger(__name__)
 
 START_DEADLINE_S: Final = 1.0
-"""Maximum time from the start command to a heartbeat that reports the operational state, s: four heartbeat
-periods."""
+"""Maximum time from the start command to a heartbeat that reports the NMT state operational, s: four
+heartbeat periods."""
 
 _PROBE_NS: Final = 250_000_000
-"""Interval between requests to an absent node: its boot-up message may have been lost, and a node that sends
-no heartbeat would otherwise never be noticed. For four nodes, the requests take 0.1 % of the capacity of a
-bus."""
+"""Interval between requests to an absent node, ns. The node's boot-up message may have been lost, and without
+requests, a node that sends no heartbeats would never be noticed. The requests to four nodes require 0.1 % of
+the capacity of a bus."""
 
 _SEARCH_NS: Final = 1_000_000_000
-"""Interval between LSS searches for an absent node."""
+"""Interval between LSS searches for an absent node, ns."""
 
 _FORGET_NS: Final = 2_000_000_000
-"""Duration of silence after which a node is no longer reported as refused or faulty."""
+"""Duration of silence after which a node is no longer reported as refused or faulty, ns."""
 
 _MUTE_NS: Final = 1_000_000_000
-"""Minimum interval between two readings of the configuration of a node that is not sending scans."""
+"""Minimum interval between two readings of the configuration of a node that sends no scans, ns."""
 
 
 class NodeSupervision:
-    """State machine of each supervised node. Owned by the supervisor's thread.
+    """State machine for all supervised nodes. Owned by the supervisor's thread.
 
-    Jobs that wait for a node run on ``pool``, one job per node at a time.
+    Jobs that wait for a node run on ``pool``, with at most one job per node at a time.
     """
 
     def __init__(self, pool: Executor) -> None:
@@ -49,12 +49,13 @@ class NodeSupervision:
         self._baselines = BaselineWatch(pool)
 
     def look(self, node: Supervised, now_ns: int) -> None:
-        """Advance the state machine of a node at monotonic time ``now_ns``."""
+        """Advance a node's state machine at monotonic time ``now_ns``."""
         count = node.remote.defects.count
         if node.upset or (count != node.defects and node.phase in (Phase.STARTING, Phase.RUNNING)):
             self._make_faulty(node, now_ns)
             return
-        if count != node.defects:  # a bring-up is due anyway; exceptions in frame handlers must not delay it
+        # bring-up is already due, and exceptions in frame handlers must not delay it
+        if count != node.defects:
             node.defects = count
             node.complaint = node.remote.monitor.defect = node.remote.defects.newest
         match node.phase:
@@ -77,12 +78,13 @@ class NodeSupervision:
                 self._begin(node, now_ns)
             return
         if now_ns - max(heard_ns, node.since_ns) > _FORGET_NS:
-            monitor.refusal = monitor.defect = None  # the node is gone, so its fault no longer applies
+            monitor.refusal = monitor.defect = None  # the node has gone, so its error no longer applies
         if remote.listen_only or remote.link.failure is not None:
             return
         if now_ns >= node.probe_ns:
             node.probe_ns = now_ns + _PROBE_NS
-            with contextlib.suppress(BusError):  # the bus is unavailable or full; retried later
+            # if the bus is unavailable or full, the request is repeated later
+            with contextlib.suppress(BusError):
                 remote.probe()
         search_is_over = node.searching is None or node.searching.done()
         if remote.searchable and search_is_over and now_ns - max(node.search_ns, node.since_ns) > _SEARCH_NS:
@@ -90,9 +92,9 @@ class NodeSupervision:
             node.searching = self._pool.submit(_search, remote)
 
     def _begin(self, node: Supervised, now_ns: int) -> None:
-        """Start configuring the node, unless another job is still using it.
+        """Start configuring a node, or abort the job that is still using the node.
 
-        Such a job is aborted, and the configuration is started in a later iteration.
+        After an aborted job, the configuration is started in a later iteration.
         """
         if node.job is not None and not node.job.done():
             node.abandon.set()
@@ -109,9 +111,9 @@ class NodeSupervision:
 
     def _join(self, node: Supervised, now_ns: int) -> None:
         remote, job = node.remote, node.job
-        assert job is not None  # a job exists in this phase
+        assert job is not None  # in phase JOINING, there is always a job
         if remote.monitor.boot_ups != remote.boot_ups:
-            node.abandon.set()  # the node booted again: the configuration written so far is lost
+            node.abandon.set()  # the node booted again and lost the configuration written so far
         if not job.done():
             return
         if node.abandon.is_set():
@@ -134,7 +136,7 @@ class NodeSupervision:
             remote.defects.report("bring-up", error)
             return
         node.phase, node.since_ns, node.probe_ns = Phase.STARTING, now_ns, now_ns + _PROBE_NS
-        if remote.has_other_master:  # the other master starts the node
+        if remote.has_other_master:  # the other master of the bus starts the node
             self._running(node, now_ns)
 
     def _starting(self, node: Supervised, now_ns: int) -> None:
@@ -144,9 +146,10 @@ class NodeSupervision:
         elif remote.monitor.said_since(NmtState.OPERATIONAL, node.since_ns):
             self._running(node, now_ns)
         elif remote.link.t_dispatched_ns > node.since_ns + START_DEADLINE_S * 1e9:
-            silent = remote.monitor.nmt_state == NmtState.OPERATIONAL  # a state reported before the command
+            # the state was reported before the command
+            silent = remote.monitor.nmt_state == NmtState.OPERATIONAL
             self._fail(node, _not_started(remote, silent=silent), now_ns, refused=not silent)
-        elif now_ns >= node.probe_ns:  # NMT commands are unconfirmed: the command may be lost
+        elif now_ns >= node.probe_ns:  # the start command may be lost, because NMT commands are unconfirmed
             node.probe_ns = now_ns + _PROBE_NS
             with contextlib.suppress(BusError):
                 nmt_master.start(remote.link.send, remote.patch.node_id)
@@ -170,13 +173,13 @@ class NodeSupervision:
         monitor = node.remote.monitor
         monitor.complaint = complaint
         monitor.refusal = complaint if refused else None
-        monitor.running = monitor.running and not refused  # Another host may be using the node.
-        self._await_again(node, now_ns, was_silent=True)  # Another node may replace a refused node.
+        monitor.running = monitor.running and not refused  # another host may be using a refused node
+        self._await_again(node, now_ns, was_silent=True)  # another node may replace a refused node
 
     def _make_faulty(self, node: Supervised, now_ns: int) -> None:
-        """Mark a patch as faulty because a defect was reported.
+        """Make a patch faulty after a defect.
 
-        If this method raises an exception, the call is retried in the next iteration.
+        If this method raises an exception, it is called again in the next iteration.
         """
         remote = node.remote
         count = remote.defects.count
@@ -226,7 +229,8 @@ class NodeSupervision:
         if remote.link.t_dispatched_ns > max(said_ns, node.since_ns) + patience_ns and not remote.listen_only:
             _log.warning("node %d (%s) is lost: no heartbeat", remote.patch.node_id, remote.patch.name)
             node.phase, node.since_ns, node.not_before_ns = Phase.AWAITED, now_ns, 0
-            remote.link.call(remote.stream.withhold, remote.defects)  # until the node's state is known
+            # withhold scans until the node is configured again
+            remote.link.call(remote.stream.withhold, remote.defects)
             return
         if node.unconfigured:
             node.unconfigured = False
@@ -241,13 +245,14 @@ class NodeSupervision:
 
 
 def _read_back(node: Supervised) -> None:
-    """Find out whether a node that is not sending scans has lost its configuration."""
-    with contextlib.suppress(BusError, ConfigError):  # the configuration is read again later
+    """Determine whether a node that sends no scans has lost its configuration."""
+    # if reading fails, the configuration is read again later
+    with contextlib.suppress(BusError, ConfigError):
         node.unconfigured = not node.remote.is_configured()
 
 
 def _search(remote: RemoteNode) -> bool:
-    """Search for the patch by LSS. Returns whether the patch was found."""
+    """Search for a node by LSS. Returns whether the node was found."""
     try:
         return remote.search()
     except Exception as error:
@@ -256,7 +261,7 @@ def _search(remote: RemoteNode) -> bool:
 
 
 def _not_started(remote: RemoteNode, *, silent: bool) -> str:
-    """Return why a node does not count as started."""
+    """Return a message that explains why a node does not count as started."""
     node = f"node {remote.patch.node_id}"
     if silent:
         return f"{node}: got no heartbeat within {START_DEADLINE_S:g} s of the start command"

@@ -1,11 +1,10 @@
-"""SDO client: read and write the object dictionary of a remote node.
+"""Read and write the object dictionary of a remote node as an SDO client.
 
-canopen's client blocks the requesting thread; the mainline feeds the client the responses through
-:meth:`SkinNetwork.notify`. This module limits the length and duration of a transfer, because canopen's client
-reads as many bytes as a server sends, however long that takes: a faulty node could fill the memory or block a
-thread forever.
+canopen's SDO client blocks the requesting thread, while the mainline passes the responses to the client
+through :meth:`SkinNetwork.notify`. This module limits the length and the duration of a transfer. canopen's
+client has no such limits, so a faulty node could fill the memory or block a thread forever.
 
-Threads: one thread at a time may use a node; different nodes may be used in parallel.
+Threads: only one thread at a time may access a node. Different nodes may be accessed in parallel.
 """
 
 from __future__ import annotations
@@ -30,11 +29,11 @@ from skinnode.process import clock
 from skinnode.text.words import counted
 
 ATTEMPTS: Final = 3
-"""Maximum number of attempts at a transfer that receives no response, or the response to an earlier
+"""Maximum number of attempts at a transfer that gets no response, or gets the response to an earlier
 transfer."""
 
 _SILENCES: Final = ("No SDO response", "could not be retransmitted")
-"""canopen's messages for a missing response; the second is used after segments have been requested again."""
+"""canopen's error messages for a missing response; the second message follows retransmission requests."""
 
 _OUT_OF_STEP: Final = (
     AbortCode.TOGGLE_BIT,
@@ -44,38 +43,39 @@ _OUT_OF_STEP: Final = (
     AbortCode.INVALID_SEQUENCE,
     AbortCode.CRC,
 )
-"""SDO abort codes by which a node reports that it missed a frame of the transfer, which is then retried:
-toggle bit, time-out, command specifier, block size, sequence number, CRC."""
+"""SDO abort codes with which a node reports that it missed a frame of the transfer: toggle bit, timeout,
+command specifier, block size, sequence number, CRC. The transfer is then retried."""
 
 MAX_UPLOAD_BYTES: Final = 4 * 254 * 254
-"""Maximum length of a value in bytes: the baseline of the largest patch."""
+"""Maximum length of a value, bytes: the baseline of the largest patch."""
 
 MAX_TEXT_BYTES: Final = 4096
-"""Maximum length of a value in bytes where a number or a text is expected."""
+"""Maximum length of a value if a number or a text is expected, bytes."""
 
 _MAX_NUMBER_BYTES: Final = 8
 
 _TRANSFER_S: Final = 5.0
 _SEGMENT_S: Final = 0.02
-"""Maximum duration of a transfer: 5 s, plus 20 ms for each segment of the longest value allowed."""
+"""Maximum duration of a transfer, s: ``_TRANSFER_S``, plus ``_SEGMENT_S`` for each segment of the longest
+value allowed."""
 
 _PLAIN: Final = {"u8": "<B", "u16": "<H", "u32": "<I", "f32": "<f"}
 
-# Transfer errors are raised here, naming the node and the object. Without a handler, Python would also print
-# canopen's own warnings on the terminal.
+# Without a handler, Python would print canopen's warnings to the terminal, in addition to the exceptions that
+# this module raises.
 logging.getLogger("canopen").addHandler(logging.NullHandler())
 
 
 class Abandoned(Exception):
-    """The caller no longer needs the result; the transfer was aborted."""
+    """Abort of a transfer whose result the caller no longer needs."""
 
 
 class _UploadTooLong(Exception):
-    """The node sends more bytes than a value can have, or takes too long."""
+    """Upload that exceeds the maximum length or the maximum duration."""
 
 
 class SkinNetwork(canopen.Network):
-    """canopen network on a skinnode port; its frames go to ``send``."""
+    """canopen network that sends its frames with the function ``send``."""
 
     def __init__(self, send: Callable[[int, bytes], None]) -> None:
         super().__init__()
@@ -93,23 +93,23 @@ class SkinNetwork(canopen.Network):
 
 
 class RemoteOd:
-    """The object dictionary of a node, read and written by SDO.
+    """Object dictionary of a remote node, read and written by SDO.
 
-    Values have one of the types ``u8 u16 u32 f32``. ``abandoned`` is called after each segment; if it returns
-    True, the transfer is aborted and Abandoned is raised. A transfer is also retried after an exception that
-    is not due to a response from the node.
+    Values have one of the types ``u8 u16 u32 f32``. ``abandoned`` is called after each segment. If the result
+    is True, the transfer is aborted and Abandoned is raised. A transfer is also retried after an exception
+    that was not caused by a response from the node.
 
-    Threads: one at a time.
+    Threads: only one thread at a time may use an instance.
 
     Args:
-        network: Sends the requests.
-        node_id: Node-ID of the server.
-        on_defect: Called with each exception that is not due to a response from the node.
+        network: Network that sends the requests.
+        node_id: Node-ID of the SDO server.
+        on_defect: Called with each exception that was not caused by a response from the node.
 
     Raises:
-        NodeTimeout: from all methods, if the node does not answer.
-        SdoAbort: from all methods, if the node aborts the transfer.
-        NodeError: from all methods, if a response is malformed, is longer than allowed, or never ends.
+        NodeTimeout: if the node does not respond; raised by all methods.
+        SdoAbort: if the node aborts the transfer; raised by all methods.
+        NodeError: if a value is malformed, too long or without end; raised by all methods.
     """
 
     def __init__(
@@ -124,7 +124,7 @@ class RemoteOd:
 
     @contextmanager
     def abort_if(self, abandoned: Callable[[], bool]) -> Iterator[None]:
-        """Abort the transfers in this ``with`` block once ``abandoned`` returns True."""
+        """Abort the transfers in the ``with`` block if ``abandoned`` returns True."""
         before, self.abandoned = self.abandoned, abandoned
         try:
             yield
@@ -132,7 +132,7 @@ class RemoteOd:
             self.abandoned = before
 
     def answers(self) -> bool:
-        """Return whether the node answers at all, even if only with an abort. One attempt."""
+        """Return whether the node responds to a single SDO request, possibly with an abort."""
         try:
             self._upload(DEVICE_TYPE, 0, _MAX_NUMBER_BYTES)
         except SdoAbortedError:
@@ -153,11 +153,11 @@ class RemoteOd:
         return True
 
     def read_bytes(self, index: int, subindex: int, most: int = MAX_TEXT_BYTES) -> bytes:
-        """Return the value as received, at most ``most`` bytes."""
+        """Return an object's value of at most ``most`` bytes, without decoding."""
         return bytes(self._transfer(index, subindex, "read", lambda: self._upload(index, subindex, most)))
 
     def read_block(self, index: int, most: int = MAX_UPLOAD_BYTES) -> bytes:
-        """Read a long value, of at most ``most`` bytes, by block transfer with CRC."""
+        """Read a long value of at most ``most`` bytes by block transfer with CRC."""
 
         def ask() -> bytes:
             with BlockUpload(self._client, index) as stream:  # type: ignore[no-untyped-call]
@@ -166,7 +166,7 @@ class RemoteOd:
         return bytes(self._transfer(index, 0, "block read", ask))
 
     def read_large(self, index: int, most: int = MAX_UPLOAD_BYTES) -> bytes:
-        """Read a long value by block transfer, or by segments if the node refuses block transfer."""
+        """Read a long value by block transfer, or by segmented transfer if the node refuses that."""
         try:
             return self.read_block(index, most)
         except SdoAbort:
@@ -183,7 +183,7 @@ class RemoteOd:
         self._transfer(index, 0, "block write", ask)
 
     def read(self, index: int, subindex: int, kind: str) -> Any:
-        """Return the value, decoded as type ``kind``."""
+        """Return an object's value, decoded as type ``kind``."""
         layout = struct.Struct(_PLAIN[kind])
         data = self.read_bytes(index, subindex, _MAX_NUMBER_BYTES)
         if len(data) != layout.size:
@@ -195,28 +195,29 @@ class RemoteOd:
         return layout.unpack(data)[0]
 
     def write(self, index: int, subindex: int, kind: str, value: float) -> None:
-        """Write the value without reading it back."""
+        """Write a value without reading it back."""
         self.write_bytes(index, subindex, struct.pack(_PLAIN[kind], value))
 
     def write_bytes(self, index: int, subindex: int, data: bytes) -> None:
-        """Write the encoded value."""
+        """Write a value that is already encoded."""
 
         def ask() -> None:
-            with Download(self._client, index, subindex, len(data)) as stream:  # type: ignore[no-untyped-call]
+            # type: ignore[no-untyped-call]
+            with Download(self._client, index, subindex, len(data)) as stream:
                 _send(stream, data)
 
         self._transfer(index, subindex, "write", ask)
 
     def write_if_different(self, index: int, subindex: int, kind: str, value: float) -> None:
-        """Write the value and read it back, unless the node already has it."""
+        """Write a value and read it back, unless the node already has this value."""
         if self.read(index, subindex, kind) != value:
             self.write_checked(index, subindex, kind, value)
 
     def write_checked(self, index: int, subindex: int, kind: str, value: float) -> None:
-        """Write the value and read it back.
+        """Write a value and read it back.
 
         Raises:
-            NodeError: if the node kept a different value.
+            NodeError: if the value read back differs.
         """
         self.write(index, subindex, kind, value)
         kept = self.read(index, subindex, kind)
@@ -244,7 +245,7 @@ class RemoteOd:
                 failure = abort
                 if abort.code not in _OUT_OF_STEP:
                     break
-            except Exception as error:  # bugs in canopen raise AttributeError, struct.error etc.
+            except Exception as error:  # bugs in canopen may raise AttributeError, struct.error etc.
                 failure = error
                 if not isinstance(error, SdoError):
                     self._on_defect(error)
@@ -258,8 +259,8 @@ class RemoteOd:
     def _whole(self, stream: Any, most: int) -> bytes:
         """Read a stream to its end.
 
-        Raises SdoCommunicationError if the data is not as long as announced, _UploadTooLong if it is longer
-        than ``most`` or takes too long, and Abandoned once ``abandoned`` returns True.
+        Raises SdoCommunicationError if the data do not have the announced length, _UploadTooLong if they are
+        longer than ``most`` or take too long, and Abandoned if ``abandoned`` returns True.
         """
         if stream.size is not None and stream.size > most:
             raise _UploadTooLong(f"a value of {counted(stream.size, 'byte')}, expected at most {most}")
@@ -304,7 +305,7 @@ class RemoteOd:
 
 
 def _send(stream: Any, data: bytes) -> None:
-    """Write all of ``data``; empty data is sent as one empty segment."""
+    """Write all of ``data`` to a stream. If ``data`` is empty, one empty segment is sent."""
     at = stream.write(data[:SEGMENT_BYTES])
     while at < len(data):
         at += stream.write(data[at : at + SEGMENT_BYTES])

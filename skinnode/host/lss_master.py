@@ -62,7 +62,7 @@ class LssFailed(BusError):
 
 
 class LssMaster:
-    """LSS master on one bus. ``send`` sends its frames; :meth:`on_response` receives frames with COB-ID 0x7E4.
+    """LSS master on one bus. Sends with ``send``; frames with COB-ID 0x7E4 go to :meth:`on_response`.
 
     Threads: only one thread at a time may use the master, except that concurrent calls to
     :meth:`give_node_id` are serialised. The mainline calls :meth:`on_response`.
@@ -237,7 +237,7 @@ class LssMaster:
         _require_done(answer, "the store command")
 
     def release(self) -> None:
-        """Switch all nodes to waiting state, in which a node that has just received its first node-ID boots."""
+        """Switch all nodes to waiting state. A node that has just received its first node-ID then boots."""
         self._request(LssCommand.SWITCH_GLOBAL, bytes((LssState.WAITING,)))
 
     # --- frames

@@ -121,8 +121,8 @@ class WireWindows:
 def _shown_noise(codes: NDArray[np.float64], power: NDArray[np.float64]) -> float:
     """Return the noise that three quarters of the crossings exceed, codes; 0 if it is not measurable.
 
-    Only crossings that have taken at least three different codes without a lasting change are measured. Even
-    a crossing without noise alternates between two codes if its value is at the edge of a quantization step.
+    Only crossings whose codes span at least three values without a lasting change count. Even a crossing
+    without noise alternates between two codes if its value is at the edge of a quantization step.
 
     Args:
         codes: (WINDOW, U, K) codes of a window.

@@ -219,8 +219,8 @@ def reader(made_of: type[_T]) -> Callable[[NDArray[np.int64]], _T]:
     """Return a kernel function that converts a ``made_of`` table to an object with the declared fields.
 
     Only compiled code can call the function. Each use of a field name reads the table again, so read fields
-    before loops. In kernels, bool arrays are uint8. The kernel raises TypeError if the table has a
-    different declaration.
+    before loops. In kernels, bool arrays have the element type uint8. The kernel raises TypeError if the
+    table has a different declaration.
     """
     view, digest = _ViewType(made_of), made_of._digest
     message = f"table: got a table of another class, must be the table of a {made_of.__name__}"

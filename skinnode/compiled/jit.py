@@ -42,7 +42,7 @@ _KERNEL_FILES = (
 def _writable(folder: Path) -> bool:
     try:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-        if folder.stat().st_uid != os.getuid():  # never load code from another user's folder
+        if folder.stat().st_uid != os.getuid():  # code from another user's folder must never be loaded
             return False
         with tempfile.TemporaryFile(dir=folder):
             return True
@@ -116,6 +116,6 @@ def njit_brief(function: _F) -> _F:
 def _kept(function: _F, *, nogil: bool) -> _F:
     compiled: _F = numba.njit(no_cfunc_wrapper=True, **_OPTIONS | {"nogil": nogil})(function)
     folder = cache_dir()
-    if folder is not None and compiled is not function:  # with NUMBA_DISABLE_JIT nothing is compiled
+    if folder is not None and compiled is not function:  # if NUMBA_DISABLE_JIT is set, nothing is compiled
         compiled._cache = KernelCache(function, folder)  # type: ignore[attr-defined]
     return compiled

@@ -125,7 +125,7 @@ def _file_digest(file: str) -> str:
 
 def _read(path: Path) -> bytes:
     """Return the payload of a file. Raises OSError if the file is unreadable, ValueError if it is damaged."""
-    if not stat.S_ISREG(path.stat().st_mode):  # reading a pipe would wait for its writer
+    if not stat.S_ISREG(path.stat().st_mode):  # reading a pipe would block until its writer writes
         raise ValueError("not a file")
     data = path.read_bytes()
     payload = data[_HEAD_BYTES:]

@@ -1,4 +1,4 @@
-"""Explanation, as text, why a field is not trusted."""
+"""Text that explains why a field is not trusted."""
 
 from __future__ import annotations
 

@@ -72,8 +72,8 @@ def point_compliance(rubber: Rubber, offset_m: ArrayLike, *, softening_m: float 
             an ideal point load.
 
     Returns:
-        (P, 3, 3) compliance, m/N. The last axis is the component of the load, the second-to-last axis that of
-        the displacement. Values at the load itself are inf or NaN if ``softening_m`` is 0.
+        (P, 3, 3) compliance, m/N. The last axis is the component of the load; the second-to-last axis is the
+        component of the displacement. Values at the load itself are inf or NaN if ``softening_m`` is 0.
 
     Raises:
         ValueError: If the array has the wrong shape or contains NaN, or the softening is negative.
@@ -92,9 +92,9 @@ def point_compliance(rubber: Rubber, offset_m: ArrayLike, *, softening_m: float 
 def rectangle_compliance(rubber: Rubber, offset_m: ArrayLike, size_m: tuple[float, float]) -> Float:
     """Return the displacement of surface points per unit traction on a rectangle; finite everywhere.
 
-    Closed form for a uniform load on a rectangle (Love, Phil. Trans. A 228, 1929, for the normal part;
-    Johnson eq. 3.25): each entry of the compliance matrix has an elementary antiderivative in x and y, which
-    is evaluated at the corners.
+    The result is the closed form for a uniform load on a rectangle (Love, Phil. Trans. A 228, 1929, for the
+    normal part; Johnson eq. 3.25): each entry of the compliance matrix has an elementary antiderivative in x
+    and y, which is evaluated at the corners.
 
     Args:
         rubber: The material.
@@ -222,7 +222,7 @@ class HertzContact:
         return np.asarray(pressure[:, None] * np.array([*self.traction_ratio, -1.0]))
 
     def displacement_m(self, points_m: ArrayLike) -> Float:
-        """Return the displacement (P, 3) in m of surface points (P, 2) in m; exactly 0 without contact.
+        """Return the displacement (P, 3) in m of surface points (P, 2) in m; exactly 0 without a contact.
 
         Raises:
             ValueError: If the array has the wrong shape or contains NaN.

@@ -58,7 +58,7 @@ class ResistanceFrame:
 
 @dataclass(frozen=True, slots=True)
 class SolveStats:
-    """Computing cost of a solve."""
+    """Number of evaluations and elapsed time of a solve."""
 
     evaluations: int
     """Number of evaluations of F."""
@@ -101,7 +101,7 @@ class Contact:
     includes no such bound."""
     axes: Float = field(default_factory=lambda: _FLAT)
     """(3, 3) unit vectors as rows, in the frame of the layout, at the centre of the contact: along the wire,
-    across the wires and out of the skin. On a flat patch these are x, y and z."""
+    across the wires and out of the skin. On a flat patch, these vectors are the x, y and z axes."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -111,9 +111,9 @@ class FieldFrame:
     displacement_m: Float
     """(U, N, 3) displacement from the rest position, metres."""
     displacement_std_m: Float
-    """(U, N, 3) standard deviation due to noise in the resistances, metres; inf if nothing is known. The
-    part due to a prior includes an allowance for the tail of the prior's errors, so an error above five
-    standard deviations indicates a fault."""
+    """(U, N, 3) standard deviation due to noise in the resistances, metres; inf if the displacement is
+    unknown. The part due to a prior includes an allowance for the tail of the prior's errors, so an error
+    above five standard deviations indicates a fault."""
     status: tuple[Status, ...]
     """Status of each upper wire."""
     residual: Float
@@ -128,7 +128,7 @@ class FieldFrame:
     """``exact`` if each wire was inverted; ``posterior`` if the patch was estimated as a whole."""
     by_prior: NDArray[np.bool_] | None = None
     """(U,) wires whose own equations were not sufficient: in an exact field, wires estimated with the prior;
-    in a posterior field, wires without equations. For these wires, ``trusted`` may rest on the prior
+    in a posterior field, wires without equations. For these wires, ``trusted`` may be based on the prior
     alone."""
     contacts: tuple[Contact, ...] = ()
     """Contacts, strongest first; empty if nothing touches, if no wire could be solved, or if ``contacts`` was

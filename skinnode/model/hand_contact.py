@@ -1,8 +1,9 @@
 """Contacts and wrenches in the frame of a link or of the hand, with their covariances.
 
-A contact on a patch acts with the force f on the skin at the point r. In the frame of a link, its wrench is
-the force f and the torque r × f about the origin of the link's frame. To first order, the covariance of the
-wrench follows from the covariances of f and r, whose errors are assumed to be independent of each other.
+A contact on a patch acts with the force f on the skin at the point r. In the frame of a link, the contact's
+wrench is the force f and the torque r × f about the origin of the link's frame. To first order, the
+covariance of the wrench follows from the covariances of f and r, whose errors are assumed to be independent
+of each other.
 """
 
 from __future__ import annotations
@@ -47,12 +48,13 @@ class HandContact:
     position_covariance_m2: Float
     """(3, 3) covariance of the position, m²."""
     normal: Float
-    """(3,) unit vector out of the skin at the contact. An object presses against this direction."""
+    """(3,) unit vector out of the skin at the contact. A pressing object exerts its normal force in the
+    opposite direction."""
     normal_force_n: float
     """Normal force, N; positive for a press."""
     normal_force_std_n: float
     force_n: Float
-    """(3,) force of the object on the skin, normal force and shear together, N."""
+    """(3,) force of the object on the skin, the vector sum of normal force and shear, N."""
     force_covariance_n2: Float
     """(3, 3) covariance of the force, N²."""
     area_m2: float
@@ -133,7 +135,7 @@ class Wrench:
     """
 
     frame: str
-    """Frame of the vectors; the torque is about its origin."""
+    """Name of the frame of all vectors; the torque is about the origin of this frame."""
     force_n: Float
     """(3,) force on the skin, N."""
     torque_nm: Float

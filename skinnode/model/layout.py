@@ -21,12 +21,12 @@ PRESETS: Final = ("aligned", "symmetric", "staggered")
 PRESET_IDS: Final = {"custom": 0, "aligned": 1, "symmetric": 2, "staggered": 3}  # object 0x2000, layout id
 
 MOST_ELECTRODES: Final = 1024
-"""Maximum number of upper electrodes on a patch, for example 32 × 32. A covariance matrix of their 3072
-coordinates takes 75 MB, and the posterior stores several."""
+"""Maximum number of upper electrodes on a patch, for example 32 × 32. A covariance matrix of 3072 coordinates
+takes 75 MB, and the posterior stores several of these matrices."""
 
 MOST_PAIRS: Final = 1 << 22
-"""Maximum number of pairs of an upper and a lower electrode. Storing their distances takes 100 MB, and each
-evaluation of all wires computes every distance."""
+"""Maximum number of pairs of an upper and a lower electrode. Storing the distances of all pairs takes 100 MB,
+and each evaluation of all wires computes every distance."""
 
 _HASH_RESOLUTION_M: Final = 1e-9
 """Resolution of coordinates in the hash, m; layouts that agree to within a nanometre count as equal."""
@@ -149,12 +149,12 @@ class PatchLayout:
     ) -> PatchLayout:
         """Return a flat layout by name.
 
-        ``aligned``    lower wires straight along y and evenly spaced in x, electrodes offset from the upper
-                       wires by a quarter pitch: the literal reading of the paper's figure
-        ``symmetric``  as ``aligned`` without the offset; the Jacobian is close to singular
-        ``staggered``  lower layer half a pitch wider than the patch, electrodes 1.2 pitches apart, wires
-                       shifted in y by 0.43 (k mod 3 − 1) pitches; measured to be up to a thousand times
-                       better conditioned
+        - ``aligned``: The lower wires run straight along y and are evenly spaced in x. Their electrodes are
+          offset from the upper wires by a quarter pitch, as in a literal reading of the paper's figure.
+        - ``symmetric``: The layout equals ``aligned`` without the offset. The Jacobian is close to singular.
+        - ``staggered``: The lower layer is half a pitch wider than the patch, its electrodes are 1.2 pitches
+          apart, and lower wire k is shifted in y by 0.43 (k mod 3 − 1) pitches. In measurements, this layout
+          was up to a thousand times better conditioned than the others.
 
         Args:
             name: ``aligned``, ``symmetric`` or ``staggered``.
@@ -217,8 +217,8 @@ class PatchLayout:
     def pitch_m(self) -> float:
         """Length scale of the patch, metres.
 
-        This is the median distance between neighbours on an upper wire or, if a wire has a single electrode,
-        the median distance from an upper electrode to the nearest lower electrode.
+        The length scale is the median distance between neighbouring electrodes on an upper wire or, if a wire
+        has a single electrode, the median distance from an upper electrode to the nearest lower electrode.
         """
         steps = np.linalg.norm(np.diff(self.upper_m, axis=1), axis=2)
         if steps.size:
@@ -233,7 +233,7 @@ class PatchLayout:
 
     @functools.cached_property
     def layout_hash(self) -> int:
-        """CRC-32 of the sizes and of all coordinates in nm; nodes store it in 0x2000, and hosts check it."""
+        """CRC-32 of the sizes and of all coordinates in nm; object 0x2000 of the nodes, checked by hosts."""
         sizes = np.array([*self.upper_m.shape, *self.lower_m.shape], dtype="<i8")
         parts = [np.rint(a / _HASH_RESOLUTION_M).astype("<i8") for a in (self.upper_m, self.lower_m)]
         return zlib.crc32(b"".join(a.tobytes() for a in (sizes, *parts)))

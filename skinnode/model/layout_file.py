@@ -28,7 +28,7 @@ _MOST_HEADER_BYTES: Final = 10_240
 
 
 def read_npz(path: Path) -> PatchLayout:
-    """Read a layout from an NPZ file. Nothing in the file is executed.
+    """Read a layout from an NPZ file without executing any content of the file.
 
     Args:
         path: File with the arrays ``upper_m`` (U, N, 3) and ``lower_m`` (K, M, 3) in metres and, optionally,
@@ -69,7 +69,7 @@ def _require_sizes(data: io.BytesIO, path: Path) -> None:
             if member.compress_type not in (
                 zipfile.ZIP_STORED,
                 zipfile.ZIP_DEFLATED,
-            ):  # all other methods unpack a whole member at once
+            ):  # other compression methods unpack whole members at once
                 got = Shown(f"compression method {member.compress_type}")
                 raise ConfigError(key, got, "stored or deflated, as NumPy writes it", where=str(path))
             most_bytes = _MOST_VALUES[key] * _MOST_ITEM_BYTES

@@ -44,7 +44,7 @@ class Pose:
     def from_rpy(cls, position_m: tuple[float, float, float], rpy_rad: tuple[float, float, float]) -> Self:
         """Return the pose for roll, pitch and yaw about the fixed axes x, y, z of the parent, in this order.
 
-        This is the convention of URDF.
+        URDF uses the same convention.
 
         Args:
             position_m: Origin of the frame, metres.
@@ -108,7 +108,7 @@ class Pose:
         return Pose((x_m, y_m, z_m), back.quaternion_xyzw)
 
     def _unit(self) -> tuple[float, float, float, float]:
-        """Return the quaternion with a length of exactly 1, so that rounding does not accumulate."""
+        """Return the quaternion normalised to unit length, so that rounding errors do not accumulate."""
         length = math.hypot(*self.quaternion_xyzw)
         x, y, z, w = self.quaternion_xyzw
         return x / length, y / length, z / length, w / length

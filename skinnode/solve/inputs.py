@@ -70,7 +70,7 @@ def checked_noise(relative_noise: ArrayLike, layout: PatchLayout) -> Float:
 
 
 def checked_mask(valid: Any, layout: PatchLayout) -> NDArray[np.bool_]:
-    """Return the mask as an array (U, K).
+    """Return the mask as an array (U, K) after checking its type and shape.
 
     Raises:
         ValueError: If the mask is not bool or not of that shape.

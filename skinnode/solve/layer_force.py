@@ -1,4 +1,4 @@
-"""Bound on the force of a contact whose layer is not calibrated.
+"""Upper bound on the force of a contact on a layer that is not calibrated.
 
 The solver computes forces from the displacement of an elastic half-space, but real skin is a layer on a
 support. The stiffest case is a layer of incompressible rubber bonded to a rigid support. For the same

@@ -55,7 +55,8 @@ class PrecisionLimits:
 def limits_of(layout: PatchLayout, options: TrackerOptions) -> PrecisionLimits:
     """Return the limits that the user set, or the defaults for the layout and the noise.
 
-    By default, forces that are not calibrated have no limit: ``Contact.force_calibrated`` marks them.
+    By default, uncalibrated forces have no limit; ``Contact.force_calibrated`` shows whether a force is
+    calibrated.
 
     Args:
         layout: The patch.
@@ -101,7 +102,7 @@ def _at_rest(layout: PatchLayout, options: TrackerOptions) -> float:
 
 
 def _looseness(tolerances: Tolerances | None) -> float:
-    """Return the largest tolerance, relative to the ordinary one; 0 for an exact patch."""
+    """Return the largest ratio of a tolerance to the ordinary tolerance; 0 for an exact patch."""
     if tolerances is None:
         return 0.0
     ordinary = astuple(ORDINARY)

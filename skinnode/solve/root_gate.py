@@ -1,4 +1,4 @@
-"""Gate for the exact inverse: finds its doubtful wires and checks them with the posterior.
+"""Gate for the exact inverse: finds doubtful wires and checks them with the posterior.
 
 A wire is doubtful if it has no root, if it jumped, or if its displacement is too rough to be a press. If a
 layout has folds within the reach of a press, every solved wire is doubtful, because F = b has nearby roots
@@ -64,7 +64,7 @@ class RootGate:
         self.hurried = False
         """Whether a doubtful wire of the last field was not checked for lack of time."""
         self._confirmed: Float | None = None  # displacement at which a rough wire was last confirmed
-        self._apart = np.zeros((len(problem.rest), 1, 1))  # m, uncertainty that the confirmation leaves
+        self._apart = np.zeros((len(problem.rest), 1, 1))  # m; see APART
         self._any_apart = False
         self._blind = roots.blind_wires(layout, options.normal_only)
         self._options = options
@@ -125,7 +125,7 @@ class RootGate:
                 field, self.hurried = self._give_up(field, doubtful), True
             else:
                 if anew:
-                    self._posterior.reset()  # anneal from rest: tracking a wrong root would confirm it
+                    self._posterior.reset()  # anneal from rest: tracking would confirm a wrong root
                 its = self._exact.arrays
                 self._posterior.stop_at(until)
                 # non-positive noise is kept: it marks a resistance that the posterior cannot use either
@@ -211,7 +211,7 @@ class RootGate:
 
         self._apart[doubtful] = 0.0
         self._apart[agreed & self._folded] = apart[agreed & self._folded]
-        self._any_apart = True  # provisional; checked with the next frame
+        self._any_apart = True  # assumed until the next frame is checked
 
         assert estimate.core_std_m is not None
         self._exact.adopt(replaced, moved)

@@ -3,8 +3,8 @@
 A zero residual does not identify the true position, because F = b has several roots. The rules use four
 criteria: the layout at rest (folds, and sensitivity of the resistances to the electrodes), properties of one
 root (its branch, its distance from rest, its roughness), the relative likelihood of two roots of one wire,
-and the posterior of the whole patch, which uses the neighbouring wires. The functions are pure; callers store
-the state.
+and the posterior of the whole patch, which uses the neighbouring wires. All functions of this module are
+pure; their callers store the state.
 
 =================  =====  ================================================  ================================
 constant           value  meaning                                           measured on
@@ -62,11 +62,11 @@ root."""
 BLIND: Final = 1e7
 """RMS of ∂x/∂(ln R), in clearances, above which a root is meaningless: electrodes can cross the whole layer
 while R changes only in its seventh digit. Wires on a symmetry line of the layout are blind, because each of
-their roots has a mirror image. The only other blind wires are those at least 1.5 pitches above aligned lower
+their roots has a mirror image. The only other blind wires are wires at least 1.5 pitches above aligned lower
 wires."""
 NEARLY_BLIND: Final = 1e5
 """RMS of ∂x/∂(ln R), in clearances, above which a root must be clearly likelier than any other; aligned
-layouts exceed it at h ≥ 1."""
+layouts exceed this value at h ≥ 1."""
 NONLINEAR: Final = 0.003
 """Standard deviation of the exact inverse, in clearances, above which F is not linear within the noise. All
 roots are then as doubtful as roots near a fold."""
@@ -77,7 +77,8 @@ JUMP: Final = 0.2
 """Movement of an electrode between two frames, in clearances, above which the next root may be wrong;
 movements of 0.24 or more were observed to cross folds."""
 LARGE: Final = 0.03
-"""Displacement, in clearances, above which the roughness is checked; folds lie at larger displacements."""
+"""Displacement, in clearances, above which the roughness is checked; all folds are at larger
+displacements."""
 ROUGH_IN_STREAM: Final = 1.2
 """Roughness-to-size ratio above which a live stream checks a displacement against the posterior.
 The ratio is 0.5 to 1 for presses, up to 1.7 if they move a single electrode, and 1 to 2 for wrong roots."""
@@ -102,7 +103,7 @@ ROOT_RESIDUAL: Final = 1e-9
 """Maximum RMS of F/b − 1 at which the end of a path counts as a root, even if J is too close to singular for
 CONVERGED."""
 STILL_CONFIRMED: Final = 0.2
-"""Maximum relative change of a rough displacement since its confirmation without a new check."""
+"""Maximum relative change since its confirmation at which a rough displacement is not checked again."""
 
 # -- two roots of one wire ----------------------------------------------------------------------------------
 
@@ -174,7 +175,7 @@ def nonlinear_in_noise(layout: PatchLayout, relative_noise: ArrayLike, normal_on
 
 
 def on_rest_branch(status: Index, branch: Index, rest_branch: Index, out_of_reach: Mask) -> Mask:
-    """Return the wires (U,) whose solve reached a root on the branch of the rest position, within reach.
+    """Return the wires (U,) whose solve reached a root within reach, on the branch of the rest position.
 
     On this branch, the determinant of J has the same sign as at rest. A system with more equations than
     unknowns has no determinant; the sign is then 0. A root is within reach if no electrode moves farther than

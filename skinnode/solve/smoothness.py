@@ -1,9 +1,9 @@
 """Gaussian covariance of the displacement of one upper wire, a model of the smoothness of rubber.
 
 C_ij = s² exp(−d_ij² / 2ℓ²) for each coordinate, where d is the distance between two electrodes at rest. This
-assumption is weaker than that of an elastic patch and needs no material constant. The covariance provides
-starting points for solves (:mod:`skinnode.solve.starts`) and ranks two roots of one wire: the root with the
-smaller roughness √(uᵀ C⁻¹ u) is likelier.
+covariance assumes less than an elastic model of the patch does, and requires no material constant. The
+covariance provides starting points for solves (:mod:`skinnode.solve.starts`) and ranks two roots of one wire:
+the root with the smaller roughness √(uᵀ C⁻¹ u) is likelier.
 """
 
 from __future__ import annotations
@@ -17,9 +17,10 @@ from skinnode.model.layout import Float, PatchLayout
 from skinnode.solve.wires.problem import PatchProblem
 
 CORRELATION_PITCHES: Final = 1.0
-"""Correlation length ℓ, pitches. At 1.0, the guided start finds 3204 of the 3209 wires that are on the branch
-of the rest position in four sets of 82 random presses on the staggered layout (presses of 70 % at h = 0.5,
-and of 10, 30 and 50 % at h = 1). With values of 0.7 and 1.5, the guided start finds fewer wires."""
+"""Correlation length ℓ, pitches. With a value of 1.0, the guided start finds 3204 of the 3209 wires that are
+on the branch of the rest position in four sets of 82 random presses on the staggered layout (presses of 70 %
+at h = 0.5, and of 10, 30 and 50 % at h = 1). With values of 0.7 and 1.5, the guided start finds fewer
+wires."""
 ROUGH_SHARE: Final = 1e-3
 """Relative increase in the diagonal of C, which makes C invertible in floating point."""
 

@@ -1,10 +1,11 @@
 """Starting points for a sample or frame that cannot be solved from an earlier solution.
 
-guided_start   finds the smooth displacement that explains the resistances, the maximum a posteriori estimate,
-               lowering the assumed noise in steps (data-space Gauss-Newton, Tarantola 2005, section 3.4)
-near_twin      estimates the second root, which lies nearby across the fold if J is nearly singular. To second
-               order, along the direction v of the smallest singular value σ, σ α + ½ α² wᵀF″[v, v] = 0 puts
-               the twin at α = −2σ / wᵀF″[v, v] (Golubitsky & Schaeffer 1985, chapter I.3)
+- ``guided_start`` finds the smooth displacement that explains the resistances (the maximum a posteriori
+  estimate), lowering the assumed noise in steps (data-space Gauss-Newton, Tarantola 2005, section 3.4).
+- ``near_twin`` estimates the second root, which is close by, across the fold, if J is nearly singular. Along
+  the direction v of the smallest singular value σ, the equation σ α + ½ α² wᵀF″[v, v] = 0 holds to second
+  order. Its solution α = −2σ / wᵀF″[v, v] is the position of the twin (Golubitsky & Schaeffer 1985, chapter
+  I.3).
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Tracker for a live stream: computes one field per frame with the method that suits the patch.
 
 ``exact`` inverts each wire separately, as the paper does; ``posterior`` estimates the whole patch with an
-elastic prior. ``auto`` chooses the exact inverse if it is accurate enough at the converter's noise. Wires on
-which the exact inverse is doubtful are checked with the posterior (:mod:`skinnode.solve.root_gate`).
+elastic prior. ``auto`` chooses the exact inverse if this method is accurate enough at the converter's noise.
+Wires on which the exact inverse is doubtful are checked with the posterior (:mod:`skinnode.solve.root_gate`).
 
 If the stream shows that its noise differs from the stated noise, the tracker scales the stated noise
 (:mod:`skinnode.solve.noise_estimate`). With ``auto``, the tracker switches to the posterior if the noise is
@@ -83,7 +83,7 @@ class Tracker:
         # estimate
         self._posterior = Posterior(layout, dataclasses.replace(options.of_posterior(), follow_noise=False))
         self._noise = NoiseEstimate(layout.shape) if options.follow_noise else None
-        self._factor = 1.0  # noise factor to which the method and the gate were adapted
+        self._factor = 1.0  # noise factor for which the method and the gate are set
         self._exact = ExactTracker(
             layout,
             operator=options.operator,
@@ -206,7 +206,7 @@ class Tracker:
             self._check.scan = number
 
     def _checked(self, field: FieldFrame, ohm: Float, start: float) -> FieldFrame:
-        """Return the field of the exact tracker's frame with its faults and the verdict on trust."""
+        """Return the exact tracker's field with its data faults and the verdict on trust."""
         exact = self._exact
         assert exact is not None
         its = exact.arrays
@@ -228,7 +228,7 @@ class Tracker:
         return field if is_precise(field, self._limits) else amended(field, precise=False)
 
     def _follow_noise(self) -> None:
-        """Adapt method and gate of an exact tracker if the estimated noise has changed."""
+        """Adapt the method and the gate of an exact tracker if the estimated noise has changed."""
         if self._exact is not None and self._noise is not None and self._noise.factor != self._factor:
             self._adapt(self._noise)
 

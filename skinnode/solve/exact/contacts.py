@@ -42,7 +42,7 @@ UNTOUCHED: Final = 4.0
 """Maximum displacement of an untouched patch, in standard deviations. Noise exceeds this limit in 2 % of
 frames, which are then searched for contacts."""
 WILD: Final = 16.0
-"""Ratio of a wire's variances to those of the others above which the wire is left out."""
+"""Ratio of a wire's variances to the other wires' variances above which the wire is left out."""
 SCALE_STEPS: Final = 30
 """Maximum number of iterations for the scale s²."""
 SCALE_CLOSE: Final = 0.01
@@ -156,7 +156,7 @@ class ExactContacts:
             self._field, factors.free, factors.rest_std, self.layout.pitch_m, self._moved, self._ratio,
             self._sorted,
         )  # fmt: skip
-        if not largest > UNTOUCHED:  # also true if every standard deviation is infinite
+        if not largest > UNTOUCHED:  # untouched, or all standard deviations are infinite
             self._finder.reset()
             return self.no_force_n, ()
         if wild:
@@ -183,7 +183,7 @@ class ExactContacts:
         """
         factors, gone = self._factors, left_out[self._wire]
         moved = np.where(gone, 0.0, self._moved)
-        columns_t = np.ascontiguousarray(factors.whitening[gone])  # (coordinates of these wires, n)
+        columns_t = np.ascontiguousarray(factors.whitening[gone])  # shape (left-out coordinates, n)
         columns, weighted = np.ascontiguousarray(columns_t.T), np.empty_like(columns_t)
         size, n = columns_t.shape
         precision, unknown, seen = np.empty((size, size)), np.empty(size), np.empty(n)
@@ -242,7 +242,7 @@ def _factors(layout: PatchLayout, rubber: Rubber | None, noise: Float, normal_on
     every = np.arange(3 * wires * electrodes)
     free = every[2::3] if normal_only else every
     n = weighted.shape[2]
-    least = 1.0 / float(problem.clearance.min())  # nothing moves farther than the clearance
+    least = 1.0 / float(problem.clearance.min())  # no electrode moves farther than the clearance
     root, std = np.zeros((free.size, free.size)), np.empty((wires, n))
     for u in range(wires):
         _, singular, turn = np.linalg.svd(weighted[u])

@@ -3,11 +3,11 @@
 With ``normal_only``, x and y of every electrode stay at their rest values. With ``active_only``, electrodes
 that no contact moves stay at rest. A wire starts with all electrodes at rest. While χ² rejects the fit, the
 electrode that explains most of the residual becomes an unknown, together with its neighbours. If more than
-half of the electrodes have become unknowns, all electrodes do. All electrodes return to rest when the rest
-position explains the frame. The standard deviation of an omitted coordinate is the smallest movement that χ²
-would detect if no other electrode moved. To first order at rest, this movement is √(quantile − degrees of
-freedom) σ / ‖component of the coordinate's column of J outside the range of the unknowns and of the
-electrode's other columns‖.
+half of the electrodes have become unknowns, all electrodes become unknowns. All electrodes return to rest
+when the rest position explains the frame. The standard deviation of an omitted coordinate is the smallest
+movement that χ² would detect if no other electrode moved. To first order at rest, this movement is √(quantile
+− degrees of freedom) σ / ‖component of the coordinate's column of J outside the range of the unknowns and of
+the electrode's other columns‖.
 
 Each option rests on an assumption about the skin, and the standard deviations of the unknowns are valid only
 if the assumption holds. A χ² test detects violations of the assumption of active_only reliably. The test is

@@ -1,9 +1,11 @@
 """Recovery of wires for which no solve in a frame found an acceptable root.
 
-bridge     interpolates R from the last trusted frame to the new frame and solves each substep
-restart    bridges from the rest position
-give up    keeps the last trusted position of a wire that still fails, with an infinite standard deviation and
-           a status other than CONVERGED
+The recovery consists of three steps:
+
+- bridge: interpolate R from the last trusted frame to the new frame, and solve each substep;
+- restart: bridge from the rest position;
+- give up: keep the last trusted position of a wire that still fails, with an infinite standard deviation and
+  a status other than CONVERGED.
 """
 
 from __future__ import annotations

@@ -1,11 +1,13 @@
 """Exact tracker: solves each frame of a live stream from the solution of the previous frame.
 
-hold       keep the position of a wire whose resistances changed no more than their noise (see ``hold``)
-predict    move by (∂x/∂R) ΔR with the J⁻¹ that an earlier frame computed for its covariance
-follow     take simplified Newton steps with the same J⁻¹ while it is still accurate enough
-correct    otherwise iterate the operator, to a tolerance far below any noise
-widen      add an omitted electrode to the unknowns if it seems to move (see ``leave_out``)
-recover    bridge a wire that fails, or give up on it (see ``recover``)
+Each wire passes through these stages until one of them yields a root:
+
+- hold: keep the position of a wire whose resistances changed no more than their noise (see ``hold``);
+- predict: move the wire by (∂x/∂R) ΔR with the J⁻¹ that an earlier frame computed for its covariance;
+- follow: take simplified Newton steps with the same J⁻¹ while it is accurate enough;
+- correct: iterate the operator to a tolerance far below any noise;
+- widen: add an omitted electrode to the unknowns if it seems to move (see ``leave_out``);
+- recover: bridge a wire that fails, or give up on the wire (see ``recover``).
 
 The rules for acceptable roots are in :mod:`skinnode.solve.roots`.
 """
@@ -251,7 +253,7 @@ class ExactTracker:
         return sigma, found
 
     def _rescue(self, frame: Frame) -> Float:
-        """Make the remaining attempts for wires that are not at a root; return the residuals (U,).
+        """Make further attempts to solve wires that are not at a root; return the residuals (U,).
 
         Writes ``good`` and ``status`` of :attr:`arrays`.
         """

@@ -21,10 +21,10 @@ def bidiagonalise(  # noqa: C901, PLR0913 - four rows at a time; every result of
 
     ``a`` (n + 3, whole lanes of m) contains A padded with zeros, so that loops over four rows and whole
     vectors need no special cases. Writes B to ``diagonal`` (n,) and ``upper`` (n,), whose last element is 0;
-    the reflectors I − β v vᵀ of Q to the rows of ``a`` with β in ``across`` (n,); and those of P to the rows
-    of ``left`` (n, whole lanes of n + 3) with β in ``down`` (n,). ``w`` is scratch with the length of a row
-    of ``a``. Squares of the elements must not overflow (Golub & Van Loan, 5.4.8, with rows and columns
-    swapped).
+    the reflectors I − β v vᵀ of Q to the rows of ``a`` with β in ``across`` (n,); and the reflectors of P to
+    the rows of ``left`` (n, whole lanes of n + 3) with β in ``down`` (n,). ``w`` is scratch with the length
+    of a row of ``a``. Squares of the elements must not overflow (Golub & Van Loan, 5.4.8, with rows and
+    columns swapped).
     """
     n, end = diagonal.size, a.shape[1]
     for k in range(n):
@@ -107,10 +107,10 @@ def damped_solve(  # noqa: PLR0913 - every result of the decomposition
     Uses Givens rotations (Eldén, Algorithms for the regularization of ill-conditioned least squares problems,
     1977).
 
-    The factor R in BᵀB + lam I = RᵀR is bidiagonal too. Writes the reciprocal of its diagonal to ``inverse``
-    (n,) and its superdiagonal to ``ru`` (n,). The squares of lam and of B must not both underflow.
+    The factor R in BᵀB + lam I = RᵀR is bidiagonal too. Writes the reciprocal of R's diagonal to ``inverse``
+    (n,) and R's superdiagonal to ``ru`` (n,). The squares of lam and of B must not both underflow.
     """
-    below, rest = lam, 0.0  # damping row below row i of B: square of its only element, and right-hand side
+    below, rest = lam, 0.0  # damping row below row i of B: square of its element, and right-hand side
     for i in range(x.size):
         radius = 1.0 / (diagonal[i] * diagonal[i] + below)
         inverse[i] = math.sqrt(radius)

@@ -116,7 +116,7 @@ def cholesky(a: Float, n: int) -> int:
 
     Reads only the diagonal and the upper triangle. Returns 1, or 0 if ``a`` is not positive definite.
     """
-    first: Any = np.int64(0)  # a literal 0 would compile the callee a second time
+    first: Any = np.int64(0)  # a literal 0 would make numba compile the callee a second time
     for r in range(0, n, ROWS):
         rows = min(ROWS, n - r)
         end = r + rows

@@ -102,7 +102,7 @@ def lu_inverse_transposed(lu: Float, pivot: Index, inverse: Float) -> None:
         for c in range(n):
             row[c] = 0.0
         row[i] = 1.0
-    for c0 in range(0, n, 4 * LANES):  # the sums of four vectors stay in registers
+    for c0 in range(0, n, 4 * LANES):  # four vectors at a time, so that their sums stay in registers
         c1, c2, c3 = c0 + LANES, c0 + 2 * LANES, c0 + 3 * LANES
         n0, n1, n2, n3 = n - c0, n - c1, n - c2, n - c3
         for sweep in range(2):

@@ -89,7 +89,7 @@ def qr_inverse(a: Float, diagonal: Float, beta: Float, v: Float, inverse: Float)
     for k in range(n - 1, -1, -1):
         for i in range(m):
             v[i] = a[i, k] if i >= k else 0.0
-        for j in range(k, n):  # this reflector does not affect the rows above
+        for j in range(k, n):  # reflector k does not affect the rows above k
             row = inverse[j]
             share = beta[k] * dot(row, v)
             for i in range(k, m):

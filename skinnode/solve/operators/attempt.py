@@ -30,7 +30,7 @@ problem of Brown & Dennis)."""
 class System:
     """Wrapper of the caller's functions that counts their calls and checks their arrays.
 
-    An array returned by a method may be the caller's own, which the next call may overwrite.
+    A method may return the caller's own array, which the caller's function may overwrite in the next call.
     """
 
     def __init__(
@@ -41,7 +41,7 @@ class System:
         first = residual(x0.copy())
         shape: tuple[int | str, ...] = ("m",)
         if type(first) is np.ndarray and first.ndim == 1 and first.size > 0:
-            shape = first.shape  # exact shape: the check then takes its fast path
+            shape = first.shape  # with an exact shape, the check takes its fast path
         self.first = require_array("residual(x0)", first, shape, finite=False).copy()
         self.m = self.first.size
 
@@ -55,7 +55,7 @@ class System:
         self.jacobians += 1
         j, shape = self._jacobian(x.copy()), (self.m, self.n)
         if type(j) is np.ndarray and j.dtype == np.float64 and j.shape == shape:
-            return j  # in any memory order, because the workspace stores J transposed
+            return j  # J may have any memory order: it is copied
         return require_array("jacobian(x)", j, shape, finite=False)
 
     @property

@@ -1,11 +1,11 @@
 """Iteration loop of all operators, with reverse communication: the caller evaluates the functions.
 
-    begin      start from x, r and J in the workspace
-    propose    factor J; unless x is a root, make the Newton step the next ``trial``
-    shorten    if the Newton step leaves the trust region, replace the trial with one inside it
-    assess     given r at ``trial`` in ``r_trial``, accept or reject the step, and update the radius
+- ``begin`` starts from x, r and J in the workspace.
+- ``propose`` factors J and, unless x is a root, makes the Newton step the next ``trial``.
+- ``shorten`` replaces a trial outside the trust region with a trial inside it.
+- ``assess`` accepts or rejects the step, given r at ``trial`` in ``r_trial``, and updates the radius.
 
-The compiled solver for a skin wire and a solve with any pair of Python callables therefore share the same
+The compiled solver for a skin wire and a solve with any pair of Python callables therefore execute the same
 compiled steps. Gauss-Newton accepts every step in full; Levenberg-Marquardt and dogleg accept a step only if
 it reduces r.
 

@@ -114,8 +114,8 @@ def curvature(jacobian: Callable[[Float], Float], at: Point) -> Curvature:
     if not bend[0] > CURVED:
         return Curvature(float(bend[0]), np.zeros(n), math.inf)
     half = (q.T * share) @ vt / d
-    inverse = (half.T / bend) @ half  # inverse of the Hessian
-    pseudo = (half.T / bend) @ (q.T * (share * sigma)) @ u.T  # inverse of the Hessian, times Jᵀ
+    inverse = (half.T / bend) @ half  # Hessian⁻¹
+    pseudo = (half.T / bend) @ (q.T * (share * sigma)) @ u.T  # Hessian⁻¹ Jᵀ
     rounded = np.abs(pseudo) @ at.rounding + EPS * (np.abs(inverse) @ (np.abs(at.j).T @ np.abs(at.r)))
     return Curvature(float(bend[0]), -pseudo @ at.r, float((rounded + EPS * np.abs(at.x)).max()))
 

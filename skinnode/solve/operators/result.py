@@ -1,4 +1,4 @@
-"""Result of solving a system of equations, with the statuses of the model."""
+"""Result of ``solve_system``, with the same statuses as a field of the skin."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ class PointKind(enum.Enum):
     MINIMUM = "minimum"
     """‖r‖ has an isolated minimum above zero: Jᵀr is zero, and the Hessian of ½ ‖r‖² is positive definite."""
     FLAT = "flat"
-    """Jᵀr is zero and r is not, but x is not determined: ‖r‖ does not change in some direction."""
+    """Jᵀr is zero, r is not zero, and x is not determined: ‖r‖ does not change in some direction."""
     SADDLE = "saddle"
-    """Jᵀr is zero and r is not, but ‖r‖ decreases in some direction."""
+    """Jᵀr is zero and r is not zero, but ‖r‖ decreases in some direction."""
     UNFINISHED = "unfinished"
-    """Neither r nor Jᵀr is zero."""
+    """Neither r nor Jᵀr is zero at this point."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -1,9 +1,9 @@
 """Workspace for the steps of a solve, and products with the Jacobian that it contains.
 
 The symbols are those of the paper: r is the residual (m,), J its Jacobian (m, n), stored transposed, and lam
-the Levenberg-Marquardt parameter. The trust region is ‖D s‖ ≤ radius, where D is the running maximum of the
-column norms of J (Moré 1978), so that the units of the unknowns do not matter, or, for a second attempt of
-``solve_system``, the identity.
+the Levenberg-Marquardt parameter. The trust region is ‖D s‖ ≤ radius. D is the running maximum of the column
+norms of J (Moré 1978), so that the units of the unknowns do not matter. For later attempts of
+``solve_system``, D is the identity.
 """
 
 from __future__ import annotations
@@ -36,14 +36,14 @@ class Work(NamedTuple):
     diagonal: Annotated[Float, "n"]
     """Diagonal of R."""
     beta: Annotated[Float, "n"]
-    """β of the reflectors of Q."""
+    """Factors β of the reflectors of Q."""
     v: Annotated[Float, "n"]
     bd: Annotated[Float, "n"]
     """Diagonal of the bidiagonal form of J D⁻¹; its superdiagonal is ``bu``."""
     bu: Annotated[Float, "n"]
     across: Annotated[Float, "n"]
     down: Annotated[Float, "n"]
-    """β of the reflectors of the bidiagonal form, as in ``across``."""
+    """Factors β of the left reflectors of the bidiagonal form; ``across`` contains those of the right."""
     inverse: Annotated[Float, "n"]
     """Reciprocal diagonal of the damped bidiagonal form; its superdiagonal is ``ru``."""
     ru: Annotated[Float, "n"]

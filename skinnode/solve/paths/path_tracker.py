@@ -1,8 +1,8 @@
 """Path tracker: stores each wire's position along a press and moves it with a predictor and a corrector.
 
 Lahaye's method solves all wires sample by sample (:meth:`PathTracker.solve`); adaptive step control advances
-each wire separately (:meth:`PathTracker.step`). The schedule chooses between them
-(:mod:`skinnode.solve.paths.step_control`). Roots at the last sample are checked by
+each wire separately (:meth:`PathTracker.step`). The schedule (:mod:`skinnode.solve.paths.step_control`)
+chooses one of these two modes. Roots at the last sample are checked by
 :mod:`skinnode.solve.paths.root_selection`.
 """
 
@@ -48,7 +48,7 @@ class PathEnd:
         return np.asarray(self.status == op.CONVERGED)
 
     def copy(self) -> PathEnd:
-        """Return a copy of all arrays."""
+        """Return a copy of this outcome, including all arrays."""
         return PathEnd(
             self.status.copy(), self.residual.copy(), self.error_estimate.copy(), self.inverse.copy(),
             self.side.copy(),
@@ -253,9 +253,9 @@ class PathTracker:
     def led_elsewhere(self) -> Mask:
         """Return the wires (U,) that are not at the root to which the samples led along a smooth path.
 
-        On a smooth path, the secant through two solutions predicts the next one, and the first solution is
-        close to rest (:data:`skinnode.solve.roots.SMOOTH_PATH`). On a long path, only the second half must be
-        smooth.
+        On a smooth path, the secant through two solutions predicts the next solution, and the first solution
+        is close to rest (:data:`skinnode.solve.roots.SMOOTH_PATH`). On a long path, only the second half must
+        be smooth.
         """
         size = roots.distance(self._path_end, self.problem.rest)
         elsewhere = roots.distance(self.solver.x, self._path_end) > roots.SAME_ROOT * size

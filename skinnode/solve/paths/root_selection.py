@@ -52,7 +52,7 @@ def doubtful(tracker: PathTracker) -> Mask:
 def guide(tracker: PathTracker, todo: Mask, accuracy: Accuracy) -> None:
     """Solve the last sample again from the smoothest displacement that explains it; keep the smoother root.
 
-    If the new root lies across a fold, the function solves for its twin on the near side. A wire for which
+    If the new root is across a fold, the function also solves for its twin on the near side. A wire for which
     neither solve finds a root is not CONVERGED afterwards.
 
     Args:
@@ -103,7 +103,7 @@ def compare_with_estimate(tracker: PathTracker, estimate: PatchEstimate, accurac
     """Compare every root with an estimate of the whole patch.
 
     A wire that has no root, or a root that the estimate does not confirm, is solved from the estimate. The
-    new root may lie across a fold if the path led to the same root, because the skin itself can cross a fold.
+    new root may be across a fold if the path led to the same root, because the skin itself can cross a fold.
     """
     solver, end = tracker.solver, tracker.end
     todo = ~(estimate.agrees(solver.x) & end.converged)

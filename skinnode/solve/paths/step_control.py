@@ -36,14 +36,14 @@ be kept. From a contraction ratio of 1/2, Newton's method takes 5 steps to 1e-9.
 
 ADAPTIVE_WALK: Final = Accuracy(tolerance=1e-9, max_steps=100)
 """Accuracy of a sample that is solved only to find the root to which the samples lead. The maximum number of
-steps is the paper's."""
+steps equals that in the paper."""
 
 
 class Schedule(Protocol):
     """Protocol of step control: any object that can move a path tracker to the end of its path."""
 
     def follow(self, tracker: PathTracker) -> None:
-        """Move ``tracker`` from the rest position to its last sample, and finish it."""
+        """Move ``tracker`` from the rest position to its last sample, and call its ``finish`` method."""
         ...
 
 
@@ -60,7 +60,7 @@ class Uniform:
             the last two solutions, and a wire with no root or a rough root is solved again from the smoothest
             displacement that explains the last sample. In 21 presses of 50 % with 10 samples each (staggered
             layout, h = 1), starting on the secant alone reduces the number of lost wires from 7 of 197 to
-            none. It also reduces the evaluations per sample from 4 to 2.9.
+            none. The secant also reduces the number of evaluations per sample from 4 to 2.9.
         intermediate_tolerance: Tolerance of r, and of x in pitches, at all samples except the last.
         final_tolerance: Tolerance at the last sample.
         intermediate_steps: Maximum operator steps at all samples except the last.
@@ -83,7 +83,7 @@ class Uniform:
         _require(self, "intermediate_tolerance", "final_tolerance", "intermediate_steps", "final_steps")
 
     def follow(self, tracker: PathTracker) -> None:
-        """Solve each chosen sample from the solution of the previous one."""
+        """Solve each chosen sample from the solution of the previous chosen sample."""
         count = tracker.samples if self.steps is None else min(self.steps, tracker.samples)
         accuracy = Accuracy(self.intermediate_tolerance, self.intermediate_steps)
         for part in range(1, count):
@@ -104,9 +104,9 @@ class Periodic:
     The cycle is determined from the samples themselves. The samples are followed from the rest position with
     a tolerance of 1e-6, 1e-5, …, skipping each sample whose first-order optimality is below the tolerance. If
     the solves have a period, T is the median number of samples from one solve to the next, on the wire that
-    needs the most solves. The path then starts again and solves every T-th sample at that tolerance, and
-    always the last sample. If no tolerance shows a cycle of at least two samples that occurs at least twice,
-    every sample is solved with a tolerance of 1e-6.
+    needs the most solves. The path then restarts from rest and solves every T-th sample with this tolerance.
+    The last sample is always solved. If no tolerance shows a cycle of at least two samples that occurs at
+    least twice, every sample is solved with a tolerance of 1e-6.
 
     The paper's tolerance applies to MATLAB's unscaled problem, in which ‖Jᵀr‖∞ is F² times its value in this
     project, where r = a F − 1 and lengths are in pitches. The value of F depends on the unit of length, which
@@ -161,7 +161,7 @@ class Periodic:
             solved = [tracker.solve(sample, accuracy) > 0 for sample in range(tracker.samples - 1)]
             cycle = shortest_cycle(np.array(solved).reshape(-1, tracker.wires))
             if cycle is None:
-                break  # a looser tolerance would show no second cycle either
+                break  # looser tolerances would not reveal a second cycle either
             if cycle > 1:
                 return cycle, tolerance
         return None, RELAXED_TOLERANCES[0]

@@ -161,7 +161,7 @@ def report_correction(  # noqa: C901, PLR0913 - one wire of a call; its results 
     """Write x, report and measures of wire ``u``, for which :func:`correct` returned ``status``.
 
     ``count`` is the number of equations. If COVARIANCE is one of the tasks, also writes the inverse and the
-    arrays that belong to it. Returns ``status``, or ILL_CONDITIONED if the root is poorly determined or fails
+    arrays that depend on it. Returns ``status``, or ILL_CONDITIONED if the root is poorly determined or fails
     the χ² test.
     """
     w: Any = solver.work
@@ -171,7 +171,7 @@ def report_correction(  # noqa: C901, PLR0913 - one wire of a call; its results 
     x_u, electrodes, measure = solver.x[u], solver.electrodes[u], solver.measure[u]
     for j in range(unknowns):
         value = w.x[j]
-        if status == CONVERGED and not skipped:  # adds the correction already computed to test convergence
+        if status == CONVERGED and not skipped:  # adds the Newton correction of the convergence test
             value += w.newton[j]
         x_u[coordinate(electrodes, j, each)] = value
     measure[RESIDUAL] = math.sqrt(dot(w.r, w.r) / count)

@@ -1,8 +1,8 @@
 """Buffers of one patch, and the single compiled call that reads and writes them.
 
-Each frame needs work before and after its solve (see ``decode`` and ``stages``). A single compiled call does
-all this work: each call from Python must check and unpack its arguments, which takes longer than any of these
-steps, especially with cold caches.
+Each frame requires computations before and after its solve (see ``decode`` and ``stages``). A single compiled
+call performs all of them: each call from Python must check and unpack its arguments, which takes longer than
+any of these steps, especially with cold caches.
 """
 
 from __future__ import annotations
@@ -144,7 +144,7 @@ class PatchSolver:
     def set_electrodes(self, u: int, electrodes: Index) -> None:
         """Make only these electrodes of wire u unknowns, and move the others to rest.
 
-        This invalidates ``inverse`` and the arrays that belong to it until the next converged solve.
+        The call invalidates ``inverse`` and the arrays that depend on it until the next converged solve.
         """
         n = self.problem.layout.unknowns // 3
         rest = np.setdiff1d(np.arange(n), electrodes)

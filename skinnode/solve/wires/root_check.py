@@ -22,7 +22,7 @@ SOME_ROUGH: Final = 2
 
 
 class RootCheck(ArrayTable):
-    """Field to check, limits for the check, and findings."""
+    """Arrays of a root check: the field to check, the limits, and the findings."""
 
     moved_m: Annotated[Float, "U N 3"]
     """Displacement."""

@@ -78,7 +78,7 @@ def _within_reach(x: Float, rest: Float, clearance: Float) -> bool:
 
 @njit_part
 def accept_roots(solver: SolverArrays, frame: FrameArrays) -> bool:
-    """Write into ``good`` which wires are at a root on the branch of the rest position and within reach.
+    """Write into ``good`` whether each wire is at a root within reach, on the branch of the rest position.
 
     Also copies the solver's status of each wire to ``status``. Returns whether all wires are good.
     """

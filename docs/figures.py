@@ -1,10 +1,11 @@
-"""Fill the tables of the solver's pages, and docs/img/, from the output of ``skinnode bench``.
+"""Write the results of ``skinnode bench`` to the tables of the solver's pages and to docs/img/.
 
     .venv/bin/skinnode bench path --json out/path.json --plot out/path.png
     .venv/bin/python docs/figures.py out
 
-The folder holds some of {kernel,solve,systems,path,accuracy,stability,trust}.json and .png; a table without a
-file stays as it is. ``wrong_models.txt`` is the output of docs/wrong_models.py.
+The folder may contain {kernel,solve,systems,path,accuracy,stability,trust}.json and the corresponding .png
+files. A table whose file is missing is not changed. ``wrong_models.txt`` is the output of
+docs/wrong_models.py.
 """
 
 from __future__ import annotations
@@ -22,10 +23,11 @@ from skinnode.bench.accuracy import best_of_each
 DOCS = Path(__file__).parent
 PAGES = (DOCS / "solver.md", DOCS / "solver-figures.md")
 COLOURS = 256
-"""Colours of a picture: it looks the same as with all of them, at a quarter of the bytes."""
+"""Number of colours to which a picture is reduced; the file size decreases to a quarter without a visible
+change."""
 MOST_BYTES = 200_000
 SHORT_NOISE = 1e-5
-"""Relative noise of the short table of ``accuracy``."""
+"""Relative noise of the rows in the short accuracy table."""
 
 
 def table(head: list[str], rows: list[list[str]]) -> str:
@@ -62,7 +64,7 @@ def solve(figures: dict[str, Any]) -> str:
 
 
 def systems(figures: dict[str, Any]) -> str:
-    """Problems of the literature, and what each solver says of them."""
+    """Return a table of the solvers' results on test problems from the literature."""
     rows = []
     for row in figures["rows"]:
         solved = [
@@ -120,7 +122,7 @@ def path(figures: dict[str, Any]) -> str:
 
 
 def step_control(figures: dict[str, Any]) -> str:
-    """The whole path by dogleg with each schedule, means per wire; the first and the last setting."""
+    """Return a table of the cost of a path by dogleg with each schedule, for the first and last setting."""
     rows = []
     for setting in (figures["settings"][0], figures["settings"][-1]):
         plain, own, adaptive = setting["dogleg"], setting["ours"], setting["adaptive"]
@@ -164,7 +166,7 @@ def _all_rows(setting: dict[str, Any]) -> list[dict[str, Any]]:
 
 
 def front(figures: dict[str, Any]) -> str:
-    """Error against time: each solver's fastest way."""
+    """Return a table of error versus time, with each solver's fastest result."""
     rows = []
     for panel in figures["front"]:
         for i, row in enumerate(best_of_each(panel["rows"])):
@@ -258,7 +260,9 @@ def limits(figures: dict[str, Any]) -> str:
             "yes" if row["reached"] else "**no**",
         ]
         for row in figures["must"]
-        if not row["what"].startswith(("coverage", "error / own bound"))  # the table of coverage shows them
+        if not row["what"].startswith(
+            ("coverage", "error / own bound")
+        )  # these requirements appear in the coverage table
     ]
     return table(["must be reached", "figure", "limit", "reached"], rows)
 
@@ -276,7 +280,8 @@ def stability(figures: dict[str, Any]) -> str:
     parts = [
         f"{machine(figures)} {figures['seeds']} seeds per row, {len(figures['rows'])} rows, "
         f"**{figures['wrong']} wires CONVERGED and wrong**. A wire is wrong if it is CONVERGED "
-        "with an error above 5 standard deviations, not explained by chance, or above 1e-6 with exact data. "
+        "with an error that exceeds 5 standard deviations and cannot be explained by chance or, with exact "
+        "data, exceeds 1e-6. "
         "The table lists the rows with noise, solved by the method that `auto` chose; errors and standard "
         "deviations are medians over the seeds, in the deepest frame."
     ]
@@ -342,14 +347,14 @@ MADE: dict[str, dict[str, Callable[[dict[str, Any]], str]]] = {
     "stability": {"stability": stability, "exact data": exact_data},
     "trust": {"trust": trust},
 }
-"""Tables by the benchmark that measures them, and by their markers."""
+"""Functions that create the tables, by benchmark and by the table's marker."""
 
 
 def fill(name: str, text: str) -> None:
-    """Write ``text`` between the markers of ``name``, on the page that has them.
+    """Write ``text`` between the markers ``name`` on the page that contains them.
 
     Raises:
-        ValueError: No page has the markers.
+        ValueError: No page contains the markers.
     """
     start, end = f"<!-- FIGURES: {name} -->", f"<!-- END: {name} -->"
     for file in PAGES:
@@ -364,12 +369,12 @@ def fill(name: str, text: str) -> None:
 
 
 def shrink(source: Path, target: Path) -> None:
-    """Save a picture with few colours, in at most ``MOST_BYTES``."""
-    from PIL import Image  # comes with matplotlib
+    """Reduce a picture's colours and, if necessary, its size, so that it needs at most ``MOST_BYTES``."""
+    from PIL import Image  # a dependency of matplotlib
 
     picture = Image.open(source).convert("RGB")
     while True:
-        # this way to choose colours keeps a thin red line red
+        # this quantisation method preserves the colour of thin red lines
         few = picture.quantize(COLOURS, method=Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE)
         few.save(target, optimize=True)
         if target.stat().st_size <= MOST_BYTES:

@@ -1,8 +1,9 @@
-"""Draw the picture of the README: one scan of the simulated hand of examples/hand.toml, solved by its host.
+"""Draw the picture in the README: one solved scan of the simulated hand in examples/hand.toml.
 
     python docs/hand_picture.py          writes docs/img/hand.png
 
-Numbers come from the running host. The outline of the hand, and the places of the patches on it, are made up.
+The numbers are results of a running host. The outline of the hand and the positions of the patches are
+invented.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ PLACES: Final = {
     "middle": (33.0, 122.0, -5.0),
     "thumb": (-104.0, 30.0, 48.0),
 }
-"""Centre (x, y) of each patch in the picture, mm, and its rotation in degrees."""
+"""Position (x, y) of each patch's centre in the picture, mm, and rotation of the patch, degrees."""
 
 FINGERS: Final = {"index": 125.0, "middle": 130.0, "thumb": 105.0}
 """Length of each finger, mm."""
@@ -39,12 +40,12 @@ FINGERS: Final = {"index": 125.0, "middle": 130.0, "thumb": 105.0}
 LONGEST_S: Final = 12.0
 COLOURS: Final = "magma"
 SHADING: Final = 0.6
-"""Exponent of the colour scale: below 1 it shows the flanks of a press."""
+"""Exponent of the colour scale; a value below 1 makes the flanks of a press visible."""
 SKIN, EDGE, INK = "#d9dde3", "#8b94a1", "#20262e"
 
 
 def deepest_scan(config: Path) -> tuple[HandConfig, dict[str, sk.FieldFrame]]:
-    """Run the hand, and return it with the fields of the scan in which its patches are pressed most."""
+    """Run the hand; return it with the fields of the scan in which all patches are pressed most deeply."""
     hand = load_hand(config)
     buses = tuple(bus.model_copy(update={"interface": "virtual"}) for bus in hand.buses)
     hand = hand.model_copy(update={"buses": buses})

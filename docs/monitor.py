@@ -1,8 +1,8 @@
-"""Draw the picture of `skinnode monitor` in these pages: four simulated patches, one of them unplugged.
+"""Create the screenshot of `skinnode monitor` for the documentation: four patches, one of them unplugged.
 
     python docs/monitor.py          writes docs/img/monitor.svg
 
-The screen is that of the program, without a terminal.
+The screenshot shows the real program, which runs without a terminal.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ LONGEST_S = 30.0
 
 
 async def screenshot(source: HostSource, fleet: Fleet) -> str:
-    """Return the screen as SVG, once a patch has been lost for a while and the others are pressed."""
+    """Return the screen as SVG, taken when one patch is lost and the other patches are pressed."""
     app = MonitorApp(source, folder=Path(), colours="rgb")
     async with app.run_test(size=SIZE):
         await asyncio.sleep(4.0)
@@ -46,7 +46,7 @@ async def screenshot(source: HostSource, fleet: Fleet) -> str:
 
 
 def without_addresses(svg: str) -> str:
-    """Replace downloaded fonts by fonts of the reader's machine."""
+    """Replace downloadable fonts in an SVG with fonts installed on the reader's machine."""
     svg = re.sub(r"@font-face \{.*?\}\s*", "", svg, flags=re.DOTALL)
     svg = re.sub(r"font-family: (Fira Code|arial)", "font-family: DejaVu Sans Mono, Menlo, Consolas", svg)
     return re.sub(r"<!--.*?-->", "", svg)

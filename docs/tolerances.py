@@ -1,10 +1,10 @@
-"""Table of docs/solver-figures.md: what tolerances cost in precision, and whether the claim covers them.
+"""Measure how tolerances affect the precision and the reported deviations, for docs/solver-figures.md.
 
 Run with ``python docs/tolerances.py [SCENES]``.
 
-Every patch is made at random to one of the tolerances, or to all of them, and pressed by a random load that
-is not of the prior's kind. The posterior then solves the press twice: once with the tolerances, once
-assuming an exact patch. Only the field at full depth counts.
+Each simulated patch has random errors within one tolerance or within all tolerances. A random load, which
+does not match the prior, presses the patch. The posterior then solves the press twice: once with the stated
+tolerances, and once for an exact patch. Only the field at full depth is scored.
 """
 
 from __future__ import annotations
@@ -31,12 +31,12 @@ from skinnode.model.tolerances import EXACT, ORDINARY, Tolerances
 from skinnode.solve.posterior.posterior import Posterior
 
 SIGMA: Final = 1e-5
-"""Relative noise."""
+"""Relative noise of the readings."""
 DEPTH: Final = 0.3
-"""Depth of the loads, in clearances."""
+"""Depth of the loads, as a fraction of the layer height."""
 SHARES: Final = np.array([0.0, 1 / 3, 2 / 3, 1.0])
 LIMIT: Final = 5.0
-"""Largest error of a coordinate, in reported standard deviations, that a claim may have."""
+"""Maximum error of a coordinate, in reported standard deviations."""
 SETTINGS: Final = {
     "exact": EXACT,
     "placement 0.01 pitch": Tolerances(placement=0.01),
@@ -51,13 +51,13 @@ SETTINGS: Final = {
 
 @dataclass
 class Claims(Pool):
-    """Errors and standard deviations of many patches, with the largest error in standard deviations."""
+    """Accumulates errors and standard deviations of many patches, and the largest error in deviations."""
 
     worst: float = 0.0
     beyond: int = 0
 
     def add(self, frame: FieldFrame, truth_m: Float) -> None:
-        """Add a field and its true displacement ``truth_m`` (U, N, 3)."""
+        """Add a field, given its true displacement ``truth_m`` (U, N, 3), metres."""
         super().add(frame, truth_m)
         used = np.array([status is Status.CONVERGED for status in frame.status])
         off = np.abs((frame.displacement_m - truth_m)[used]) / frame.displacement_std_m[used]
@@ -65,15 +65,16 @@ class Claims(Pool):
         self.beyond += int((off > LIMIT).sum())
 
     def row(self) -> dict[str, Any]:
-        """Return the figures."""
+        """Return the accumulated figures."""
         return super().row() | {"worst": self.worst, "beyond": self.beyond, "coordinates": self.coordinates}
 
 
 def made(skin: Skin, tolerances: Tolerances, rng: np.random.Generator) -> tuple[Skin, Float]:
-    """Return the skin as a workshop might make it, and the relative errors (U, 1) of its changes in R.
+    """Return a skin with random manufacturing errors, and the relative errors (U, 1) of its changes in R.
 
-    Half of the variance of the gain is common to all upper wires. The electrodes have the stated radius,
-    unless they lie on a curved surface, on which :class:`Skin` has no electrodes of finite size.
+    Half of the variance of the gain errors is common to all upper wires. The electrodes have the stated
+    radius. On a curved surface, they are points, because :class:`Skin` does not support larger electrodes
+    there.
     """
     layout = skin.layout
     wires, equations = layout.shape
@@ -90,7 +91,7 @@ def made(skin: Skin, tolerances: Tolerances, rng: np.random.Generator) -> tuple[
 
 
 def _skins() -> dict[str, tuple[Skin, PatchLayout]]:
-    """Return the patches, each with the flat layout on which a load is drawn."""
+    """Return the patches by name, each with the flat layout for which loads are chosen."""
     flat, aligned = preset("staggered", 0.5), preset("aligned", 0.5)
     return {
         "staggered h=0.5": (Skin(flat), flat),
@@ -102,10 +103,10 @@ def _skins() -> dict[str, tuple[Skin, PatchLayout]]:
 def scene(
     skin: Skin, flat: PatchLayout, tolerances: Tolerances, seed: int, depth: float = DEPTH
 ) -> tuple[Float, Float]:
-    """Return a press of a random patch: resistances (T, U, K) and truth (U, N, 3) at the end.
+    """Return a press on a random patch: resistances (T, U, K), ohm, and final displacement (U, N, 3), metres.
 
-    The resistances are divided by those of the patch at rest and multiplied by those of the layout, so that
-    one solver serves all patches of a layout.
+    The resistances are normalised to the patch at rest and then scaled to the layout at rest. One solver can
+    therefore solve all patches of a layout.
     """
     rng = np.random.default_rng([seed, 16])
     true, gain = made(skin, tolerances, rng)
@@ -118,7 +119,7 @@ def scene(
 
 
 def claims(scenes: int, depth: float = DEPTH) -> Iterator[dict[str, Any]]:
-    """Solve random patches. Yields one row per layout and setting."""
+    """Solve presses on random patches, and yield one row per layout and setting."""
     for name, (skin, flat) in _skins().items():
         for what, tolerances in SETTINGS.items():
             pools = {"stated": Claims(), "exact": Claims()}
@@ -142,7 +143,7 @@ def claims(scenes: int, depth: float = DEPTH) -> Iterator[dict[str, Any]]:
 
 
 def times(rounds: int) -> list[tuple[str, float]]:
-    """Return the time per frame of a press and its release, in µs, without and with tolerances."""
+    """Measure the time per frame of a press and its release, µs, without and with tolerances."""
     skin = Skin(preset("staggered", 0.5))
     press = Press((18.3e-3, 17.1e-3), 10e-3, DEPTH * skin.layout.height_m, (0.2, -0.1))
     rng = np.random.default_rng(5)
@@ -160,7 +161,7 @@ def times(rounds: int) -> list[tuple[str, float]]:
 
 
 def main() -> None:
-    """Print the tables."""
+    """Print the table of errors and the times per frame."""
     scenes = int(sys.argv[1]) if len(sys.argv) > 1 else 24
     print(
         f"{scenes} patches per row, {DEPTH:.0%} presses, noise {SIGMA:.0e}; last two columns: assumed exact"

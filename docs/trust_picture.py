@@ -1,9 +1,9 @@
-"""Draw the picture of trust in docs/concepts.md: a press with a faulty crossing and with lost readings.
+"""Plot the example of trust in docs/concepts.md: presses with a faulty crossing and with lost readings.
 
     python docs/trust_picture.py          writes docs/img/trust.png
 
-The displacements are those of a sphere on rubber in closed form, the readings have noise, and the verdicts
-are those of the solver.
+The displacements are closed-form solutions for a sphere on rubber. The readings contain noise. The solver
+decides whether a field is trusted.
 """
 
 from __future__ import annotations
@@ -25,16 +25,16 @@ PICTURE: Final = Path(__file__).parent / "img" / "trust.png"
 NOISE: Final = 1e-5
 FRAMES: Final = 150
 STUCK: Final = (range(20, 62), (5, 15))
-"""Frames in which one crossing keeps its value of the first, and this crossing."""
+"""Frames in which a crossing repeats the value of the first of these frames, and the crossing."""
 FEW_LOST: Final = (range(80, 95), 0.12)
-"""Frames in which readings are lost, and the share of them."""
+"""Frames in which readings are lost, and the fraction of lost readings."""
 HALF_LOST: Final = (range(115, 130), 0.5)
 COLOURS: Final = {"trusted": "#cfe8d5", "not precise": "#fbe3b0", "not trusted": "#f4c2bd"}
 INK, DATA, FAULT = "#20262e", "#1f6f8b", "#b3372b"
 
 
 def stream(skin: Skin) -> tuple[list[float], list[sk.FieldFrame]]:
-    """Return the true depths, m, and the fields of a stream."""
+    """Solve a stream; return the true depths, m, and the fields."""
     rng = np.random.default_rng(7)
     tracker = sk.Tracker(skin.layout, relative_noise=NOISE, baseline_ohm=skin.rest_ohm, method="posterior")
     press = Press((0.019, 0.020), 0.03, 3.5e-4, (0.3, 0.1))
@@ -59,7 +59,7 @@ def stream(skin: Skin) -> tuple[list[float], list[sk.FieldFrame]]:
 
 
 def deepest_um(field: sk.FieldFrame) -> tuple[float, float]:
-    """Return the depth of the deepest electrode and its standard deviation."""
+    """Return the depth of the deepest electrode and its standard deviation, µm."""
     z, std = field.displacement_m[..., 2], field.displacement_std_m[..., 2]
     return -1e6 * float(z.min()), 1e6 * float(std.flat[z.argmin()])
 

@@ -1,10 +1,11 @@
-"""Measure what a wrong model costs, for the section "Limits" of docs/solver.md.
+"""Measure the errors due to a wrong model, for the section "Limits" of docs/solver.md.
 
     .venv/bin/python docs/wrong_models.py [SEEDS]
 
-Print three tables: wrong models of ``skinnode bench stability`` (case 13), without and with ``model_error``;
-presses on a layer of rubber bonded to a rigid base, which the posterior takes for a half-space; and untouched
-patches whose resistances are all wrong by one gain.
+The script prints three tables. The first contains the wrong models of ``skinnode bench stability`` (case 13),
+without and with ``model_error``. The second contains presses on a rubber layer bonded to a rigid base, which
+the posterior assumes to be a half-space. The third contains untouched patches whose resistances all have the
+same gain error.
 """
 
 from __future__ import annotations
@@ -25,11 +26,11 @@ from skinnode.model.elastic import Rubber
 Float = NDArray[np.float64]
 
 WAVES = 6000
-"""Wave numbers of the integrals: a layer of 1 m then moves as a half-space to 0.3 % of the press."""
+"""Number of wave numbers in the integrals; a layer of 1 m then matches a half-space within 0.3 %."""
 SHARPEST = 40.0
-"""Largest wave number, times the smaller of contact radius and thickness."""
+"""Maximum wave number, multiplied by contact radius or thickness, whichever is smaller."""
 DEEP = 20.0
-"""k t from which the bottom of the layer has no effect: e⁻²⁰."""
+"""Wave number times thickness above which the base has no effect; the effect is of order e⁻²⁰."""
 NOISE = 1e-5
 SHARES = (1 / 3, 2 / 3, 1.0)
 
@@ -37,11 +38,11 @@ SHARES = (1 / 3, 2 / 3, 1.0)
 def layer_response(k: Float, thickness_m: float, shear_modulus_pa: float) -> tuple[Float, Float]:
     """Return the surface displacement of an incompressible bonded layer under a pressure of wave number k.
 
-    A pressure cos(k x) moves the surface by U sin(k x) along it and W cos(k x) along its normal, m/Pa. With
-    Z = k z the displacement is (−f′ sin, f cos), which keeps the volume, and f = C Z sinh Z +
-    D (sinh Z − Z cosh Z), which solves G ∇²u = ∇p and vanishes with its slope at the base. No shear at the
-    surface asks f″ + f = 0; the pressure there is then −G k (3 f′ − f‴). Around an axis the same U and W go
-    with J₁ and J₀.
+    A pressure cos(k x) displaces the surface by U sin(k x) tangentially and by W cos(k x) normally, m/Pa.
+    With Z = k z, the displacement (−f′ sin, f cos) preserves the volume. The function f = C Z sinh Z + D
+    (sinh Z − Z cosh Z) solves G ∇²u = ∇p, and vanishes with its slope at the base. The condition of zero
+    shear stress at the surface is f″ + f = 0, and the surface pressure is −G k (3 f′ − f‴). In the
+    axisymmetric case, the same U and W are the factors of J₁ and J₀.
     """
     z = np.minimum(k * thickness_m, DEEP)
     s, c = np.sinh(z), np.cosh(z)
@@ -60,7 +61,7 @@ def hertz_displacement(
 ) -> Float:
     """Return the (P, 3) surface displacement of a bonded layer under the pressure √(1 − r²/a²), peak 1 Pa."""
     k = (np.arange(WAVES) + 0.5) * SHARPEST / min(radius_m, thickness_m) / WAVES
-    # Hankel transform of the pressure, times k dk
+    # Hankel transform of the pressure, multiplied by k dk
     load = (np.sin(k * radius_m) - k * radius_m * np.cos(k * radius_m)) / (k**2 * radius_m) * (k[1] - k[0])
     along, normal = layer_response(k, thickness_m, rubber.shear_modulus_pa)
     gap = points_m - center_m
@@ -70,7 +71,7 @@ def hertz_displacement(
 
 
 def press_layers(seeds: int) -> None:
-    """Print a line for each depth and thickness: means over ``seeds`` presses by fingertip-like bodies."""
+    """Print one line per depth and thickness, with means over ``seeds`` presses by fingertip-sized bodies."""
     layout = sk.PatchLayout.preset("staggered", pitch_m=4e-3, height_m=2e-3)
     rubber = Rubber()
     points = layout.upper_m[..., :2].reshape(-1, 2)
@@ -111,7 +112,7 @@ def press_layers(seeds: int) -> None:
 
 
 def _error(field: sk.FieldFrame, truth: Float) -> tuple[float, float, float, float, float]:
-    """Return error, share of CONVERGED wires, standard deviation, coverage, and number of wrong wires."""
+    """Return error, fraction of CONVERGED wires, standard deviation, coverage, and number of wrong wires."""
     used = np.array([status is sk.Status.CONVERGED for status in field.status])
     if not used.any():
         return np.nan, 0.0, np.nan, np.nan, np.nan
@@ -131,7 +132,7 @@ def _force(field: sk.FieldFrame, true_n: float) -> tuple[float, float]:
 
 
 def drift_gains() -> None:
-    """Print a line for each gain and solver: the apparent displacement of an untouched patch."""
+    """Print one line per gain and solver, with the apparent displacement of an untouched patch."""
     layout = sk.PatchLayout.preset("staggered", pitch_m=4e-3, height_m=2e-3)
     rest = sk.resistance_ohm(layout, layout.upper_m)
     solvers: dict[str, sk.Tracker | sk.Posterior] = {

@@ -1,9 +1,9 @@
-"""Prints every message that the programs can show, one per line, for an editor to read in one sitting::
+"""Prints all messages of the programs, one per line, so that an editor can read them together::
 
     python tools/messages.py [FOLDER...]
 
-A message is a string that contains a space and is not a docstring; this includes help texts of options.
-Braces mark values that an f-string fills in.
+A message is any string that contains a space and is not a docstring; help texts of options are included.
+Braces mark the values that an f-string inserts.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ FOLDERS = ("skinnode", "vcan_sim")
 
 
 class Message(NamedTuple):
-    """A string in the source that a user may read."""
+    """A string literal that the user may see, and its location."""
 
     place: str
     """File and line number."""
@@ -26,7 +26,7 @@ class Message(NamedTuple):
 
 
 def messages(folder: Path) -> Iterator[Message]:
-    """Yield the messages in all modules under ``folder``, file by file."""
+    """Yield the messages of all modules under ``folder``, file by file."""
     for file in sorted(folder.rglob("*.py")):
         tree = ast.parse(file.read_text(encoding="utf-8"))
         silent = {id(node) for node in _docstrings(tree)}
@@ -42,14 +42,14 @@ def messages(folder: Path) -> Iterator[Message]:
 
 
 def _docstrings(tree: ast.AST) -> Iterator[ast.AST]:
-    """Yield standalone strings: docstrings, including those of variables."""
+    """Yield string literals that are statements, such as docstrings of functions and variables."""
     for node in ast.walk(tree):
         if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant):
             yield node.value
 
 
 def _text(node: ast.AST) -> str | None:
-    """Return a string literal with its placeholders, or None for other nodes."""
+    """Return the text of a string literal with placeholders, or None if the node is not a string."""
     if isinstance(node, ast.Constant) and isinstance(node.value, str):
         return node.value
     if isinstance(node, ast.JoinedStr):

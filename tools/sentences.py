@@ -1,7 +1,7 @@
-"""Draw sentences from the project at random, for an editor to grade: ``python -m tools.sentences --seed 1``.
+"""Select random sentences for an editor to grade: ``python -m tools.sentences --seed 1``.
 
-Sentences come from docstrings, comments, messages (other strings of at least five words) and pages. Tests,
-the changelog, code blocks and tables are left out.
+The sentences are taken from docstrings, comments, messages (other strings of at least five words) and pages.
+Tests, the changelog, code blocks and tables are excluded.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ _LEAST_WORDS = 5
 
 
 class Sentence(NamedTuple):
-    """A sentence and its location."""
+    """Sentence with its location and kind."""
 
     place: str
     kind: str
@@ -29,7 +29,7 @@ class Sentence(NamedTuple):
 
 
 def sentences() -> list[Sentence]:
-    """Find all sentences, ordered by file and line."""
+    """Return all sentences of the project, file by file."""
     found: list[Sentence] = []
     for folder in ("skinnode", "vcan_sim", "tools"):
         for path in sorted((ROOT / folder).rglob("*.py")):
@@ -81,7 +81,7 @@ def _of_page(path: Path) -> Iterator[Sentence]:
 
 
 def _split(text: str) -> Iterator[str]:
-    """Yield the sentences of paragraphs and list items, which end at full stops."""
+    """Split paragraphs and list items into sentences."""
     for paragraph in re.split(r"\n\s*\n|\n\s*[-*] |\n\s*\d+\. ", text):
         plain = " ".join(paragraph.split())
         if re.search(r"={4,}|-{4,}|::", plain):  # tables and drawings
@@ -92,8 +92,8 @@ def _split(text: str) -> Iterator[str]:
 
 
 def main() -> None:
-    """Print the drawn sentences, one per line, with their locations."""
-    parser = argparse.ArgumentParser(description="Draw sentences from the project at random.")
+    """Print the selected sentences, one per line, with their locations."""
+    parser = argparse.ArgumentParser(description="Select random sentences from the project.")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--count", type=int, default=50)
     options = parser.parse_args()

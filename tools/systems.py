@@ -1,9 +1,10 @@
 """Compare ``solve_system`` with SciPy on the Moré-Garbow-Hillstrom set: ``python -m tools.systems``.
 
-Every solver gets the same functions, a tolerance of 1e-12 and at most 2000 evaluations, from the standard
-starts times 1, 10 and 100. A problem is solved if the point is a root or, if the system has none or is tall,
-a minimum. This is judged in 80-bit arithmetic, whatever the solver says. A claim is false if a solver reports
-success where there is neither, or a root where a square system has only a minimum.
+All solvers use the same functions, a tolerance of 1e-12, at most 2000 evaluations, and the standard starting
+points multiplied by 1, 10 and 100. A problem is solved if the resulting point is a root. If the system has no
+root or is tall, the point must be a minimum. This verdict is computed in 80-bit arithmetic, independently of
+the status that the solver reports. A claim is false if a solver reports success at a point that is neither
+root nor minimum, or reports a root of a square system at a minimum.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ MOST = 2000
 
 Function = Callable[[Any], Any]
 Solve = Callable[[Function, Function, Any], tuple[Any, bool, bool]]
-"""Returns the point, whether a root or minimum is claimed, and whether the claim is a root."""
+"""Function that returns the point, whether a root or minimum is claimed, and whether a root is claimed."""
 
 
 def ours(operator: str) -> Solve:
@@ -57,7 +58,7 @@ def least_squares(method: str) -> Solve:
     def solve(f: Function, j: Function, x0: Any) -> tuple[Any, bool, bool]:
         try:
             found = optimize.least_squares(f, x0, jac=j, method=method, max_nfev=MOST, **tolerances)
-        except (ValueError, np.linalg.LinAlgError):  # an overflow
+        except (ValueError, np.linalg.LinAlgError):  # raised on overflow
             return x0, False, False
         return found.x, found.success, False
 
@@ -72,14 +73,14 @@ SOLVERS: dict[str, Solve] = {
 
 
 def solved(problem: Problem, truth: Verdict) -> bool:
-    """Whether a point with this verdict solves the problem."""
+    """Return whether a point with the verdict ``truth`` solves the problem."""
     if truth.root or (problem.square and problem.least == 0):
         return truth.root
     return truth.minimum and (truth.isolated or truth.norm**2 <= problem.least * (1 + 5e-6))
 
 
 def outcomes(solve: Solve, square: bool) -> Iterator[dict[str, Any]]:
-    """Yield the outcome of each start of the square or of the tall problems."""
+    """Solve the square or the tall problems from every starting point, and yield each outcome."""
     for problem in PROBLEMS:
         for factor in FACTORS if problem.square == square else ():
             calls = [0, 0]
@@ -104,7 +105,7 @@ def outcomes(solve: Solve, square: bool) -> Iterator[dict[str, Any]]:
 
 
 def measure(name: str) -> dict[str, Any]:
-    """Return the row of a solver; ``None`` for tall problems if it solves only square ones."""
+    """Run one solver on all problems; the row contains None for tall problems if it cannot solve them."""
     kinds = {"square": True, "tall": False}
     found = {
         kind: None if "hybr" in name and not square else list(outcomes(SOLVERS[name], square))
@@ -130,7 +131,7 @@ def main() -> None:
     of = {"square": sum(each.square for each in PROBLEMS)}
     of["tall"] = len(PROBLEMS) - of["square"]
     figures: dict[str, Any] = {"benchmark": "systems", "machine": machine(), "of": of, "rows": []}
-    print(f"{'solved from starts × 1, 10, 100':34}{f'{of} each':>34}  false  unclaimed  calls of r, J")
+    print(f"{'solved, starting points × 1, 10, 100':34}{f'{of} each':>34}  false  unclaimed  calls of r, J")
     with np.errstate(all="ignore"), warnings.catch_warnings():
         warnings.simplefilter("ignore")
         for name in SOLVERS:

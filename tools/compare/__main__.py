@@ -1,13 +1,14 @@
 """Compare the results of two commits bit by bit: ``python -m tools.compare OLD [NEW]``.
 
-NEW is the working tree by default. The old commit generates the inputs: streams of resistances on five
-layouts, with two noise levels, with and without faults, and recordings of simulated hands. Both commits then
-process the inputs: forward model, every method of the tracker, path following with every operator, systems of
-equations, replay of the recordings, generated files. The report gives, for each part, a hash of all its
-arrays in each commit and, for each array that differs, the largest relative difference.
+NEW is the working tree by default. The old commit generates the inputs: recordings of simulated hands, and
+streams of resistances on five layouts, with two noise levels, with and without faults. Both commits then
+process the inputs with the forward model, every method of the tracker, path following with every operator,
+and the solver for systems of equations. They also replay the recordings and generate files. For each part,
+the report contains one hash per commit over all arrays of the part. For each array that differs, the report
+states the largest relative difference.
 
-Exit status 0 if every array is equal in both commits or, for a float array, differs by at most ``--rtol``;
-otherwise 1.
+The exit status is 0 if every array is equal in both commits, or if all differences between float arrays are
+at most ``--rtol``. Otherwise the exit status is 1.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ HERE: Final = Path(__file__).parent
 
 
 def tree_of(commit: str | None, folder: Path) -> Path:
-    """Return a folder with the files of ``commit``; None selects the working tree."""
+    """Extract the files of ``commit`` to ``folder``, and return the folder; None selects the working tree."""
     if commit is None:
         return ROOT
     folder.mkdir()
@@ -39,7 +40,7 @@ def tree_of(commit: str | None, folder: Path) -> Path:
 
 
 def run_in(tree: Path, script: str, *arguments: str) -> None:
-    """Run a script in this folder with the packages in ``tree``."""
+    """Run a script from the folder of this module, with the packages in ``tree``."""
     code = (
         f"import runpy, sys, skinnode; assert skinnode.__file__.startswith({str(tree)!r}), 'another tree'; "
         f"sys.argv = {[script, *arguments]!r}; runpy.run_path({str(HERE / script)!r}, run_name='__main__')"
@@ -51,8 +52,8 @@ def run_in(tree: Path, script: str, *arguments: str) -> None:
 def relative_difference(old: Any, new: Any) -> float:
     """Return the largest difference between arrays, relative to the largest finite value in the old array.
 
-    Returns inf if shape, type or the positions of NaN and infinity differ, or if the arrays are not float
-    arrays.
+    Returns inf if shapes, types, or positions of NaN and infinity differ, or if the arrays do not contain
+    floats.
     """
     if old.shape != new.shape or old.dtype != new.dtype or old.dtype.kind != "f":
         return np.inf
@@ -65,7 +66,7 @@ def relative_difference(old: Any, new: Any) -> float:
 
 
 def report(old: Any, new: Any, rtol: float) -> Iterable[tuple[str, bool]]:
-    """Yield the lines of the report, each with whether the difference that it reports is allowed."""
+    """Yield each line of the report, and whether the reported difference is allowed."""
     names = dict.fromkeys([*old.files, *new.files])
     for part in dict.fromkeys(name.partition(":")[0] for name in names):
         mine = [name for name in names if name.startswith(f"{part}:")]
@@ -94,7 +95,7 @@ def main() -> int:
     parser.add_argument("old", metavar="OLD", help="commit, such as HEAD~1 or a tag")
     parser.add_argument("new", metavar="NEW", nargs="?", help="commit; the working tree by default")
     parser.add_argument(
-        "--rtol", type=float, default=0.0, help="allowed relative difference of floats; default 0"
+        "--rtol", type=float, default=0.0, help="maximum relative difference of floats; default 0"
     )
     parser.add_argument("--part", action="append", default=[], help="part to compare; default all")
     parser.add_argument(

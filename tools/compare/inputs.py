@@ -1,9 +1,9 @@
-"""Inputs for a comparison of two commits: streams of resistances, and recordings of simulated hands.
+"""Generates the inputs for a comparison of two commits: streams of resistances, and recordings of hands.
 
-Both commits read the same files, so the files must not depend on either commit. The displacements are sums of
-Gaussian bumps, not solutions of the elastic model; the noise has a fixed seed.
+Both commits read the same files, so the files should depend on neither commit. The displacements are
+therefore sums of Gaussian bumps, not solutions of the elastic model, and the noise has a fixed seed.
 
-Run in the tree of the old commit with ``python inputs.py FOLDER``. Uses only the public API.
+Run this script in the tree of the old commit: ``python inputs.py FOLDER``. It uses only the public API.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ node_id = 6
 {tolerances}
 layout = {{ preset = "aligned", {sizes} }}
 """
-TOLERANCES = 'tolerances = "exact"' if hasattr(sk, "Tolerances") else ""  # older commits do not know the key
+TOLERANCES = 'tolerances = "exact"' if hasattr(sk, "Tolerances") else ""  # older commits reject this key
 SIZES = "upper_wires = 6, upper_electrodes = 4, lower_wires = 12, lower_electrodes = 6"
 RECORDINGS = {
     "plain": ("auto", []),
@@ -60,7 +60,7 @@ RECORDINGS = {
 
 
 def layouts() -> dict[str, sk.PatchLayout]:
-    """Return patches of two presets, one bent round a cylinder, and two with different numbers of wires."""
+    """Return two preset layouts, a layout bent round a cylinder, and two with different numbers of wires."""
     flat = sk.PatchLayout.preset("staggered")
     middle, radius_m = flat.upper_m[..., 0].mean(), 25e-3
 
@@ -82,7 +82,7 @@ def layouts() -> dict[str, sk.PatchLayout]:
 
 
 def displacements(layout: sk.PatchLayout) -> Float:
-    """Return (T, U, N, 3) metres: rest, a growing and sliding press with shear, a second press, release."""
+    """Return the displacements (T, U, N, 3), metres: rest, a sliding press, a second press, and release."""
     pitch, height = layout.pitch_m, layout.height_m
     x, y = layout.upper_m[..., 0], layout.upper_m[..., 1]
     low, high = np.array([x.min(), y.min()]), np.array([x.max(), y.max()])
@@ -101,7 +101,7 @@ def displacements(layout: sk.PatchLayout) -> Float:
 
 
 def streams() -> dict[str, Float]:
-    """Return ``LAYOUT/NOISE/ohm`` (T, U, K), and ``…/faulty`` with invalid and false resistances."""
+    """Return ``LAYOUT/NOISE/ohm`` (T, U, K), and ``LAYOUT/NOISE/faulty`` with invalid and wrong readings."""
     made: dict[str, Float] = {}
     for number, (name, layout) in enumerate(layouts().items()):
         exact = np.array([sk.resistance_ohm(layout, layout.upper_m + d) for d in displacements(layout)])
@@ -111,18 +111,18 @@ def streams() -> dict[str, Float]:
             ohm = exact * (1.0 + noise * rng.standard_normal(exact.shape))
             made[f"{name}/{noise_name}/ohm"] = ohm
             faulty = ohm.copy()
-            faulty[6:9, 2] = np.nan  # an upper wire is lost
+            faulty[6:9, 2] = np.nan  # readings of an upper wire are missing
             faulty[10:14, :, 4] = np.inf  # a lower wire is open
-            faulty[15] = np.nan  # a whole scan
+            faulty[15] = np.nan  # all readings are missing
             faulty[17, 1, :5] = 0.0
-            faulty[19, 3, 7] *= 1.1  # one false reading
-            faulty[20:, 4] = faulty[19, 4]  # a frozen wire
+            faulty[19, 3, 7] *= 1.1  # one reading is wrong
+            faulty[20:, 4] = faulty[19, 4]  # an upper wire is frozen
             made[f"{name}/{noise_name}/faulty"] = faulty
     return made
 
 
 def record(folder: Path, name: str) -> None:
-    """Record a simulated hand with the commands that a user would use."""
+    """Record a simulated hand by running the simulator's and the recorder's commands."""
     method, faults = RECORDINGS[name]
     group = f"239.74.{random.randrange(256)}.{random.randrange(1, 255)}"
     hand = folder / f"{name}.toml"

@@ -1,11 +1,11 @@
 """Time a benchmark for two commits alternately on one machine: ``python -m tools.compare.speed OLD [NEW]``.
 
-NEW is the working tree by default. Each round runs the benchmark once in each tree; the order alternates, so
-that a change in the machine's speed affects both trees equally. The report gives the shortest time of each
-row in both commits, and the ratio of the two. The rows for NumPy and LAPACK show the timing noise of the
-machine.
+NEW is the working tree by default. Each round runs the benchmark once in each tree. The order alternates, so
+that changes in the machine's speed affect both trees equally. For each row, the report contains the shortest
+time in each commit, and the ratio of the two times. The rows for NumPy and LAPACK indicate the timing noise
+of the machine.
 
-Exit status 0 if no row takes more than ``--limit`` times its old time, otherwise 1.
+The exit status is 1 if any row takes more than ``--limit`` times as long as in the old commit, otherwise 0.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from tools.compare.__main__ import tree_of
 
 
 def rows_of(report: Any) -> dict[str, float]:
-    """Return every time in the JSON report of a benchmark, keyed by the names of its row and key."""
+    """Return all times in the JSON report of a benchmark; the keys consist of the row's name and the unit."""
     found: dict[str, float] = {}
 
     def collect(part: Any, label: str) -> None:
@@ -61,13 +61,15 @@ def main() -> int:
     parser.add_argument("old", metavar="OLD", help="commit, such as HEAD~1 or a tag")
     parser.add_argument("new", metavar="NEW", nargs="?", help="commit; the working tree by default")
     parser.add_argument("--benchmark", default="kernel", help="name of the benchmark; default kernel")
-    parser.add_argument("--rounds", type=int, default=5, help="runs of each commit; default 5")
-    parser.add_argument("--limit", type=float, default=1.05, help="largest allowed ratio; default 1.05")
+    parser.add_argument("--rounds", type=int, default=5, help="number of runs of each commit; default 5")
+    parser.add_argument(
+        "--limit", type=float, default=1.05, help="maximum ratio of new to old time; default 1.05"
+    )
     options, arguments = parser.parse_known_args()
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
         trees = [tree_of(options.old, folder / "old"), tree_of(options.new, folder / "new")]
-        for tree in trees:  # fills the cache of compiled kernels
+        for tree in trees:  # the first run only fills the cache of compiled kernels
             run(tree, options.benchmark, arguments, folder / "out.json")
         best: list[dict[str, float]] = [{}, {}]
         for turn in range(options.rounds):

@@ -1,4 +1,4 @@
-"""Reference of the commands, with arguments and options read from the Typer applications."""
+"""Generates the command reference; arguments and options are read from the Typer applications."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from vcan_sim.cli import app as vcan_sim
 
 
 def commands() -> str:
-    """Return one section per command."""
+    """Return one section of Markdown per command."""
     programs = {"skinnode": get_command(skinnode), "vcan-sim": get_command(vcan_sim)}
     return "\n\n".join(text for name, command in programs.items() for text in _sections(name, command))
 

@@ -1,5 +1,7 @@
-"""Reference of hand.toml and of scene files: purpose, type, unit, default and range of each key, read from
-their models."""
+"""Generates the reference of hand.toml and of scene files from their models.
+
+The reference contains the purpose, type, unit, default and range of each key.
+"""
 
 from __future__ import annotations
 
@@ -36,12 +38,12 @@ _UNITS: Final = {
 
 
 def keys_of_a_hand() -> str:
-    """Return one section per table of the file, in the order of the models."""
+    """Return one section of Markdown per table of hand.toml, in the order of the models."""
     return "\n\n".join(_sections("", HandConfig, listed=False))
 
 
 def keys_of_a_scene() -> str:
-    """Return one section per table of a scene file."""
+    """Return one section of Markdown per table of a scene file."""
     return "\n\n".join(_sections("", SceneConfig, listed=False))
 
 
@@ -72,7 +74,7 @@ def _row(name: str, field: FieldInfo) -> tuple[str, ...]:
 
 
 def _kind(annotation: Any) -> str:
-    """Return the TOML name of a type."""
+    """Return the TOML name of a Python type."""
     origin, inside = get_origin(annotation), [part for part in get_args(annotation) if part is not type(None)]
     if origin in (Union, types.UnionType, Annotated):
         return _kind(inside[0])

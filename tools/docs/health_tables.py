@@ -1,4 +1,4 @@
-"""Tables of a patch's conditions and of a simulated node's faults, read from their definitions."""
+"""Generates tables of a patch's conditions and of the simulator's faults from their definitions."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _PLAIN: Final = {
     "NEVER_SEEN": "No frame from the patch has arrived since the host started.",
     "OPERATIONAL": "All is well.",
 }
-"""Meanings of members that have no docstring."""
+"""Descriptions of conditions whose definitions have no docstring."""
 
 
 def conditions() -> str:
@@ -31,7 +31,7 @@ def _without_reference(text: str) -> str:
 
 
 def faults() -> str:
-    """Return the table of the faults that `vcan-sim --fault` can inject."""
+    """Return a table of the faults that `vcan-sim --fault` can inject into a node."""
     docs = md.member_docs(Faults)
     kinds = {"bool": "on or off", "int": "integer", "int | None": "integer"}
     rows = []
@@ -60,7 +60,7 @@ def bus_faults() -> str:
 
 
 def imperfections() -> str:
-    """Return the table of the imperfections of a simulated patch, with the sizes of an ordinary patch."""
+    """Return a table of a simulated patch's imperfections, with their values in an ordinary patch."""
     docs, ordinary = md.member_docs(Imperfections), Imperfections.ordinary()
     rows = [
         (md.code(name), docs[name], _size(getattr(ordinary, name)))

@@ -1,5 +1,7 @@
-"""Documentation hooks, which replace a line `<!-- generated: NAME -->` with the table NAME, generated from
-the code when the site is built. A name without a table, or a table that no page uses, aborts the build."""
+"""MkDocs hooks that replace each line `<!-- generated: NAME -->` with a table generated from the code.
+
+The build fails if there is no table with this name, or if a table is not used by any page.
+"""
 
 from __future__ import annotations
 
@@ -42,5 +44,5 @@ def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
 
 def on_env(env: Any, **_: Any) -> Any:
     if unused := sorted(TABLES.keys() - _used):
-        raise PluginError(f"no page has <!-- generated: {unused[0]} -->")
+        raise PluginError(f"no page contains <!-- generated: {unused[0]} -->")
     return env

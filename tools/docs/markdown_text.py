@@ -1,4 +1,4 @@
-"""Markdown helpers for the generators."""
+"""Helpers that format Markdown for the documentation generators."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from collections.abc import Iterable, Sequence
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """Return a pipe table; bars in cells are escaped, except in code."""
+    """Return a Markdown table; vertical bars in cells are escaped, except in code."""
     lines = [head, ["---"] * len(head), *rows]
     return "\n".join("| " + " | ".join(map(_cell, line)) + " |" for line in lines)
 
@@ -20,7 +20,7 @@ def _cell(text: str) -> str:
 
 
 def code(text: object) -> str:
-    """Mark ``text`` as code; an empty text stays empty."""
+    """Format ``text`` as inline code; an empty string remains empty."""
     shown = str(text)
     return f"`{shown}`" if shown else ""
 
@@ -32,12 +32,12 @@ def prose(docstring: str) -> str:
 
 
 def c_hex(value: int, digits: int = 4) -> str:
-    """Format a number as 0x and upper-case digits."""
+    """Format a number in hexadecimal with the prefix 0x and upper-case digits."""
     return f"0x{value:0{digits}X}"
 
 
 def member_docs(kind: type) -> dict[str, str]:
-    """Return the docstring below each member of a class, read from the source."""
+    """Return the docstring that follows each member of a class in its source."""
     (body,) = ast.parse(inspect.getsource(kind)).body
     assert isinstance(body, ast.ClassDef)
     docs: dict[str, str] = {}

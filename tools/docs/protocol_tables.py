@@ -1,4 +1,4 @@
-"""Tables of the protocol page, made from the modules that implement the protocol."""
+"""Generates the tables of the protocol page from the modules that implement the protocol."""
 
 from __future__ import annotations
 
@@ -28,15 +28,14 @@ PROFILE: Final = REFERENCE_PROFILES[0]
 NODE_ID: Final = 4
 _BITRATE_BPS, _DATA_BITRATE_BPS = 1_000_000, 5_000_000
 _HIGHEST: Final = highest(0, 0).name
-"""Name of sub-index 0 of nearly every object, which is left out because the rows below give the same
-number."""
+"""Name of sub-index 0 of most objects; the table omits this row, because the rows below imply its value."""
 _PLUS_NODE_ID: Final = " + node\u2011ID"
 _FEW: Final = 3
-"""Maximum number of equal entries that are listed individually."""
+"""Maximum number of equivalent entries that are listed individually."""
 
 
 def cob_ids() -> str:
-    """List a patch's identifiers, lowest first, which is the order of their priority on the bus."""
+    """List a patch's identifiers in ascending order, which is the order of decreasing bus priority."""
     rows = (
         ("NMT command", od.NMT_COB_ID, od.NMT_COB_ID, "NMT master → node", 2),
         ("SYNC", od.SYNC_COB_ID, od.SYNC_COB_ID, "producer → node", "1 (counter)"),
@@ -68,7 +67,7 @@ def cob_ids() -> str:
 
 
 def formats() -> str:
-    """Compare the four formats of the reference patch."""
+    """Compare the four wire formats for the reference patch."""
     rows = []
     for profile in REFERENCE_PROFILES:
         frame_s = worst_case_bits(8) / _BITRATE_BPS
@@ -100,7 +99,7 @@ def formats() -> str:
 
 
 def example_scan() -> str:
-    """Show the frames of one press as the bytes that the codec produces."""
+    """Show the bytes that the codec produces for the frames of one pressed scan."""
     scale, scan = CodeScale(16), 7
     resistance = np.full((PROFILE.rows, PROFILE.columns), 1500.0)
     baseline = resistance.copy()
@@ -126,20 +125,20 @@ def example_scan() -> str:
     values = ", ".join(f"{int(code)} (`{int(code):04X}`)" for code in codes[0, :3])
     return (
         "```text\n" + "\n".join(lines) + "\n```\n\n"
-        f"Resistances of {resistance[0, 0]:g}, {resistance[0, 1]:g} and infinite ohm over a baseline of "
-        f"{baseline[0, 0]:g} ohm are the codes {values}; on the bus the low byte comes first. "
-        f"An open wire has the code {scale.open}, a short {scale.short}, a value out of range "
-        f"{scale.over_range}."
+        f"Resistances of {resistance[0, 0]:g}, {resistance[0, 1]:g} and infinite ohm with a baseline of "
+        f"{baseline[0, 0]:g} ohm have the codes {values}; on the bus, the low byte is sent first. "
+        f"The code of an open wire is {scale.open}, that of a short circuit is {scale.short}, and that of a "
+        f"value out of range is {scale.over_range}."
     )
 
 
 def summary_flags() -> str:
-    """List the bits in the second byte of a summary."""
+    """List the flag bits in the second byte of a summary."""
     return _enum_table(SummaryFlag, ("bit", "name", "meaning"), 2)
 
 
 def pdos() -> str:
-    """List the PDO parameters after a reset."""
+    """List the values of the PDO parameters after a reset."""
     objects = {item.index: item for item in PROFILE.objects()}
     names = {(e.index, e.subindex): e.name for item in objects.values() for e in item.entries}
     rows = []
@@ -176,7 +175,7 @@ def manufacturer() -> str:
 
 
 def emergencies() -> str:
-    """List the error codes that a node sends."""
+    """List the EMCY error codes that a node sends."""
     rows = (
         (md.c_hex(code), error_text(code, ours=True), md.c_hex(code.register_bit, 2))
         for code in EmcyCode
@@ -186,7 +185,7 @@ def emergencies() -> str:
 
 
 def aborts() -> str:
-    """List the abort codes of the SDO server."""
+    """List the abort codes that the SDO server sends."""
     rows = (
         (md.c_hex(code, 8), SdoAbortedError.CODES.get(code, code.name.replace("_", " ").capitalize()))
         for code in AbortCode
@@ -195,7 +194,7 @@ def aborts() -> str:
 
 
 def rejected() -> str:
-    """List the sub-indices of 0x2040."""
+    """List the sub-indices of object 0x2040."""
     names = {entry.subindex: entry.name for entry in _find(PROFILE, od.REJECTED_FRAMES).entries}
     docs = md.member_docs(Rejected)
     rows = ((str(kind.value), names[kind.value], docs[kind.name]) for kind in Rejected)
@@ -224,7 +223,7 @@ def _family(item: Object) -> str:
 
 
 def _dictionary(objects: Iterable[Object]) -> str:
-    """Return one row per entry; equal neighbouring entries, or equal neighbouring objects, share a row."""
+    """Return one row per entry; consecutive equivalent entries or objects share a row."""
     runs: list[list[Object]] = []
     for item in objects:
         if runs and _family(item) == _family(runs[-1][-1]) and _shape(item) == _shape(runs[-1][0]):

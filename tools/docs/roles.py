@@ -1,4 +1,4 @@
-"""Rendering of docstring roles (:class:`~skinnode.model.frames.FieldFrame`) as code."""
+"""Renders docstring roles such as :class:`~skinnode.model.frames.FieldFrame` as code."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ _ROLE = re.compile(r":[a-z]+:`~?(?:[\w.]+\.)?([\w.]+)`")
 
 
 class Roles(griffe.Extension):
-    """Rewrites each docstring as it is loaded."""
+    """Griffe extension that rewrites the roles in each docstring when the docstring is loaded."""
 
     def on_object(self, *, obj: griffe.Object, **_: Any) -> None:
         if obj.docstring is not None:

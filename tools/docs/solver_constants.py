@@ -1,4 +1,4 @@
-"""Table of the solver's tuning constants, read from the modules of ``skinnode.solve``."""
+"""Generates a table of the solver's tuning constants from the modules of ``skinnode.solve``."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ _NOT_TUNED: Final = {
     *("PREDICT", "HOLD", "COVARIANCE", "SKIP", "REUSE", "TASKS"),
     *("ROWS", "TILE", "REST", "TINY", "SQUARE_FLOOR", "A_MIN", "A_MAX", "NOISE_MAX"),
 }
-"""Names of task flags, tile sizes and overflow limits, whose values do not affect any result."""
+"""Names of constants that do not affect any result: task flags, tile sizes and overflow limits."""
 
 
 def constants() -> str:
-    """Return the table of all documented constants that are numbers or accuracies."""
+    """Return a table of all documented constants whose values are numbers or accuracies."""
     rows = [
         (md.code(f"{module.__name__.removeprefix('skinnode.solve.')}.{name}"), value, text)
         for module in _modules()

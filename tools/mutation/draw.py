@@ -1,12 +1,12 @@
-"""Draw mutants of the source: ``python -m tools.mutation.draw`` writes ``mutants.json``.
+"""Select random mutants of the source: ``python -m tools.mutation.draw`` writes ``mutants.json``.
 
-The operators are those of cosmic-ray. A draw picks places in the source, each equally likely, and then one
-mutation at each place; if mutations were drawn directly, a ``+`` would be drawn eleven times as often as a
-``not``.
+The mutation operators are those of cosmic-ray. The selection first chooses places in the source with equal
+probability, and then one mutation at each place. If mutations were chosen directly, a ``+`` would be selected
+eleven times as often as a ``not``.
 
-A mutant is identified by its change (file, function, operator, text before and after), never by a line
-number, and the draw depends only on a digest of its place and the seed. A list of mutants therefore stays
-valid when code moves, and an edit elsewhere does not change which mutants are drawn.
+A mutant is identified by its change (file, function, operator, text before and after), not by a line number.
+The selection depends only on the seed and on digests of the places. A list of mutants therefore remains valid
+when code moves, and edits elsewhere do not change which mutants are selected.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ GROUPS: Final = {
     "solve": ("solve",),
     "host": ("host",),
 }
-"""Packages of ``skinnode`` from which each group of mutants is drawn."""
+"""Packages of ``skinnode`` from which the mutants of each group are selected."""
 SEED: Final = 20260
 PER_PACKAGE: Final = 50
 
@@ -46,7 +46,7 @@ _DECORATORS_FOR_SPEED: Final = ("njit", "njit_part", "njit_body", "njit_brief", 
 
 @dataclass(frozen=True)
 class Mutant:
-    """One change to one file."""
+    """Mutant of the source: one change to one file."""
 
     file: str
     """Path relative to the root of the repository."""
@@ -59,11 +59,11 @@ class Mutant:
     after: str
     """Lines that the change adds."""
     nth: int
-    """Number of earlier mutants in this file whose other fields are the same."""
+    """Number of mutants earlier in this file that are equal in all other fields."""
 
     @property
     def name(self) -> str:
-        """Name of ten hexadecimal digits, derived from the fields."""
+        """Name of ten hexadecimal digits, computed from the other fields."""
         return _digest(self.file, self.function, self.operator, self.before, self.after, self.nth)[:10]
 
     @property
@@ -85,7 +85,7 @@ class _Candidate:
 
 
 class _OnlyBehaviour(ast.NodeTransformer):
-    """Removes code that tests need not check: annotations, strings, and decorators that only affect speed."""
+    """Removes code that tests need not check: annotations, strings, and decorators that affect only speed."""
 
     def visit_AnnAssign(self, node: ast.AnnAssign) -> Any:
         node.annotation = ast.Constant(0)
@@ -117,7 +117,7 @@ class _OnlyBehaviour(ast.NodeTransformer):
 
     def visit_Call(self, node: ast.Call) -> Any:
         if isinstance(node.func, ast.Name) and node.func.id == "dataclass":
-            node.keywords = []  # frozen and slots guard against mistakes that mypy reports anyway
+            node.keywords = []  # frozen and slots prevent mistakes that mypy reports anyway
         return self.generic_visit(node)
 
     def visit_If(self, node: ast.If) -> Any:
@@ -134,9 +134,9 @@ def _for_speed(decorator: ast.expr) -> bool:
 
 
 def _behaviour(source: str) -> str | None:
-    """Return a text that represents the behaviour of ``source``, or None if Python cannot compile it."""
+    """Return a string that represents the behaviour of ``source``; None if ``source`` does not compile."""
     try:
-        with warnings.catch_warnings(action="ignore"):  # for example "is" with a literal
+        with warnings.catch_warnings(action="ignore"):  # Python warns of "is" with a literal, for example
             compile(source, "mutant", "exec")
     except (SyntaxError, ValueError):
         return None
@@ -178,7 +178,7 @@ def _candidates(source: str, operators: dict[str, Any]) -> Iterator[_Candidate]:
 
 
 def mutated(source: str, operator: str, occurrence: int) -> str:
-    """Return ``source`` with one mutation. Raises LookupError if the occurrence does not exist."""
+    """Return ``source`` with one mutation applied. Raises LookupError if the occurrence does not exist."""
     code = mutate_code(source, _operators()[operator], occurrence)
     if code is None:
         raise LookupError(f"{operator}: no occurrence {occurrence}")
@@ -193,7 +193,7 @@ def _changed_lines(source: str, other: str) -> tuple[str, str]:
 
 
 def _name(file: str, source: str, wanted: _Candidate) -> Mutant:
-    """Return a mutation as an identified mutant, with the number of equal mutations that precede it."""
+    """Convert a candidate to a mutant, and count the preceding mutations that are equal to it."""
     functions = _functions(source)
     function = functions.get(wanted.line, "<module>")
     before, after = _changed_lines(source, mutated(source, wanted.operator, wanted.occurrence))
@@ -220,11 +220,13 @@ def find(mutant: Mutant, source: str) -> str:
             if nth == mutant.nth:
                 return other
             nth += 1
-    raise LookupError(f"{mutant.name}: {mutant.file}, {mutant.function}: no longer has {mutant.before!r}")
+    raise LookupError(
+        f"{mutant.name}: {mutant.file}, {mutant.function}: no longer contains {mutant.before!r}"
+    )
 
 
 def draw(group: str, count: int, seed: int, root: Path = ROOT) -> list[Mutant]:
-    """Draw ``count`` mutants from a group's packages, each at a different place."""
+    """Select ``count`` mutants from a group's packages, each at a different place."""
     sources: dict[str, str] = {}
     places: dict[str, list[tuple[str, _Candidate]]] = defaultdict(list)
     folders = [root / "skinnode" / package for package in GROUPS[group]]
@@ -261,12 +263,12 @@ def draw(group: str, count: int, seed: int, root: Path = ROOT) -> list[Mutant]:
 
 
 def read() -> list[Mutant]:
-    """Read the stored list of mutants."""
+    """Read the list of mutants from ``mutants.json``."""
     return [Mutant(**entry) for entry in json.loads(LIST.read_text("utf-8"))["mutants"]]
 
 
 def write(mutants: list[Mutant]) -> None:
-    """Store ``mutants``, ordered by group and file."""
+    """Write ``mutants`` to ``mutants.json``, ordered by group and file."""
     mutants = sorted(
         mutants, key=lambda each: (list(GROUPS).index(each.group), each.file, each.function, each.name)
     )
@@ -277,7 +279,7 @@ def write(mutants: list[Mutant]) -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description="Draw new mutants; mutants of other groups are kept.")
+    parser = argparse.ArgumentParser(description="Select new mutants; keep the mutants of all other groups.")
     parser.add_argument("--package", choices=GROUPS, action="append")
     packages = parser.parse_args().package or list(GROUPS)
     kept = [each for each in read() if each.group not in packages] if LIST.exists() else []

@@ -1,9 +1,10 @@
-"""Run the tests against each drawn mutant: ``python -m tools.mutation.run --package protocol``.
+"""Run the tests on each selected mutant: ``python -m tools.mutation.run --package protocol``.
 
-Each mutant is applied to a private copy of the repository, and the stages of ``stages.toml`` run on it, each
-until its first failure. A failure of a real-time test counts only if the test also fails when run alone. A
-stage that exceeds its time limit also kills the mutant. Verdicts are written to ``results.json`` immediately;
-the next run skips the mutants listed there except, with ``--again``, the survivors.
+Each mutant is applied to a private copy of the repository. The test stages of ``stages.toml`` then run on the
+copy until the first failure, which kills the mutant. A failure of a real-time test counts only if the test
+also fails when run alone. A stage that exceeds its time limit also kills the mutant. Verdicts are written to
+``results.json`` immediately. The next run skips all mutants with a verdict; with ``--again``, it repeats the
+survivors.
 
 One process imports the libraries and forks for every pytest run, because the imports take longer than most
 tests.
@@ -47,9 +48,9 @@ _KERNELS: Final = (
 _MEMORY_BYTES: Final = 8 << 30
 _FILE_BYTES: Final = 1 << 30
 _TEST_S: Final = 120
-"""Time limit for one test, s."""
+"""Time limit for a single test, s."""
 _GRACE_S: Final = 60.0
-"""Time allowed for a stage in addition to six times its unmutated duration, s."""
+"""Constant part of a stage's time limit, s; the other part is six times the duration without a mutant."""
 _PR_SET_CHILD_SUBREAPER: Final = 36
 _PASSED, _FAILED = 0, 1
 
@@ -59,14 +60,14 @@ class Outcome:
     """Outcome of one pytest run."""
 
     status: int | None
-    """Exit status, or None if the run was stopped at its time limit."""
+    """Exit status of pytest; None if the run exceeded its time limit."""
     failed: tuple[str, ...]
-    """Names of the failed tests."""
+    """Node IDs of the failed tests."""
     took_s: float
 
 
 class Tree:
-    """A private copy of the repository with the kernels compiled from it."""
+    """Private copy of the repository, together with the kernels compiled from the copy."""
 
     def __init__(self, folder: Path) -> None:
         self.source, self.cache, self.warm = folder / "tree", folder / "cache", folder / "warm"
@@ -75,7 +76,7 @@ class Tree:
         self.log = folder / "log"
         self._copy()
         if self.warm.exists() and not (self.warm / "skinnode" / self._leaf()).exists():
-            shutil.rmtree(self.warm)  # compiled from different sources
+            shutil.rmtree(self.warm)  # these kernels were compiled from a different source
 
     def _copy(self) -> None:
         listed = subprocess.run(
@@ -100,10 +101,10 @@ class Tree:
             shutil.copy2(here, there)
 
     def put(self, mutant: Mutant) -> None:
-        """Apply a mutant to the copy, keeping the compiled kernels that it does not affect.
+        """Apply a mutant to the copy, but keep the compiled kernels that the mutant does not affect.
 
-        numba recompiles a kernel if its own file has changed; this method removes the kernels of files that
-        import that file.
+        numba recompiles a kernel if the kernel's own file has changed. This method also removes the kernels
+        of all files that import the mutated file.
         """
         path = self.source / mutant.file
         found = path.stat()
@@ -119,7 +120,7 @@ class Tree:
             return
         try:
             new = old.with_name(self._leaf())
-        except subprocess.CalledProcessError:  # the mutant cannot be imported
+        except subprocess.CalledProcessError:  # the mutated package cannot be imported
             return
         old.rename(new)
         for stem in self._reached(mutant.file):
@@ -127,7 +128,7 @@ class Tree:
                 kept.unlink()
 
     def _leaf(self) -> str:
-        """Return the name of the folder that holds the compiled kernels of the current copy."""
+        """Return the name of the cache folder for the kernels of the current copy."""
         code = "from skinnode.compiled.jit import cache_dir; print(cache_dir().name)"
         with tempfile.TemporaryDirectory() as folder:
             environment = os.environ | {"PYTHONPATH": str(self.source), "SKINNODE_CACHE_DIR": folder}
@@ -152,13 +153,13 @@ class Tree:
         return {module.rpartition(".")[2] for module in reached}
 
     def put_back(self) -> None:
-        """Undo :meth:`put`."""
+        """Restore the file that :meth:`put` changed."""
         path, text, times_ns = self._original
         path.write_text(text, "utf-8")
-        os.utime(path, ns=times_ns)  # numba would recompile files that seem to have changed
+        os.utime(path, ns=times_ns)  # numba recompiles files whose modification time has changed
 
     def keep_kernels(self) -> None:
-        """Keep the kernels compiled from the unmutated source."""
+        """Save the kernels compiled from the source without a mutant."""
         shutil.rmtree(self.warm, ignore_errors=True)
         compiled = self.cache / "skinnode" / self._leaf()
         if compiled.exists():
@@ -170,7 +171,7 @@ class Tree:
 
 
 class _Failures:
-    """pytest plugin that records the failed tests."""
+    """pytest plugin that records which tests fail."""
 
     def __init__(self) -> None:
         self.failed: list[str] = []
@@ -185,7 +186,7 @@ class _Failures:
 
 
 def run_tests(tree: Tree, arguments: Sequence[str], limit_s: float) -> Outcome:
-    """Run pytest in its own process group, then end all processes that it started."""
+    """Run pytest in a new process group, and then kill all processes that pytest started."""
     answer, begin_s = tree.log.with_name("answer"), time.monotonic()
     answer.unlink(missing_ok=True)
     child = os.fork()
@@ -222,7 +223,7 @@ def _be_pytest(tree: Tree, arguments: Sequence[str], answer: Path, limit_s: floa
         os.environ |= {
             "PYTHONPATH": str(tree.source),
             "SKINNODE_CACHE_DIR": str(tree.cache),
-            "PYTHONDONTWRITEBYTECODE": "1",  # two mutants of one file within a second would look the same
+            "PYTHONDONTWRITEBYTECODE": "1",  # stale bytecode might run instead of a mutant
         }
         sys.dont_write_bytecode = True
         sys.path[:] = [str(tree.source), *(each for each in sys.path if Path(each or ".").resolve() != ROOT)]
@@ -233,7 +234,7 @@ def _be_pytest(tree: Tree, arguments: Sequence[str], answer: Path, limit_s: floa
         failures = _Failures()
         options = ["-q", "-n", "0", "--tb=short", "-p", "no:cacheprovider", "-o", f"timeout={_TEST_S}"]
         options += ["-W", "ignore::pytest.PytestAssertRewriteWarning"]
-        options += ["-W", "ignore::SyntaxWarning"]  # for example "is" with a literal: no test would notice
+        options += ["-W", "ignore::SyntaxWarning"]  # Python warns of "is" with a literal, for example
         status = int(pytest.main([*options, *arguments], plugins=[failures]))
         answer.write_text(json.dumps(failures.failed), "utf-8")
     except BaseException:
@@ -245,7 +246,7 @@ def _be_pytest(tree: Tree, arguments: Sequence[str], answer: Path, limit_s: floa
 
 
 def _end_children(group: int) -> None:
-    """Kill a process group and the processes that left it, which this process adopts as orphans."""
+    """Kill a process group, and the processes that left the group and were adopted by this process."""
     with contextlib.suppress(ProcessLookupError):
         os.killpg(group, signal.SIGKILL)
     for _ in range(100):
@@ -260,7 +261,7 @@ def _end_children(group: int) -> None:
 
 
 def _stages(mutant: Mutant, table: dict[str, Any]) -> list[list[str]]:
-    """Return the test files for a mutant by stage, each file once."""
+    """Return the test files for a mutant, grouped by stage; each file is listed once."""
     group = table[mutant.group]
     first = group.get("first", {}).get(Path(mutant.file).stem, [])
     stages, seen = [], set[str]()
@@ -275,12 +276,12 @@ def _stages(mutant: Mutant, table: dict[str, Any]) -> list[list[str]]:
 def _expand(pattern: str) -> list[str]:
     found = sorted(str(path.relative_to(ROOT)) for path in ROOT.glob(pattern))
     if not found:
-        raise SystemExit(f"stages.toml: got {pattern}, which matches no file")
+        raise SystemExit(f"stages.toml: got {pattern}, which does not match any file")
     return found
 
 
 class Session:
-    """Test runs on one tree, with its unmutated results."""
+    """Runs tests on one tree, and stores the results of the tests without a mutant."""
 
     def __init__(self, tree: Tree, table: dict[str, Any], *, quick: bool) -> None:
         self._tree, self._table, self._quick = tree, table, quick
@@ -289,8 +290,7 @@ class Session:
         self._kept = tree.log.with_name("unmutated.json")
 
     def measure(self, mutants: Sequence[Mutant], *, trust: bool) -> None:
-        """Run the test files of ``mutants`` unmutated, to measure their durations and to find the tests that
-        fail and therefore prove nothing."""
+        """Run the test files without a mutant, to measure durations and to find tests that fail anyway."""
         if self._kept.exists() and trust:
             self._known = json.loads(self._kept.read_text("utf-8"))
         files = {path: None for each in mutants for stage in self._stages(each) for path in stage}
@@ -301,14 +301,12 @@ class Session:
         for path in missing:
             run = run_tests(self._tree, [path], 900.0)
             if run.status not in (_PASSED, _FAILED):
-                raise SystemExit(
-                    f"{path}: exit status {run.status} without a mutant; {self._tree.log} says why"
-                )
+                raise SystemExit(f"{path}: exit status {run.status} without a mutant; see {self._tree.log}")
             failed = [
                 test for test in run.failed if run_tests(self._tree, [test], 900.0).status != _PASSED
-            ]  # a test that passes when run alone failed because of load
+            ]  # a test that passes when run alone probably failed because of load
             for test in failed:
-                print(f"left out because it fails without a mutant: {test}", flush=True)
+                print(f"test excluded because it fails without a mutant: {test}", flush=True)
             self._known[path] = {"took_s": run.took_s, "failed": failed}
             self._kept.write_text(json.dumps(self._known, indent=1), "utf-8")
         if missing:
@@ -319,7 +317,7 @@ class Session:
         return stages[:1] if self._quick else stages
 
     def judge(self, mutant: Mutant) -> dict[str, Any]:
-        """Return the verdict on one mutant, and its cause."""
+        """Run the tests on a mutant; return the verdict and its cause."""
         begin_s = time.monotonic()
         try:
             self._tree.put(mutant)
@@ -333,7 +331,7 @@ class Session:
             files = sorted(files, key=lambda path: self._known[path]["took_s"])
             left_out = [test for path in files for test in self._known[path]["failed"]]
             limit_s = _GRACE_S + 6.0 * sum(self._known[path]["took_s"] for path in files)
-            for _ in range(8):  # each round excludes one more flaky test
+            for _ in range(8):  # each repetition excludes one more flaky test
                 deselected = [word for test in left_out for word in ("--deselect", test)]
                 run = run_tests(self._tree, ["-x", *deselected, *files], limit_s)
                 if run.status is None:
@@ -360,13 +358,13 @@ def _equivalent() -> dict[str, str]:
 
 
 def show(mutant: Mutant) -> str:
-    """Describe a mutant in a few lines."""
+    """Format a mutant as several lines of text."""
     before, after = mutant.before.replace("\n", "\n  - "), mutant.after.replace("\n", "\n  + ")
     return f"{mutant.name} {mutant.file}, {mutant.function}\n  - {before}\n  + {after}"
 
 
 def summary(mutants: Sequence[Mutant], results: dict[str, Any]) -> str:
-    """Return one line per group, then each survivor that is not equivalent."""
+    """Return one line of text per group, followed by all survivors that are not equivalent."""
     equivalent, lines = _equivalent(), []
     verdict = {each.name: results.get(each.name, {}).get("verdict", "not run") for each in mutants}
     verdict |= dict.fromkeys(equivalent, "equivalent")
@@ -383,7 +381,7 @@ def summary(mutants: Sequence[Mutant], results: dict[str, Any]) -> str:
 
 
 def _preload() -> None:
-    """Import slow libraries that are not mutated."""
+    """Import libraries that are slow to import and are never mutated."""
     import can  # noqa: F401
     import canopen  # noqa: F401
     import hypothesis  # noqa: F401
@@ -398,14 +396,18 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--package", choices=GROUPS, action="append", help="default: all")
     parser.add_argument(
-        "--only", action="append", metavar="NAME", help="run this mutant even if it has a verdict"
+        "--only", action="append", metavar="NAME", help="run this mutant even if it already has a verdict"
     )
     parser.add_argument("--again", action="store_true", help="run survivors again")
-    parser.add_argument("--trust", action="store_true", help="reuse earlier measurements of unmutated tests")
     parser.add_argument(
-        "--quick", action="store_true", help="run the first stage only; its survivors stay undecided"
+        "--trust", action="store_true", help="reuse earlier results of tests without a mutant"
     )
-    parser.add_argument("--show", action="store_true", help="print the verdicts and run nothing")
+    parser.add_argument(
+        "--quick",
+        action="store_true",
+        help="run only the first stage; mutants that survive it remain undecided",
+    )
+    parser.add_argument("--show", action="store_true", help="print the verdicts without running tests")
     parser.add_argument(
         "--folder", type=Path, default=Path(tempfile.gettempdir()) / f"skinnode-mutation-{os.getuid()}"
     )
@@ -430,7 +432,7 @@ def main() -> None:
             try:
                 result = session.judge(each)
             except LookupError as error:
-                print(f"{error}; draw the mutants again", flush=True)
+                print(f"{error}; select the mutants again with tools.mutation.draw", flush=True)
                 continue
             if result["verdict"] != "open":
                 results = _load(RESULTS) | {each.name: result}

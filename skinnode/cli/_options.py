@@ -18,7 +18,7 @@ def node_ids(ctx: typer.Context, incomplete: str) -> list[tuple[str, str]]:
     """Return shell completions for a node-ID, each with the name of its patch.
 
     The completions are the node-IDs in the --hand file or, by default, in hand.toml. If the file contains no
-    node-IDs or cannot be read, they are all node-IDs.
+    node-IDs or cannot be read, all node-IDs are offered.
     """
     patches = _patches(ctx)
     offered = [(str(patch.node_id), patch.name) for patch in patches]

@@ -36,7 +36,7 @@ def kernel(json: JsonFile = None, plot: PlotFile = None, rounds: Rounds = 31) ->
         typer.echo(f"{row['what']:28}{row['who']:22}{row['us']:10.1f}{row['ratio']:8.1f}")
     typer.echo(
         "F + J and steps are timed per wire. A step includes its evaluations; the trust radius is so short\n"
-        "that the operator must search for a step within it. LAPACK and BLAS use one thread, like skinnode."
+        "that the operator must search for a step within it. skinnode, LAPACK and BLAS use one thread."
     )
     _write(json, figures)
     if plot is not None:
@@ -47,7 +47,7 @@ def kernel(json: JsonFile = None, plot: PlotFile = None, rounds: Rounds = 31) ->
 
 @app.command()
 def solve(json: JsonFile = None, plot: PlotFile = None, rounds: Rounds = 31) -> None:
-    """Solve one wire to 1e-9 with skinnode, SciPy and Ceres: same F, J and start near the solution."""
+    """Solve one wire to 1e-9 with skinnode, SciPy and Ceres, from the same start near the solution."""
     from skinnode.bench import solve as bench
 
     _prepare(json, plot)

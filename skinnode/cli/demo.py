@@ -37,8 +37,8 @@ def demo(
 
     Each patch is a CANopen node on an embedded virtual bus. A spherical indenter presses and slides; the host
     collects the PDOs and solves the scans. The exit status is 1 if a scan was torn, a frame was lost, or
-    errors exceed the reported uncertainty: the RMS error over the run exceeds 1.15 times the reported RMS, or
-    the error of any coordinate exceeds 6 standard deviations.
+    errors exceed the reported uncertainty. The limits are 1.15 times the reported RMS for the RMS error over
+    the run, and 6 standard deviations for the error of any coordinate.
     """
     import json
 

@@ -251,7 +251,7 @@ _NEW = """\
 #:schema hand.schema.json
 # Hand file. Check it:  skinnode hand check hand.toml
 # Simulate it:          vcan-sim hand.toml, and in another terminal: skinnode host hand.toml
-# Editors can complete and check it after:  skinnode hand schema > hand.schema.json
+# For completion and checks in an editor:  skinnode hand schema > hand.schema.json
 
 name = "hand"
 {buses}
@@ -261,7 +261,7 @@ period_ms = {period_ms}                    # each SYNC starts one scan of every 
 [solver]
 method = "auto"                   # every field has contacts with forces: field.contacts, HandFrame.contacts
 # max_std_m = 20e-6               # field.precise: maximum standard deviation of a displacement, in metres,
-# max_force_std_n = 0.1           # and of a contact's normal force; without them, what a sound patch reaches
+# max_force_std_n = 0.1           # and of a contact's normal force; default: limits that a sound patch meets
 
 [stream]
 partial = "pass"                  # incomplete scans: pass them on with a mask, or "withhold"
@@ -280,9 +280,9 @@ _NEW_PATCH = """
 name = "patch{i}"
 {bus}node_id = {i}
 # serial = 12345                  # expected number; LSS uses it to find a node that has no node-ID
-# link = "palm_link"              # name of the robot link that carries the patch; without: the hand itself
+# link = "palm_link"              # name of the robot link that carries the patch; default: the hand itself
 # pose = {{ position_m = [0.0, 0.0, 0.0], rpy_rad = [0.0, 0.0, 0.0] }}   # in the frame of the link
 layout = {{ preset = "staggered", pitch_m = 4e-3, height_m = 2e-3, upper_wires = 10, upper_electrodes = 10 }}
-# calibration = {{ young_pa = 1e6, force_calibrated = true }}   # once known forces are reproduced
-tolerances = "ordinary"           # how exactly the patch was made; "exact" for a simulated patch
+# calibration = {{ young_pa = 1e6, force_calibrated = true }}   # after a test with known forces
+tolerances = "ordinary"           # manufacturing tolerances; "exact" for a simulated patch
 """

@@ -28,8 +28,8 @@ def info(
 ) -> None:
     """Print identity, layout, baseline, errors, PDOs, wires and configuration of one node.
 
-    The command only reads. The exit status is 0 if the node reports no fault, 1 if it has an error, faulty
-    wires or no baseline; 2 if the node does not answer.
+    The command only reads. The exit status is 0 if the node reports no fault, and 1 if the node has an error,
+    faulty wires or no baseline. The exit status is 2 if the node does not answer.
     """
     from skinnode.cli._bus import find_node
     from skinnode.cli._console import print_json, progress

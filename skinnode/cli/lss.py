@@ -111,7 +111,7 @@ def set_node(
     from skinnode.errors import ConfigError, Shown
 
     if node_id is None and bit_rate is None:
-        raise ConfigError("--node-id, --bit-rate", None, "at least one of the two")
+        raise ConfigError("--node-id, --bit-rate", None, "at least one of the two options")
     if bit_rate is not None and bit_rate not in BIT_RATES_BPS.values():
         allowed = ", ".join(str(rate) for rate in BIT_RATES_BPS.values())
         raise ConfigError("--bit-rate", bit_rate, allowed)

@@ -69,8 +69,9 @@ def node(
 
     A source is a class or function that takes the layout and returns an object whose read(t_ns) returns
     the (U, K) resistances in ohms. `--source simulated` needs no hardware. The command reports every second
-    until Ctrl-C. The exit status is 1 if the source failed, scans were skipped, frames were not sent, another
-    node used its node-ID or the --store file could not be used; 2 if the node could not run.
+    until Ctrl-C. The exit status is 1 if the source failed, scans were skipped, frames were not sent,
+    another node used the same node-ID, or the --store file could not be used. The exit status is 2 if the
+    node could not run.
     """
     from skinnode.canopen.lss import NOT_CONFIGURED
     from skinnode.cli._layout_option import find_layout, import_from_here

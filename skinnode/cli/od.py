@@ -163,8 +163,8 @@ def _note(sheet: DataSheet) -> None:
 def _sheet_if_any(remote: RemoteOd, eds: Path | None) -> DataSheet:
     """Return the EDS of the node.
 
-    The sheet has no entries for a third-party device without an EDS, or for a node that refuses to identify
-    itself; the objects then have only their CiA 301 names.
+    The EDS has no entries if a third-party device has no EDS file, or if the node refuses to identify itself.
+    The objects then have only their CiA 301 names.
     """
     from skinnode.conformance.eds_reader import Eds
     from skinnode.diagnose.data_sheet import DataSheet, data_sheet_of

@@ -11,9 +11,9 @@ from skinnode.config.table import Allowed, Name, NodeId, Table, one_of
 from skinnode.errors import ConfigError
 
 MAX_BUS_LOAD: Final = 0.70
-"""Default load limit of a bus. Above this limit, the response times of low-priority frames grow steeply
-(Davis, Burns, Bril, Lukkien: Controller Area Network (CAN) schedulability analysis, Real-Time Systems 35,
-2007), and no capacity is left to repeat frames after errors."""
+"""Default load limit of a bus, as a fraction. Above this limit, the response times of low-priority frames
+grow steeply (Davis, Burns, Bril, Lukkien: Controller Area Network (CAN) schedulability analysis, Real-Time
+Systems 35, 2007), and no capacity is left to repeat frames after errors."""
 
 Role = Literal["master", "guest"]
 GuestSends = Literal["nothing", "sdo"]

@@ -29,7 +29,7 @@ class HandConfig(Table):
     """Hand with its buses and patches, and the settings of the host.
 
     A duplicate name, node-ID or serial number, an unknown bus, an impossible geometry or a conflict with the
-    role of a bus causes a ConfigError, which pydantic wraps in its ValidationError; :func:`parse_hand`
+    role of a bus causes a ConfigError. Pydantic wraps this error in its ValidationError; :func:`parse_hand`
     unwraps it. :func:`skinnode.bus_load.plan.check_plan` checks whether the plan fits its buses.
     """
 

@@ -54,8 +54,9 @@ class StreamConfig(Table):
     """Settings for delivering scans and fields to programs."""
 
     partial: Annotated[Partial, one_of(Partial)] = "pass"
-    """Handling of incomplete scans, which lack chunks or the summary with the scan check: ``pass`` them on
-    unchecked with a mask of the valid resistances, or ``withhold`` them. Both are counted."""
+    """Handling of incomplete scans, which lack chunks or the summary with the scan check. ``pass`` delivers
+    these scans unchecked with a mask of the valid resistances; ``withhold`` does not deliver them. Both are
+    counted."""
     capacity_fields: Annotated[int, Field(ge=1, le=1_000_000), Allowed("an integer from 1 to 1000000")] = 64
     """Maximum number of fields by which a subscriber may lag before the oldest fields are lost. At the
     default of 64, four patches at 12.5 scans per second fill more than a second."""

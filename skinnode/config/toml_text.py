@@ -37,7 +37,7 @@ _PART: Final = r"(?:[\w-]++|\"[^\"\n]*+\"|'[^'\n]*+')[ \t]*+"
 _LONG_KEY: Final = re.compile(rf"(?<![\w\-\"'])(?:{_PART}\.[ \t]*+){{{4 * _DEEPEST}}}")
 """Pattern of a key with far more than ``_DEEPEST`` parts; also matches long runs of numbers joined by dots,
 which no hand file has."""
-_LEAST, _MOST = -(1 << 63), (1 << 63) - 1  # integer range of TOML 1.0
+_LEAST, _MOST = -(1 << 63), (1 << 63) - 1  # range of integers in TOML 1.0
 _INTEGERS: Final = "integers from -2^63 to 2^63 - 1"
 _TOO_LONG: Final = Shown("a longer integer")
 _TOO_DEEP: Final = f"tables and arrays nested at most {_DEEPEST} deep"

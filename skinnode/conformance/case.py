@@ -31,7 +31,7 @@ class NotApplicable(Exception):
 
 
 class Warned(Exception):
-    """Raised if the device passes with a doubt. The exception text explains the doubt."""
+    """Raised if the device passes but its behaviour is doubtful. The exception text explains why."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -35,7 +35,9 @@ def read_configuration(dut: Dut) -> dict[tuple[int, int], bytes]:
 
 
 def write_back(dut: Dut, before: Values) -> list[str]:
-    """Undo what a case stored or restored on the node, which must have been reset since.
+    """Restore a node's original configuration after a case that stored or restored parameters.
+
+    The node must have been reset after that case.
 
     Restores the defaults, writes the values of ``before`` that differ from the defaults, and stores the
     result.

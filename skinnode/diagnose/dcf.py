@@ -112,7 +112,7 @@ def _with_value(entry: EdsEntry, value: str | None, as_bytes: str | None) -> Eds
             return replace(entry, given=bytes.fromhex(as_bytes))
         except ValueError:
             return entry  # another tool wrote this text, which is not hexadecimal
-    if value and entry.data_type == _VISIBLE_STRING:  # no trailing zeros: those are written as bytes
+    if value and entry.data_type == _VISIBLE_STRING:  # text with trailing zeros is written as bytes
         return replace(entry, given=octets(value.strip()))
     return replace(entry, default=value.strip()) if value else entry
 

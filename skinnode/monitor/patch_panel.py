@@ -62,10 +62,10 @@ def _tile(number: int, patch: PatchView, paint: Paint, width: int, height: int) 
 
 
 def _map(patch: PatchView, paint: Paint, width: int, height: int, *, arrows: bool) -> list[Line]:
-    """Draw the height map centred in its box.
+    """Draw the depth map of a patch, centred in its box.
 
     The map has an outline because untouched skin is as dark as the screen. If a patch stops sending data, its
-    last map is drawn without colours and with the condition written over it, so that it cannot be mistaken
+    last map is drawn without colours and with the condition written over it. Such a map cannot be mistaken
     for live data.
     """
     theme = paint.theme

@@ -58,7 +58,7 @@ def others(facts: BusFacts) -> list[str]:
 
 
 def not_judged(facts: BusFacts) -> list[str]:
-    """Return one line for each check that could not be made, with the reason."""
+    """Return one line for each check that could not be performed, with the reason."""
     if facts.failure:
         return [f"{facts.name}: all checks except that of the interface"]
     lines = []

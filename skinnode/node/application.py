@@ -1,4 +1,4 @@
-"""Interface between a CANopen device and its application, for example a patch."""
+"""Interface between a CANopen device and its application, such as the patch application."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from skinnode.node.storage import Storage
 
 
 class Application(Protocol):
-    """Application of a device. The object dictionary contains the application's objects from the start."""
+    """Application of a CANopen device. Its objects are part of the device's object dictionary."""
 
     @property
     def deadline_ns(self) -> int:
@@ -21,19 +21,19 @@ class Application(Protocol):
         ...
 
     def power_on(self, t_ns: int) -> None:
-        """Start the application before the boot-up message is sent. A reset does not call this method."""
+        """Start the application at power-on, before the boot-up message; not called at a reset."""
         ...
 
     def reset(self) -> None:
-        """Reset the application; its objects have already been set to their defaults."""
+        """Reset the application, after its objects have been set to their power-on values."""
         ...
 
     def enter(self, *, operational: bool) -> None:
-        """Handle a change of the NMT state."""
+        """Handle a change of the NMT state. The argument tells whether the new state is OPERATIONAL."""
         ...
 
     def on_sync(self, counter: int | None, turns: frozenset[int], t_ns: int) -> None:
-        """Handle a SYNC in OPERATIONAL. ``turns``: numbers of the synchronous TPDOs now due."""
+        """Handle a SYNC in OPERATIONAL; ``turns`` contains the numbers of the synchronous TPDOs now due."""
         ...
 
     def on_timer(self, t_ns: int) -> None:
@@ -48,10 +48,10 @@ class ApplicationServices:
     store: ObjectStore
     """Object dictionary."""
     storage: Storage
-    """Values that survive a power cycle."""
+    """Storage of the values that survive a power cycle."""
     tpdos: TpdoEngine
-    """TPDO transmitter."""
+    """Transmitter of all TPDOs."""
     emcy: EmcyProducer
     """Emergency producer."""
     now: Clock
-    """Time of the event being handled, ns."""
+    """Function that returns the time of the event being handled, ns."""

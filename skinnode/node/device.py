@@ -1,9 +1,9 @@
-"""CANopen device: the CiA 301 communication services around an application.
+"""CANopen device: the CiA 301 communication services and an application that uses them.
 
-The device is synchronous and deterministic: it has no thread and reads no clock. The caller passes in frames
-and times, and reads the time of the next call from the device. On a bus the caller is
-:class:`~skinnode.node.runner.NodeRunner`; a test passes plain numbers. No received frame causes an exception,
-but an exception from the application or from ``send`` propagates to the caller.
+The device is synchronous and deterministic: it has no thread and reads no clock. The caller passes received
+frames and the current time to the device, and asks it for the time of the next call. On a bus, the caller is
+:class:`~skinnode.node.runner.NodeRunner`; tests call the device directly. No received frame causes an
+exception in the device itself, but exceptions from the application and from ``send`` propagate to the caller.
 """
 
 from __future__ import annotations
@@ -36,24 +36,24 @@ from skinnode.node.time_of_day import TimeConsumer
 from skinnode.transport.bus_state import BusState
 
 HARDWARE_VERSION: Final = "none"
-"""Value of 0x1009 for a software node, which has no board."""
+"""Hardware version (0x1009) of a software node, which has no board."""
 
 Handler = Callable[[bytes, int], None]
-"""Callback that takes the payload of a frame and the time at which it was received, ns."""
+"""Callback that takes a frame's payload and its time of reception, ns."""
 
 
 class CanopenDevice:
-    """A CANopen node. The node sends nothing until :meth:`power_on`.
+    """CANopen device with its communication services; it sends nothing before :meth:`power_on`.
 
     Args:
-        node_id: 1 to 127, or 255 to wait for a node-ID. A node-ID that LSS stored in the memory takes
-            precedence.
+        node_id: 1 to 127, or 255 to wait until LSS assigns a node-ID. If the memory contains a node-ID stored
+            by LSS, that node-ID is used instead.
         objects: declarations of the node's object dictionary.
         application: called once, with the device's services, to create the application.
         send: called with the COB-ID and payload of each frame that the node sends, in order.
         serial: serial number (0x1018:4), u32.
-        memory: keeps values across a power cycle; None to keep nothing, which 0x1010 then indicates.
-        kind: sizes and layout of the patch, which must match those in the memory; see
+        memory: memory for the values that survive a power cycle; None for a device without a memory.
+        kind: sizes and layout of the patch; the memory's content is used only if it has the same; see
             :class:`~skinnode.node.memory.Kept`.
         set_bit_rate: changes the bit rate (bit/s) for LSS; None if the node cannot change it.
 
@@ -79,7 +79,7 @@ class CanopenDevice:
             raise ValueError(f"serial: got {serial}, must be an unsigned 32-bit integer")
         self._default_node_id = node_id
         self.node_id = node_id
-        """Active node-ID; 255 while the node has none."""
+        """Active node-ID; 255 while the device has no node-ID."""
         self._send = send
         self._now_ns = 0
         self._store = ObjectStore(objects, node_id)
@@ -109,7 +109,7 @@ class CanopenDevice:
     # --- events
 
     def power_on(self, t_ns: int) -> None:
-        """Start the application, then boot into PRE-OPERATIONAL or, without a node-ID, wait for one.
+        """Start the application and boot into PRE-OPERATIONAL or, without a node-ID, wait for a node-ID.
 
         Args:
             t_ns: current time, ns.
@@ -124,7 +124,7 @@ class CanopenDevice:
         self._reset(EVERYTHING, t_ns)
 
     def power_off(self) -> None:
-        """Stop sending immediately."""
+        """Switch the device off: it stops sending immediately."""
         self._enter(NmtState.INITIALISING, self._now_ns)
         self._bit_rate_change.cancel()
         self._handlers = {}
@@ -141,7 +141,7 @@ class CanopenDevice:
         if self._bit_rate_change.silent(t_ns):
             return
         self._now_ns = t_ns
-        # A node that has not booted has no handlers, or only the LSS handler.
+        # Before boot-up, a node has no handlers, or only the LSS handler.
         if not remote and (handler := self._handlers.get(can_id)) is not None:
             handler(data, t_ns)
         elif self.nmt_state is NmtState.INITIALISING:
@@ -156,10 +156,11 @@ class CanopenDevice:
     def on_bus(self, state: BusState, t_ns: int) -> None:
         """Handle a change of the CAN controller's state.
 
-        EMCY reports bus-off after the bus has recovered; the error behaviour (0x1029) applies immediately.
+        The error behaviour (0x1029) applies immediately at bus-off. An emergency message reports bus-off
+        after the bus has recovered.
 
         Args:
-            state: state of the controller.
+            state: new state of the CAN controller.
             t_ns: current time, ns.
         """
         was, self._bus_state = self._bus_state, state
@@ -194,12 +195,12 @@ class CanopenDevice:
     def silent_from_ns(self) -> int:
         """Time from which :meth:`on_timer` reports a master or a monitored node as silent, ns.
 
-        The caller must first deliver all frames received before that time.
+        The caller must first pass all frames received before that time to :meth:`on_frame`.
         """
         return self._error_control.silent_from_ns
 
     def on_timer(self, t_ns: int) -> None:
-        """Perform all actions that are due. Early or repeated calls are harmless.
+        """Perform all actions that are due at ``t_ns``. Early or repeated calls have no effect.
 
         Args:
             t_ns: current time, ns.
@@ -240,7 +241,7 @@ class CanopenDevice:
                 self._nmt.obey(command, t_ns)
 
     def _reset(self, objects: tuple[int, int], t_ns: int) -> None:
-        """Initialise and boot with the node-ID set by LSS, or wait for a node-ID if none is set."""
+        """Reset objects and services, and boot unless LSS has not assigned a node-ID yet."""
         self._enter(NmtState.INITIALISING, t_ns)
         self._lss.reset_communication()
         self.node_id = self._lss.node_id
@@ -268,7 +269,8 @@ class CanopenDevice:
         self._nmt.enter(state, t_ns)
 
     def _entered(self, state: NmtState, before: NmtState, t_ns: int) -> None:
-        self._emcy.allow(state.communicates, t_ns)  # first, because clearing errors below may queue messages
+        # Must come first, because the calls below may queue messages.
+        self._emcy.allow(state.communicates, t_ns)
         if not state.communicates:
             self._sdo.reset()
         if state is NmtState.OPERATIONAL:
@@ -304,7 +306,7 @@ class CanopenDevice:
             self._synchronise(data, t_ns)
 
     def _synchronise(self, sync: bytes, t_ns: int) -> None:
-        """Apply the RPDOs received before the SYNC, have the application sample, and send the samples."""
+        """Handle a SYNC in OPERATIONAL: apply received RPDOs, call the application, send TPDOs."""
         if self.nmt_state is not NmtState.OPERATIONAL:
             return
         counter = sync[0] if sync else None
@@ -343,7 +345,7 @@ class CanopenDevice:
     # --- object dictionary
 
     def _describe(self, serial: int) -> None:
-        """Set the objects whose values are specific to this device."""
+        """Set the objects that differ between devices: serial number and versions."""
         self._store.put(od.IDENTITY, od.IDENTITY_SERIAL, serial)
         self._store.put(od.HARDWARE_VERSION, 0, HARDWARE_VERSION)
         self._store.put(od.SOFTWARE_VERSION, 0, importlib.metadata.version("skinnode"))
@@ -359,11 +361,12 @@ class CanopenDevice:
         self._reload()
 
     def _reload(self) -> None:
-        """Register handlers for the COB-IDs in the object dictionary, except RPDO COB-IDs."""
+        """Register a handler for each COB-ID that the device receives, except those of RPDOs."""
         handlers: dict[int, Handler] = self._error_control.handlers()
         if self._time.cob_id is not None:
             handlers[self._time.cob_id] = self._on_time
-        # Registered last, so that no configuration can replace the handlers of SYNC, SDO, NMT and LSS.
+        # These handlers are registered last, so that no configuration can replace the handlers of SYNC, SDO,
+        # NMT and LSS.
         handlers[self._sync.cob_id] = self._on_sync
         handlers[od.sdo_request_cob_id(self.node_id)] = self._on_sdo
         handlers[od.NMT_COB_ID] = self._on_nmt
@@ -372,5 +375,5 @@ class CanopenDevice:
 
 
 def _count(objects: Sequence[Object], first: int) -> int:
-    """Return the number of PDOs in the index range that starts at ``first``."""
+    """Return the number of PDOs whose communication records have indices from ``first`` on."""
     return sum(first <= item.index < first + od.MAX_PDOS for item in objects)

@@ -1,4 +1,4 @@
-"""EMCY producer: emergency messages (0x1014, 0x1015), error register (0x1001) and error history (0x1003).
+"""EMCY producer: emergency messages (0x1014, 0x1015), error register (0x1001), error history (0x1003).
 
 CiA 301 v4.2, 7.2.7.
 """
@@ -20,13 +20,13 @@ from skinnode.node.object_dictionary import ObjectStore
 from skinnode.node.pdo.parameters import COB_ID_MASK, INVALID_BIT, check_cob_id
 
 _WAITING: Final = 16
-"""Maximum number of messages held back by the inhibit time, the STOPPED state or the bus; beyond this number,
-the oldest are dropped."""
+"""Maximum number of queued messages; if more messages must wait, the oldest message is dropped. Messages wait
+for the end of the inhibit time, for the end of the STOPPED state, or for the bus."""
 _RESERVED_BIT: Final = 1 << 30
 
 
 class EmcyProducer:
-    """Producer that tracks active errors and sends a message when an error occurs or ends.
+    """Producer of emergency messages, which are sent whenever an error occurs or ends.
 
     Args:
         store: object dictionary.
@@ -38,7 +38,7 @@ class EmcyProducer:
         self._present: dict[tuple[EmcyCode, int], bytes] = {}
         self._history: deque[int] = deque(maxlen=od.ERROR_FIELD_LENGTH)  # newest first
         self._waiting: deque[bytes] = deque()
-        self._lost = 0  # dropped messages that have not been reported yet
+        self._lost = 0  # number of dropped messages that have not been reported yet
         self._sent_ns = -NO_DEADLINE_NS
         self._allowed = False
         self._connect()
@@ -57,7 +57,7 @@ class EmcyProducer:
         return self._free_ns if self._waiting and self._allowed else NO_DEADLINE_NS
 
     def report_once(self, code: EmcyCode, detail: bytes, t_ns: int) -> None:
-        """Report a momentary error with two messages, one for the error and one for its end.
+        """Report an error without duration by two messages, one for the error and one for its end.
 
         Args:
             code: error code.
@@ -68,20 +68,20 @@ class EmcyProducer:
         self._send_end(code, t_ns)
 
     def report(self, code: EmcyCode, detail: bytes, t_ns: int, who: int = 0) -> None:
-        """Report an error that lasts until :meth:`clear`; repeated calls send only a changed ``detail``.
+        """Report an error that lasts until :meth:`clear`, unless it is already active with the same detail.
 
         Args:
             code: error code.
             detail: up to five manufacturer-specific bytes.
             t_ns: current time, ns.
-            who: distinguishes errors that share a code but occur and end independently.
+            who: number that distinguishes errors with the same code that occur and end independently.
         """
         if self._present.get((code, who)) != detail:
             self._present[code, who] = detail
             self._send_error(code, self.register, detail, t_ns)
 
     def clear(self, code: EmcyCode, t_ns: int, who: int = 0) -> None:
-        """Report the end of a lasting error, if it was active.
+        """Report the end of an error that :meth:`report` has reported; otherwise, do nothing.
 
         Args:
             code: error code.
@@ -92,15 +92,15 @@ class EmcyProducer:
             self._send_end(code, t_ns)
 
     def allow(self, allowed: bool, t_ns: int) -> None:
-        """Allow or hold back messages, as the node's NMT state requires."""
+        """Allow or hold back messages, depending on the node's NMT state."""
         self._allowed = allowed
         self._try(t_ns)
 
     def on_timer(self, t_ns: int) -> None:
-        """Send the messages that are allowed now. A message that the bus refuses stays queued."""
+        """Send the messages allowed at ``t_ns``. A message that the bus refuses stays queued."""
         cob_id = self._store.integer(od.COB_ID_EMCY) & COB_ID_MASK
         while self._waiting and self._allowed and t_ns >= self._free_ns:
-            if self._lost:  # the dropped messages are older than all queued messages
+            if self._lost:  # reported first, because the dropped messages are the oldest
                 self._send(cob_id, self._loss())
                 self._lost = 0
             else:
@@ -120,11 +120,11 @@ class EmcyProducer:
         self._queue(_message(code, register, detail), t_ns)
 
     def _send_end(self, code: EmcyCode, t_ns: int) -> None:
-        """Queue the message that ends an error; its register byte shows the remaining errors."""
+        """Queue a message that reports the end of an error; its error register shows the remaining errors."""
         self._queue(_message(EmcyCode.RESET, self.register, code.to_bytes(2, "little")), t_ns)
 
     def _remember(self, code: EmcyCode, detail: bytes) -> None:
-        # The manufacturer-specific upper half of an entry holds the first two bytes of the detail.
+        # The upper 16 bits of an entry are manufacturer-specific: they contain the first two detail bytes.
         self._history.appendleft(code | int.from_bytes(detail[:2], "little") << 16)
 
     def _queue(self, message: bytes, t_ns: int) -> None:
@@ -137,9 +137,9 @@ class EmcyProducer:
         self._try(t_ns)
 
     def _try(self, t_ns: int) -> None:
-        """Send the queued messages if the bus accepts them; otherwise leave them for the next timer event.
+        """Send the queued messages; if the bus refuses a message, try again at the next timer event.
 
-        A BusError is suppressed, because the caller still has to handle the error being reported.
+        A BusError is suppressed, because the caller must still be able to handle the error that it reports.
         """
         with contextlib.suppress(BusError):
             self.on_timer(t_ns)
@@ -147,7 +147,8 @@ class EmcyProducer:
     def _loss(self) -> bytes:
         """Return the message that reports dropped messages.
 
-        Detail bytes 0 and 1 hold the number of lost scans, here 0.
+        Detail bytes 0 and 1 contain the number of skipped scans, here 0, and bytes 2 and 3 the number of
+        dropped messages.
         """
         detail = struct.pack("<HH", 0, min(self._lost, 0xFFFF))
         self._remember(EmcyCode.CAN_OVERRUN, detail)
@@ -155,7 +156,7 @@ class EmcyProducer:
 
     @property
     def _free_ns(self) -> int:
-        """Earliest time at which the inhibit time allows another message, ns."""
+        """Earliest time at which the inhibit time allows the next message, ns."""
         return self._sent_ns + self._store.integer(od.EMCY_INHIBIT_TIME) * 100_000
 
     # --- object dictionary
@@ -174,7 +175,7 @@ class EmcyProducer:
         store.watch(od.COB_ID_EMCY, lambda _: self._on_cob_id())
 
     def _read_history(self, subindex: int) -> bytes:
-        """Return the number of errors (sub-index 0) or one of the errors; sub-index 1 holds the newest."""
+        """Return a sub-object of the error history: the number of entries, or an entry, newest first."""
         if subindex == 0:
             return bytes((len(self._history),))
         if subindex > len(self._history):
@@ -187,7 +188,7 @@ class EmcyProducer:
         check_cob_id(value, self._store.integer(od.COB_ID_EMCY))
 
     def _on_cob_id(self) -> None:
-        if not self._exists:  # messages queued before EMCY was switched off must not be sent later
+        if not self._exists:  # queued messages must not be sent after EMCY has been switched on again
             self._waiting.clear()
             self._lost = 0
 

@@ -1,7 +1,7 @@
-"""Error control: boot-up, heartbeat producer and consumer, node guarding (CiA 301 v4.2, 7.2.8.3).
+"""Error control services: boot-up message, heartbeat and node guarding (CiA 301 v4.2, 7.2.8.3).
 
-A node sends heartbeats or is guarded, never both: a node with a nonzero producer heartbeat time (0x1017)
-ignores guarding requests.
+A node never uses heartbeat and guarding at the same time: a node whose producer heartbeat time (0x1017) is
+nonzero ignores guarding requests.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ from skinnode.node.services import NodeServices
 Handler = Callable[[bytes, int], None]
 
 _RIVAL_BEATS: Final = 3
-"""Duration of silence after which another node with this node-ID counts as gone, in heartbeat periods of this
-node. Both nodes usually have the same period, set by the same master, and one heartbeat may be lost."""
+"""Time without frames after which another node with this node-ID counts as gone, in heartbeat periods of this
+node. Both nodes usually have the same heartbeat period, and one heartbeat may be lost."""
 _RIVAL_NS: Final = 750_000_000
-"""Duration of silence after which another node with this node-ID counts as gone when this node sends no
-heartbeats, ns; three default periods.
+"""Time without frames after which another node with this node-ID counts as gone if this node sends no
+heartbeats, ns; three default heartbeat periods.
 """
 
 
@@ -47,12 +47,12 @@ class ErrorControl:
         listen: Callable[[], None],
         failed: Callable[[int], None],
     ) -> None:
-        self._cob_id = 0  # set once there is a node-ID
+        self._cob_id = 0  # set as soon as the node has a node-ID
         store, emcy, now = services.store, services.emcy, services.now
         self._store, self._emcy, self._now = store, emcy, now
         self._rejected, self._send = services.rejected, services.send
         self._listen = listen
-        self._booted_ns: int | None = None  # time of a boot-up message that has not been sent yet
+        self._booted_ns: int | None = None  # time of boot-up, until the boot-up message has been sent
         self._producer = HeartbeatProducer()
         self._rival_until_ns = NO_DEADLINE_NS  # time at which another node with this node-ID counts as gone
         self._guarding = Guarding(store, emcy, failed)
@@ -70,11 +70,11 @@ class ErrorControl:
 
     @property
     def silent_from_ns(self) -> int:
-        """Time at which a monitored node or the guarding master counts as silent, ns."""
+        """Time from which a monitored node or the guarding master counts as silent, ns."""
         return min(self._guarding.deadline_ns, self._consumer.deadline_ns)
 
     def handlers(self) -> dict[int, Handler]:
-        """Return the handlers for data frames, by COB-ID."""
+        """Return the handlers of received data frames, by COB-ID."""
         handlers: dict[int, Handler] = {
             od.heartbeat_cob_id(node_id): functools.partial(self._on_heartbeat, node_id)
             for node_id in self._consumer.node_ids
@@ -83,7 +83,7 @@ class ErrorControl:
         return handlers
 
     def reset(self, node_id: int) -> None:
-        """Reset to the state in which the node is not guarded and no heartbeat has been received.
+        """Reset all error control services, as if no guarding request or heartbeat had been received.
 
         Args:
             node_id: the new node-ID.
@@ -94,14 +94,14 @@ class ErrorControl:
         self._consumer.reset()
 
     def boot_up(self, t_ns: int) -> None:
-        """Send the boot-up message as soon as the bus accepts it; heartbeats follow if 0x1017 is nonzero."""
+        """Send the boot-up message as soon as the bus accepts it, and schedule the heartbeats."""
         self._producer.boot_up(self._store.integer(od.HEARTBEAT_PRODUCER), t_ns)
         self._booted_ns = t_ns
         with contextlib.suppress(BusError):
             self._send_boot_up()
 
     def on_request(self, state: NmtState, t_ns: int) -> None:
-        """Answer a remote frame that requests the NMT state."""
+        """Answer a guarding request, which is a remote frame, unless the node sends heartbeats."""
         if not self._producer.period_ns:
             self._send(self._cob_id, self._guarding.answer(state, t_ns))
 
@@ -122,9 +122,9 @@ class ErrorControl:
             self._booted_ns = None
 
     def _on_own(self, _: bytes, t_ns: int) -> None:
-        """Report another node with this node-ID once, and clear the error after three periods of silence.
+        """Report another node with this node-ID once; the error ends after three silent periods.
 
-        Every frame from the other node is counted. Further action is up to the operator.
+        Every frame from the other node is counted. The operator must correct the node-IDs.
         """
         self._rival_until_ns = t_ns + (_RIVAL_BEATS * self._producer.period_ns or _RIVAL_NS)
         self._rejected.count(Rejected.OWN_ERROR_CONTROL)

@@ -13,33 +13,33 @@ from skinnode.node.object_dictionary import ObjectStore
 
 
 class Guarding:
-    """Guarding slave, which answers the master's state requests and detects when they stop.
+    """Guarding slave, which answers the master's guarding requests and reports if the requests stop.
 
     Args:
         store: object dictionary.
-        emcy: reports a life guarding event.
-        failed: called, after the EMCY, with the time of a life guarding event, ns.
+        emcy: emergency producer, which reports life guarding events.
+        failed: called after the emergency message, with the time of a life guarding event, ns.
     """
 
     def __init__(self, store: ObjectStore, emcy: EmcyProducer, failed: Callable[[int], None]) -> None:
         self._store, self._emcy, self._failed = store, emcy, failed
         self._toggle = 0
-        self._guarded = False  # true from the first request onwards
+        self._guarded = False  # true after the first guarding request
         self.deadline_ns = NO_DEADLINE_NS
-        """Time at which the life time expires, ns."""
+        """Time at which the node life time expires, ns."""
 
     def reset(self) -> None:
-        """Reset the toggle bit and end guarding. Only *reset communication* resets the toggle bit."""
+        """Reset the toggle bit and end guarding. The toggle bit is reset only by *reset communication*."""
         self._toggle = 0
         self._guarded = False
         self.deadline_ns = NO_DEADLINE_NS
 
     def answer(self, state: NmtState, t_ns: int) -> bytes:
-        """Return the answer to a remote frame with the error control COB-ID, and restart the life time.
+        """Return the answer to a guarding request, and restart the node life time.
 
         Args:
-            state: state of the node.
-            t_ns: when the remote frame was received, ns.
+            state: NMT state of the node.
+            t_ns: time at which the request was received, ns.
         """
         answer = bytes((state | self._toggle,))
         self._toggle ^= GUARD_TOGGLE
@@ -50,19 +50,19 @@ class Guarding:
     def on_written(self, t_ns: int) -> None:
         """Apply a new guard time or life time factor.
 
-        A running life time restarts. If the new life time is 0, a life guarding error is cleared.
+        A running node life time restarts. If the new node life time is 0, a life guarding error ends.
         """
         if self._guarded or not self._life_ns:
             self._start(t_ns)
 
     def end(self, t_ns: int) -> None:
-        """End guarding, because heartbeats replace it; the next request restarts guarding."""
+        """End guarding, because heartbeats replace guarding. The next guarding request starts it again."""
         self._guarded = False
         self.deadline_ns = NO_DEADLINE_NS
         self._emcy.clear(EmcyCode.HEARTBEAT, t_ns)
 
     def on_timer(self, t_ns: int) -> None:
-        """Report a life guarding event if the life time has expired, but only once until the next request."""
+        """Report a life guarding event, once until the next request, if the node life time has expired."""
         if t_ns >= self.deadline_ns:
             self._guarded = False
             self.deadline_ns = NO_DEADLINE_NS

@@ -15,15 +15,16 @@ from skinnode.node.emcy import EmcyProducer
 from skinnode.node.object_dictionary import ObjectStore
 
 _BOOTED: Final = 1
-"""Second detail byte of an emergency that reports a restart of the monitored node rather than its silence."""
+"""Second detail byte of an emergency message that reports a monitored node's restart instead of its
+silence."""
 
 
 class HeartbeatProducer:
-    """Heartbeat schedule, which drifts only if a heartbeat is late by a period or more."""
+    """Schedule of a node's heartbeats, which shifts only if a heartbeat is late by one period or more."""
 
     def __init__(self) -> None:
         self.period_ns = 0
-        """Heartbeat period, ns; 0 for no heartbeats."""
+        """Heartbeat period, ns; 0 if the node sends no heartbeats."""
         self.deadline_ns = NO_DEADLINE_NS
         """Time at which the next heartbeat is due, ns."""
 
@@ -32,13 +33,13 @@ class HeartbeatProducer:
 
         Args:
             period_ms: heartbeat period, ms; 0 for no heartbeats.
-            t_ns: when the message was sent, ns.
+            t_ns: time of the boot-up message, ns.
         """
         self.period_ns = period_ms * 1_000_000
         self.deadline_ns = t_ns + self.period_ns if period_ms else NO_DEADLINE_NS
 
     def set_period(self, period_ms: int, t_ns: int) -> None:
-        """Change the period; a heartbeat is due immediately, so that no consumer waits out the old period.
+        """Change the heartbeat period, and make a heartbeat due immediately.
 
         Args:
             period_ms: heartbeat period, ms; 0 for no heartbeats.
@@ -48,7 +49,7 @@ class HeartbeatProducer:
         self.deadline_ns = t_ns if period_ms else NO_DEADLINE_NS
 
     def beat(self, t_ns: int) -> bool:
-        """Return whether a heartbeat is due at ``t_ns``, and if so, schedule the next one."""
+        """Return whether a heartbeat is due at ``t_ns``; if so, schedule the next heartbeat."""
         if t_ns < self.deadline_ns:
             return False
         self.deadline_ns += self.period_ns
@@ -62,16 +63,16 @@ class _Monitored:
     node_id: int
     within_ns: int
     deadline_ns: int = NO_DEADLINE_NS
-    """Monitoring starts at the first heartbeat."""
+    """Time at which the next heartbeat counts as missed, ns; monitoring starts at the first heartbeat."""
 
 
 class HeartbeatConsumer:
-    """Consumer that monitors the nodes listed in object 0x1016.
+    """Heartbeat consumer that monitors the nodes in object 0x1016.
 
     Args:
         store: object dictionary.
-        emcy: reports missed heartbeats and restarts.
-        failed: called, after the EMCY, with the time at which a heartbeat was missed, ns.
+        emcy: emergency producer, which reports missed heartbeats and restarts of monitored nodes.
+        failed: called after the emergency message, with the time at which a heartbeat was missed, ns.
     """
 
     def __init__(self, store: ObjectStore, emcy: EmcyProducer, failed: Callable[[int], None]) -> None:
@@ -87,12 +88,12 @@ class HeartbeatConsumer:
         return list(self._monitored)
 
     def reset(self) -> None:
-        """Apply 0x1016 after a reset, when no heartbeat has been received yet."""
+        """Apply object 0x1016 after a reset, as if no heartbeat had been received."""
         self._monitored = {}
         self.on_written(0)
 
     def on_written(self, t_ns: int) -> None:
-        """Apply a write to 0x1016, and restart the monitoring of a changed entry."""
+        """Apply a write to object 0x1016. Monitoring restarts only for changed entries."""
         words = [self._store.integer(od.HEARTBEAT_CONSUMER, i + 1) for i in range(od.HEARTBEAT_CONSUMERS)]
         wanted = [_Monitored(word >> 16, (word & 0xFFFF) * 1_000_000) for word in words]
         before, self._monitored = self._monitored, {}
@@ -109,8 +110,8 @@ class HeartbeatConsumer:
     def on_heartbeat(self, node_id: int, state: int, t_ns: int) -> None:
         """Handle a heartbeat or boot-up message from a monitored node.
 
-        A boot-up message does not start monitoring, because a node that boots need not send heartbeats. A
-        boot-up message after a heartbeat shows that the node has restarted.
+        A boot-up message does not start monitoring, because not every node sends heartbeats after it boots. A
+        boot-up message after a heartbeat means that the node has restarted.
 
         Args:
             node_id: node-ID of the monitored node.
@@ -127,7 +128,7 @@ class HeartbeatConsumer:
         self._plan()
 
     def on_timer(self, t_ns: int) -> None:
-        """Report each node whose heartbeat is overdue at ``t_ns``, but only once until its next heartbeat."""
+        """Report each node whose heartbeat is overdue at ``t_ns``, once until the node's next heartbeat."""
         if t_ns < self.deadline_ns:
             return
         for item in self._monitored.values():
@@ -143,11 +144,11 @@ class HeartbeatConsumer:
         )
 
     def _guard(self, subindex: int, value: int) -> None:
-        """Refuse a second entry for the same node; an entry without a time or valid node-ID has no effect."""
+        """Refuse a second entry for the same node. An entry with node-ID 0 or time 0 is unused."""
         if value >> 24:
             raise Refused(AbortCode.INVALID_VALUE)
         node_id, time_ms = value >> 16, value & 0xFFFF
         others = (i for i in range(1, od.HEARTBEAT_CONSUMERS + 1) if i != subindex)
         taken = {self._store.integer(od.HEARTBEAT_CONSUMER, i) for i in others}
         if node_id and time_ms and any(word >> 16 == node_id and word & 0xFFFF for word in taken):
-            raise Refused(AbortCode.INCOMPATIBLE)  # two entries for one node
+            raise Refused(AbortCode.INCOMPATIBLE)  # CiA 301 forbids two entries for one node

@@ -1,8 +1,8 @@
-"""LSS slave (CiA 305 v3.0): sets the node-ID and bit rate, and answers searches for nodes.
+"""LSS slave (CiA 305 v3.0), which receives the node-ID and bit rate and answers searches for nodes.
 
-The slave takes and returns bytes, and needs neither a bus nor a clock. Callbacks store the configuration and
-change the bit rate; :attr:`LssSlave.may_boot` shows whether the node must boot. LSS requests are served in
-every NMT state. A node without a node-ID serves only LSS.
+The slave takes requests and returns responses as bytes; it needs neither a bus nor a clock. Callbacks store
+the configuration and change the bit rate. :attr:`LssSlave.may_boot` tells the caller that the node must boot.
+LSS requests are served in every NMT state. A node without a node-ID serves only LSS requests.
 """
 
 from __future__ import annotations
@@ -26,10 +26,11 @@ from skinnode.node.clock import NO_DEADLINE_NS
 _CIA_301_TABLE: Final = 0
 
 _OUT_OF_RANGE, _CANNOT_STORE, _STORE_FAILED = 1, 1, 2
-"""Error codes in responses to the configuration services; the meaning of code 1 depends on the service."""
+"""Error codes in responses to configuration requests; the meaning of code 1 depends on the request."""
 
 
-# For each frame of *switch selective* and *identify*: the part of the address tested, and the comparison.
+# For each request of *switch state selective* and *identify*: the field of the LSS address that is compared,
+# and the comparison.
 _QUESTIONS: Final[dict[int, tuple[int, Callable[[int, int], bool]]]] = {
     0x40: (0, operator.eq),
     0x41: (1, operator.eq),
@@ -49,14 +50,14 @@ class LssSlave:
     """LSS slave of one node.
 
     Args:
-        address: LSS address (identity) of the slave.
+        address: LSS address of the slave, which is its identity (0x1018).
         node_id: persistent node-ID, 1 to 127, or :data:`NOT_CONFIGURED`.
         bit_rates_bps: supported bit rates, bit/s; empty if the slave cannot change its bit rate.
         bit_rate_bps: previously configured bit rate, bit/s; None if there is none.
-        store: saves the pending node-ID and bit rate permanently and raises OSError on failure;
-            None if nothing can be saved.
-        activate: called with the pending bit rate and the delay in ms, to start the bit rate change;
-            see :meth:`on_request`.
+        store: saves the pending node-ID and bit rate permanently, or raises OSError; None if the node has no
+            memory.
+        activate: called with the pending bit rate and the delay in ms, to start the bit rate change; None if
+            the slave cannot change its bit rate. See :meth:`on_request`.
     """
 
     def __init__(  # noqa: PLR0913 - keywords with defaults, one for each ability of a slave
@@ -86,12 +87,12 @@ class LssSlave:
 
     @property
     def configured(self) -> bool:
-        """Whether the node has a node-ID; without one it serves only LSS."""
+        """Whether the node has a node-ID; a node without a node-ID serves only LSS requests."""
         return self.node_id != NOT_CONFIGURED
 
     @property
     def may_boot(self) -> bool:
-        """Whether the node must boot: it has received its first node-ID and left the configuration state."""
+        """Whether the node must boot: it has received a node-ID and left the configuration state."""
         return (
             not self.configured and self.pending_node_id != NOT_CONFIGURED and self.state is LssState.WAITING
         )
@@ -99,12 +100,13 @@ class LssSlave:
     def reset_node(self) -> None:
         """Copy the persistent node-ID to the pending node-ID, as required on NMT *reset node*.
 
-        A pending node-ID that was never stored is lost. Call :meth:`reset_communication` afterwards.
+        A pending node-ID that was not stored is lost. The caller must then call :meth:`reset_communication`.
 
-        Two open-source CiA 305 stacks do the same. c-open copies the persistent node-ID to the pending
-        node-ID in the NMT sub-state *reset application*, and the pending node-ID to the active node-ID in
-        *reset communication* (src/co_nmt.c). CANopenNode initialises the pending node-ID from non-volatile
-        memory after *reset node* and does not change it at *reset communication* (305/CO_LSSslave.h).
+        Two open-source CiA 305 stacks behave in the same way. The stack c-open copies the persistent node-ID
+        to the pending node-ID in the NMT sub-state *reset application*, and the pending node-ID to the active
+        node-ID in *reset communication* (src/co_nmt.c). The stack CANopenNode initialises the pending node-ID
+        from non-volatile memory after *reset node*, and does not change it at *reset communication*
+        (305/CO_LSSslave.h).
         """
         self.pending_node_id = self._persistent_node_id
 
@@ -115,19 +117,19 @@ class LssSlave:
         self._scan_part = 0
 
     def on_request(self, data: bytes) -> bytes | None:
-        """Serve a frame from the LSS master.
+        """Process a request from the LSS master and return the response.
 
-        A frame that does not have 8 bytes, belongs to another protocol or does not fit the current state is
-        ignored, as the standard requires, because it may be meant for other slaves.
+        As the standard requires, a frame is ignored if it does not have 8 bytes, if its command is unknown,
+        or if the request is not allowed in the current state. Such a frame may be intended for other slaves.
 
-        After *activate bit timing* the node stops sending immediately, changes its bit rate after one delay,
-        and may send again after a second delay, by which time all other nodes have changed their bit rates.
+        After *activate bit timing*, the node stops sending immediately and changes its bit rate after one
+        delay. It may send again after a second delay, when all other nodes have changed their bit rates.
 
         Args:
             data: the payload.
 
         Returns:
-            The response; None if there is none.
+            The response; None if the request has no response.
         """
         if len(data) != 8:
             return None
@@ -160,7 +162,7 @@ class LssSlave:
         self._next_question = 0
 
     def _agrees(self, command: int, value: int) -> bool:
-        """Return whether the address matches this frame and all earlier frames of an ordered sequence."""
+        """Return whether the LSS address matches this request and all earlier requests of its sequence."""
         part, holds = _QUESTIONS[command]
         in_turn = command in _FIRST_QUESTIONS or command == self._next_question
         agreed = in_turn and holds(self._address[part], value)
@@ -168,9 +170,9 @@ class LssSlave:
         return agreed
 
     def _fastscan(self, value: int, bit: int, part: int, next_part: int) -> bytes | None:
-        """Return the response if the address equals ``value`` in bits ``bit`` and above.
+        """Return the response to a fastscan request; None unless bits ``bit`` to 31 match ``value``.
 
-        A slave that does not match stays silent, so one request can address many slaves.
+        A slave that does not match sends no response, so a single request can test many slaves.
         """
         if bit == RESET_SCAN:
             self._scan_part = 0
@@ -180,7 +182,8 @@ class LssSlave:
             if (self._address[part] ^ value) >> bit:
                 return None
             self._scan_part = next_part
-            if bit == 0 and next_part < part:  # all four parts match, so this slave is found
+            # All four address fields match: the master has found this slave.
+            if bit == 0 and next_part < part:
                 self._enter(LssState.CONFIGURATION)
         return _frame(LssCommand.IDENTIFIED)
 
@@ -236,19 +239,19 @@ class BitRateChange:
         """Time at which :meth:`silent` must be called next, ns."""
 
     def begin(self, bit_rate_bps: int | None, delay_ms: int, t_ns: int) -> None:
-        """Start the change.
+        """Start a bit rate change.
 
         Args:
             bit_rate_bps: new bit rate, bit/s; None to keep the current bit rate.
-            delay_ms: delay given in the request, ms.
-            t_ns: when the request was received, ns.
+            delay_ms: delay that the request specifies, ms.
+            t_ns: time at which the request was received, ns.
         """
         self._bit_rate_bps = bit_rate_bps
         self._change_ns = self.deadline_ns = t_ns + delay_ms * 1_000_000
         self._over_ns = t_ns + 2 * delay_ms * 1_000_000
 
     def silent(self, t_ns: int) -> bool:
-        """Change the bit rate if the change is due; return whether the node must neither send nor receive."""
+        """Change the bit rate if due; return whether the node must neither send nor receive."""
         if self.deadline_ns == NO_DEADLINE_NS:
             return False
         if t_ns >= self._change_ns:
@@ -260,7 +263,7 @@ class BitRateChange:
         return self.deadline_ns != NO_DEADLINE_NS
 
     def cancel(self) -> None:
-        """Cancel the change at power-off."""
+        """Cancel the bit rate change, because the node is switched off."""
         self.deadline_ns = NO_DEADLINE_NS
 
 

@@ -1,4 +1,4 @@
-"""Memory of a node in a JSON file with a checksum, replaced atomically."""
+"""Non-volatile memory of a node in a JSON file, which has a checksum and is replaced atomically."""
 
 from __future__ import annotations
 
@@ -21,28 +21,27 @@ from skinnode.node.memory import Fault, Kept, MemoryFault, Parameters
 
 _FORMAT: Final = "skinnode node memory 1"
 _MOST_BYTES: Final = 1 << 24
-"""Maximum number of bytes read from a file; 512 PDOs and the largest baseline need less than a tenth of
-this."""
+"""Maximum number of bytes read from a memory file; a node with 512 PDOs and the largest baseline needs less
+than a tenth of this."""
 
 
 class FileMemory:
-    """Memory in a human-readable JSON file with a checksum.
+    """Non-volatile memory of a node in a human-readable JSON file with a checksum.
 
-    Saving waits a few milliseconds for the storage medium and meanwhile blocks the node and all other nodes
-    on its thread.
+    Saving takes a few milliseconds, during which the node and all other nodes on its thread are blocked.
 
-    A memory owns the file exclusively from :meth:`claim` or the first :meth:`save` until :meth:`close`, the
-    end of a ``with`` block or the deletion of the object. The claim is a kernel lock on a lock file beside
-    the memory file, and is released when the process ends, even if the process is killed.
+    A ``FileMemory`` has exclusive access to its file from :meth:`claim` or the first :meth:`save` until
+    :meth:`close`, the end of a ``with`` block or the deletion of the object. It locks a separate file in the
+    same folder. The kernel releases this lock when the process ends, even if the process is killed.
 
-    The file is replaced atomically (written under a temporary name, flushed to the medium, renamed), so a
-    killed process or a power failure leaves either the old content or the new. The file is readable only by
-    its owner (mode 0600), and a symbolic link in its place is refused. A file that is damaged or belongs to
-    another patch is not overwritten; it is renamed to a name that ends in ``.unused-`` followed by a digest
-    of its bytes.
+    Saving writes a temporary file, flushes it to the storage medium and renames it. After a power failure or
+    a killed process, the file therefore has either its old or its new content. Only the owner can read the
+    file (mode 0600). A symbolic link in place of the file is refused. A file that is damaged or belongs to
+    another patch is not overwritten: it is renamed, with ``.unused-`` and a digest of its content added to
+    its name.
 
     Args:
-        path: the file; its folder must exist.
+        path: path of the file; its folder must exist.
     """
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
@@ -51,10 +50,10 @@ class FileMemory:
         self._release: Callable[[], object] | None = None
 
     def claim(self) -> None:
-        """Claim the file exclusively.
+        """Lock the file for exclusive access.
 
         Raises:
-            FileInUse: if another memory owns the file, in this process or another.
+            FileInUse: if the file is locked, in this process or another.
             OSError: if the file cannot be locked.
         """
         if self._release is None:
@@ -63,7 +62,7 @@ class FileMemory:
             discard_leftovers(self.path)
 
     def close(self) -> None:
-        """Release the file. A closed memory can be claimed again."""
+        """Release the lock on the file. A later :meth:`claim` is allowed."""
         release, self._release = self._release, None
         if release is not None:
             release()
@@ -91,14 +90,14 @@ class FileMemory:
             raise MemoryFault(error.fault, f"{self.path}: {error}") from None
 
     def save(self, kept: Kept) -> None:
-        """Replace the content of the file; return once it is on the storage medium.
+        """Replace the content of the file, and return as soon as the new content is on the storage medium.
 
         Args:
             kept: the new content.
 
         Raises:
             FileInUse: if another memory owns the file.
-            OSError: if the file cannot be written; it then still has its old content.
+            OSError: if the file cannot be written; it then keeps its old content.
         """
         self.claim()
         beside = create_beside(self.path, pack(kept), durable=True)
@@ -111,7 +110,8 @@ class FileMemory:
         flush_folder(self.path.parent)
 
     def _read(self) -> bytes:
-        flags = os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK  # opening a pipe must not block
+        # O_NONBLOCK: opening a pipe must not block.
+        flags = os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
         try:
             descriptor = os.open(self.path, flags)
         except OSError as error:
@@ -138,7 +138,7 @@ class FileMemory:
 
 
 def pack(kept: Kept) -> bytes:
-    """Return the bytes of a file with the content ``kept``."""
+    """Convert a memory's content to the bytes of a memory file."""
     content = {
         "patch": kept.patch,
         "node_id": kept.node_id,
@@ -152,13 +152,13 @@ def pack(kept: Kept) -> bytes:
 
 
 def unpack(data: bytes) -> Kept:
-    """Return the content of a file.
+    """Convert the bytes of a memory file to the memory's content.
 
     Args:
-        data: the bytes of the file.
+        data: bytes of the file.
 
     Raises:
-        MemoryFault: if :func:`pack` cannot have written the file.
+        MemoryFault: if the file is damaged or has a different format.
     """
     try:
         document = json.loads(data)

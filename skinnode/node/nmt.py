@@ -1,4 +1,4 @@
-"""NMT slave: a node's state and the commands that change it (CiA 301 v4.2, 7.2.8 and 7.3.2)."""
+"""NMT slave, which controls the NMT state of a node (CiA 301 v4.2, 7.2.8 and 7.3.2)."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ class NmtSlave:
     """NMT state machine of a node.
 
     Args:
-        store: object dictionary; 0x1029 holds the error behaviour.
-        rejected: counts frames that are not NMT commands.
-        entered: called after each change with the new state, the previous state and the time in ns.
+        store: object dictionary, of which 0x1029 (error behaviour) is used.
+        rejected: counters of rejected frames.
+        entered: called after each change of state, with the new state, the previous state and the time in ns.
     """
 
     def __init__(
@@ -27,14 +27,14 @@ class NmtSlave:
     ) -> None:
         self._store, self._rejected, self._entered = store, rejected, entered
         self.state = NmtState.INITIALISING
-        """Current state."""
+        """Current NMT state."""
 
     def command(self, data: bytes, node_id: int) -> NmtCommand | None:
-        """Return the command in a frame with COB-ID 0; None if the frame is malformed or for another node.
+        """Return the NMT command in a frame; None if the frame is malformed or addresses another node.
 
         Args:
             data: the payload.
-            node_id: the node's own node-ID.
+            node_id: node-ID of this node.
         """
         try:
             return parse(data, node_id)
@@ -43,19 +43,20 @@ class NmtSlave:
             return None
 
     def obey(self, command: NmtCommand, t_ns: int) -> None:
-        """Enter the state that a command other than a reset requests."""
+        """Enter the NMT state that a command requests; the command must not be a reset."""
         self.enter(AFTER_COMMAND[command], t_ns)
 
     def enter(self, state: NmtState, t_ns: int) -> None:
-        """Enter a state, unless the node is already in it."""
+        """Enter an NMT state, unless the node is already in that state."""
         if state is not self.state:
             before, self.state = self.state, state
             self._entered(state, before, t_ns)
 
     def on_communication_error(self, t_ns: int) -> None:
-        """Change the state as 0x1029 specifies, after a missed heartbeat, a life guarding event or bus-off.
+        """Apply the error behaviour (0x1029) after a missed heartbeat, a life guarding event or bus-off.
 
-        0: change from OPERATIONAL to PRE-OPERATIONAL; 1: no change; 2: enter STOPPED.
+        If 0x1029:1 is 0, the state changes from OPERATIONAL to PRE-OPERATIONAL. If it is 1, the state does
+        not change. If it is 2, the node enters STOPPED.
         """
         behaviour = self._store.integer(od.ERROR_BEHAVIOUR, 1)
         if behaviour == 2:

@@ -1,10 +1,12 @@
-"""Object dictionary of a running node: declarations and values.
+"""Object dictionary of a running node, with the declarations and the current values of its objects.
 
-Declarations come from :mod:`skinnode.protocol.objects`, which is also the source of the EDS files. Values are
-stored as the bytes sent on the bus (little-endian), so an SDO response is a slice of a value and a PDO is a
-concatenation of values. An object can be computed when it is read (:meth:`ObjectStore.bind`), refuse a value
-(:meth:`ObjectStore.guard`) or trigger an action after a write (:meth:`ObjectStore.watch`). A DOMAIN can be
-stored elsewhere (:meth:`ObjectStore.bind_domain`). A refused write changes nothing.
+The declarations come from :mod:`skinnode.protocol.objects`, from which the EDS files are also generated. Each
+value is stored as the bytes sent on the bus (little-endian), so an SDO response contains a slice of a value,
+and a PDO is a concatenation of values. Services can register functions for an object: a function that
+computes the value when it is read (:meth:`ObjectStore.bind`), checks a value before a write
+(:meth:`ObjectStore.guard`) or is called after a write (:meth:`ObjectStore.watch`). The value of a DOMAIN can
+be stored outside the object dictionary (:meth:`ObjectStore.bind_domain`). A refused write does not change the
+object.
 """
 
 from __future__ import annotations
@@ -17,18 +19,19 @@ from skinnode.canopen.abort import AbortCode, Refused
 from skinnode.canopen.dictionary import DataType, Entry, Object, Value
 
 MAX_BYTES: Final = 1 << 16
-"""Maximum length of a value whose type has no fixed size, bytes."""
+"""Maximum length of a value whose data type has no fixed length, bytes."""
 
 Reader = Callable[[int], bytes]
-"""Callback that takes a sub-index and returns the value; may raise Refused."""
+"""Callback that takes a sub-index and returns its value as bytes; may raise Refused."""
 Guard = Callable[[int, int], None]
-"""Callback that takes a sub-index and the proposed value (bit pattern for REAL32); may raise Refused."""
+"""Callback that takes a sub-index and the new value (a bit pattern for REAL32), and raises Refused to reject
+it."""
 Watcher = Callable[[int], None]
-"""Callback that takes the sub-index that has just been written."""
+"""Callback that takes the sub-index that a client has written."""
 ChangeWatcher = Callable[[int, int], None]
-"""Callback that takes the index and sub-index of a parameter whose value has changed."""
+"""Callback that takes the index and sub-index of a parameter whose value a client has changed."""
 DomainWriter = Callable[[bytes], None]
-"""Callback that takes a complete value; may raise Refused, and then changes nothing."""
+"""Callback that takes a complete value and stores it, or raises Refused and stores nothing."""
 
 
 class Lengths(NamedTuple):
@@ -50,10 +53,10 @@ class Lengths(NamedTuple):
             raise Refused(AbortCode.TOO_SHORT)
 
     def check_not_above(self, length: int) -> None:
-        """Check the length of the part of a value received so far.
+        """Check whether the part of a value received so far is already too long.
 
         Raises:
-            Refused: if this part alone is already too long.
+            Refused: if the part exceeds the maximum length.
         """
         if length > self.most:
             raise Refused(AbortCode.TOO_LONG if self.most == self.least else AbortCode.OUT_OF_MEMORY)
@@ -64,7 +67,7 @@ def to_bytes(entry: Entry, value: Value | bytes) -> bytes:
 
     Args:
         entry: declaration of the object.
-        value: the value; bytes are returned unchanged.
+        value: value of the object; bytes are returned unchanged.
 
     Raises:
         OverflowError: if the integer type cannot hold the value.
@@ -80,13 +83,14 @@ def to_bytes(entry: Entry, value: Value | bytes) -> bytes:
 
 
 class ObjectStore:
-    """Values of all objects of one node.
+    """Object dictionary of one node, with the current values of all objects.
 
-    ``read`` and ``write`` are client accesses and may raise :class:`~skinnode.canopen.abort.Refused`.
-    ``raw``, ``integer`` and ``put`` are accesses by the node itself; the objects must exist.
+    The methods ``read`` and ``write`` perform an access by a client and may raise
+    :class:`~skinnode.canopen.abort.Refused`. The methods ``raw``, ``integer`` and ``put`` perform an access
+    by the node itself, which requires that the object exists.
 
     Args:
-        objects: the declarations.
+        objects: declarations of all objects.
         node_id: node-ID added to the default COB-IDs.
     """
 
@@ -107,12 +111,12 @@ class ObjectStore:
         return bytes(entry.data_type.bits // 8) if value is None else to_bytes(entry, value)
 
     def bind(self, index: int, reader: Reader, *, count: bool = False) -> None:
-        """Register a function that computes the sub-objects of an object when they are read.
+        """Register a function that computes the values of an object when they are read.
 
         Args:
             index: index of the object.
             reader: returns the value of a sub-index.
-            count: whether sub-index 0 of an array or record is computed too.
+            count: whether the function also computes sub-index 0 of an array or record.
         """
         whole = count or (index, 1) not in self._entries
         for key in self._entries:
@@ -120,19 +124,19 @@ class ObjectStore:
                 self._readers[key] = reader
 
     def bind_domain(self, index: int, length: int, reader: Reader, writer: DomainWriter) -> None:
-        """Register functions that read and write the value of a DOMAIN stored elsewhere.
+        """Register functions that read and write a DOMAIN stored outside the object dictionary.
 
         Args:
             index: index of the object.
             length: length of every value, bytes.
             reader: returns the value.
-            writer: takes the value.
+            writer: stores the value.
         """
         self._readers[index, 0] = reader
         self._domains[index] = Lengths(length, length), writer
 
     def guard(self, index: int, guard: Guard) -> None:
-        """Register ``guard``, which may refuse values written to ``index``."""
+        """Register ``guard``, which checks every value before it is written to ``index``."""
         self._guards[index] = guard
 
     def watch(self, index: int, watcher: Watcher) -> None:
@@ -140,7 +144,7 @@ class ObjectStore:
         self._watchers[index] = watcher
 
     def watch_changes(self, watcher: ChangeWatcher) -> None:
-        """Register ``watcher``, called after a client changes a writable object that is not computed."""
+        """Register ``watcher``, called after a client has changed any object that is not computed."""
         self._change_watcher = watcher
 
     def find(self, index: int, subindex: int) -> Entry:
@@ -159,7 +163,7 @@ class ObjectStore:
         return (index, subindex) in self._entries
 
     def lengths(self, index: int, subindex: int) -> Lengths:
-        """Return the permitted length of the data that a client writes to an object.
+        """Return the permitted length of a value that a client writes to an object.
 
         Raises:
             Refused: if the object does not exist or is read-only.
@@ -183,10 +187,10 @@ class ObjectStore:
         return self.raw(index, subindex)
 
     def write(self, index: int, subindex: int, data: bytes) -> None:
-        """Write an object for a client: check the declaration and guard, store, then call the watcher.
+        """Write an object for a client: check and store the value, then call the object's watcher.
 
         Raises:
-            Refused: if the value is not allowed; the object is then unchanged.
+            Refused: if the value is not allowed; the object then keeps its old value.
         """
         self.lengths(index, subindex).check(len(data))
         if index in self._domains:
@@ -212,20 +216,20 @@ class ObjectStore:
             guard(subindex, value)
 
     def raw(self, index: int, subindex: int) -> bytes:
-        """Return the bytes of an object, computed if the object is bound."""
+        """Return the current bytes of an object, whether stored or computed."""
         reader = self._readers.get((index, subindex))
         return self._values[index, subindex] if reader is None else reader(subindex)
 
     def written(self, index: int, subindex: int) -> bytes:
-        """Return the bytes that a client has written, even if the object is computed when it is read."""
+        """Return the bytes that a client wrote last, even if reads of the object are computed."""
         return self._values[index, subindex]
 
     def integer(self, index: int, subindex: int = 0) -> int:
-        """Return the value of an unsigned object that is not bound."""
+        """Return the value of an unsigned integer object that is not computed."""
         return int.from_bytes(self._values[index, subindex], "little")
 
     def put(self, index: int, subindex: int, value: Value | bytes) -> None:
-        """Set an object from within the node, without calling the guard or watcher."""
+        """Set an object from within the node, without calling its guard or watcher."""
         self._values[index, subindex] = to_bytes(self._entries[index, subindex], value)
 
     def restore(self, first: int, last: int) -> None:
@@ -236,7 +240,7 @@ class ObjectStore:
     def not_at_default(self, first: int, last: int) -> dict[tuple[int, int], bytes]:
         """Return the parameters from index ``first`` to ``last`` that differ from their defaults.
 
-        Computed objects are not parameters and are left out.
+        Computed objects are not parameters, so the result does not contain them.
         """
         return {
             key: self._values[key]

@@ -1,4 +1,4 @@
-"""Counters (0x2040) of malformed frames, which a node ignores because the standard defines no response."""
+"""Counters of rejected frames (0x2040), to which the standard defines no response."""
 
 from __future__ import annotations
 
@@ -15,23 +15,24 @@ class Rejected(IntEnum):
     """Reason for rejecting a frame; the value is the sub-index of object 0x2040."""
 
     NMT = 1
-    """NMT frame that is not two bytes long, or that carries an unknown command for this node."""
+    """NMT frame that is not two bytes long, or that contains an unknown command for this node."""
     SYNC = 2
     """SYNC message that is longer or shorter than 0x1019 requires."""
     TIME = 3
-    """TIME message that is not six bytes long, or does not hold a valid time of day."""
+    """TIME message that is not six bytes long, or that does not contain a valid time of day."""
     HEARTBEAT = 4
-    """Heartbeat that is not one byte long, from a monitored node."""
+    """Heartbeat of a monitored node that is not one byte long."""
     SDO = 5
     """SDO request that is not eight bytes long."""
     RPDO = 6
     """RPDO that is shorter than its mapped objects."""
     OWN_ERROR_CONTROL = 7
-    """Boot-up message or heartbeat with this node's own node-ID; another node uses the same node-ID."""
+    """Boot-up message or heartbeat with this node's own node-ID, which shows that another node uses this
+    node-ID."""
 
 
 class RejectedFrames:
-    """Counters of object 0x2040, which restart at power-on and *reset node*, and saturate at their maximum.
+    """Counters of rejected frames (0x2040), which *reset node* sets to 0 and which stop at their maximum.
 
     Args:
         store: object dictionary.
@@ -42,11 +43,11 @@ class RejectedFrames:
         store.bind(od.REJECTED_FRAMES, lambda sub: self._counts[Rejected(sub)].to_bytes(4, "little"))
 
     def count(self, kind: Rejected) -> None:
-        """Count one frame."""
+        """Count one rejected frame."""
         self._counts[kind] = min(self._counts[kind] + 1, _MOST)
 
     def counted(self, kind: Rejected) -> int:
-        """Return the number of frames counted so far."""
+        """Return the number of frames rejected for this reason."""
         return self._counts[kind]
 
     def reset(self) -> None:

@@ -1,4 +1,4 @@
-"""Runner of nodes on a bus, with one thread for all nodes that share a port."""
+"""Runner of nodes on a bus, which uses one thread for all nodes that share a port."""
 
 from __future__ import annotations
 
@@ -17,37 +17,37 @@ from skinnode.transport.frame import Frame
 from skinnode.transport.port import CanPort
 
 _IDLE_S: Final = 0.1
-"""Maximum wait for a frame, s; also the maximum delay before the thread ends."""
+"""Maximum wait for a frame, s; also the maximum time that the thread takes to notice a stop request."""
 
 _RETRY_S: Final = 0.02
-"""Pause after a bus error, s; a full queue drains within this time."""
+"""Pause after a bus error, s; a full transmit queue drains within this time."""
 
 _CATCH_UP_FRAMES: Final = 4096
-"""Maximum number of frames served before a node is reported as silent; a full bus at 1 Mbit/s carries
-that many in half a second."""
+"""Maximum number of waiting frames that are served before a heartbeat counts as missed; at full load, a bus
+at 1 Mbit/s carries this number of frames in half a second."""
 
 OFF_AFTER_S: Final = 0.1
-"""Duration of uninterrupted bus errors after which nodes treat their controller as bus-off, s; a full queue
-drains sooner."""
+"""Time of continuous bus errors after which the nodes treat their CAN controller as bus-off, s. A full
+transmit queue drains in less time."""
 
 REOPEN_S: Final = 1.0
-"""Duration of uninterrupted bus errors after which the interface is reopened, s, in case it was unplugged and
-plugged in again."""
+"""Time of continuous bus errors after which the CAN interface is reopened, s; the interface may have been
+unplugged and plugged in again."""
 
 
 class NodeRunner:
     """Runner that powers nodes on and runs them until :meth:`stop`.
 
-    A runner can be started only once. Bus errors do not stop it. The runner's thread owns the nodes from
-    :meth:`start` to :meth:`stop`; other threads may only read the nodes' counters. The port stays open
-    afterwards. Timers are as precise as the most demanding node requires.
+    A runner can be started only once. Bus errors do not stop a runner. From :meth:`start` to :meth:`stop`,
+    only the runner's thread may use the nodes; other threads may read the nodes' counters. The runner does
+    not close the port. Its timers have the precision that the most demanding node requires.
 
     Args:
-        port: the port that all nodes share.
-        nodes: the nodes, any of which may still lack a node-ID.
+        port: CAN port that all nodes share.
+        nodes: nodes to run, with or without a node-ID.
 
     Raises:
-        ValueError: if there are no nodes, or two nodes have the same node-ID.
+        ValueError: if there are no nodes, or if two nodes have the same node-ID.
     """
 
     def __init__(self, port: CanPort, nodes: Iterable[PatchNode]) -> None:
@@ -61,23 +61,24 @@ class NodeRunner:
             raise ValueError(f"nodes: got node-IDs {sorted(ids)}, must differ")
         self._slack_ns = min(node.pacing.slack_ns for node in self.nodes)
         self.bus_errors = 0
-        """Number of bus errors so far."""
+        """Number of bus errors since the runner was created."""
         self.bus_error = ""
-        """First error of the latest series of errors, in one line."""
+        """First error of the latest series of bus errors, in one line; empty before the first bus error."""
         self._heard = 0
         self._bus_state = BusState.ACTIVE
-        self._sent_before = 0  # frames sent before bus-off; one more shows that the bus has recovered
+        # Number of frames sent before bus-off; a larger number shows that the bus has recovered.
+        self._sent_before = 0
         self._powered, self._stopping = clock.event(), clock.event()
         self._error: BaseException | None = None
         self._thread = clock.thread(target=self._run, name=f"nodes {port.config.name}")
 
     @property
     def failed(self) -> bool:
-        """Whether an error has ended the thread; :meth:`stop` raises it."""
+        """Whether an error has ended the runner's thread; :meth:`stop` raises this error."""
         return self._error is not None
 
     def start(self) -> None:
-        """Power the nodes on in order, and return once each is on and has loaded any stored node-ID.
+        """Start the thread, and return after all nodes have been powered on and have loaded their memories.
 
         If an error ends the thread, :meth:`stop` raises it.
         """
@@ -85,10 +86,10 @@ class NodeRunner:
         self._powered.wait()
 
     def stop(self) -> None:
-        """Stop and join the thread, which powers the nodes off. Further calls have no effect.
+        """Power the nodes off and end the runner's thread. Further calls have no effect.
 
         Raises:
-            BaseException: the error that ended the thread earlier.
+            BaseException: any error that ended the thread before.
         """
         if self._stopping.is_set():
             return
@@ -108,7 +109,7 @@ class NodeRunner:
         try:
             self.stop()
         except Exception:
-            if error is None:  # otherwise the original error is already being raised
+            if error is None:  # the error of the ``with`` block has precedence
                 raise
 
     def _run(self) -> None:
@@ -118,7 +119,7 @@ class NodeRunner:
                 node.power_on(now_ns)
             self._powered.set()
             self._drive()
-        except BaseException as error:  # stop() raises it
+        except BaseException as error:  # stop() raises this error
             self._error = error
         finally:
             self._powered.set()
@@ -133,7 +134,7 @@ class NodeRunner:
             try:
                 self._turn()
             except BusError as error:
-                # A frame that could not be sent is lost, as on any bus, and the nodes continue.
+                # A frame that cannot be sent is lost, as in a hardware node, and the nodes continue to run.
                 self.bus_errors += 1
                 now_s = clock.monotonic()
                 if failing_since_s is None:
@@ -147,7 +148,7 @@ class NodeRunner:
                     with contextlib.suppress(BusError):
                         self._port.reopen()
                 self._stopping.wait(_RETRY_S)
-            # An iteration without frames does not show that the bus works.
+            # Only a frame that was sent or received shows that the bus works.
             if self._port.sent + self._heard > moved:
                 failing_since_s = None
             if self._bus_state is BusState.OFF and self._port.sent > self._sent_before:
@@ -157,20 +158,21 @@ class NodeRunner:
         self._bus_state = state
         now_ns = clock.monotonic_ns()
         for node in self.nodes:
-            with contextlib.suppress(BusError):  # the emergency stays queued in the node
+            with contextlib.suppress(BusError):  # the node keeps the emergency message in its queue
                 node.on_bus(state, now_ns)
 
     def _on_error_frame(self, frame: Frame) -> None:
-        if self._port.config.interface == "socketcan":  # other interfaces define error frames differently
+        # Error frames of other interfaces have a different meaning.
+        if self._port.config.interface == "socketcan":
             state = bus_state(frame)
             if state is not None:
                 self._set_bus_state(state)
-                self._sent_before = 1 << 63  # frames queued for a bus-off controller are not sent
+                self._sent_before = 1 << 63  # a queued frame does not show that the bus has recovered
 
     def _turn(self) -> None:
-        """Serve all timers and at most one frame; return when a timer is due, or after a limited wait."""
+        """Serve all timers that are due, then wait for a frame, until the next timer is due."""
         nodes, now = self.nodes, clock.monotonic_ns
-        # All nodes receive the same time, so that nodes started together share one wake-up of the thread.
+        # All nodes receive the same time, so that a single wake-up serves nodes that were started together.
         now_ns, first_ns = now(), NO_DEADLINE_NS
         silent = any(now_ns >= node.silent_from_ns for node in nodes)
         failure = self._catch_up(now_ns) if silent else None
@@ -192,9 +194,10 @@ class NodeRunner:
             raise failure
 
     def _catch_up(self, now_ns: int) -> BusError | None:
-        """Serve the frames received before ``now_ns``.
+        """Serve the waiting frames that were received before ``now_ns``.
 
-        This keeps a heartbeat received in time from counting as missed if this thread was delayed.
+        If this thread was delayed, a heartbeat may have been received in time but not yet served. Without
+        this method, such a heartbeat would count as missed.
         """
         failure: BusError | None = None
         for _ in range(_CATCH_UP_FRAMES):
@@ -207,7 +210,7 @@ class NodeRunner:
         return failure
 
     def _serve(self, frame: Frame) -> BusError | None:
-        """Pass a frame to all nodes, then return a bus error if a node raised one."""
+        """Pass a frame to all nodes; return the last bus error that a node raised, or None."""
         failure: BusError | None = None
         if frame.error:
             self._on_error_frame(frame)

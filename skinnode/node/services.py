@@ -1,4 +1,4 @@
-"""Resources shared by all CiA services of a node: object dictionary, EMCY, counters, sender and clock."""
+"""Resources that a node's communication services share."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from skinnode.node.object_dictionary import ObjectStore
 from skinnode.node.rejected import RejectedFrames
 
 Send = Callable[[int, bytes], None]
-"""Callback that sends a frame, given its COB-ID and payload."""
+"""Callback that takes a COB-ID and a payload and sends the frame."""
 
 
 @dataclass(frozen=True, slots=True)
 class NodeServices:
-    """Resources of a node that its services share."""
+    """Resources that all communication services of a node share."""
 
     store: ObjectStore
     """Object dictionary."""
@@ -25,6 +25,6 @@ class NodeServices:
     rejected: RejectedFrames
     """Counters of rejected frames (0x2040)."""
     send: Send
-    """Sends a frame."""
+    """Function that sends a frame."""
     now: Clock
-    """Time of the event being handled, ns."""
+    """Function that returns the time of the event being handled, ns."""

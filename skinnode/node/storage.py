@@ -1,7 +1,7 @@
-"""Store parameters (0x1010), restore defaults (0x1011) and verify configuration (0x1020), as in CiA 301 v4.2.
+"""Saving of parameters: objects 0x1010 (store), 0x1011 (restore defaults) and 0x1020 (verify), CiA 301 v4.2.
 
-The module also saves the baseline and the LSS configuration. A *parameter* is an object that a client can
-write and read back; commands and computed objects are not parameters.
+This module also saves the baseline and the LSS configuration of a node. A *parameter* is an object that a
+client can write and read back; commands and computed objects are not parameters.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ from skinnode.node.services import NodeServices
 from skinnode.node.write_order import Key, write_configuration
 
 COMMUNICATION: Final = 0x1000, 0x1FFF
-"""First and last index of the communication parameters."""
+"""First and last index of the communication parameters (CiA 301)."""
 APPLICATION: Final = 0x2000, 0x9FFF
-"""First and last index of the application parameters."""
+"""First and last index of the application parameters (CiA 301)."""
 EVERYTHING: Final = 0x1000, 0x9FFF
 """First and last index of all parameters."""
 _ALL, _COMMUNICATION_ONLY, _APPLICATION_ONLY = 1, 2, 3
-"""Sub-indices of 0x1010 and 0x1011."""
+"""Sub-indices of 0x1010 and 0x1011: all, communication or application parameters."""
 
 _CAN_ID_MASK: Final = 0x7FF
 
@@ -33,14 +33,15 @@ Rows = tuple[tuple[float, ...], ...]
 
 
 class Storage:
-    """Values that a node keeps, and the objects that control saving and restoring.
+    """Storage of the values that survive a power cycle, with the objects that save and restore them.
 
-    A value that could not be saved or restored is reported by EMCY 0x6300, whose first manufacturer-specific
-    byte is a :class:`~skinnode.node.memory.Fault`.
+    If a value cannot be saved or restored, the node sends EMCY 0x6300, whose first manufacturer-specific byte
+    is a :class:`~skinnode.node.memory.Fault`.
 
     Args:
         services: the resources that the node's services share.
-        memory: the memory; if None, 0x1010 and 0x1011 read 0 and refuse writes (CiA 301).
+        memory: memory of the node; None if there is no memory, in which case 0x1010 and 0x1011 read 0 and
+            refuse writes (CiA 301).
         patch: sizes and layout of the patch; see :class:`~skinnode.node.memory.Kept`.
     """
 
@@ -51,10 +52,11 @@ class Storage:
         self._lasting: dict[Fault, bytes] = {}
         self._kept = Kept(patch)
         self.problem = ""
-        """Latest problem with the memory, in one line; empty if there was no problem."""
+        """Latest problem with the memory, in one line; empty if no problem has occurred."""
         self.baseline_ohm: Callable[[], Rows] = tuple
         """Function that returns the current R0, ohm; set by the application."""
-        able = int(memory is not None).to_bytes(4, "little")  # 1: the node saves and restores on command
+        # Value 1 means that the node saves and restores on command.
+        able = int(memory is not None).to_bytes(4, "little")
         for index, signature, command in (
             (od.STORE, od.STORE_SIGNATURE, self._save),
             (od.RESTORE, od.RESTORE_SIGNATURE, self._forget),
@@ -65,7 +67,7 @@ class Storage:
 
     @property
     def kept(self) -> Kept:
-        """Usable content of the memory."""
+        """Content of the memory that this node can use."""
         return self._kept
 
     @property
@@ -74,7 +76,7 @@ class Storage:
         return self._memory is not None
 
     def load(self) -> None:
-        """Load the memory at power-on. A memory without usable content is treated as empty."""
+        """Load the memory's content at power-on. A memory without usable content is treated as empty."""
         patch = self._kept.patch
         self._kept, self._unreported, self._lasting, self.problem = Kept(patch), [], {}, ""
         try:
@@ -88,13 +90,13 @@ class Storage:
             self._kept = kept
 
     def note(self, fault: Fault, index: int = 0, subindex: int = 0, why: str = "") -> None:
-        """Record a fault, to be reported by :meth:`report`.
+        """Record a fault, which :meth:`report` will report.
 
         Args:
-            fault: kind of the fault.
+            fault: type of the fault.
             index: index of a refused parameter.
             subindex: sub-index of a refused parameter.
-            why: the reason, in one line; if empty, the reason is that the parameter is not allowed.
+            why: description of the fault, in one line; if empty, the description names the refused parameter.
         """
         self.problem = why or f"the stored value of 0x{index:04X}:{subindex} is not allowed"
         detail = struct.pack("<BHB", fault, index, subindex)
@@ -104,10 +106,10 @@ class Storage:
             self._lasting[fault] = detail
 
     def report(self, t_ns: int) -> None:
-        """Send emergencies for the faults recorded since the last call.
+        """Send emergency messages for the faults recorded since the last call.
 
-        A fault that affects the whole memory stays active in the error register, even across resets, until
-        the memory is reliable again.
+        A fault of the whole memory stays active in the error register until the memory is reliable again,
+        even after a reset.
         """
         for fault, detail in self._lasting.items():
             self._emcy.report(EmcyCode.DATA_SET, detail, t_ns, fault)
@@ -118,8 +120,8 @@ class Storage:
     def restore(self, first: int, last: int) -> None:
         """Set the objects from index ``first`` to ``last`` to their power-on values.
 
-        A saved value undergoes the same checks as a value written by a client. An object without a saved
-        value, or whose saved value is no longer allowed, is set to its default.
+        A saved value must pass the same checks as a value written by a client. An object is set to its
+        default if it has no saved value, or if its saved value is not allowed.
         """
         self._store.restore(first, last)
         values: dict[Key, bytes] = {}
@@ -132,10 +134,10 @@ class Storage:
         for index, subindex in write_configuration(self._store, values):
             self.note(Fault.REFUSED, index, subindex)
         if self._present(*APPLICATION) != self._kept.application.values:
-            self._clear_verification()  # only part of the verified configuration was restored
+            self._clear_verification()  # the restored configuration differs from the verified one
 
     def keep_baseline(self) -> None:
-        """Save only the baseline, if there is a memory."""
+        """Save the baseline, and no other value, if the node has a memory."""
         if self._memory is None:
             return
         try:
@@ -144,7 +146,7 @@ class Storage:
             self.note(Fault.NOT_SAVED, why=f"baseline not saved: {error}")
 
     def keep_lss(self, node_id: int, bit_rate_bps: int | None) -> None:
-        """Save the LSS configuration.
+        """Save the node-ID and bit rate that LSS has configured.
 
         Args:
             node_id: 1 to 127, or 255 for no node-ID.
@@ -162,7 +164,7 @@ class Storage:
         self._settle(Fault.NOT_SAVED)
 
     def _settle(self, *faults: Fault) -> None:
-        """Clear faults that have ended, because the memory is reliable again."""
+        """Report the end of faults, because the memory is reliable again."""
         for fault in faults:
             if self._lasting.pop(fault, None) is not None:
                 self._emcy.clear(EmcyCode.DATA_SET, self._now(), fault)
@@ -177,8 +179,8 @@ class Storage:
                 self._keep(command(subindex))
             except OSError:
                 raise Refused(AbortCode.HARDWARE) from None
-            # Unlike an automatic save of the baseline, a save on command shows that the user has accepted
-            # the current parameters, so these faults end.
+            # A save on command means that the user accepts the current parameters, so these faults end. An
+            # automatic save of the baseline does not.
             self._settle(Fault.UNREADABLE, Fault.DAMAGED, Fault.FOREIGN)
 
         return guard
@@ -191,13 +193,13 @@ class Storage:
         if subindex in (_ALL, _APPLICATION_ONLY):
             application_kept = Parameters(node_id, application)
             kept = replace(kept, application=application_kept, baseline_ohm=self.baseline_ohm())
-        # 0x1020 verifies the configuration as a whole, so it is saved only if the whole configuration is
-        # saved.
+        # Object 0x1020 refers to the whole configuration, so it is saved only if the memory then contains the
+        # whole configuration.
         whole = kept.communication.values == communication and kept.application.values == application
         return kept if whole else _unverified(kept)
 
     def _forget(self, subindex: int) -> Kept:
-        """Return the content without the saved parameters, so that the defaults apply from the next reset."""
+        """Return the memory's content without the saved parameters, so that a reset restores the defaults."""
         kept = _unverified(self._kept)
         if subindex in (_ALL, _COMMUNICATION_ONLY):
             kept = replace(kept, communication=Parameters())
@@ -219,7 +221,7 @@ class Storage:
         return {key: value for key, value in changed.items() if key not in od.COMMANDS}
 
     def _for_this_node(self, key: Key, value: bytes, node_id: int) -> bytes:
-        """Translate a COB-ID that was the default for ``node_id`` into the default for this node."""
+        """Convert a saved COB-ID: the default COB-ID for ``node_id`` becomes this node's default COB-ID."""
         if not self._store.has(*key):
             return value
         entry = self._store.find(*key)

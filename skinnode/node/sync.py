@@ -18,17 +18,17 @@ from skinnode.node.rejected import Rejected
 from skinnode.node.services import NodeServices
 
 PRODUCER_BIT: Final = 1 << 30
-"""Bit of 0x1005 that makes the device produce SYNC."""
+"""Bit of 0x1005 that makes the node produce SYNC."""
 
 SHORTEST_PERIOD_US: Final = 100
-"""Shortest cycle period (0x1006), µs: a SYNC takes half of it at 1 Mbit/s."""
+"""Minimum cycle period (0x1006), µs; a SYNC message takes half of this time at 1 Mbit/s."""
 
 _DO_NOT_CARE_BIT: Final = 1 << 31
-"""Bit of 0x1005 that may be written and has no meaning (CiA 301 v4.2, table 44)."""
+"""Bit of 0x1005 that a client may set, without effect (CiA 301 v4.2, table 44)."""
 
 
 class SyncWindow:
-    """Time window after a SYNC in which synchronous PDOs are valid (0x1007, µs; 0 for no limit)."""
+    """Time window after a SYNC (0x1007, µs; 0 for no limit) in which synchronous PDOs are valid."""
 
     def __init__(self, store: ObjectStore, emcy: EmcyProducer) -> None:
         self._store, self._emcy = store, emcy
@@ -36,24 +36,25 @@ class SyncWindow:
         self._missed: set[int] = set()
 
     def start(self, t_ns: int) -> None:
-        """Open the window: a SYNC was received at ``t_ns``."""
+        """Open the window, because a SYNC was received at ``t_ns``."""
         self._sync_ns = t_ns
 
     def forget(self, t_ns: int) -> None:
-        """Forget the last SYNC and all discarded TPDOs, because the node has entered another NMT state."""
+        """Reset the window and end its errors, because the node has entered another NMT state."""
         self._sync_ns = None
         for number in tuple(self._missed):
             self._clear(number, t_ns)
 
     def is_open(self, t_ns: int) -> bool:
-        """Return whether synchronous PDOs are valid at ``t_ns``; before the first SYNC they always are."""
+        """Return whether synchronous PDOs are valid at ``t_ns``; always true before the first SYNC."""
         length_us = self._store.integer(od.SYNC_WINDOW)
         return not length_us or self._sync_ns is None or t_ns - self._sync_ns <= length_us * 1000
 
     def lets_out(self, number: int, t_ns: int) -> bool:
         """Return whether a synchronous TPDO may be sent; if not, the caller must discard it.
 
-        An emergency reports a discarded TPDO once, and again only after the TPDO has been sent in time.
+        An emergency message reports the first discarded TPDO of a series, until this TPDO is sent within the
+        window again.
 
         Args:
             number: number of the TPDO, counted from 0.
@@ -73,10 +74,10 @@ class SyncWindow:
 
 
 class Sync:
-    """SYNC consumer that checks message lengths, and producer if 0x1005 enables production.
+    """SYNC consumer, which checks message lengths, and SYNC producer if 0x1005 enables production.
 
-    A device that produces SYNC also acts on it, so the caller treats a SYNC returned by :meth:`on_timer` like
-    a SYNC accepted by :meth:`accept`.
+    A SYNC producer also consumes its own SYNC messages: the caller must treat a SYNC returned by
+    :meth:`on_timer` like a SYNC accepted by :meth:`accept`.
 
     Args:
         services: the resources that the node's services share.
@@ -89,9 +90,9 @@ class Sync:
         self.window = SyncWindow(store, services.emcy)
         """The synchronous window."""
         self._communicates = False
-        self._counter = 0  # counter of the last SYNC produced
+        self._counter = 0  # counter of the last SYNC sent
         self._period_ns = 0
-        self._wrong_length: int | None = None  # length of the last SYNC consumed, if wrong
+        self._wrong_length: int | None = None  # length of the last SYNC received; None if it was right
         self.cob_id = od.SYNC_COB_ID
         """COB-ID of SYNC messages."""
         self.deadline_ns = NO_DEADLINE_NS
@@ -109,9 +110,9 @@ class Sync:
         return bool(self._store.integer(od.COB_ID_SYNC) & PRODUCER_BIT)
 
     def reload(self) -> None:
-        """Apply objects that were written or reset.
+        """Apply 0x1005 and 0x1006 after a write or a reset.
 
-        A producer sends its next SYNC one period later, and its first SYNC has counter 1.
+        A producer sends its next SYNC one period later. The counter of its first SYNC is 1.
         """
         self.cob_id = self._store.integer(od.COB_ID_SYNC) & COB_ID_MASK
         self._start()
@@ -120,7 +121,7 @@ class Sync:
         """Handle a change of the NMT state.
 
         SYNC is produced and consumed in PRE-OPERATIONAL and OPERATIONAL. The counter restarts at 1 when the
-        node enters one of these two states from any other state.
+        node enters these states from STOPPED or after boot-up.
         """
         if communicates != self._communicates:
             self._communicates, self._wrong_length, self._period_ns = communicates, None, 0
@@ -134,7 +135,7 @@ class Sync:
         self.deadline_ns = self._now() + self._period_ns if runs else NO_DEADLINE_NS
 
     def on_timer(self, t_ns: int) -> bytes | None:
-        """Send and return the SYNC if it is due. The schedule does not drift; missed SYNCs are skipped."""
+        """Send and return the SYNC if it is due. If SYNCs were missed, they are skipped, without drift."""
         if t_ns < self.deadline_ns:
             return None
         self.deadline_ns += (t_ns - self.deadline_ns) // self._period_ns * self._period_ns + self._period_ns
@@ -146,9 +147,9 @@ class Sync:
         return message
 
     def accept(self, message: bytes, t_ns: int) -> bool:
-        """Return whether a SYNC has the length that 0x1019 requires.
+        """Return whether a SYNC message has the length that 0x1019 requires.
 
-        A wrong length is reported once, and again only if the length changes.
+        A wrong length is reported once, until the length changes.
 
         Args:
             message: the payload.
@@ -173,7 +174,7 @@ class Sync:
             raise Refused(AbortCode.INVALID_VALUE)
 
     def _guard_overflow(self, _: int, value: int) -> None:
-        if value == 1:  # allowed: 0, or 2 to 240
+        if value == 1:  # CiA 301 allows 0 and 2 to 240
             raise Refused(AbortCode.INVALID_VALUE)
         if self._store.integer(od.CYCLE_PERIOD):
             raise Refused(AbortCode.DEVICE_STATE)

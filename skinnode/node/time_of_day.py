@@ -1,8 +1,8 @@
-"""TIME consumer: the time of day (CiA 301 v4.2, 7.2.6 and object 0x1012).
+"""TIME consumer, which receives the time of day (CiA 301 v4.2, 7.2.6 and object 0x1012).
 
-A device has no real-time clock. Instead, the node keeps the last time received, and the reading of its own
-clock at that moment. From these two times, object 0x2022 gives the current time of day, and the device time
-of a scan can be converted to a date.
+A node has no real-time clock. It stores the last time received, together with the time on its own clock at
+that moment. From these two times, it computes the current time of day (0x2022), and a host can convert the
+device time of a scan to a date.
 """
 
 from __future__ import annotations
@@ -20,12 +20,13 @@ _CONSUMES: Final = 1 << 31
 _PRODUCES: Final = 1 << 30
 _DAY_MS: Final = 86_400_000
 _FORMAT: Final = struct.Struct("<IH")
-"""TIME_OF_DAY (CiA 301 v4.2, 7.1.6.5): u28 ms after midnight, 4 reserved bits, u16 days since 1984-01-01."""
+"""Format of TIME_OF_DAY (CiA 301 v4.2, 7.1.6.5): u28 ms after midnight, 4 reserved bits, u16 days since
+1984-01-01."""
 _MS_MASK: Final = (1 << 28) - 1
 
 
 class TimeConsumer:
-    """Consumer of TIME messages, which provides the time of day.
+    """Consumer of TIME messages, which provides the time of day in object 0x2022.
 
     Args:
         store: object dictionary.
@@ -34,7 +35,8 @@ class TimeConsumer:
 
     def __init__(self, store: ObjectStore, now: Clock) -> None:
         self._store, self._now = store, now
-        self._received_ms = 0  # time since 1984-01-01 when the node's clock read _received_ns
+        # Last time received, counted from 1984-01-01; the node's clock then showed _received_ns.
+        self._received_ms = 0
         self._received_ns = 0
         self._messages = 0
         store.guard(od.COB_ID_TIME, self._guard)
@@ -54,7 +56,7 @@ class TimeConsumer:
             t_ns: time of reception, ns.
 
         Returns:
-            False if the payload is not a time of day; the stored time is then unchanged.
+            Whether the payload is a valid time of day; if not, the stored time does not change.
         """
         if len(data) != _FORMAT.size:
             return False
@@ -67,11 +69,11 @@ class TimeConsumer:
         return True
 
     def reset(self) -> None:
-        """Discard the time, as after a reset."""
+        """Discard the time received, as after *reset node*."""
         self._received_ms = self._received_ns = self._messages = 0
 
     def _read(self, subindex: int) -> bytes:
-        """Return a sub-object of 0x2022; zero before the first message."""
+        """Return a sub-object of 0x2022; 0 before the first TIME message."""
         passed_ms = (self._now() - self._received_ns) // 1_000_000 if self._messages else 0
         days, ms = divmod(self._received_ms + passed_ms, _DAY_MS)
         match subindex:
@@ -85,10 +87,11 @@ class TimeConsumer:
                 return (self._received_ns // 1000 & 0xFFFF_FFFF).to_bytes(4, "little")
 
     def _guard(self, _: int, value: int) -> None:
-        """Refuse TIME production, and a new COB-ID while the node consumes TIME."""
+        """Refuse a COB-ID that enables TIME production, or that changes while the node consumes TIME."""
         current = self._store.integer(od.COB_ID_TIME)
         if value & _PRODUCES:
             raise Refused(AbortCode.INVALID_VALUE)
-        # Bit 31 means "in use" here, not "invalid" as in other COB-IDs. Restricted CAN-IDs are never allowed.
+        # In this object, bit 31 means "in use", not "invalid" as in other COB-IDs. Restricted CAN-IDs are
+        # never allowed.
         check_cob_id(value ^ _CONSUMES, current ^ _CONSUMES)
         check_cob_id(value & ~_CONSUMES, INVALID_BIT)

@@ -1,4 +1,4 @@
-"""Timers by key, served in order of time without searching all timers."""
+"""Timers, one per key, served in order of time."""
 
 from __future__ import annotations
 
@@ -9,26 +9,26 @@ from skinnode.node.clock import NO_DEADLINE_NS
 
 
 class Timers:
-    """Heap with one time per key. Setting, moving or removing a time costs O(log n), amortised."""
+    """Timers, one per key, in a heap. Each operation takes O(log n) time, amortised."""
 
     def __init__(self) -> None:
         self._due: dict[int, int] = {}
-        self._heap: list[tuple[int, int]] = []  # also holds times that were moved or cancelled
+        self._heap: list[tuple[int, int]] = []  # also contains timers that were changed or cancelled
 
     @property
     def deadline_ns(self) -> int:
-        """Earliest time, ns; NO_DEADLINE_NS if no time is set."""
+        """Time of the earliest timer, ns; NO_DEADLINE_NS if no timer is set."""
         heap, due = self._heap, self._due
         while heap and due.get(heap[0][1]) != heap[0][0]:
             heapq.heappop(heap)
         return heap[0][0] if heap else NO_DEADLINE_NS
 
     def set(self, key: int, t_ns: int) -> None:
-        """Set or replace the time of a key.
+        """Set or replace the timer of a key.
 
         Args:
-            key: any number.
-            t_ns: time, ns; NO_DEADLINE_NS cancels the time of the key.
+            key: number that identifies the timer.
+            t_ns: time at which the timer is due, ns; NO_DEADLINE_NS cancels the timer.
         """
         if t_ns == NO_DEADLINE_NS:
             self._due.pop(key, None)
@@ -40,15 +40,15 @@ class Timers:
                 heapq.heapify(self._heap)
 
     def clear(self) -> None:
-        """Cancel all times."""
+        """Cancel all timers."""
         self._due.clear()
         self._heap.clear()
 
     def take(self, t_ns: int) -> Iterator[int]:
-        """Yield the keys that are due at ``t_ns``, earliest first.
+        """Yield the keys of the timers that are due at ``t_ns``, earliest first.
 
-        Each key is removed when it is yielded, so an exception in the caller's loop does not lose any other.
-        A key set again to a time that has passed is yielded again.
+        A timer is removed when its key is yielded, so an exception in the caller's loop does not affect the
+        other timers. If the caller sets a timer again to a time up to ``t_ns``, its key is yielded again.
         """
         while self.deadline_ns <= t_ns:
             _, key = heapq.heappop(self._heap)

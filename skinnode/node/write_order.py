@@ -1,4 +1,4 @@
-"""Order in which CiA 301 permits the values of a stored configuration to be written."""
+"""Restoring of a saved configuration, in an order in which CiA 301 allows the values to be written."""
 
 from __future__ import annotations
 
@@ -14,29 +14,31 @@ Key = tuple[int, int]
 
 _PDO_END: Final = 0x1C00
 _LATE: Final = (od.CYCLE_PERIOD, od.COB_ID_SYNC, od.VERIFY_CONFIGURATION)
-"""Objects written last, in this order. The SYNC counter overflow cannot change while a cycle period is set,
-the producer starts once both objects are set, and any change clears 0x1020."""
+"""Indices of the objects that are written last, in this order. The cycle period must follow the SYNC counter
+overflow, which cannot change while a cycle period is set. The COB-ID of SYNC, which starts the producer,
+comes next. Object 0x1020 must be last, because any other write clears it."""
 
 
 def write_configuration(store: ObjectStore, values: Mapping[Key, bytes]) -> list[Key]:
-    """Overwrite the defaults with the given values.
+    """Write the values of a saved configuration to an object dictionary that contains the defaults.
 
-    A PDO is switched off, mapped, given its parameters and switched on again. EMCY is switched off before its
+    Each PDO is switched off while its mapping and its parameters are written. EMCY is switched off before its
     COB-ID changes.
 
     Args:
-        store: object dictionary, with its defaults.
-        values: bytes of each value, by index and sub-index.
+        store: object dictionary whose objects have their defaults.
+        values: saved bytes, by index and sub-index.
 
     Returns:
-        Index and sub-index of each value that is not allowed. Such an object keeps its default; if the object
+        Index and sub-index of each value that was refused. The object then keeps its default. If the object
         is a mapping entry, the whole mapping keeps its default.
     """
     known = {key: value for key, value in values.items() if store.has(*key)}
     refused = [key for key in values if key not in known]
     pdos = {index & ~od.PDO_MAPPING_OFFSET for index, _ in known if od.RPDO1_PARAMETER <= index < _PDO_END}
     defaults = {pdo: store.raw(pdo, od.PDO_COB_ID) for pdo in sorted(pdos)}
-    for pdo, default in defaults.items():  # all PDOs first, because a value may be another PDO's default
+    # All PDOs are switched off first, because a saved COB-ID may be another PDO's default.
+    for pdo, default in defaults.items():
         _accepted(store, [((pdo, od.PDO_COB_ID), _switched_off(default))])
     for pdo, default in defaults.items():
         refused += _write_pdo(store, known, pdo, default)
@@ -52,9 +54,10 @@ def write_configuration(store: ObjectStore, values: Mapping[Key, bytes]) -> list
 
 
 def _write_pdo(store: ObjectStore, values: Mapping[Key, bytes], pdo: int, default: bytes) -> Iterator[Key]:
-    """Write the two records of the PDO whose parameters are at ``pdo``, and yield the refused values.
+    """Write both records of a PDO, and yield the index and sub-index of each refused value.
 
-    ``default``: the PDO's COB-ID if ``values`` contains none.
+    The argument ``pdo`` is the index of the communication record. The argument ``default`` is the PDO's
+    COB-ID if ``values`` does not contain it.
     """
     cob_id, count = (pdo, od.PDO_COB_ID), (pdo + od.PDO_MAPPING_OFFSET, 0)
     own = sorted(item for item in values.items() if item[0][0] == pdo and item[0] != cob_id)

@@ -22,7 +22,7 @@ _DOUBT_NS: Final = 2_000_000_000
 _REGISTER_NS: Final = 500_000_000
 """Minimum interval between readings of a nonzero error register, ns. The emergency message that clears an
 error may be lost, but the patch must count as operational within a second after the end of the error. The
-readings require four SDO frames per second."""
+register readings require four SDO frames per second."""
 
 
 class BaselineWatch:
@@ -84,7 +84,7 @@ class BaselineWatch:
         node.read_ns = now_ns + (LEAST_NS if stream.withholding else _DOUBT_NS)
         try:
             read = job.result()
-        except (BusError, ConfigError) as error:  # if the node has gone, missing heartbeats will show this
+        except (BusError, ConfigError) as error:  # a node that has gone is detected by its missing heartbeats
             stream.doubtful = True
             _log.warning("%s; reading its baseline again", error)
             return

@@ -51,7 +51,7 @@ class FieldCallback:
         return self._failed
 
     def close(self) -> None:
-        """Stop the calls, and wait up to a second for a running call. The function may call this method."""
+        """Stop the calls, and wait up to a second for a running call. The function itself may call this."""
         self._fields.end()
         self.join()
 

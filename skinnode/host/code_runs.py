@@ -1,4 +1,4 @@
-"""Track in a compiled kernel how often each crossing's code has repeated, and how its neighbours changed.
+"""Track how often each crossing's code has repeated, and how its neighbours changed meanwhile.
 
 A crossing's *run* is the number of scans in which its code has been repeated without a change. A crossing's
 *lead* measures how far the codes of its neighbours have changed since the run began. The lead along the upper
@@ -18,9 +18,9 @@ from skinnode.compiled.jit import njit_brief, njit_part
 from skinnode.protocol.codes import MISSING as _MISSING
 
 LAST, BEFORE, RUN, NAMED, ALONG, ACROSS, _ANCHORS = range(7)
-"""Planes of the state array: last code (-1 before the first code), previous code, run, flag of a crossing in
-a part already detected as frozen, lead along the upper wire, lead across. Four further planes contain the
-neighbours' codes at the beginning of the run."""
+"""Planes of the state array: last code (-1 before the first code), previous code, run, whether the crossing
+belongs to a part already detected as frozen, lead along the upper wire, lead across. Four further planes
+contain the neighbours' codes at the beginning of the run."""
 _PLANES: Final = 10
 
 UPPER, LOWER, CROSSING, WIRE_LEAD, CROSSING_LEAD, STEPS, FRESH = range(7)
@@ -30,7 +30,7 @@ or the crossing itself, is frozen. ``STEPS``: highest code of a measurement. ``F
 every code, 0 if unchanged codes were not sent and a repeated code is therefore no evidence."""
 MEASURED, CHANGED, RETURNED, LARGEST, RESERVED, LEAST, RELEASED, SUSPECT = range(8)
 """Indices of the results. ``MEASURED``, ``CHANGED`` and ``RETURNED``: number of crossings with a measurement,
-with a changed code, and with the code before the last change. ``LARGEST``: largest change of a code.
+with a changed code, and with the code before the last change. ``LARGEST``: largest change of any code.
 ``RESERVED``: number of crossings whose last code is reserved. ``LEAST``: smallest code. ``RELEASED``: number
 of changed crossings in parts detected as frozen. ``SUSPECT``: whether a further part may be frozen."""
 

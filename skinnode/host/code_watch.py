@@ -82,7 +82,7 @@ class CodeWatch:
         code_runs.compile_kernels()
         self._seen_windows = 0
         self._broken: tuple[WireFault, ...] = ()
-        # first scan with each broken wire, and (key None) with a frozen patch
+        # number of the first scan with each broken wire and, under the key None, with a frozen patch
         self._since: dict[WireFault | None, int] = {}
         self._verdict = FAULTLESS
 
@@ -163,6 +163,6 @@ class CodeWatch:
         return Verdict(distrust, (*faults, *parts.faults), parts.left_out)
 
     def on_scan(self, scan: Scan) -> None:
-        """Search the scan for noisy and drifting wires. :meth:`judge` must have been called for the scan."""
+        """Include a scan in the search for noisy and drifting wires, after :meth:`judge`."""
         if scan.complete and not scan.flags & _CHANGED_ONLY:
             self._windows.on_scan(scan)

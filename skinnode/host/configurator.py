@@ -52,7 +52,8 @@ class Configurator:
     bus: BusConfig
     boot_deadline_s: float
     abandoned: Callable[[], bool]
-    """Function called repeatedly. If it returns True, configuration raises Abandoned."""
+    """Function called repeatedly during configuration, which raises Abandoned if the function returns
+    True."""
     on_answer: Callable[[PatchConfig], None]
     """Function called for each node after the node's first response."""
     search: Callable[[PatchConfig], object]
@@ -185,7 +186,7 @@ class Configurator:
         _watch_master(remote, watched)
 
     def _configure_heartbeat(self, remote: RemoteOd, *, master: bool) -> float:
-        """Set the heartbeat period, on another master's bus only if unset. Returns the period, s."""
+        """Set the heartbeat period, unless another master has already set it. Returns the period, s."""
         heartbeat_ms = self.hand.bring_up.heartbeat_ms
         if not master:
             present_ms = int(remote.read(od.HEARTBEAT_PRODUCER, 0, "u16"))

@@ -2,7 +2,7 @@
 
 An exception raised while serving one subject (a patch, a bus or a subscriber) is reported to that subject's
 :class:`Defects`, and does not affect other subjects. The operation is then retried. The table in
-:mod:`skinnode.host` lists every thread.
+:mod:`skinnode.host` lists the effects of an exception in each thread.
 """
 
 from __future__ import annotations

@@ -1,9 +1,10 @@
 """Detect whether a patch's converter is running, from the conversion phase and from repeated codes.
 
 **Phase.** Some patches count their conversions and send the conversion phase
-(:attr:`~skinnode.protocol.summary.SummaryFlag.CONVERSIONS`). Two successive scans with the same phase and the
-same codes then contain the same conversion. After missed scans or a lost summary, an equal phase proves
-nothing, because any phase may follow. A different phase always proves that a conversion took place.
+(:attr:`~skinnode.protocol.summary.SummaryFlag.CONVERSIONS`). If two successive scans of such a patch have the
+same phase and the same codes, they contain the same conversion. After missed scans or a lost summary, an
+equal phase proves nothing, because any phase may follow. A different phase always proves that a conversion
+took place.
 
 **Repeats.** Without a phase, the decision must be based on the codes. A run is a sequence of scans in which
 no code changes. A run counts as frozen if a live converter would produce the run with a probability below
@@ -43,7 +44,7 @@ _SOURCE_FAILED: Final = int(SummaryFlag.SOURCE_FAILED)
 FALSE_ALARM: Final = 1e-12
 """Maximum probability that a live part (crossing, wire or patch) repeats its codes as often as observed, at
 the assumed noise. A patch of 10 × 30 wires has 341 parts. At 100 scans/s, all parts together are tested 1.2e9
-times in ten hours, so 0.001 false alarms are expected; the requirement is at most one."""
+times in ten hours, so 0.001 false alarms are expected; the requirement is at most one false alarm."""
 FALSE_ALARM_QUIET: Final = 1e-8
 """Maximum probability that a live patch repeats its codes as often as observed, at a noise ``QUIETER`` times
 smaller than stated. For the 3.6e6 scans of ten hours, this limit corresponds to 0.04 false alarms, and few
@@ -51,7 +52,8 @@ converters have so little noise."""
 QUIETER: Final = 10.0
 """Maximum ratio of the noise stated in the hand file to a converter's actual noise."""
 ABRUPT: Final = 16
-"""Minimum change of a code in the last scan before a movement counts as ended abruptly, codes. Not tuned."""
+"""Minimum change of a code in the last scan of a movement that ended abruptly, codes. This value is not
+tuned."""
 DOUBT_RUN: Final = 64
 """Number of scans after an abruptly ended movement whose fields are not trusted; after these scans, only the
 probability of the repeats decides. For most simulated patches that froze in mid-press, the decision took up
@@ -188,7 +190,7 @@ class ConverterLiveness:
     def _compare_phase(self, scan: Scan, *, unchanged: bool) -> None:
         phase = scan.phase
         if not phase:
-            # the summary arrived without a phase: the patch does not count
+            # the patch does not count its conversions, because the summary arrived without a phase
             if scan.device_time_us is not None:
                 self._phase = self._same_phase = 0
             return
@@ -201,7 +203,7 @@ class ConverterLiveness:
     def _end_run(self, returned: int, largest: int) -> None:
         self._t_proof_ns = self._t_ns
         self._flickers += returned > 0
-        if self._run and (not self._repeats_frozen() or largest <= 1):  # otherwise the end of a frozen run
+        if self._run and (not self._repeats_frozen() or largest <= 1):  # otherwise a frozen run has ended
             self._longest[self._pressed] = max(self._longest[self._pressed], self._run)
         self._run = self._codes = self._check_at = self._same_phase = 0
         self._pressed = self._abrupt = self._improbable = False

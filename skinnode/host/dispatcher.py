@@ -37,7 +37,7 @@ timeouts are at least 5 ms. Batches of frames arrive about a millisecond apart."
 
 @dataclass(frozen=True, slots=True)
 class BusStats:
-    """Counters for a bus since the host opened it."""
+    """Counters of the frames on a bus since the host opened the bus."""
 
     received: int
     """Number of data frames received, excluding the host's own frames."""
@@ -158,7 +158,7 @@ class Dispatcher:
         self._outgoing.append((can_id, data))
 
     def dispatch(self, batch: Sequence[Frame]) -> None:
-        """Pass frames to their handlers, in order. An exception in a handler loses only that frame."""
+        """Pass frames to their handlers, in order. An exception in a handler affects only its frame."""
         for listener in self._listeners:
             try:
                 listener(batch)

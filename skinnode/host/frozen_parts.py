@@ -9,7 +9,7 @@ The limits were verified with simulated presses on live patches; :mod:`skinnode.
 lead. In 696 presses (two layouts, layers of 0.3 to 1 pitch, depths of 2 to 50 %, friction of 0 to 0.8, noise
 of 0 to 3e-6, 16-bit codes), the maximum lead of a crossing whose code stayed constant for five scans was 75
 codes. In 1,800 presses without noise (depths from 0.2 %), the maximum lead of a wire whose codes stayed
-constant for at least one scan was 25 codes. An indentation by 10 % changes codes by thousands.
+constant for at least one scan was 25 codes. An indentation of 10 % changes codes by thousands.
 
 **Noise.** A wire or crossing is also frozen if the probability that a live converter would repeat its codes
 as often as observed is :data:`~skinnode.host.converter_liveness.FALSE_ALARM` or less. This probability is
@@ -83,7 +83,7 @@ class FrozenParts:
         self.assume_noise(0.0, 0)
 
     def assume_noise(self, measured: float, least: int) -> None:
-        """Set the limits for runs from the assumed noise.
+        """Set the minimum runs of frozen wires and crossings from the assumed noise.
 
         Args:
             measured: Noise measured over recent windows, codes; 0 if no noise was measurable.

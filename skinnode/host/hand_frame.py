@@ -65,7 +65,7 @@ class HandFrame:
 
     @property
     def distrust(self) -> Mapping[str, str]:
-        """Reason why each untrusted patch is not trusted, in words, by patch name."""
+        """Reasons why patches are not trusted, in words, by patch name; empty if all are trusted."""
         reasons = {patch: f"no field: {reason}" for patch, reason in self.missing.items()}
         return reasons | {name: why_not(each) for name, each in self.fields.items() if not each.trusted}
 
@@ -140,7 +140,9 @@ class HandFrame:
 
 
 class HandGatherer:
-    """Assembler of hand frames from fields, in order of scan number. Uses no clock; not thread-safe.
+    """Assembler of hand frames from fields, in order of scan number.
+
+    The assembler uses no clock and is not thread-safe.
 
     A hand frame is ready when every awaited patch has delivered its field for the frame, or a newer field. A
     patch whose fields were missing in :data:`~skinnode.host.health.SCANS_MISSED` consecutive hand frames is

@@ -145,7 +145,7 @@ class HealthWatch:
         self._compare_counters(name, before, now, _PATCH_COUNTERS)
 
     def _compare_frozen_parts(self, name: str, before: PatchHealth, now: PatchHealth) -> None:
-        """Publish changes in which frozen wires and crossings are left out of the fields."""
+        """Publish when frozen wires and crossings are left out of the fields, and when they return."""
         was, are = (
             {each.place: each for each in health.faults if _is_frozen_part(each)} for health in (before, now)
         )

@@ -145,8 +145,7 @@ class Host:
             interface: python-can interface that replaces the hand's interfaces.
             channel: Channel that replaces the hand's channel; only for a hand with one bus.
             boot_deadline_s: Maximum time until the first response from a node, s.
-            cancelled: Called repeatedly during bring-up. If it returns True, bring-up raises
-                BringUpCancelled.
+            cancelled: Called repeatedly during bring-up, which raises BringUpCancelled if the result is True.
             tap: Recorder of the traffic, including bring-up; see :class:`skinnode.record.Recorder`.
             open_port: Function that opens a bus, for interfaces that python-can does not provide.
 

@@ -56,7 +56,7 @@ class StartOptions:
     boot_deadline_s: float = BOOT_DEADLINE_S
     """Maximum time until the first response from a node, s."""
     cancelled: Callable[[], bool] = never
-    """Function called repeatedly during bring-up. If it returns True, bring-up raises BringUpCancelled."""
+    """Function called repeatedly during bring-up, which raises BringUpCancelled if the result is True."""
     tap: HostTap | None = None
     """Recorder of the traffic, including bring-up; None for no recording."""
     open_port: Callable[[BusConfig], CanPort] = CanPort

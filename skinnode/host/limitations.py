@@ -27,7 +27,7 @@ BY_PRIOR: Final = 0.3
 elasticity mostly determine the displacement. Few presses indent the layer by a larger fraction."""
 
 
-_BY_PRIOR: Final = "neighbours and elasticity fill the gap (see data_share)"
+_BY_PRIOR: Final = "neighbours and elasticity determine the rest (see data_share)"
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,7 +88,7 @@ def _of_results(patch: PatchConfig, solver: SolverConfig) -> Iterator[tuple[str,
             "bonded to metal (force_calibrated)",
         )
     if solver.normal_only:
-        yield "solver.normal_only", "no shear, neither displacement nor force"
+        yield "solver.normal_only", "no shear displacements and no shear forces"
     reached_m = share * float(PatchProblem.of(layout).clearance.min()) * layout.pitch_m
     if solver.max_std_m is not None and method == "exact" and solver.max_std_m < reached_m:
         text = f"no field will be precise: at rest the standard deviation is already {1e6 * reached_m:.2g} µm"
@@ -113,7 +113,7 @@ def _of_deadline(layout: PatchLayout, options: TrackerOptions, deadline_us: int)
 def _of_place(patch: PatchConfig, hand: HandConfig) -> Iterator[tuple[str, str]]:
     """Yield the keys and texts of coordinate frames that are unavailable for a patch's contacts."""
     if "pose" not in patch.model_fields_set:
-        yield "patches.pose", "no pose: contacts are in the frame of the patch itself"
+        yield "patches.pose", "no pose: contacts are in the patch's own coordinate frame"
     if patch.link is not None and patch.link not in [link.name for link in hand.links]:
         text = f"link {patch.link!r} has no pose in the hand: the program must supply the pose (HandFrame.at)"
         yield "links", text

@@ -60,7 +60,7 @@ class BusLink(Dispatcher):
         self._jobs: deque[tuple[Callable[[], object], Defects]] = deque()
         self.failure: BusError | None = None
         """Error that makes the bus unavailable; None while the bus works."""
-        self._due_s = 0.0  # a reopened interface counts as working from then on
+        self._due_s = 0.0  # time from which a reopened interface counts as working
         self._outages = 0
         self.t_dispatched_ns = 0
         """Monotonic time up to which all received frames have been dispatched, ns."""
@@ -93,7 +93,7 @@ class BusLink(Dispatcher):
             for listener in self._sent_listeners:
                 listener(Frame(can_id, data, t_ns, fd=len(data) > 8))
         except Exception as error:
-            self.defects.report("a listener to sent frames", error)
+            self.defects.report("a listener for sent frames", error)
 
     def remote_od(
         self,
@@ -232,7 +232,7 @@ class BusLink(Dispatcher):
             try:
                 job()
             except Exception as error:
-                owner.report("a job of the mainline", error)
+                owner.report("a job on the mainline", error)
         # While frames wait in the queue or the interface, pollers receive the time of the newest dispatched
         # frame instead of the current time, so that a delay in the host does not make nodes appear late.
         if batch:
@@ -246,7 +246,7 @@ class BusLink(Dispatcher):
         return bool(batch)
 
     def _rest(self) -> None:
-        """End a pause that is over, or restart the reopening if its thread did not start."""
+        """End a pause that is over, or start the reopening thread again if it did not start."""
         if not self._opening:
             self._rests = clock.monotonic() < self._rest_end_s
         elif (

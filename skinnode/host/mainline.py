@@ -71,6 +71,6 @@ class Mainline:
             try:
                 link.turn()
             except Exception as error:
-                link.defects.report("a turn of the mainline", error)
+                link.defects.report("an iteration of the mainline", error)
         next(self._measured).measure_load()
         return True

@@ -238,7 +238,7 @@ class PatchStream:
         self._box.clear()
         while self._unwatched:
             scan = self._unwatched.popleft()[1]
-            with contextlib.suppress(Exception):  # no caller remains that could handle it
+            with contextlib.suppress(Exception):  # no caller remains that could handle the exception
                 self._options.watch(scan)
 
     def _doubt(self) -> None:
@@ -345,7 +345,7 @@ class PatchStream:
         self._publisher.publish(field, stamp.patch)
 
     def _work_failed(self, error: Exception) -> None:
-        """Handle an exception raised outside the solving itself."""
+        """Handle an exception that a worker raised outside the solving itself."""
         self._report(error)
         self._leave()
 
@@ -358,7 +358,7 @@ class PatchStream:
         try:
             if self._box:
                 self._call_worker()
-        except Exception as error:  # the waiting scan is solved after the next call
+        except Exception as error:  # the waiting scan is solved when the next scan arrives
             self._report(error)
 
     def _report(self, error: Exception) -> None:

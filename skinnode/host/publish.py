@@ -52,7 +52,7 @@ class Subscription:
         self._subscribed = patches
         # Each patch has its own counter, which only one worker writes at a time.
         self._dropped = dict.fromkeys([*patches, ""], 0)
-        self._wakers: dict[object, Callable[[], object]] = {}  # one per waiting event loop
+        self._wakers: dict[object, Callable[[], object]] = {}  # one wake-up function per waiting event loop
 
     @property
     def dropped(self) -> int:

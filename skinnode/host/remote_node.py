@@ -96,7 +96,7 @@ class RemoteNode:
 
         Args:
             deadline_s: Maximum time until the node's first response, s.
-            abandoned: Called repeatedly; once it returns True, configuration raises Abandoned.
+            abandoned: Called repeatedly during configuration, which raises Abandoned if the result is True.
             on_answer: Called when the node has responded.
 
         Returns:
@@ -104,7 +104,7 @@ class RemoteNode:
 
         Raises:
             NodeError: if the node's electrode layout cannot be solved, or two nodes have the same node-ID.
-            SkinError: as raised by :meth:`Configurator.configure`.
+            SkinError: if :meth:`Configurator.configure` raises it.
         """
         self.boot_ups = self.monitor.boot_ups
         if self.monitor.running and self.monitor.nmt_state == NmtState.STOPPED and not self.has_other_master:
@@ -158,7 +158,7 @@ class RemoteNode:
             A solver with the new baseline; None if the baseline is unchanged and no scans are withheld.
 
         Raises:
-            SkinError: as raised by :meth:`Configurator.settle_baseline`.
+            SkinError: if :meth:`Configurator.settle_baseline` raises it.
         """
         facts = self.facts
         assert facts is not None  # called only for running nodes
@@ -176,7 +176,7 @@ class RemoteNode:
         """Read the node's error register, in case the emergency that clears an error was lost.
 
         Raises:
-            NodeError: as raised by :class:`RemoteOd`.
+            NodeError: if reading fails; see :class:`RemoteOd`.
         """
         said = self.monitor.registers_said
         register = self._remote.read(od.ERROR_REGISTER, 0, "u8")
@@ -203,7 +203,7 @@ class RemoteNode:
         """Command the node to use its current resistances as its baseline. Any thread.
 
         Raises:
-            SkinError: as raised by :meth:`Host.tare`.
+            SkinError: for the reasons listed under :meth:`Host.tare`.
         """
         node_id, said = self.patch.node_id, f"patch {self.patch.name!r} on {self.patch.bus}: not tared"
         if self.has_other_master:

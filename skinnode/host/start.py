@@ -57,7 +57,7 @@ def configure_all(
         nodes: Nodes to configure.
         missing: ``wait`` if silent nodes may join later, ``refuse`` if all nodes must be present.
         deadline_s: Maximum time until the first response from a node, s.
-        cancelled: Called repeatedly. If the result is True, configuration ends.
+        cancelled: Called repeatedly during configuration, which ends if the result is True.
 
     Returns:
         Nodes that are present, each with the solver for its scans.

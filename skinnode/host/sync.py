@@ -72,7 +72,7 @@ class SyncFollower:
         """Monotonic time of the newest SYNC, ns; 0 before the first."""
 
     def on_sync(self, data: bytes, t_ns: int) -> None:
-        """Process a received SYNC. If its counter is missing or out of range, the SYNC is only counted."""
+        """Process a received SYNC. A SYNC whose counter is missing or out of range is only counted."""
         self.received += 1
         self.t_newest_ns = t_ns
         overflow = self._ticks.counter_overflow
@@ -97,8 +97,8 @@ class SyncProducer:
     """Producer that sends SYNC on all buses, at the same instant or staggered, until :meth:`close`.
 
     The counter runs from 1 to its overflow value (CiA 301, 0x1019). SYNC number n + 1 is due n periods after
-    the first SYNC. If the thread wakes a whole period late, that period is skipped, because sending two SYNC
-    messages in quick succession would disturb the scans. A SYNC that has been sent on one bus is always sent
+    the first SYNC. If the thread wakes a whole period late, that period is skipped, so that two SYNC messages
+    are never sent in quick succession. A SYNC that has been sent on one bus is always sent
     on the other buses too.
 
     Threads: a dedicated thread sends the SYNC messages.

@@ -33,8 +33,7 @@ WINDOW: Final = 16
 WINDOWS: Final = 3
 """Number of consecutive windows in which a wire must be noisy or drift before it is reported."""
 NOISY: Final = 25.0
-"""Minimum ratio of a noisy wire's noise power to the median wire's noise power, or five times the
-amplitude."""
+"""Minimum ratio of a noisy wire's noise power to the median wire's noise power; the amplitude ratio is 5."""
 DRIFT: Final = 1e-3
 """Minimum drift of a drifting wire, as a fraction of R0: a tenth of the change that a light touch causes in
 the crossings below it."""
@@ -121,8 +120,8 @@ class WireWindows:
 def _shown_noise(codes: NDArray[np.float64], power: NDArray[np.float64]) -> float:
     """Return the noise that three quarters of the crossings exceed, codes; 0 if it is not measurable.
 
-    Only crossings whose codes span at least three values without a lasting change count. Even a crossing
-    without noise alternates between two codes if its value is at the edge of a quantization step.
+    Only crossings whose codes span at least three values without a lasting change are considered. Even a
+    crossing without noise alternates between two codes if its value is at the edge of a quantization step.
 
     Args:
         codes: (WINDOW, U, K) codes of a window.

@@ -1,4 +1,4 @@
-"""CAN interfaces: bus ports, their receiving threads, and frame log files.
+"""Access CAN interfaces: bus ports, their receiving threads, and frame log files.
 
 The module ``socketcan`` receives batches of frames through the system call wrapped by ``recvmmsg``, and reads
 the kernel's counter of dropped frames. ``port`` sends and counts frames and reopens failed interfaces;

@@ -16,15 +16,15 @@ _CONTROLLER_BYTE: Final = 1
 
 
 class BusState(StrEnum):
-    """Fault confinement state of a controller."""
+    """Fault confinement state of a CAN controller."""
 
     ACTIVE = "error active"
     WARNING = "error warning"
-    """Warning limit of an error counter reached; the controller is still error active."""
+    """An error counter has reached the warning limit; the controller is still error active."""
     PASSIVE = "error passive"
-    """Error passive limit of an error counter reached; the controller still sends and receives."""
+    """An error counter has reached the error passive limit; the controller still sends and receives."""
     OFF = "bus-off"
-    """The controller neither sends nor receives."""
+    """The controller neither sends nor receives frames."""
 
 
 def bus_state(frame: Frame) -> BusState | None:

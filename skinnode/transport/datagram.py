@@ -1,4 +1,4 @@
-"""UDP bus for load tests: each packet holds one frame in SocketCAN's memory layout.
+"""Provide a UDP bus for load tests; each packet contains one frame in SocketCAN's memory layout.
 
 Packets are received by the same reader as SocketCAN frames, with the same system calls, kernel timestamps,
 bounded buffer and drop counter. UDP over the loopback device only replaces the CAN driver and the CAN

@@ -1,7 +1,7 @@
 """Write CAN frames to a candump text file (``.log``) or a Vector BLF file, with python-can's writers.
 
-In both formats, all frames written before the last :meth:`FrameLog.flush` survive even if the process is
-killed later. In a ``.log`` file, each frame is simply appended. python-can's BLF writer buffers up to 128 kB
+In both formats, all frames written before the last :meth:`FrameLog.flush` survive if the process is killed
+later. In a ``.log`` file, each frame is simply appended. python-can's BLF writer buffers up to 128 kB
 of frames and completes the file header only when the writer stops. Each flush therefore stops the BLF writer,
 which leaves a complete file, and opens another writer that appends.
 """

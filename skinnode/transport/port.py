@@ -1,4 +1,4 @@
-"""Endpoint on a CAN bus, with the same behaviour on every type of interface.
+"""Provide a CAN bus endpoint with the same behaviour on every type of interface.
 
 Each python-can error is raised as a one-line :class:`~skinnode.errors.BusError`. Frame times are times of the
 host's monotonic clock. If the interface timestamps frames with the wall clock (virtual, udp_multicast,
@@ -56,8 +56,8 @@ _MULTICAST: Final = "udp_multicast"
 _VIRTUAL: Final = "virtual"
 
 _DELIVERY_S: Final = 0.05
-"""Time allowed for the kernel to finish delivering a frame, s. The value is an assumption: a frame from
-another multicast group once arrived after a virtual machine had been suspended for 28 ms."""
+"""Time allowed for the kernel to finish delivering a frame, s. The value is an assumption that exceeds 28 ms,
+the delay once observed on a virtual machine."""
 
 # In a program that does not configure logging, python-can's loggers would print warnings to stderr, even for
 # errors that are already reported by a BusError.
@@ -255,7 +255,7 @@ class CanPort:
         return batch[0] if batch else None
 
     def recv_batch(self, timeout_s: float, most: int = BATCH_FRAMES) -> list[Frame]:
-        """Return the waiting frames; if there are none, wait for the first.
+        """Return the waiting frames, or wait for the first frame if none is waiting.
 
         Args:
             timeout_s: Maximum wait for the first frame, s.
@@ -334,7 +334,7 @@ class CanPort:
             self.reopen()
 
     def close(self) -> None:
-        """Close the interface, which may be closed already. The receiving thread must have ended."""
+        """Close the interface; a second call is allowed. The receiving thread must have ended."""
         if not self._closed:
             self._closed = True
             self._bus.shutdown()

@@ -1,4 +1,4 @@
-"""Receiving threads, which only copy CAN frames into bounded queues and count the frames that do not fit.
+"""Receive CAN frames on threads that only copy frames into bounded queues and count those that do not fit.
 
 A single reader thread takes whole batches of frames from the queues.
 """
@@ -88,7 +88,7 @@ class Intake:
 
     @property
     def dropped(self) -> int:
-        """Number of frames lost because the queue was full. The port counts those dropped by the kernel."""
+        """Number of frames lost because the queue was full. Drops by the kernel are counted by the port."""
         return self._dropped
 
     @property
@@ -252,7 +252,7 @@ class Receiver:
         self._alone[intake] = thread  # set after start(): a thread that was not started cannot be joined
 
     def close(self) -> None:
-        """End and join the receiving threads. The ports stay open; closing them is up to their owner."""
+        """End and join the receiving threads. The ports stay open and are closed by their owner."""
         self._stop.set()
         for thread in self._alone.values():
             thread.join()

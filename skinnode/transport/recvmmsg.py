@@ -1,4 +1,4 @@
-"""Receive many socket messages with one call of recvmmsg(2), which Python's socket module does not provide.
+"""Receive many socket messages with one call to recvmmsg(2), which Python's socket module does not provide.
 
 The call does not release Python's global interpreter lock, but it does not wait either and takes only about
 1 µs per message. Releasing the lock 8,000 times a second, once per message, would delay the other threads
@@ -21,7 +21,7 @@ class _Iovec(ctypes.Structure):
 
 
 class _Head(ctypes.Structure):
-    """The C structure ``msghdr`` from <sys/socket.h>."""
+    """C structure ``msghdr`` from <sys/socket.h>."""
 
     _fields_ = (
         ("name", ctypes.c_void_p),
@@ -35,7 +35,7 @@ class _Head(ctypes.Structure):
 
 
 class _Message(ctypes.Structure):
-    """The C structure ``mmsghdr`` from <sys/socket.h>."""
+    """C structure ``mmsghdr`` from <sys/socket.h>."""
 
     _fields_ = (("head", _Head), ("length", ctypes.c_uint))
 

@@ -84,7 +84,7 @@ class SocketReader:
         return self._sock.fileno()
 
     def read(self, timeout_s: float, most: int = BATCH_FRAMES) -> list[Frame]:
-        """Return the waiting frames; if there are none, wait for the first.
+        """Return the waiting frames, or wait for the first frame if none is waiting.
 
         Args:
             timeout_s: Maximum wait for the first frame, s.

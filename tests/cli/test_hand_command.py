@@ -254,7 +254,7 @@ def test_forces_that_are_not_calibrated(tmp_path: Path) -> None:
 def test_where_contacts_cannot_be_placed(tmp_path: Path) -> None:
     listed = notes(tmp_path, PALM + TIP)
     assert said(listed, "patches.pose") == {
-        "palm, tip": "no pose: contacts are in the frame of the patch itself"
+        "palm, tip": "no pose: contacts are in the patch's own coordinate frame"
     }
     listed = notes(tmp_path, PALM + PLACED + TIP + PLACED + 'link = "distal"\n')
     assert not said(listed, "patches.pose")
@@ -265,7 +265,7 @@ def test_where_contacts_cannot_be_placed(tmp_path: Path) -> None:
 
 def test_what_the_solver_leaves_out_or_cannot_reach(tmp_path: Path) -> None:
     listed = notes(tmp_path, "[solver]\nnormal_only = true\nmax_std_m = 1e-9\n" + PALM + PLACED + EXACT)
-    assert said(listed, "solver.normal_only") == {"palm": "no shear, neither displacement nor force"}
+    assert said(listed, "solver.normal_only") == {"palm": "no shear displacements and no shear forces"}
     assert "no field will be precise" in said(listed, "solver.max_std_m")["palm"]
     roomy = notes(tmp_path, "[solver]\nmax_std_m = 1e-4\n" + PALM + PLACED + EXACT)
     assert not said(roomy, "solver.max_std_m")

@@ -92,9 +92,9 @@ def point_compliance(rubber: Rubber, offset_m: ArrayLike, *, softening_m: float 
 def rectangle_compliance(rubber: Rubber, offset_m: ArrayLike, size_m: tuple[float, float]) -> Float:
     """Return the displacement of surface points per unit traction on a rectangle; finite everywhere.
 
-    The result is the closed form for a uniform load on a rectangle (Love, Phil. Trans. A 228, 1929, for the
-    normal part; Johnson eq. 3.25): each entry of the compliance matrix has an elementary antiderivative in x
-    and y, which is evaluated at the corners.
+    The result is the closed form for a uniform load on a rectangle (Love, Philosophical Transactions A 228,
+    1929, for the normal part; Johnson eq. 3.25): each entry of the compliance matrix has an elementary
+    antiderivative in x and y, which is evaluated at the corners.
 
     Args:
         rubber: The material.
@@ -158,7 +158,7 @@ class HertzContact:
     """Hertzian contact with a rigid sphere that presses on the rubber and slides over it.
 
     The traction on the rubber is p (t_x, t_y, −1) with p = p₀ √(1 − r²/a²) inside the contact circle. The
-    surface displacement has a closed form everywhere: p is radially symmetric, so all the integrals follow
+    surface displacement has a closed form everywhere. Since p is radially symmetric, all integrals follow
     from two radial functions, Φ = ∫ p/|d| (Johnson eqs. 3.41a, 3.42a) and P, the load within r. The model
     assumes that shear does not change the pressure, which is exact for incompressible rubber and an
     approximation for ν < 0.5 (Johnson 7.1).
@@ -166,8 +166,8 @@ class HertzContact:
     Args:
         rubber: The material.
         radius_m: Radius of the sphere, metres.
-        indentation_m: Approach δ of the sphere, metres. This is the normal displacement at the centre of a
-            contact without shear or, if ν = 0.5, of any contact. 0 means no contact.
+        indentation_m: Approach δ of the sphere, metres. This approach is the normal displacement at the
+            centre of a contact without shear or, if ν = 0.5, of any contact. 0 means no contact.
         center_m: Centre (x, y) of the contact circle, metres.
         traction_ratio: (t_x, t_y) ratio of the shear on the rubber to the pressure: the coefficient of
             friction in the sliding direction of the sphere.

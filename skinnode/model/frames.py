@@ -96,9 +96,8 @@ class Contact:
     force_calibrated: bool = False
     """Whether the forces are based on a calibration of this patch (``force_calibrated`` of Tracker or of
     ``[patches.calibration]``). Without a calibration, five standard deviations of the normal force cover the
-    range from a half-space's force to the force of a layer as thick as the clearance, bonded to a rigid
-    support. This range is a bound on the model error, not noise. The standard deviation of the shear force
-    includes no such bound."""
+    range from a half-space's force to the force of a bonded layer as thick as the clearance. This range is a
+    bound on the model error, not noise. The standard deviation of the shear force includes no such bound."""
     axes: Float = field(default_factory=lambda: _FLAT)
     """(3, 3) unit vectors as rows, in the frame of the layout, at the centre of the contact: along the wire,
     across the wires and out of the skin. On a flat patch, these vectors are the x, y and z axes."""

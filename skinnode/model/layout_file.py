@@ -19,7 +19,7 @@ _ARRAYS = ("upper_m", "lower_m")
 _KEYS = (*_ARRAYS, "resistivity_ohm_per_m")
 _MOST_NPZ_BYTES: Final = 16 << 20
 _MOST_VALUES: Final = {"upper_m": 3 * MOST_ELECTRODES, "lower_m": 3 * MOST_PAIRS, "resistivity_ohm_per_m": 1}
-"""Maximum number of values in each array."""
+"""Maximum number of values in each array of a layout file."""
 _MOST_ITEM_BYTES: Final = 32
 """Maximum size of one value: a complex long double, which is rejected later because of its type."""
 _LONGEST_KEY: Final = 40

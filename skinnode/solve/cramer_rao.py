@@ -39,7 +39,7 @@ def wire_std(layout: PatchLayout, relative_noise: ArrayLike, normal_only: bool =
     return _std(layout, np.broadcast_to(relative_noise, layout.shape), normal_only)
 
 
-@functools.lru_cache(maxsize=64)  # cached: it takes 3 ms per layout, and every path needs it
+@functools.lru_cache(maxsize=64)  # cached, because this takes 3 ms per layout
 def _unit_std(layout: PatchLayout, normal_only: bool) -> Float:
     return _std(layout, np.ones(layout.shape), normal_only)
 

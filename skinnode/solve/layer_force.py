@@ -9,9 +9,10 @@ thickness t is indented by
     δ = (1/2πG) ∫ p̂(k) f(k t) dk,   f(x) = (sinh 2x − 2x) / (cosh 2x + 1 + 2x²),   p̂(k) = ∫ p e^(ikx) d²x
 
 where f = 1 for the half-space (Johnson, Contact Mechanics, 1985, 5.8; the thin-layer limit F ∝ G a⁴ δ / t³ is
-from Barber, Int. J. Mech. Sci. 32, 129, 1990). At the same δ, the ratio of the bonded layer's force to the
-half-space's force is a function of a/t. The force on any real layer lies between these two forces. The sum of
-the half-space's pressing loads is a second bound: on thicker layers, pulling loads cancel part of this sum.
+from Barber, International Journal of Mechanical Sciences 32, 129, 1990). At the same δ, the ratio of the
+bonded layer's force to the half-space's force is a function of a/t. The force on any real layer lies between
+these two forces. The sum of the half-space's pressing loads is a second bound: on thicker layers, pulling
+loads cancel part of this sum.
 """
 
 from __future__ import annotations
@@ -27,10 +28,10 @@ LINEAR: Final = 1.05
 CUBIC: Final = 0.51
 """Coefficient of (a/t)³ in the ratio of the bonded layer's force to the half-space's force."""
 SPAN: Final = 2.5
-"""Number of standard deviations between the half-space's force and the bonded layer's force; these express a
-bound on the model error, not noise. With a value of 3, force errors reached 4.3 standard deviations on layers
-of 2, 4, 8 and 16 mm, pressed over radii from 1.6 to 10 mm on a patch with a clearance of 2 mm. A value of 2.5
-keeps force errors below 5 standard deviations with some margin."""
+"""Number of standard deviations between the half-space's force and the bonded layer's force. The standard
+deviation expresses a bound on the model error, not noise. With a value of 3, force errors reached 4.3
+standard deviations (layers of 2, 4, 8 and 16 mm, contact radii from 1.6 to 10 mm, clearance of 2 mm). A value
+of 2.5 keeps force errors below 5 standard deviations with some margin."""
 
 
 def stiffening(radius_m: float, thickness_m: float) -> float:

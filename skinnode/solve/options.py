@@ -28,11 +28,12 @@ class EstimateOptions:
     Args:
         relative_noise: Relative standard deviation of R, a number or (U, K).
         baseline_ohm: (U, K) resistances measured at rest, ohm; if given, resistivity and gain cancel.
-        rubber: Material of the skin. Forces are proportional to its modulus; the displacement does not depend
-            on it.
+        rubber: Material of the skin. Forces are proportional to the rubber's modulus; the displacement does
+            not depend on the modulus.
         estimate_noise: Whether to estimate a scale factor for ``relative_noise`` from the data.
-        follow_noise: Whether to scale ``relative_noise`` if the stream shows that it is wrong by a factor of
-            more than 1.5 (:mod:`skinnode.solve.noise_estimate`); ignored if ``estimate_noise`` is set.
+        follow_noise: Whether to scale ``relative_noise`` if the stream shows that this value is wrong by a
+            factor of more than 1.5 (:mod:`skinnode.solve.noise_estimate`); ignored if ``estimate_noise`` is
+            set.
         drift: Gain errors to estimate: ``patch`` for one gain common to all resistances, ``wire`` for one
             gain per upper wire, or ``none``.
         drift_std: Prior standard deviation of a gain error, as a fraction.

@@ -29,7 +29,8 @@ times under a press (ten layouts, noise from 3e-6 to 1e-3, presses from 5 to 30 
 MOST: Final = 0.3
 """Limit of a standard deviation, clearances, for layouts and noise levels at which mainly the prior
 determines the displacement. In the 2,640 fields measured for :data:`MULTIPLE`, only thick patches (h = 1)
-with a noise of 1e-3 exceeded this limit: 5 of 66 fields on `staggered` and 20 of 66 on `aligned`."""
+with a noise of 1e-3 exceeded this limit. They did so in 5 of 66 fields on `staggered`, and in 20 of 66 fields
+on `aligned`."""
 TOLERANCE_SHARE: Final = 0.06
 """Part of the limit for a patch made to the ordinary tolerances, clearances; proportional to the largest
 tolerance. In the presses measured for :data:`MULTIPLE`, the ordinary tolerances caused standard deviations of

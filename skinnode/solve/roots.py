@@ -1,10 +1,10 @@
 """Rules and thresholds that decide which root of F = b is the true position of the skin.
 
 A zero residual does not identify the true position, because F = b has several roots. The rules use four
-criteria: the layout at rest (folds, and sensitivity of the resistances to the electrodes), properties of one
-root (its branch, its distance from rest, its roughness), the relative likelihood of two roots of one wire,
-and the posterior of the whole patch, which uses the neighbouring wires. All functions of this module are
-pure; their callers store the state.
+criteria: the layout at rest, the properties of a root, the relative likelihood of two roots of a wire, and
+the posterior of the whole patch. The relevant properties of a layout are folds, and the sensitivity of its
+resistances to electrode positions; those of a root are its branch, distance from rest and roughness. All
+functions of this module are pure; their callers store the state.
 
 =================  =====  ================================================  ================================
 constant           value  meaning                                           measured on
@@ -117,7 +117,7 @@ TWIN_ROUGHNESS: Final = 1.05
 random presses of 50 % on the staggered layout, h = 1, the twins of wrong roots were at most 1.044 times as
 rough as the wrong roots themselves. Of 100 correct roots, 4 have a twin within this ratio and lose the status
 CONVERGED. In 60 further presses of each depth and height (6710 wires, h = 0.3 to 1), no wrong root was
-reported as CONVERGED; in another 40 presses (4510 wires), one wrong root was."""
+reported as CONVERGED. In another 40 presses (4510 wires), one wrong root was reported as CONVERGED."""
 UNLIKELY: Final = 4.0
 """Energy margin by which all other roots must be less likely than the accepted root. In 1530 pairs of roots
 from presses of 30 to 70 % (staggered layout, h = 1; aligned layout, h = 0.5), the wrong root was likelier in

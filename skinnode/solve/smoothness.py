@@ -17,10 +17,10 @@ from skinnode.model.layout import Float, PatchLayout
 from skinnode.solve.wires.problem import PatchProblem
 
 CORRELATION_PITCHES: Final = 1.0
-"""Correlation length ℓ, pitches. With a value of 1.0, the guided start finds 3204 of the 3209 wires that are
-on the branch of the rest position in four sets of 82 random presses on the staggered layout (presses of 70 %
-at h = 0.5, and of 10, 30 and 50 % at h = 1). With values of 0.7 and 1.5, the guided start finds fewer
-wires."""
+"""Correlation length ℓ, pitches. With a value of 1.0, the guided start finds 3204 of the 3209 roots on the
+branch of the rest position. These roots come from four sets of 82 random presses on the staggered layout:
+presses of 70 % at h = 0.5, and of 10, 30 and 50 % at h = 1. With values of 0.7 and 1.5, the guided start
+finds fewer roots."""
 ROUGH_SHARE: Final = 1e-3
 """Relative increase in the diagonal of C, which makes C invertible in floating point."""
 

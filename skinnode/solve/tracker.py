@@ -196,7 +196,7 @@ class Tracker:
 
     @property
     def scan(self) -> int | None:
-        """Scan number of the next frame, for ``DataFault.since``; None if the tracker counts the frames."""
+        """Scan number of the next frame, used for ``DataFault.since``; None if the tracker counts frames."""
         return self._posterior.check.scan
 
     @scan.setter

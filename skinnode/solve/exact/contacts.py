@@ -65,7 +65,7 @@ class LoadFactors:
     rest_std: Float
     """(n,) standard deviations of the exact inverse at rest, pitches."""
     free: Index
-    """(n,) indices of the free coordinates."""
+    """(n,) indices of the free coordinates (the unknowns)."""
 
 
 class ExactContacts:

@@ -23,10 +23,10 @@ from skinnode.solve.wires.arrays import solve_options
 from skinnode.solve.wires.stages import DEADLINE
 
 BRIDGES: Final = (3, 5, 10)
-"""Number of substeps in each successive bridge. On the staggered layout, h = 0.5, 3 substeps solve every wire
-if a press of 50 % starts from rest between two frames; for a press of 70 %, 5 substeps solve 23 of 24 wires.
-Adaptive steps restricted to the trusted branch solve fewer wires, because the straight line in R crosses
-singular points that the press avoids."""
+"""Number of substeps in each successive bridge. If a press of 50 % starts from rest between two frames
+(staggered layout, h = 0.5), 3 substeps solve every wire. For a press of 70 %, 5 substeps solve 23 of 24
+wires. Adaptive steps restricted to the trusted branch solve fewer wires, because the straight line in R
+crosses singular points that the press avoids."""
 BRIDGE_TOLERANCE: Final = 1e-6
 """Tolerance of bridge substeps: the paper's intermediate tolerance."""
 BRIDGE_STEPS: Final = 20

@@ -1,8 +1,8 @@
 """State shared by the parts of the exact tracker: solver, arrays and rest position of one patch.
 
-A root is accepted only on the branch that the skin can reach: the determinant of J has the same sign as at
-rest, and no electrode moves farther than its clearance from the lower layer. A system with more equations
-than unknowns has no determinant; instead, χ² of the residual must be compatible with noise.
+A root is accepted only on the branch that the skin can reach. On this branch, the determinant of J has the
+same sign as at rest, and no electrode moves farther than its clearance from the lower layer. A system with
+more equations than unknowns has no determinant; instead, χ² of the residual must be compatible with noise.
 """
 
 from __future__ import annotations

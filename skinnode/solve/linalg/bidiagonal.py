@@ -20,11 +20,11 @@ def bidiagonalise(  # noqa: C901, PLR0913 - four rows at a time; every result of
     """Decompose A (n, m), n ≤ m, as P Bᵀ Qᵀ with P and Q orthogonal and B (n, n) upper bidiagonal.
 
     ``a`` (n + 3, whole lanes of m) contains A padded with zeros, so that loops over four rows and whole
-    vectors need no special cases. Writes B to ``diagonal`` (n,) and ``upper`` (n,), whose last element is 0;
-    the reflectors I − β v vᵀ of Q to the rows of ``a`` with β in ``across`` (n,); and the reflectors of P to
-    the rows of ``left`` (n, whole lanes of n + 3) with β in ``down`` (n,). ``w`` is scratch with the length
-    of a row of ``a``. Squares of the elements must not overflow (Golub & Van Loan, 5.4.8, with rows and
-    columns swapped).
+    vectors need no special cases. Writes B to ``diagonal`` (n,) and ``upper`` (n,), whose last element is 0.
+    Writes the reflectors I − β v vᵀ of Q to the rows of ``a``, with β in ``across`` (n,). Writes the
+    reflectors of P to the rows of ``left`` (n, whole lanes of n + 3), with β in ``down`` (n,). ``w`` is
+    scratch with the length of a row of ``a``. Squares of the elements must not overflow (Golub & Van Loan,
+    5.4.8, with rows and columns swapped).
     """
     n, end = diagonal.size, a.shape[1]
     for k in range(n):

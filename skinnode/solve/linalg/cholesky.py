@@ -5,7 +5,7 @@ frames must give equal fields. These kernels compute each element of a result as
 for any number of threads and any split of the columns.
 
 All kernels share one loop: a tile of 6 rows and 2 vectors of the result stays in registers while k runs, so
-that 12 multiply-adds need only 8 loads (Goto & van de Geijn, Anatomy of high-performance matrix
+that 12 multiply-adds require only 8 loads (Goto & van de Geijn, Anatomy of high-performance matrix
 multiplication, 2008). Arrays are C-ordered float64. A buffer may be larger than the problem; the kernels then
 use its leading n rows and columns. No kernel allocates memory.
 """

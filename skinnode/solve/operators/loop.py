@@ -12,9 +12,9 @@ it reduces r.
 For a square system, CONVERGED means a root: max|r| ≤ tol_f *and* a simplified Newton correction
 ‖J⁻¹ r₊‖∞ ≤ tol_x · max(1, ‖x‖∞) with the current factors. If rounding keeps r above tol_f, an r within the
 rounding error of J·x counts as zero. For a tall system, CONVERGED means a minimum: ‖P r‖ ≤ tol_f ‖r‖, with P
-the projection onto the range of J, and the same condition on the correction; ``minimum`` distinguishes minima
-from saddles. A stationary point of a square system with r ≠ 0 is ILL_CONDITIONED, because J is singular
-there.
+the projection onto the range of J, and the same condition on the correction. The module ``minimum``
+distinguishes minima from saddles. A stationary point of a square system with r ≠ 0 is ILL_CONDITIONED,
+because J is singular there.
 """
 
 from __future__ import annotations
@@ -175,7 +175,7 @@ def assess(operator: int, w: Work, tol_f: float, tol_x: float) -> int:
 
 @njit
 def start(w: Work) -> int:
-    """Call :func:`begin` for a Python caller."""
+    """Provide :func:`begin` to Python callers."""
     return begin(w)
 
 
@@ -196,5 +196,5 @@ def advance(operator: int, w: Work, went: int, tol_f: float, tol_x: float) -> in
 
 @njit
 def final_error(w: Work, inverse: Float) -> float:
-    """Call :func:`estimate_error` for a Python caller."""
+    """Provide :func:`estimate_error` to Python callers."""
     return estimate_error(w, inverse)

@@ -1,10 +1,11 @@
 """Solver for any square or tall system F(x) = 0, with the same operators as for the skin.
 
-Levenberg-Marquardt and dogleg make up to three attempts from the same start, which differ in their trust
-region: Moré's column scaling with a radius of 100 ‖D x₀‖, as in MINPACK, then D = I with a radius of ‖x₀‖,
-then of 0.1 ‖x₀‖. No single scaling is best for every system: column scaling suits unknowns with different
-units, but a column that was large near the start confines all later steps. Therefore the attempts take turns
-of 100, 200, 400, … steps until one attempt ends at a root or minimum.
+Levenberg-Marquardt and dogleg make up to three attempts from the same start, with different trust regions.
+The first attempt uses Moré's column scaling with a radius of 100 ‖D x₀‖, as in MINPACK. The second uses D = I
+with a radius of ‖x₀‖, and the third uses D = I with a radius of 0.1 ‖x₀‖. No single scaling is best for every
+system: column scaling suits unknowns with different units, but a column that was large near the start
+confines all later steps. Therefore the attempts take turns of 100, 200, 400, … steps until one attempt ends
+at a root or minimum.
 """
 
 from __future__ import annotations

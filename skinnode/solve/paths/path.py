@@ -90,11 +90,11 @@ def solve_path(
     """Follow a press from the rest position to its last sample.
 
     A wire is ILL_CONDITIONED instead of CONVERGED if it may have ended on a branch of F = b other than the
-    skin's. The possible reasons are that the determinant of its Jacobian changed sign on the way, that its
-    electrodes crossed to the other side of the lower layer, that an equally smooth root is across a nearby
-    fold, or that the samples led smoothly to another root. In the last case, the wire stays at that other
-    root. Since the skin itself can cross a fold, a root across a fold is accepted if the path led there and
-    the posterior of the patch finds the same root.
+    skin's. There are four possible reasons: the determinant of its Jacobian changed sign on the way; its
+    electrodes crossed to the other side of the lower layer; an equally smooth root is across a nearby fold;
+    or the samples led smoothly to another root. In the last case, the wire stays at that other root. Since
+    the skin itself can cross a fold, a root across a fold is accepted if the path led there and the posterior
+    of the patch finds the same root.
 
     Args:
         layout: The patch, with at least as many lower wires as unknowns per wire (K ≥ 3N).

@@ -56,11 +56,11 @@ class Uniform:
     Args:
         steps: Number of samples to solve; by default, or if there are fewer samples, all samples are solved.
         plain: Whether to start each sample at the last solution, as the paper does (Lahaye), and to leave
-            each wire at the outcome of the last sample. Otherwise each sample starts on the secant through
-            the last two solutions, and a wire with no root or a rough root is solved again from the smoothest
-            displacement that explains the last sample. In 21 presses of 50 % with 10 samples each (staggered
-            layout, h = 1), starting on the secant alone reduces the number of lost wires from 7 of 197 to
-            none. The secant also reduces the number of evaluations per sample from 4 to 2.9.
+            each wire at the outcome of the last sample. Otherwise, each sample starts on the secant through
+            the last two solutions. A wire with no root or a rough root is then solved again from the
+            smoothest displacement that explains the last sample. In 21 presses of 50 % with 10 samples each
+            (staggered layout, h = 1), starting on the secant alone reduces the number of lost wires from 7 of
+            197 to none. The secant also reduces the number of evaluations per sample from 4 to 2.9.
         intermediate_tolerance: Tolerance of r, and of x in pitches, at all samples except the last.
         final_tolerance: Tolerance at the last sample.
         intermediate_steps: Maximum operator steps at all samples except the last.

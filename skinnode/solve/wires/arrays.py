@@ -1,4 +1,4 @@
-"""Arrays of a patch that kernels read and write, declared once with name, element type and axes.
+"""Declarations of the arrays of a patch that kernels read and write, with name, element type and axes.
 
 A patch has U upper wires with N electrodes each and K lower wires with M electrodes each. An upper wire has n
 unknowns, which belong to E of its electrodes. Lengths are in pitches (see ``problem``).

@@ -4,7 +4,7 @@ The unknowns of a wire are all coordinates of its electrodes or fewer: some elec
 may be the only unknown (``normal_only``). A system with fewer unknowns than equations is tall; χ² = Σ
 (ρ_k/σ_k)² at its minimum tests the fit. If χ² is above its 1 − 1e-9 quantile, no position explains the frame,
 and the wire is ILL_CONDITIONED. If χ² is above its 95 % quantile, the standard deviations are multiplied by
-√(χ²/dof) (Birge, Phys. Rev. 40, 207, 1932). The χ² test replaces the test of the sign of det J, which is
+√(χ²/dof) (Birge, Physical Review 40, 207, 1932). The χ² test replaces the test of the sign of det J, which is
 defined only for a square system.
 """
 

@@ -11,10 +11,11 @@ mean K + n t, and half its variance is K + 2 n t + n t² (2 χ²_K for a square 
 This sum may fail to reveal a slow movement, especially along the worst-determined of the K directions of a
 wire. The variance of a held coordinate allows for such a movement. The coordinate's correction c = Σ_k
 (∂x_j/∂r_k) ρ_k contains the movement and the noise of both frames, so the excess of c² over the noise
-variance is a lower bound on the variance. Measured coverage of the 95 % intervals (staggered layout, h = 0.5,
-noise 1e-5): 98 % for unmoved wires (99 % of the frames held), 97 % for a press that grows by 5 % of h in 100
-to 1600 frames, and 96 % for a movement by 40 standard deviations along the worst-determined direction in 200
-or 800 frames (86 % without the allowance).
+variance is a lower bound on the coordinate's variance. The coverage of the 95 % intervals was measured on the
+staggered layout, h = 0.5, with noise 1e-5. For unmoved wires, held in 99 % of the frames, the coverage is 98
+%. For a press that grows by 5 % of h in 100 to 1600 frames, the coverage is 97 %. For a movement by 40
+standard deviations along the worst-determined direction in 200 or 800 frames, the coverage is 96 %, but only
+86 % without the allowance.
 """
 
 from __future__ import annotations

@@ -82,7 +82,7 @@ class PatchProblem:
             return np.asarray(((moved**2).sum(axis=-1) > self.clearance**2).any(axis=1))
 
 
-@functools.lru_cache(maxsize=64)  # cached: it takes 2 ms per layout, as long as ten paths of a wire
+@functools.lru_cache(maxsize=64)  # cached, because this takes 2 ms per layout
 def _at_rest(layout: PatchLayout) -> tuple[Float, Float, Float, Float, Float]:
     """Return rest, lower, F, share_at_rest and clearance for a :class:`PatchProblem`, all read-only."""
     pitch = layout.pitch_m

@@ -35,11 +35,11 @@ class RootCheck(ArrayTable):
     whitening: Annotated[Float, "U N N"]
     """Inverse of the Cholesky factor of one coordinate's C (see ``Smoothness``)."""
     lost: Annotated[Mask, "U"]
-    """Output: wires without a root."""
+    """Output of the check: wires without a root."""
     unsure: Annotated[Mask, "U"]
-    """Output: solved wires that have folds, or that moved by more than ``jump_m``."""
+    """Output of the check: solved wires that have folds, or that moved by more than ``jump_m``."""
     rough: Annotated[Mask, "U"]
-    """Output: solved wires farther than ``far_m`` from rest and rougher than ``rough_limit``."""
+    """Output of the check: solved wires farther than ``far_m`` from rest and rougher than ``rough_limit``."""
     jump_m: float
     far_m: float
     pitch_m: float

@@ -1,7 +1,7 @@
 """Solver for all upper wires of a patch in one compiled call, without the GIL or memory allocation.
 
 Each wire is held in place (``hold``), followed with its stored inverse (``follow``), or corrected with an
-operator (``correct``); the three methods are tried in this order until one of them yields a root.
+operator (``correct``). The three methods are tried in this order until one yields a root.
 """
 
 from __future__ import annotations

@@ -49,7 +49,8 @@ def run(scenes: int, rounds: int) -> dict[str, Any]:
 def requirements(figures: dict[str, Any]) -> list[dict[str, Any]]:
     """Return a row for each requirement: name, measured value, limit as text, and whether the limit is met.
 
-    A time requirement is ``absolute``: it depends on the machine, so failing to meet it is not an error.
+    Time requirements are marked ``absolute``. They depend on the machine, so the benchmark does not fail if a
+    time requirement is not met.
     """
     found = []
     for row in figures["noise"]:

@@ -1,10 +1,10 @@
 """Measures error versus time for four wires: our solvers and their peers use the same compiled F and J.
 
-Only the most deeply pressed wires of the patch are solved; the samples of the press contain no noise. Every
-solver starts from rest. A solver solves either the last sample alone or, as in the paper, all samples in
-sequence, each starting from the solution for the previous sample. Each solver is run with several tolerances,
-and each tolerance yields one data point. The time of ``solve_path`` includes work that the bare operators
-omit: setting up the patch, following the branch, and estimating the error.
+Only the four most deeply pressed wires of the patch are solved. The samples of the press are free of noise.
+Every solver starts from rest. A solver solves either the last sample alone or, as in the paper, all samples
+in sequence, each starting from the solution for the previous sample. Each solver is run with several
+tolerances, and each tolerance yields one data point. The time of ``solve_path`` includes work that the bare
+operators omit: setting up the patch, following the branch, and estimating the error.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ class Scene:
     """(U, N, 3), true displacement at the last sample, metres."""
 
     def thinned(self, samples: int) -> Float:
-        """Return ``samples`` evenly spaced samples, including the last."""
+        """Return ``samples`` evenly spaced samples of the press, including the last sample."""
         step = len(self.samples_ohm) // samples
         return self.samples_ohm[step - 1 :: step]
 
@@ -65,7 +65,7 @@ class Scene:
 
 
 def scene_of(name: str, height: float, depth: float) -> Scene:
-    """Return the four middle wires of a preset, pressed ``depth`` heights deep by a sphere."""
+    """Create the scene of a preset's four middle wires, pressed ``depth`` heights deep by a sphere."""
     full = preset(name, height)
     layout = PatchLayout(full.upper_m[3:7], full.lower_m, full.resistivity_ohm_per_m)
     press = Press((18.3e-3, 17.1e-3), 10e-3, depth * full.height_m, (0.2, -0.1))

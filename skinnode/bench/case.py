@@ -18,7 +18,7 @@ PITCH_M: Final = 4e-3
 FINE: Final = Converter(sigma=1e-5)
 """Converter whose noise is roughly that of a 16-bit converter."""
 STRIDE: Final = 4
-"""Number of path samples per tracker frame."""
+"""Number of samples of a path per frame that a tracker solves."""
 DRIFT: Final = 0.02
 MODEL_ERROR: Final = 0.05
 """Relative error in the change in R that the wrong models of case 13 predict. On a 30 % press, staggered,

@@ -1,8 +1,8 @@
 """Compares our dense kernels with LAPACK, in a process that limits LAPACK to a single thread.
 
-After each call, LAPACK's worker threads keep spinning for some time. If they share a core with the next
-candidate, that candidate takes up to three times as long; on a busy machine the threads also wait for each
-other.
+After each call, LAPACK's worker threads keep spinning for some time. If these threads share a core with the
+next candidate, that candidate takes up to three times as long. On a busy machine, the worker threads also
+wait for each other.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ ONE_THREAD: Final = {
 
 
 def measure(rounds: int) -> list[dict[str, Any]]:
-    """Return the rows of the benchmark, with times in µs per call."""
+    """Time the dense kernels and their LAPACK peers; return one row per candidate, with µs per call."""
     command = [sys.executable, "-m", "skinnode.bench.dense_kernels", str(rounds)]
     done = subprocess.run(command, env=os.environ | ONE_THREAD, stdout=subprocess.PIPE, check=True)
     rows: list[dict[str, Any]] = json.loads(done.stdout)
@@ -84,7 +84,7 @@ def dense_pairs() -> dict[str, dict[str, Callable[[], object]]]:
 
 
 def main(rounds: int) -> None:
-    """Print the rows as JSON."""
+    """Run the benchmark of the dense kernels and print its rows as JSON."""
     rows = [
         {"what": what, "who": who, "us": timing.call_us, "ratio": timing.ratio}
         for what, candidates in dense_pairs().items()

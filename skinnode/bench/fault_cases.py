@@ -2,7 +2,7 @@
 
 In case 14, the data are wrong but not marked invalid. Accuracy is claimed for a wire if it is CONVERGED and
 trusted. Only a tracker tests the data, so case 14 does not use the bare posterior. A tracker receives
-resistances. It cannot detect a frozen wire by repeated codes, as the host does
+resistances and therefore cannot detect a frozen wire by its repeated codes, as the host does
 (:mod:`skinnode.host.frozen_parts`).
 """
 
@@ -28,7 +28,7 @@ SHARES: Final = np.array([0.0, 0.0, 0.0, 0.0, 0.25, 0.5, 0.75, 1.0, 1.0, 1.0, 1.
 FAILS: Final = 5
 """First frame with wrong data in case 14; the press has already begun."""
 TESTED: Final = ("exact", "auto")
-"""Methods that solve case 14."""
+"""Methods that are tested with the wrong data of case 14."""
 KNOWN: Final = {
     ("upper wire frozen", "1e-5"),
     ("upper wire frozen", "1e-4"),

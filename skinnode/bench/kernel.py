@@ -29,8 +29,8 @@ SHORT: Final = 1e-3
 class NumpyWire:
     """Computes F and Jᵀ of one wire as fast as NumPy allows: structure of arrays, preallocated buffers.
 
-    This is the fastest combination of axis order and summation method that was tried; it takes 85 % of the
-    time of the obvious one.
+    Of the combinations of axis order and summation method that were tried, the class uses the fastest, which
+    takes 85 % of the time of the most obvious combination.
     """
 
     def __init__(self, lower: Float, electrodes: int) -> None:
@@ -48,7 +48,7 @@ class NumpyWire:
         self.jt = np.empty((electrodes, 3, wires))
 
     def __call__(self, x: Float) -> tuple[Float, Float]:
-        """Return F (K,) and Jᵀ (3N, K) at x."""
+        """Return the potential F (K,) and its transposed Jacobian Jᵀ (3N, K) at x."""
         self._x[:] = x.reshape(-1, 3).T[:, :, None]
         np.subtract(self._lower, self._x.reshape(3, 1, -1), out=self._gap)
         np.einsum("amp,amp->mp", self._gap, self._gap, out=self._square)
@@ -63,7 +63,7 @@ class NumpyWire:
 
 
 def numpy_step(operator: str, wire: NumpyWire, x: Float, a: Float) -> Float:
-    """Evaluate, step and evaluate again, as :func:`compiled_steps` does, and return the final r.
+    """Evaluate r, take one step and evaluate r again, as :func:`compiled_steps` does; return the final r.
 
     The Levenberg-Marquardt parameter, which the compiled step has to search for, is fixed here.
     """
@@ -133,7 +133,7 @@ def compiled_steps(  # noqa: PLR0913 - a kernel takes its buffers
 
 
 def run(rounds: int) -> dict[str, Any]:
-    """Run the benchmark and return µs per wire (dense kernels: per call) and ratios to our kernels."""
+    """Run the benchmark; return times in µs per wire (dense kernels: per call) and ratios to our kernels."""
     layout = PatchLayout.preset("staggered", pitch_m=4e-3, height_m=2e-3)
     problem = PatchProblem.of(layout)
     rng = np.random.default_rng(1)

@@ -1,9 +1,9 @@
 """Generates load for ``skinnode bench pipeline``: node frames that another process replays in real time.
 
 The nodes are those of ``skinnode node`` and measure simulated patches. In simulated time, their frames cross
-a bus with CAN arbitration. Whenever the bus is free, the pending frame with the lowest identifier is sent. It
-occupies the bus for the duration of its bits, including stuff bits. This module may import the simulator, as
-the demo may, because frames generated from the solver's own assumptions would prove nothing.
+a bus with CAN arbitration. Whenever the bus is free, the pending frame with the lowest identifier is sent.
+Each frame occupies the bus for the duration of its bits, including stuff bits. This module may import the
+simulator, as the demo may, because frames generated from the solver's own assumptions would prove nothing.
 """
 
 from __future__ import annotations
@@ -263,7 +263,7 @@ def _arbitrate(frames: Sequence[tuple[int, int, bytes, bool, int]], durations: S
     return Stream(times, packets, busy_ns / max(1, now_ns))
 
 
-# --- replay in real time
+# --- replay of the prepared frames in real time
 
 
 def _play(pipe: Connection, hand: HandConfig, loads: Sequence[tuple[BusConfig, Stream]]) -> Sent:

@@ -87,11 +87,11 @@ class _Rig:
 
 
 def run(seconds: float, rounds: int, interface: str, channel: str | None) -> dict[str, Any]:
-    """Return all rows.
+    """Measure chunk pacing, heartbeats and the cost of frames; return all rows.
 
     Args:
         seconds: Duration of each measurement on the bus.
-        rounds: Number of measurements of each candidate.
+        rounds: Number of times that each kind of frame is timed.
         interface: python-can interface.
         channel: Channel of the interface; None for an unused name.
     """
@@ -115,7 +115,7 @@ def _row(what: str, late_ns: Float, goal_ms: float, load_hz: float = 0.0) -> Row
 
 
 def _scans(config: BusConfig, seconds: float, pacing: Pacing, name: str) -> list[Row]:
-    """Measure the time between chunks, and the time from SYNC to the first chunk."""
+    """Measure the intervals between chunks, and the time from SYNC to the first chunk."""
     gaps: list[int] = []
     first: list[int] = []
     with _Rig(config, pacing) as rig:
@@ -136,7 +136,7 @@ def _scans(config: BusConfig, seconds: float, pacing: Pacing, name: str) -> list
 
 
 def _heartbeat(config: BusConfig, seconds: float, load_hz: int) -> Row:
-    """Measure the time between heartbeats."""
+    """Measure the intervals between a node's heartbeats."""
     stop = threading.Event()
     with _Rig(config, EXACT) as rig:
         period = bytes((0x2B, 0x17, 0x10, 0, *BEAT_MS.to_bytes(2, "little"), 0, 0))

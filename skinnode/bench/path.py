@@ -16,9 +16,9 @@ and depends on the unit of length. The paper does not state this unit.
 Settings: At the paper's press depth of 10 %, our Gauss-Newton never fails: on ``aligned`` with h = 0.3, 0.4 …
 1, it solves all 10 experiments with any number of steps. The hardest ``aligned`` setting at that depth is
 therefore h = 1. At h = 0.7 and 30 %, Gauss-Newton fails as reported in the paper: in 6 of 10 experiments with
-5 steps and in 2 experiments with 10 steps, but never with 20 or more steps. This setting was found by a
-search over h = 0.3 … 1 and depths of 15 … 30 %. At h = 1 and 25 %, 5 experiments fail with 5 steps and 3 with
-10 steps, but there levenberg_marquardt also fails with more steps.
+5 steps and in 2 experiments with 10 steps, but never with 20 or more steps. The setting h = 0.7 and 30 % was
+found by a search over h = 0.3 … 1 and depths of 15 … 30 %. At h = 1 and 25 %, 5 experiments fail with 5 steps
+and 3 with 10 steps, but there levenberg_marquardt also fails with more steps.
 """
 
 from __future__ import annotations
@@ -171,7 +171,7 @@ def _setting(made: list[Experiment]) -> dict[str, Any]:
 
 
 def _row(made: list[Experiment], schedule: Schedule, operator: str, samples: int) -> dict[str, Any]:
-    """Return the cost and accuracy of a step control, averaged over the experiments."""
+    """Solve all experiments with a step control; return its mean cost and accuracy."""
     paths, times = [], []
     for one in made:
         start = time.perf_counter()

@@ -1,8 +1,8 @@
 """Measures a host's throughput, latency and CPU time per thread group, for several numbers of buses.
 
-The host is that of ``skinnode host``. It is a guest on the buses of a robot, whose master and nodes another
-process replays (:mod:`skinnode.bench.load`). Frames arrive on a real CAN interface, or over UDP through the
-receiver for SocketCAN (see :mod:`skinnode.transport.datagram`).
+The host is that of ``skinnode host``. The host is a guest on the buses of a robot, and another process
+replays the robot's master and nodes (:mod:`skinnode.bench.load`). Frames arrive on a real CAN interface, or
+over UDP through the receiver for SocketCAN (see :mod:`skinnode.transport.datagram`).
 """
 
 from __future__ import annotations
@@ -223,7 +223,7 @@ def lost(row: Row) -> int:
 
 
 def hand_name(row: Row) -> str:
-    """Return a short description of the row's hand."""
+    """Return a short description of the hand for which a row was measured."""
     kind = "CAN FD" if row["fd"] else "classic"
     scene = "touched" if row["touched"] else "at rest"
     apart = f", {row['stagger_ms']:g} ms apart" if row["stagger_ms"] else ""
@@ -231,7 +231,7 @@ def hand_name(row: Row) -> str:
 
 
 def _must(rows: list[Row]) -> list[Row]:
-    """Return the requirements on the largest hands with touched patches, and whether they are met."""
+    """Check the requirements, which apply to the largest hands with touched patches."""
     must = []
     for row in rows:
         if row["buses"] < 4 or not row["touched"]:

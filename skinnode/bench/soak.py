@@ -43,7 +43,7 @@ from vcan_sim.fleet import Fleet
 from vcan_sim.sensor import REMEMBERED_READINGS
 
 WARM_UP: Final = 0.25
-"""Fraction of the run after which memory use is measured for the first time."""
+"""Fraction of the test duration after which memory use is first measured."""
 BLOCKS: Final = 2000
 """Maximum growth in the number of memory blocks. The number normally varies by a few hundred blocks; a leak
 of one block per scan adds 10,000 blocks in three minutes."""

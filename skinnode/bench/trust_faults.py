@@ -1,7 +1,7 @@
 """Faults for ``skinnode bench trust``, applied to arrays of readings and codes.
 
-They include the simulator's faults that change values. Each fault acts at the stage at which it occurs in a
-real patch:
+The set of faults includes all simulator faults that change values. Each fault acts at the stage at which it
+occurs in a real patch:
 
 made    deviation of the patch from its layout, present when the baseline is measured
 wired   wiring, before the converter adds noise
@@ -153,7 +153,7 @@ def _stick(constant: bool) -> InPlace:
     def sent(signal: Signal) -> None:
         t, (u, k) = _at_rest(signal), _crossing(signal)
         value = signal.codes[t, u, k]
-        if constant:  # R/R₀ from 0.6 to 1.1
+        if constant:  # choose a constant R/R₀ between 0.6 and 1.1
             value = np.uint32(round((float(signal.rng.uniform(0.6, 1.1)) - SCALE.lo) / SCALE.step))
         signal.codes[t + 1 :, u, k] = value
         signal.bad[t + 1 :, u, k] = True

@@ -155,7 +155,7 @@ class Plate:
     center_m: tuple[float, float]
     depth_m: float
     tilt: tuple[float, float]
-    """Relative change of the depth per metre along x and y."""
+    """Relative change of the plate's depth along x and y, 1/m."""
     traction_ratio: tuple[float, float] = (0.0, 0.0)
 
     def displacement_m(self, points_m: Float, share: float) -> Float:
@@ -174,8 +174,8 @@ class Bonded:
 
     The displacement is computed by Hankel transforms. With x = k h, the transformed deflection of the layer
     is L(x) = (sinh 2x − 2x)/(cosh 2x + 2x² + 1) times that of a half-space. The tangential displacement is
-    −2x²/(sinh 2x − 2x) times the deflection. Both follow from the biharmonic solution with no displacement
-    at the base and no shear stress at the surface.
+    −2x²/(sinh 2x − 2x) times the deflection. Both formulas follow from the biharmonic solution with no
+    displacement at the base and no shear stress at the surface.
     """
 
     center_m: tuple[float, float]

@@ -34,7 +34,7 @@ def verdicts(rows: Sequence[dict[str, Any]], settings: Sequence[Setting]) -> lis
         found.append(_must(f"trusted coordinates beyond 5 deviations, {what}", share, BEYOND))
         if section == "single":
             missed = [row for row in by_section[section] if row["share_beyond"] > BEYOND]
-            found.append(_must("faults with more than 1 in 1000 such coordinates", len(missed), 0))
+            found.append(_must("faults with over 1 in 1000 coordinates beyond 5 deviations", len(missed), 0))
     if by_section["healthy"]:
         quiet = {setting.name for setting in settings if setting.noise <= 1e-4}
         cells = [

@@ -142,7 +142,7 @@ Naming = tuple[FaultyPart, int | None, int | None, int]
 
 
 def judge(taken: CodeStream, fields: Sequence[FieldFrame], known: set[Naming] | None = None) -> Score:
-    """Score the fields of a stream, one per scan.
+    """Score the fields of a stream, which has one field per scan.
 
     Args:
         taken: The stream.

@@ -126,7 +126,7 @@ class Setting:
 
     preset: str
     height: float
-    """Height of the upper layer, pitches."""
+    """Height of the upper layer above the lower layer, pitches."""
     noise: float
 
     @property

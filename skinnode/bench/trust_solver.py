@@ -90,7 +90,7 @@ def _scan_of(profile: PatchProfile, codes: Codes, number: int, phase: int) -> tu
         chunks_expected=chunks,
         chunks_received=chunks - -(-lost // profile.codes_per_chunk),
         device_time_us=t_ns // 1000,
-        flags=phase * (CONVERSIONS & -CONVERSIONS),  # shifted to the lowest bit of the mask
+        flags=phase * (CONVERSIONS & -CONVERSIONS),  # shift the phase to the position of the mask
         t_first_ns=t_ns,
         t_last_ns=t_ns,
     )

@@ -13,8 +13,8 @@ therefore meet two conditions. If errors are Gaussian with the reported standard
 fails with a probability of 1e-4:
 
 - No coordinate exceeds z(n) or 5 standard deviations, whichever is larger. z(n) is the limit that any of n
-  independent coordinates exceeds with probability 1e-4: 5.7 for 9,000 coordinates and 6.4 for 1e6. This is
-  Bonferroni's bound; correlated coordinates only decrease the probability.
+  independent coordinates exceeds with probability 1e-4: 5.7 for 9,000 coordinates and 6.4 for 1e6. The
+  limit is Bonferroni's bound; correlated coordinates only decrease the probability.
 - The number of seeds with a coordinate beyond 5 is within the limit of a binomial distribution. The
   probability of the distribution is the expected number of such coordinates per seed (an upper bound). Seeds
   are independent even though coordinates are not.
@@ -127,8 +127,8 @@ class Tally:
     def _shares(self, error: Float, std: Float, truth: Float) -> None:
         """Add the error and standard deviation of the converged wires in the deepest frame.
 
-        Both values are relative to the displacement in the deepest frame, as is the worst error, which is the
-        largest error in any frame.
+        Error and standard deviation are relative to the displacement in the deepest frame, as is the worst
+        error, which is the largest error in any frame.
         """
         deepest = int(np.argmax(np.linalg.norm(truth.reshape(len(truth), -1), axis=1)))
         used = np.isfinite(error[deepest])

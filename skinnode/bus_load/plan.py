@@ -3,8 +3,8 @@
 On each bus, the plan includes SYNC, the host's heartbeat if enabled, and the frames of other devices listed
 in the hand file. SDO transfers occupy the fraction :data:`SDO_SHARE` of the bandwidth. For each patch, the
 plan includes all chunks and the summary of a scan in every SYNC period, and a heartbeat and one EMCY in every
-heartbeat period. The SDO transfers that configure a returning node are not included. They have a lower
-priority than any PDO and therefore use only spare bandwidth.
+heartbeat period. The SDO transfers that configure a returning node are not included, because SDO frames have
+a lower priority than any PDO and therefore use only spare bandwidth.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ class PlannedFrame:
     period_s: float
     """Period of the frames, s."""
     count: int
-    """Number of frames per period."""
+    """Number of frames with this identifier per period."""
     spacing_s: float
     """Minimum time between consecutive frames of a period, s."""
     jitter_s: float
@@ -95,7 +95,7 @@ class ScanTime:
 
 @dataclass(frozen=True, slots=True)
 class BusPlan:
-    """Traffic plan of one bus."""
+    """Traffic plan of one bus: its frames and the duration of its scans."""
 
     bus: BusConfig
     period_s: float

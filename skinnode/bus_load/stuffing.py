@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 
 from skinnode.compiled.jit import njit_brief
 
-HEAD_BITS: Final = 19  # SOF, 11-bit identifier, RTR, IDE, r0, 4-bit DLC
+HEAD_BITS: Final = 19  # head: SOF, 11-bit identifier, RTR, IDE, r0, 4-bit DLC
 CRC_BITS: Final = 15
 TAIL_BITS: Final = 13
 """Length of CRC delimiter, ACK slot, ACK delimiter, end of frame (7) and inter-frame space (3), bits."""
-FD_NOMINAL_BITS: Final = 17 + 12  # SOF, 11-bit identifier, RRS, IDE, FDF, res, BRS; then the tail
+FD_NOMINAL_BITS: Final = 17 + 12  # SOF, 11-bit identifier, RRS, IDE, FDF, res, BRS, and the tail
 _CRC_POLYNOMIAL: Final = 0x4599
 _RUN: Final = 5
 ALTERNATING: Final = 0x5555_5555_5555  # ends in 1
@@ -75,7 +75,7 @@ def are_loaded() -> bool:
 def load_kernels() -> None:
     """Compile the kernels, or load them from the cache.
 
-    Call this function in advance. It takes half a second, during which a receiving thread cannot answer
+    Call this function in advance: loading takes half a second, during which a receiving thread cannot answer
     requests.
     """
     global _loaded
@@ -189,7 +189,7 @@ def _fd(  # noqa: PLR0913 - arrays of a compiled kernel
         if run - 1 >> 2 != last:
             stuff -= 1
         crc_bits, fixed = (17, 6) if length <= 16 else (21, 7)
-        # ESI, DLC, data, count, CRC, delimiter
+        # bits of ESI, DLC, data, stuff count, CRC and CRC delimiter
         fast[i] = 1 + 4 + 8 * length + 4 + crc_bits + fixed + 1 + stuff
         nominal[i] = FD_NOMINAL_BITS + slow
         begin += length

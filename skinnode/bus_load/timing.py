@@ -1,20 +1,20 @@
 """Computes the exact duration of CAN frames on the bus (ISO 11898-1:2015), and the resulting bus load.
 
 Classic frames. From start of frame to the end of the CRC sequence, a stuff bit of the opposite value follows
-every five equal bits, and stuff bits count towards the five. The 13-bit tail is not stuffed: CRC delimiter,
-ACK slot, ACK delimiter, 7-bit end of frame and 3-bit inter-frame space. CRC: polynomial 0x4599, 15 bits,
-initial value 0.
+every five equal bits. Stuff bits themselves count towards the next five equal bits. The 13-bit tail is not
+stuffed: CRC delimiter, ACK slot, ACK delimiter, 7-bit end of frame and 3-bit inter-frame space. The CRC has
+15 bits, the polynomial 0x4599 and the initial value 0.
 
 Tables are used to compute CRC and stuffing byte by byte. The head of a frame is padded on the left to whole
-bytes. For the CRC, the padding consists of zeros, which leave the CRC at 0. For stuffing, it consists of
-alternating bits that end in a 1, so the dominant start of frame begins a new run.
+bytes. For the CRC, the padding consists of zeros, which leave the CRC at 0. For stuffing, the padding
+consists of alternating bits that end in a 1, so the dominant start of frame begins a new run.
 
 The CAN FD frames of a hand have an 11-bit identifier and switch the bit rate; only :func:`exact_fd_bits`
 counts other CAN FD frames. Bit stuffing follows the same rule up to the end of the data. The CRC field holds
 a 4-bit stuff count, 17 CRC bits (21 for more than 16 data bytes), and fixed stuff bits: one at the start of
 the field and one after every 4 bits. The bits from ESI to the CRC delimiter are sent at the data bit rate.
-The 17 bits before them (36 bits with a 29-bit identifier) and the 12 bits after them (ACK slot, ACK
-delimiter, 7-bit end of frame and 3-bit inter-frame space) are sent at the nominal bit rate.
+The 17 bits before ESI (36 bits with a 29-bit identifier) and the 12 bits after the CRC delimiter (ACK slot,
+ACK delimiter, 7-bit end of frame and 3-bit inter-frame space) are sent at the nominal bit rate.
 """
 
 from __future__ import annotations
@@ -168,7 +168,7 @@ def exact_fd_bits(
 
 
 def fd_bits(can_id: ArrayLike, data: ArrayLike) -> tuple[_Int, _Int]:
-    """Return the number of bits in each of several CAN FD frames of the same length.
+    """Count the bits of each of several CAN FD frames of the same length.
 
     Args:
         can_id: (n,) identifiers.
@@ -197,7 +197,7 @@ def fd_bits(can_id: ArrayLike, data: ArrayLike) -> tuple[_Int, _Int]:
 
 @functools.cache
 def fd_worst_case_bits(length: int) -> tuple[int, int]:
-    """Return the maximum number of bits in a CAN FD frame over all possible data.
+    """Return the maximum number of bits that a CAN FD frame of a given length can have.
 
     Args:
         length: number of data bytes.
@@ -235,7 +235,7 @@ def fd_worst_case_bits(length: int) -> tuple[int, int]:
 
 
 def exact_bits_batch(can_id: ArrayLike, dlc: ArrayLike, data: ArrayLike) -> _Int:
-    """Return the number of bits in each of many classic data frames, as :func:`exact_bits` does.
+    """Count the bits of each of many classic data frames, as :func:`exact_bits` does for one frame.
 
     Args:
         can_id: (n,) identifiers of 11 bits.

@@ -60,7 +60,7 @@ class PatchReport:
 
 @dataclass(frozen=True, slots=True)
 class Report:
-    """Results of the whole run."""
+    """Results of a demo run."""
 
     seconds: float
     scan_rate_hz: float
@@ -194,7 +194,7 @@ class _Progress:
 
 
 def play(hand: HandConfig, seconds: float, console: Console) -> Run:
-    """Run a hand and score the decoded fields against the truth.
+    """Run a hand, and score the decoded fields by comparison with the true displacements.
 
     Args:
         hand: Hand whose patches are on a virtual bus.

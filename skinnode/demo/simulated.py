@@ -1,7 +1,7 @@
 """Runs simulated patches for commands that demonstrate a host.
 
-The patches run in a separate process. Like the patches of a real hand, they do not share a Python interpreter
-with the host, so performance figures measure only the host.
+The patches run in a separate process. Simulated patches, like those of a real hand, do not share a Python
+interpreter with the host, so performance figures measure only the host.
 """
 
 from __future__ import annotations

@@ -23,28 +23,28 @@ class Clock(Protocol):
         """Return the monotonic time, ns."""
 
     def time_ns(self) -> int:
-        """Return the time since 1970, ns."""
+        """Return the Unix time, ns."""
 
     def sleep(self, seconds: float, /) -> None:
         """Suspend the current thread for ``seconds``."""
 
     def event(self) -> threading.Event:
-        """Return an event that is not set."""
+        """Create an event that is not set."""
 
     def queue(self) -> queues.Queue[Any]:
-        """Return an empty queue without a limit."""
+        """Create an empty queue of unlimited size."""
 
     def simple_queue(self) -> queues.SimpleQueue[Any]:
-        """Return an empty queue without a limit."""
+        """Create an empty queue of unlimited size."""
 
     def lock(self) -> AbstractContextManager[Any]:
-        """Return a lock."""
+        """Create a lock."""
 
     def thread(self, target: Callable[..., object], name: str, args: tuple[Any, ...]) -> threading.Thread:
-        """Return a daemon thread that has not been started."""
+        """Create a daemon thread without starting it."""
 
     def pool(self, threads: int, name: str) -> Executor:
-        """Return a pool of threads."""
+        """Create a pool of threads."""
 
 
 class SystemClock:
@@ -57,19 +57,19 @@ class SystemClock:
     lock = staticmethod(threading.Lock)
 
     def queue(self) -> queues.Queue[Any]:
-        """Return an empty queue without a limit."""
+        """Create an empty queue of unlimited size."""
         return queues.Queue()
 
     def simple_queue(self) -> queues.SimpleQueue[Any]:
-        """Return an empty queue without a limit."""
+        """Create an empty queue of unlimited size."""
         return queues.SimpleQueue()
 
     def thread(self, target: Callable[..., object], name: str, args: tuple[Any, ...]) -> threading.Thread:
-        """Return a daemon thread that has not been started."""
+        """Create a daemon thread without starting it."""
         return threading.Thread(target=target, name=name, args=args, daemon=True)
 
     def pool(self, threads: int, name: str) -> Executor:
-        """Return a pool of threads."""
+        """Create a pool of threads."""
         return ThreadPoolExecutor(threads, thread_name_prefix=name)
 
 
@@ -112,12 +112,12 @@ def perf_counter() -> float:
 
 
 def time_ns() -> int:
-    """Return the time since 1970, ns."""
+    """Return the Unix time, ns."""
     return _here.clock.time_ns()
 
 
 def time() -> float:
-    """Return the time since 1970, s."""
+    """Return the Unix time, s."""
     return _here.clock.time_ns() * 1e-9
 
 
@@ -127,32 +127,32 @@ def sleep(seconds: float) -> None:
 
 
 def event() -> threading.Event:
-    """Return a :class:`threading.Event` that is not set."""
+    """Create a :class:`threading.Event` that is not set."""
     return _here.clock.event()
 
 
 def queue() -> queues.Queue[Any]:
-    """Return an empty :class:`queues.Queue` without a limit."""
+    """Create an empty :class:`queue.Queue` of unlimited size."""
     return _here.clock.queue()
 
 
 def simple_queue() -> queues.SimpleQueue[Any]:
-    """Return an empty :class:`queues.SimpleQueue`."""
+    """Create an empty :class:`queue.SimpleQueue`."""
     return _here.clock.simple_queue()
 
 
 def lock() -> AbstractContextManager[Any]:
-    """Return a :class:`threading.Lock`."""
+    """Create a :class:`threading.Lock`."""
     return _here.clock.lock()
 
 
 def thread(target: Callable[..., object], name: str, args: tuple[Any, ...] = ()) -> threading.Thread:
-    """Return a daemon :class:`threading.Thread` that has not been started."""
+    """Create a daemon :class:`threading.Thread` without starting it."""
     return _here.clock.thread(target, name, args)
 
 
 def pool(threads: int, name: str) -> Executor:
-    """Return a :class:`concurrent.futures.ThreadPoolExecutor`.
+    """Create a :class:`concurrent.futures.ThreadPoolExecutor`.
 
     To wait for a job, use :meth:`concurrent.futures.Future.add_done_callback`. Other waiting methods ignore
     virtual time.

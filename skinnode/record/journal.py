@@ -56,7 +56,7 @@ class Header:
 
     hand: HandConfig
     started: str
-    """Local date and time, ISO 8601."""
+    """Local date and time at which the recording began, ISO 8601."""
     wall_minus_mono_ns: int
     """Log time minus time on the host's monotonic clock, ns."""
 

@@ -150,7 +150,7 @@ class Recorder:
         """Return the number of frames recorded and lost so far."""
         return RecorderStats(self._log.frames, self._lost, self._failure)
 
-    # --- called on the host's threads
+    # --- methods called on the host's threads
 
     def received(self, bus: str, frames: Sequence[Frame]) -> None:
         """Record a batch of received frames."""
@@ -209,7 +209,7 @@ class Recorder:
         bus, t_ns = self._bus_of[patch], clock.monotonic_ns() if t_ns is None else t_ns
         self._put(lambda: self._write_event(bus, t_ns, event, patch=patch, **more), 0)
 
-    # --- called on the recorder's thread
+    # --- methods called on the recorder's thread
 
     def _run(self) -> None:
         keep_on(self._turn, self._defects, "recording")

@@ -43,7 +43,7 @@ LONGEST_SILENCE_S: Final = 60.0
 shortened."""
 
 _ROUNDING_NS: Final = 2_000
-"""Maximum rounding error of a timestamp in a log, ns."""
+"""Maximum rounding error of a log's timestamps, ns."""
 
 _SLICE_S: Final = 0.1
 """Maximum time until :meth:`Replay.stop` takes effect, s."""
@@ -330,7 +330,7 @@ class _Bus:
                     stream.resume(solver, stream.withholdings, anew=bool(event.get("anew")))
 
     def _solver(self, event: dict[str, Any]) -> ScanSolver | None:
-        """Return the solver for an event; None if the node's facts are unknown or unusable."""
+        """Return the solver for a journal event; None if the node's facts are unknown or unusable."""
         name, replay = event["patch"], self._replay
         if "facts" in event:
             self._solvers[name] = None

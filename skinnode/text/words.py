@@ -1,4 +1,4 @@
-"""Plural forms and placeholders in messages."""
+"""Formats numbers with nouns, and unknown values, for messages."""
 
 from __future__ import annotations
 
@@ -15,5 +15,5 @@ def counted(number: int, one: str, several: str = "") -> str:
 
 
 def known(value: object) -> str:
-    """Return ``value`` as text, or "unknown" for None, because messages never show ``None``."""
+    """Convert ``value`` to text; None becomes "unknown", because messages must not contain ``None``."""
     return "unknown" if value is None else str(value)

@@ -283,7 +283,10 @@ def row(section: str, name: str, **changes: float) -> dict:
     [
         (row("healthy", "sphere", beyond=2), "trusted coordinates beyond 5 deviations, no fault"),
         (row("healthy", "sphere", trusted=98), "trusted fields without a fault, noise up to 1e-4"),
-        (row("single", "upper wire open", beyond=2), "faults with more than 1 in 1000 such coordinates"),
+        (
+            row("single", "upper wire open", beyond=2),
+            "faults with over 1 in 1000 coordinates beyond 5 deviations",
+        ),
         (
             row("single", "upper wire open", after_trusted=47),
             "trusted fields with one fault, after its detection",

@@ -3,9 +3,9 @@
 NEW is the working tree by default. The old commit generates the inputs: recordings of simulated hands, and
 streams of resistances on five layouts, with two noise levels, with and without faults. Both commits then
 process the inputs with the forward model, every method of the tracker, path following with every operator,
-and the solver for systems of equations. They also replay the recordings and generate files. For each part,
-the report contains one hash per commit over all arrays of the part. For each array that differs, the report
-states the largest relative difference.
+and the solver for systems of equations. Both commits also replay the recordings and generate files. For each
+part, the report contains one hash per commit over all arrays of the part. For each array that differs, the
+report states the largest relative difference.
 
 The exit status is 0 if every array is equal in both commits, or if all differences between float arrays are
 at most ``--rtol``. Otherwise the exit status is 1.

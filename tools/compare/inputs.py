@@ -3,7 +3,8 @@
 Both commits read the same files, so the files should depend on neither commit. The displacements are
 therefore sums of Gaussian bumps, not solutions of the elastic model, and the noise has a fixed seed.
 
-Run this script in the tree of the old commit: ``python inputs.py FOLDER``. It uses only the public API.
+Run this script in the tree of the old commit: ``python inputs.py FOLDER``. The script uses only the public
+API.
 """
 
 from __future__ import annotations

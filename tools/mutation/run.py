@@ -57,7 +57,7 @@ _PASSED, _FAILED = 0, 1
 
 @dataclass(frozen=True)
 class Outcome:
-    """Outcome of one pytest run."""
+    """Result of one pytest run."""
 
     status: int | None
     """Exit status of pytest; None if the run exceeded its time limit."""

@@ -18,7 +18,7 @@ UNIT_TOLERANCE: Final = 1e-3
 
 @dataclass(frozen=True, slots=True)
 class Pose:
-    """Position and orientation of a frame in its parent: of a patch on its link, or of a link on the hand.
+    """Position and orientation of a frame in its parent frame, such as a patch on its link.
 
     The patch's x axis is along its upper wires, and its z axis points out of the skin.
 

@@ -110,7 +110,7 @@ class PosteriorOptions(EstimateOptions):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class TrackerOptions(EstimateOptions):
-    """Options of :class:`skinnode.Tracker`: all options of :class:`EstimateOptions`, and seven others.
+    """Options of :class:`skinnode.Tracker`: all options of :class:`EstimateOptions`, and seven more options.
 
     The method ``auto`` chooses the posterior if ``drift``, ``model_error``, ``tolerances`` or
     ``estimate_noise`` is set, since only the posterior supports them.

@@ -109,8 +109,8 @@ class Tracker:
     def prepare(self) -> None:
         """Compute tables in advance, for which the first frames of a touch would otherwise wait up to 0.1 s.
 
-        For the reference patch, the tables take 0.25 s and 85 MB; trackers of the same layout share the
-        tables. A host calls this method before it starts the nodes.
+        For the reference patch, computing the tables takes 0.25 s and 85 MB; trackers of the same layout
+        share them. A host calls this method before it starts the nodes.
         """
         self._posterior.check.prepare()
 
@@ -162,7 +162,7 @@ class Tracker:
         """Compute the field of a scan from its codes, much faster than by decoding and :meth:`update`.
 
         Args:
-            codes: (U, K) uint32, converted by the mapping passed to the constructor as ``codes``.
+            codes: (U, K) uint32, converted by the mapping that the constructor received as ``codes``.
 
         Returns:
             The field, as computed from the decoded resistances and their noise, and the number of invalid

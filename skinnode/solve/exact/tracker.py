@@ -152,8 +152,8 @@ class ExactTracker:
         No resistance value raises an exception. A wire with fewer usable resistances than unknowns is
         ILL_CONDITIONED, or NON_FINITE if resistances not marked as missing were unusable. Such a wire, and
         any wire for which no solve finds a root, keeps its last trusted position with an infinite standard
-        deviation. The residual of such a wire is computed at this position; it is inf if no time remains
-        before the deadline. Raises ValueError if a shape is wrong.
+        deviation. The residual of an unsolved wire is computed at its last trusted position, or is inf if no
+        time remains before the deadline. Raises ValueError if a shape is wrong.
         """
         start = perf_counter()
         arrays = self.arrays

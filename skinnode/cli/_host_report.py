@@ -284,7 +284,7 @@ def _doubts(facts: Mapping[str, object]) -> str:
     """Return text about limits of a trusted field: low precision, and readings that were left out."""
     doubts, faults = "  imprecise" if facts["precise"] is False else "", facts["data_faults"]
     if isinstance(faults, list) and faults:
-        doubts += f"  {counted(len(faults), 'fault')} of its readings left out"
+        doubts += f"  {counted(len(faults), 'fault')} in the readings, left out"
     return doubts
 
 

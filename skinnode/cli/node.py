@@ -87,7 +87,7 @@ def node(
     from skinnode.transport import CanPort
 
     if node_id is None and store is None:
-        raise ConfigError("--node-id", None, "1 to 127, or --store FILE if LSS stores the node-ID")
+        raise ConfigError("--node-id", None, "1 to 127, or --store FILE and a node-ID stored there by LSS")
     if store is not None:
         require_writable("--store", store)
     import_from_here()

@@ -25,7 +25,7 @@ def replay(
     as_json: Annotated[
         bool,
         typer.Option(
-            "--json", help="Print a JSON object for each field, and one with the counters at the end."
+            "--json", help="Print a JSON object for each field, and an object with the counters at the end."
         ),
     ] = False,
 ) -> None:

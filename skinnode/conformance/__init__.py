@@ -4,8 +4,8 @@
 device under test) build on both, and the cases use ``sdo`` and ``dut``. ``run`` resets the device before each
 case and restores its configuration; ``report`` and ``html_report`` write the results.
 
-The suite relies only on a node's EDS and its frames. It deliberately has its own tester, SDO client,
-EDS reader and constants, because an error in code shared with the node would go unnoticed.
+The suite relies only on a node's EDS and its frames. It has its own tester, SDO client, EDS reader
+and constants, because an error in code that the suite shared with the node would go unnoticed.
 """
 
 from skinnode.conformance.case import Case, NotApplicable, Result, Verdict

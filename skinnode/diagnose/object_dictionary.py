@@ -47,7 +47,7 @@ _ADDRESS: Final = re.compile(r"(?:0[xX])?([0-9A-Fa-f]{1,4})(?::(0[xX][0-9A-Fa-f]
 
 @dataclass(frozen=True, slots=True)
 class Reading:
-    """One value read from a node."""
+    """Result of reading one value from a node."""
 
     index: int
     subindex: int

@@ -110,7 +110,7 @@ class HostSource:
 
     def snapshot(self) -> Snapshot:
         """Return the current state of the hand."""
-        for _ in range(_CAPACITY + 1):  # a failure is queued after the fields
+        for _ in range(_CAPACITY + 1):  # the error of a failed host is queued last
             self._fields.get(0.0)
         host, stats = self._host, self._host.stats()
         return Snapshot(

@@ -180,7 +180,7 @@ class Storage:
             except OSError:
                 raise Refused(AbortCode.HARDWARE) from None
             # A save on command means that the user accepts the current parameters, so these faults end. An
-            # automatic save of the baseline does not.
+            # automatic save of the baseline does not end them.
             self._settle(Fault.UNREADABLE, Fault.DAMAGED, Fault.FOREIGN)
 
         return guard

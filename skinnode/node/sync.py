@@ -53,8 +53,7 @@ class SyncWindow:
     def lets_out(self, number: int, t_ns: int) -> bool:
         """Return whether a synchronous TPDO may be sent; if not, the caller must discard it.
 
-        An emergency message reports the first discarded TPDO of a series, until this TPDO is sent within the
-        window again.
+        An emergency message reports a discarded TPDO once, until the TPDO is sent within the window again.
 
         Args:
             number: number of the TPDO, counted from 0.

@@ -1,4 +1,5 @@
-"""Process data objects.
+"""Process data objects (PDO) of a node.
 
-``parameters`` reads the records of a PDO and checks writes to them, ``rpdo`` receives, ``tpdo`` transmits.
+The module ``parameters`` reads the records of a PDO and checks writes to these records. The module ``rpdo``
+receives PDOs, and ``tpdo`` transmits PDOs.
 """

@@ -1,6 +1,6 @@
-"""PDO parameters: the values that may be written, and their meaning (CiA 301 v4.2, 7.5.2.33 to 7.5.2.38).
+"""PDO parameters: their permitted values and their meaning (CiA 301 v4.2, 7.5.2.33 to 7.5.2.38).
 
-Where the standard does not define an abort code, the abort code that CANopenNode sends is used.
+If the standard does not define an abort code for an error, a node sends the same abort code as CANopenNode.
 """
 
 from __future__ import annotations
@@ -19,15 +19,16 @@ NO_RTR_BIT: Final = 1 << 30
 EXTENDED_BIT: Final = 1 << 29
 """Bit of a COB-ID that marks a 29-bit CAN-ID."""
 COB_ID_MASK: Final = 0x7FF
-"""Bits of a COB-ID that hold an 11-bit CAN-ID."""
+"""Mask for the 11-bit CAN-ID in a COB-ID."""
 SYNC_CYCLIC_MAX: Final = 240
 """Highest synchronous transmission type."""
 SYNC_REMOTE, REMOTE = 252, 253
-"""Transmission types of PDOs sent only on remote request: sampled at SYNC (252) or on request (253)."""
+"""Transmission types of PDOs that are sent only on request by a remote frame, with values sampled at the last
+SYNC (252) or at the request (253)."""
 EVENT_TYPES: Final = (254, 255)
 """Event-driven transmission types."""
 
-_MOST_MAPPED: Final = 64  # maximum number of entries in a mapping record
+_MOST_MAPPED: Final = 64  # maximum number of entries in a PDO mapping (CiA 301)
 
 _TRANSMITTED: Final = ("const", "ro", "rw", "rwr")
 _RECEIVED: Final = ("wo", "rw", "rww")
@@ -40,19 +41,18 @@ _RESTRICTED: Final = (
     range(0x6E0, 0x700),
     range(0x701, 0x800),
 )
-"""Restricted CAN-IDs (CiA 301 v4.2, table 40)."""
+"""CAN-IDs that no configurable service may use (CiA 301 v4.2, table 40)."""
 
 
 def check_cob_id(value: int, current: int) -> None:
     """Check a COB-ID that a client writes.
 
     Args:
-        value: the COB-ID.
-        current: the current COB-ID.
+        value: new COB-ID, with its flag bits.
+        current: current COB-ID, with its flag bits.
 
     Raises:
-        Refused: if no configurable service may use the new COB-ID, or if the CAN-ID changes while it is in
-            use.
+        Refused: if the new COB-ID is restricted or malformed, or if the CAN-ID changes while it is in use.
     """
     if value & EXTENDED_BIT or value & ~(INVALID_BIT | NO_RTR_BIT) > COB_ID_MASK:
         raise Refused(AbortCode.INVALID_VALUE)
@@ -65,54 +65,54 @@ def check_cob_id(value: int, current: int) -> None:
 
 @dataclass(frozen=True, slots=True)
 class Mapped:
-    """Object mapped into a PDO. An object at the index of a data type is a dummy, whose bytes are ignored."""
+    """Object mapped into a PDO. The index of a data type denotes a dummy, whose bytes are ignored."""
 
     index: int
     subindex: int
     size: int
-    """Length, bytes."""
+    """Length of the object, bytes."""
 
 
 @dataclass(frozen=True, slots=True)
 class PdoParameters:
-    """PDO parameters from the two records of a PDO. Times are in ns; 0 means not used."""
+    """Parameters of a PDO, from its two records. Times are in ns; a time of 0 is not used."""
 
     enabled: bool
-    """Whether the PDO is valid and maps at least one object."""
+    """Whether the PDO is enabled and has at least one mapped object."""
     cob_id: int
-    """Its 11-bit CAN-ID."""
+    """CAN-ID of the PDO, 11 bits."""
     answers_rtr: bool
-    """Whether the COB-ID allows remote frames."""
+    """Whether the PDO is a TPDO that may be requested by remote frames."""
     kind: int
-    """Transmission type."""
+    """Transmission type of the PDO."""
     inhibit_ns: int
     event_timer_ns: int
     sync_start: int
     mapping: tuple[Mapped, ...]
-    """The mapped objects, in order."""
+    """Mapped objects, in payload order."""
     size: int
-    """Length of the payload, bytes."""
+    """Length of the PDO's payload, bytes."""
 
     @property
     def event_driven(self) -> bool:
-        """Whether an event triggers the PDO."""
+        """Whether the PDO is event-driven."""
         return self.kind in EVENT_TYPES
 
     @property
     def synchronous(self) -> bool:
-        """Whether SYNC triggers the PDO; false if it is sampled at SYNC but sent on request."""
+        """Whether SYNC triggers the PDO; false for a PDO that is sampled at SYNC but sent on request."""
         return self.kind <= SYNC_CYCLIC_MAX
 
 
 class PdoRecords:
-    """Communication and mapping records of one PDO, with guarded writes.
+    """Communication record and mapping record of one PDO, with checks of the values that clients write.
 
     Args:
         store: object dictionary.
         parameter: index of the communication record.
         mapping: index of the mapping record.
         transmits: whether the PDO is a TPDO.
-        taken: returns whether another PDO uses a CAN-ID; None if several PDOs may share a CAN-ID.
+        taken: returns whether another PDO already uses a CAN-ID; None if PDOs may share a CAN-ID.
     """
 
     def __init__(
@@ -127,14 +127,14 @@ class PdoRecords:
         self._store = store
         self._parameter, self._mapping, self._transmits = parameter, mapping, transmits
         self._taken = taken
-        # The maximum length of a PDO in bytes equals its maximum number of mapping entries, because the
-        # smallest object is one byte long.
+        # The maximum length of a PDO in bytes equals its maximum number of mapped objects, because the
+        # smallest object has one byte.
         self._longest = sum([store.has(mapping, sub) for sub in range(1, _MOST_MAPPED + 1)])
         store.guard(parameter, self._guard_parameter)
         store.guard(mapping, self._guard_mapping)
 
     def _word(self, subindex: int) -> int:
-        """Return a communication parameter; 0 if this PDO does not have that parameter."""
+        """Return the communication parameter at a sub-index; 0 if this PDO does not have the parameter."""
         has = self._store.has(self._parameter, subindex)
         return self._store.integer(self._parameter, subindex) if has else 0
 
@@ -187,7 +187,7 @@ class PdoRecords:
             raise Refused(AbortCode.UNSUPPORTED_ACCESS)
         if not subindex:
             self._check_mapping(value)
-        elif value:  # an entry may be 0 as long as sub-index 0 does not count it
+        elif value:  # an unused entry may be 0; sub-index 0 must not count it
             self._mapped_bytes(value)
 
     def _check_mapping(self, count: int) -> None:
@@ -198,7 +198,7 @@ class PdoRecords:
             raise Refused(AbortCode.PDO_TOO_LONG)
 
     def _mapped_bytes(self, word: int) -> int:
-        """Return the length in bytes of the object that a mapping entry names."""
+        """Return the length in bytes of the object that a mapping entry refers to."""
         index, subindex, bits = word >> 16, word >> 8 & 0xFF, word & 0xFF
         if not self._transmits and not subindex and index in od.DUMMY_BITS:
             allowed, size = True, od.DUMMY_BITS[index]

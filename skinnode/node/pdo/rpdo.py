@@ -1,9 +1,10 @@
-"""RPDO engine, which writes received PDOs to the object dictionary (CiA 301 v4.2, 7.2.2 and 7.5.2.33).
+"""RPDO engine, which writes received RPDOs to the object dictionary (CiA 301 v4.2, 7.2.2 and 7.5.2.33).
 
-RPDOs of types 0 to 240 apply, at each SYNC, the last PDO received within the synchronous window (0x1007);
-RPDOs of types 254 and 255 apply a PDO immediately. Bytes beyond the mapping are ignored, and a PDO that is
-too short is not applied. Each of these errors is reported by EMCY once, and again only after a PDO of the
-right length. In OPERATIONAL, an event timer monitors its RPDO from the first PDO received onwards.
+A synchronous RPDO (types 0 to 240) is applied at the SYNC after its reception, if it was received within the
+synchronous window (0x1007). If several arrive, the last is applied. An RPDO of type 254 or 255 is applied
+immediately. If an RPDO is too long, its excess bytes are ignored; if it is too short, it is not applied.
+Either error is reported once by an emergency message, until an RPDO of the right length arrives. In
+OPERATIONAL, an event timer monitors the reception of an RPDO after it has been received for the first time.
 """
 
 from __future__ import annotations
@@ -24,22 +25,22 @@ from skinnode.node.timers import Timers
 
 
 class _Rpdo:
-    """RPDO with its parameters and its current error."""
+    """State of one RPDO: its parameters and its current length error."""
 
     def __init__(self, number: int, records: PdoRecords) -> None:
         self.number, self._records = number, records
         self.wrong: EmcyCode | None = None
-        """Length error reported for the last PDO; None if its length was right."""
+        """Length error of the last PDO received; None if its length was right."""
         self.parameters = records.read()
         self.fields = self._fields()
 
     def reload(self) -> None:
-        """Apply written parameters."""
+        """Apply the parameters in the object dictionary."""
         self.parameters = self._records.read()
         self.fields = self._fields()
 
     def _fields(self) -> list[tuple[int, int, int, int]]:
-        """Return the index, sub-index, first byte and exclusive end of each mapped object except dummies."""
+        """Return the index, sub-index, first byte and end byte of each mapped object except dummies."""
         at, fields = 0, []
         for each in self.parameters.mapping:
             if each.index not in od.DUMMY_BITS:
@@ -49,7 +50,7 @@ class _Rpdo:
 
 
 class RpdoEngine:
-    """The RPDOs of a node.
+    """Engine for all RPDOs of a node.
 
     Args:
         services: the resources that the node's services share.
@@ -64,9 +65,9 @@ class RpdoEngine:
         self._operational = False
         self._timers = Timers()
         self._by_cob_id: dict[int, list[_Rpdo]] = {}
-        self._pending: dict[int, bytes] = {}  # synchronous RPDOs received since the last SYNC
+        self._pending: dict[int, bytes] = {}  # payloads of synchronous RPDOs, to be applied at the next SYNC
 
-        # Numbers of the RPDOs with a lasting error.
+        # Numbers of the RPDOs that are too short, and of those that are late.
         self._short: set[int] = set()
         self._late: set[int] = set()
         self._rpdos: list[_Rpdo] = []
@@ -86,7 +87,7 @@ class RpdoEngine:
     # --- parameters
 
     def restore(self) -> None:
-        """Apply all parameters and clear all errors after a reset."""
+        """Apply all parameters, and forget all errors, after a reset."""
         self._by_cob_id.clear()
         self._pending.clear()
         self._timers.clear()
@@ -115,10 +116,9 @@ class RpdoEngine:
     # --- events
 
     def enter(self, *, operational: bool) -> None:
-        """Handle a change of the NMT state by dropping received PDOs and stopping monitoring.
+        """Handle a change of the NMT state: drop the RPDOs not yet applied, and end monitoring.
 
-        Deadlines are monitored only in OPERATIONAL (CiA 301 v4.2, 7.5.2.33), so no RPDO remains marked as
-        late.
+        Deadlines are monitored only in OPERATIONAL (CiA 301 v4.2, 7.5.2.33), so errors of late RPDOs end.
         """
         self._operational = operational
         self._pending.clear()
@@ -127,7 +127,7 @@ class RpdoEngine:
             self._recover(self._late, number, EmcyCode.RPDO_TIMEOUT, self._now())
 
     def on_frame(self, cob_id: int, data: bytes, t_ns: int) -> None:
-        """Pass a frame to every RPDO that has its COB-ID.
+        """Pass a frame to each RPDO that has the frame's COB-ID.
 
         Args:
             cob_id: identifier of the frame.
@@ -145,7 +145,7 @@ class RpdoEngine:
             self._execute(self._rpdos[number], pending[number])
 
     def on_timer(self, t_ns: int) -> None:
-        """Report RPDOs that are late at ``t_ns``. Monitoring restarts with the next PDO."""
+        """Report each RPDO that is late at ``t_ns``. Monitoring restarts when the RPDO is received again."""
         for number in self._timers.take(t_ns):
             self._late.add(number)
             self._emcy.report(EmcyCode.RPDO_TIMEOUT, (number + 1).to_bytes(2, "little"), t_ns)
@@ -155,7 +155,7 @@ class RpdoEngine:
         wrong = None
         if len(data) < parameters.size:
             wrong = EmcyCode.PDO_NOT_PROCESSED
-        elif len(data) > fd_length(parameters.size):  # lengths up to 8 are not padded
+        elif len(data) > fd_length(parameters.size):  # lengths up to 8 bytes need no padding
             wrong = EmcyCode.PDO_LENGTH_EXCEEDED
         self._set_wrong(rpdo, wrong, data, t_ns)
         if wrong is EmcyCode.PDO_NOT_PROCESSED:
@@ -170,7 +170,7 @@ class RpdoEngine:
             self._pending[rpdo.number] = data
 
     def _execute(self, rpdo: _Rpdo, data: bytes) -> None:
-        """Write the mapped objects. A refused object does not affect the others; a PDO has no response."""
+        """Write the mapped objects. A refused value is ignored, because a PDO has no response."""
         for index, subindex, start, end in rpdo.fields:
             with contextlib.suppress(Refused):
                 self._store.write(index, subindex, data[start:end])
@@ -178,7 +178,7 @@ class RpdoEngine:
     # --- errors
 
     def _set_wrong(self, rpdo: _Rpdo, wrong: EmcyCode | None, data: bytes, t_ns: int) -> None:
-        """Report a new length error, or the end of a length error."""
+        """Report a new length error of an RPDO, or the end of a length error."""
         if wrong is rpdo.wrong:
             return
         rpdo.wrong = wrong

@@ -1,4 +1,4 @@
-"""TPDO engine, which transmits objects as the PDO parameters require (CiA 301 v4.2, 7.2.2 and 7.5.2.37).
+"""TPDO engine, which transmits mapped objects as the PDO parameters require (CiA 301 v4.2, 7.2.2, 7.5.2.37).
 
 =========  =======================================================================================
 type       sent
@@ -11,12 +11,12 @@ type       sent
            never before the inhibit time has passed
 =========  =======================================================================================
 
-If the application has *claimed* the first object of a TPDO, the application sends that TPDO, and SYNCs and
-events do not trigger it. The engine still counts the TPDO's SYNCs and serves its remote frames and event
-timer.
+An application can *claim* an object. It then sends all TPDOs whose first mapped object is this object, and
+SYNC and events do not trigger these TPDOs. For such TPDOs, the engine still counts SYNCs, answers remote
+frames and runs the event timer.
 
-The time to handle a SYNC grows with the number of enabled TPDOs that respond to SYNC, and the time to handle
-a timer event with the number of TPDOs that are due. Other TPDOs add nothing to these times.
+The processing time of a SYNC depends only on the number of enabled TPDOs that are sent or sampled at SYNC.
+The processing time of a timer event depends only on the number of TPDOs that are due.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from skinnode.node.timers import Timers
 
 
 class Tpdo:
-    """TPDO with its parameters and the times at which it may be sent.
+    """State of one TPDO: its parameters, and the times at which it may and must be sent.
 
     Args:
         number: number of the TPDO, counted from 0.
@@ -45,13 +45,13 @@ class Tpdo:
     def __init__(self, number: int, records: PdoRecords) -> None:
         self.number, self._records = number, records
         self.ready_ns = 0
-        """Earliest time at which the inhibit time allows the next transmission, ns."""
+        """Earliest time at which the inhibit time allows the TPDO to be sent again, ns."""
         self.timer_ns = NO_DEADLINE_NS
-        """Time at which the event timer elapses, ns."""
+        """Time at which the TPDO's event timer elapses, ns."""
         self.waiting = False
-        """Whether values are waiting for a SYNC or for the end of the inhibit time."""
+        """Whether the TPDO must be sent at a SYNC or after the inhibit time."""
         self.last: bytes | None = None
-        """Last payload sent or, for type 252, sampled."""
+        """Payload sent last or, for transmission type 252, sampled last; None if there is none."""
         self.owner: Owner | None = None
         """Part of the application that sends the TPDO; None if the engine sends it."""
         self._in_step = False
@@ -60,18 +60,18 @@ class Tpdo:
 
     @property
     def first_index(self) -> int:
-        """Index of the first mapped object; 0 if nothing is mapped."""
+        """Index of the first mapped object; 0 if the mapping is empty."""
         mapping = self.parameters.mapping
         return mapping[0].index if mapping else 0
 
     @property
     def deadline_ns(self) -> int:
-        """Time at which the TPDO must be served next, ns."""
+        """Time at which the TPDO's timers must be served next, ns."""
         held = self.waiting and self.parameters.event_driven
         return min(self.timer_ns, self.ready_ns) if held else self.timer_ns
 
     def reload(self, t_ns: int) -> None:
-        """Apply parameters written at ``t_ns``."""
+        """Apply the parameters in the object dictionary, which were written at ``t_ns``."""
         old, new = self.parameters, self._records.read()
         self.parameters = new
         if (old.enabled, old.kind, old.sync_start) != (new.enabled, new.kind, new.sync_start):
@@ -80,18 +80,18 @@ class Tpdo:
             self.start_timer(t_ns)
 
     def start(self, t_ns: int) -> None:
-        """Start in OPERATIONAL, with the history cleared."""
+        """Start the TPDO in OPERATIONAL, without its previous state."""
         self.waiting, self.last, self._in_step, self._syncs = False, None, False, 0
         self.start_timer(t_ns)
 
     def start_timer(self, t_ns: int) -> None:
-        """Restart the event timer at ``t_ns``, if the TPDO has one."""
+        """Restart the event timer at ``t_ns``, if the TPDO has an event timer."""
         parameters = self.parameters
         timed = parameters.enabled and parameters.event_driven and parameters.event_timer_ns > 0
         self.timer_ns = t_ns + parameters.event_timer_ns if timed else NO_DEADLINE_NS
 
     def elapse(self, t_ns: int) -> None:
-        """Restart the elapsed event timer, without drift, and without a burst if it was served late."""
+        """Restart the event timer after it has elapsed, without drift unless it was served a period late."""
         self.timer_ns += self.parameters.event_timer_ns
         if self.timer_ns <= t_ns:
             self.start_timer(t_ns)
@@ -103,14 +103,14 @@ class Tpdo:
             counter: the SYNC counter; None if SYNC carries none.
 
         Returns:
-            Whether this synchronous TPDO is due.
+            Whether this synchronous TPDO is due at the SYNC.
         """
         parameters = self.parameters
         if not self._in_step and parameters.sync_start and counter is not None:
             if counter != parameters.sync_start:
                 return False
             self._in_step, self._syncs = True, 0
-            return True  # the SYNC with the start value is the first of the cycle
+            return True  # the SYNC with the start value counts as the first
         self._syncs += 1
         if self._syncs < parameters.kind:
             return False
@@ -119,19 +119,19 @@ class Tpdo:
 
 
 class Owner(Protocol):
-    """Part of the application that sends the TPDOs of the objects it has claimed."""
+    """Part of an application that has claimed objects, and sends the TPDOs with these objects."""
 
     def sends(self, tpdo: Tpdo) -> bool:
-        """Return whether the owner is about to send this TPDO without a request."""
+        """Return whether the owner will send this TPDO soon, without a request."""
         ...
 
     def on_reload(self, tpdo: Tpdo) -> None:
-        """Handle a parameter change or the loss of one of the owner's TPDOs."""
+        """Handle a change of a TPDO's parameters, after which it may no longer belong to this owner."""
         ...
 
 
 class TpdoEngine:
-    """The TPDOs of a node.
+    """Engine for all TPDOs of a node.
 
     Args:
         services: the resources that the node's services share.
@@ -143,11 +143,13 @@ class TpdoEngine:
         store = services.store
         self._store, self._send, self._now = store, services.send, services.now
         self.window = window
-        """Window for synchronous TPDOs; the engine sends TPDOs without an owner immediately after SYNC."""
+        """Synchronous window, for the owners of TPDOs; the engine sends TPDOs without an owner right after
+        SYNC."""
         self._claims: dict[int, Owner] = {}
         self._running = False
         self._timers = Timers()
-        # Numbers of enabled TPDOs, ascending: those sent on SYNC, on events, and by an owner.
+        # Numbers of the enabled TPDOs in ascending order, in three lists: TPDOs sent or sampled at SYNC,
+        # TPDOs sent on events, and TPDOs with an owner.
         self._listening: list[int] = []
         self._eventful: list[int] = []
         self._owned: list[int] = []
@@ -167,18 +169,18 @@ class TpdoEngine:
         return self._timers.deadline_ns
 
     def claim(self, index: int, owner: Owner) -> None:
-        """Register ``owner`` as the sender of the TPDOs whose first object has this index."""
+        """Register ``owner`` as the sender of all TPDOs whose first mapped object has this index."""
         self._claims[index] = owner
         self.restore()
 
     def owned(self, index: int) -> list[Tpdo]:
-        """Return the enabled, claimed TPDOs whose first object has this index."""
+        """Return the enabled TPDOs whose first mapped object is the claimed object at this index."""
         return [tpdo for tpdo in map(self._tpdos.__getitem__, self._owned) if tpdo.first_index == index]
 
     # --- parameters
 
     def restore(self) -> None:
-        """Apply all parameters after a reset."""
+        """Apply the parameters of all TPDOs after a reset."""
         for number in range(len(self._tpdos)):
             self._reload(number)
 
@@ -205,7 +207,8 @@ class TpdoEngine:
         self._plan(tpdo)
 
     def _taken(self, cob_id: int) -> bool:
-        # Read the store, because the applied parameters lag behind while the store is being restored.
+        # The object dictionary is read directly, because during a restore its new values have not been
+        # applied yet.
         numbers = range(od.TPDO1_PARAMETER, od.TPDO1_PARAMETER + len(self._tpdos))
         words = [self._store.integer(index, od.PDO_COB_ID) for index in numbers]
         return any(not word & INVALID_BIT and word & COB_ID_MASK == cob_id for word in words)
@@ -213,19 +216,19 @@ class TpdoEngine:
     # --- events
 
     def start(self, t_ns: int) -> None:
-        """Start transmission when the node has entered OPERATIONAL."""
+        """Start all TPDOs, because the node has entered OPERATIONAL."""
         self._running = True
         for tpdo in self._tpdos:
             tpdo.start(t_ns)
             self._plan(tpdo)
 
     def stop(self) -> None:
-        """Stop transmission when the node has left OPERATIONAL."""
+        """Stop all TPDOs, because the node has left OPERATIONAL."""
         self._running = False
         self._timers.clear()
 
     def count_sync(self, counter: int | None) -> frozenset[int]:
-        """Count a SYNC for all TPDOs.
+        """Count a SYNC for all TPDOs, and determine which are due.
 
         Args:
             counter: the SYNC counter; None if SYNC carries none.
@@ -239,9 +242,9 @@ class TpdoEngine:
         )
 
     def on_sync(self, turns: Collection[int], t_ns: int) -> None:
-        """Send the TPDOs that are due and sample the TPDOs of type 252.
+        """Send the synchronous TPDOs that are due, and sample the TPDOs of type 252.
 
-        Called after the application has handled the SYNC.
+        This method must be called after the application has handled the SYNC.
 
         Args:
             turns: numbers of the synchronous TPDOs that are due.
@@ -257,7 +260,7 @@ class TpdoEngine:
                     self._transmit(tpdo, payload, t_ns)
 
     def trigger(self, t_ns: int) -> None:
-        """Send all event-driven TPDOs that have no owner."""
+        """Send all event-driven TPDOs that have no owner, because an event has occurred."""
         for number in tuple(self._eventful):
             self.request(self._tpdos[number], t_ns)
 
@@ -267,7 +270,7 @@ class TpdoEngine:
         self._let_out(tpdo, t_ns)
 
     def on_remote(self, cob_id: int, t_ns: int) -> None:
-        """Answer a remote frame in OPERATIONAL. Synchronous TPDOs do not answer (7.2.2.3)."""
+        """Send the TPDO that a remote frame requests, unless it is synchronous (CiA 301, 7.2.2.3)."""
         tpdo = self._by_cob_id.get(cob_id)
         if tpdo is None or not tpdo.parameters.answers_rtr or self._sent_anyway(tpdo):
             return
@@ -280,7 +283,7 @@ class TpdoEngine:
             self._transmit(tpdo, tpdo.last, t_ns)
 
     def on_timer(self, t_ns: int) -> None:
-        """Send everything that is due at ``t_ns``."""
+        """Send all TPDOs that are due at ``t_ns``."""
         for number in self._timers.take(t_ns):
             tpdo = self._tpdos[number]
             if t_ns >= tpdo.timer_ns:
@@ -296,16 +299,16 @@ class TpdoEngine:
     # --- sending
 
     def payload(self, tpdo: Tpdo) -> bytes:
-        """Return the current values of the mapped objects."""
+        """Return the payload of a TPDO: the current values of its mapped objects."""
         raw = self._store.raw
         return b"".join([raw(each.index, each.subindex) for each in tpdo.parameters.mapping])
 
     def emit(self, tpdo: Tpdo, payload: bytes) -> None:
-        """Send a payload immediately; the owner of the TPDO has already checked the time."""
+        """Send a payload immediately; the TPDO's owner is responsible for its timing."""
         self._send(tpdo.parameters.cob_id, payload)
 
     def transmit(self, tpdo: Tpdo, t_ns: int) -> None:
-        """Send a synchronous TPDO now, or discard it if the synchronous window (0x1007) has closed."""
+        """Send a synchronous TPDO now, or discard it if the synchronous window (0x1007) is closed."""
         if self.window.lets_out(tpdo.number, t_ns):
             self._transmit(tpdo, self.payload(tpdo), t_ns)
         else:
@@ -318,20 +321,21 @@ class TpdoEngine:
             self._plan(tpdo)
 
     def _transmit(self, tpdo: Tpdo, payload: bytes, t_ns: int, *, timer: bool = True) -> None:
-        """Send a payload, and restart the event timer if ``timer`` is true."""
+        """Send a payload, start the inhibit time, and restart the event timer if ``timer`` is true."""
         tpdo.last, tpdo.waiting = payload, False
         tpdo.ready_ns = t_ns + tpdo.parameters.inhibit_ns
         if timer:
             tpdo.start_timer(t_ns)
         self._plan(tpdo)
-        self._send(tpdo.parameters.cob_id, payload)  # last, because the bus may refuse the frame
+        # This call comes last, because the bus may refuse the frame.
+        self._send(tpdo.parameters.cob_id, payload)
 
     def _plan(self, tpdo: Tpdo) -> None:
         self._timers.set(tpdo.number, tpdo.deadline_ns if self._running else NO_DEADLINE_NS)
 
 
 def _keep(numbers: list[int], number: int, wanted: bool) -> None:
-    """Add ``number`` to the ascending list or remove it, depending on ``wanted``."""
+    """Add ``number`` to the ascending list if ``wanted`` is true; otherwise, remove it."""
     at = bisect_left(numbers, number)
     there = at < len(numbers) and numbers[at] == number
     if wanted and not there:

@@ -1,4 +1,5 @@
-"""Service data objects (SDO): ``server`` runs expedited and segmented transfers, ``block`` block transfers.
+"""SDO server of a node, for expedited, segmented and block transfers (CiA 301 v4.2, 7.2.4.3).
 
-``transfer`` holds the parts shared by all transfers: channel, time-out, and the value of a download.
+The module ``server`` performs expedited and segmented transfers, and ``block`` performs block transfers. The
+module ``transfer`` contains the code that all transfers share.
 """

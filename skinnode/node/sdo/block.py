@@ -1,9 +1,9 @@
-"""SDO block transfer (CiA 301 v4.2, 7.2.4.3.9 to 7.2.4.3.15): up to 127 segments, then one acknowledgement.
+"""SDO block transfer, with one acknowledgement per block of segments (CiA 301 v4.2, 7.2.4.3.9 to 7.2.4.3.15).
 
-CAN delivers a frame twice if the last bit of its end of frame is disturbed (ISO 11898-1), and a frame does
-not say which block it belongs to. If a repeated acknowledgement were mistaken for that of the next block,
-segments would be skipped. For this reason a frame equal to the previous frame is ignored unless the protocol
-allows a repetition there.
+CAN may deliver a frame twice if the last bit of its end-of-frame field is disturbed (ISO 11898-1). A frame
+contains no block number, so a repeated acknowledgement could be mistaken for the acknowledgement of the next
+block, and segments would be skipped. For this reason, a frame equal to the previous frame is ignored, unless
+the protocol allows two equal frames in succession.
 """
 
 from __future__ import annotations
@@ -22,26 +22,26 @@ from skinnode.node.sdo.transfer import MULTIPLEXER_U32, Channel, Incoming, Targe
 SEGMENT_NS: Final = 500_000
 """Minimum mean time between two segments, ns.
 
-PDOs may use 70 % of a bus. At 1 Mbit/s at least 2200 frames/s remain, of which this pace uses 2000, so the
-transmit queue, which is shared with PDOs, does not fill up. A block takes 64 ms, or 100 ms if the thread
-wakes late; clients wait at least 300 ms for a frame (canopen library). Each time the bus refuses a
-segment, as slower buses do, this time is doubled for the rest of the transfer.
+PDOs may cause a bus load of 70 %. At 1 Mbit/s, this leaves at least 2200 frames/s, of which block transfers
+use 2000, so the transmit queue does not fill up. A block takes 64 ms, or 100 ms if the thread wakes up late.
+Clients wait longer than this for a frame: at least 300 ms (canopen library). Whenever the bus refuses a
+segment, as a slower bus may do, the time between segments is doubled for the rest of the transfer.
 """
 SLOWEST_SEGMENT_NS: Final = 8 * SEGMENT_NS
-"""Maximum mean time between two segments, ns; at this pace, segments take a quarter of the capacity of a 125
-kbit/s bus. If the bus refuses segments even at this pace, the pace is not the cause."""
+"""Maximum mean time between two segments, ns; at this pace, the segments use a quarter of a 125 kbit/s bus.
+If the bus refuses segments even at this pace, a slower pace would not help."""
 SEGMENTS_AT_ONCE: Final = 4
-"""Maximum number of segments sent per timer event, to compensate for a thread that wakes late (by default, up
-to 2 ms).
+"""Maximum number of segments sent per timer event. Several segments per event compensate for a thread that
+wakes up late, by default up to 2 ms late.
 
-The transmit queue of a Linux CAN interface holds 10 frames, and a delayed thread may handle two events in a
-row.
+The transmit queue of a Linux CAN interface has space for 10 frames, and a delayed thread may handle two timer
+events in succession.
 """
 TWICE_NS: Final = 3_000_000
-"""Maximum time between the two deliveries of one frame, ns: the duration of two maximum-length frames and an
-error frame at 125 kbit/s.
+"""Maximum time between two receptions of the same frame, ns: the duration of two frames of maximum length and
+an error frame at 125 kbit/s.
 
-A client that sends a genuine second acknowledgement has received more segments since the first.
+An intended second acknowledgement differs from the first, because the client has received more segments.
 """
 
 _LAST: Final = 0x80
@@ -51,7 +51,7 @@ _FIVE_ZEROS: Final = bytes(5)
 
 
 class _Client(IntEnum):
-    """Client sub-commands in a block upload (the lowest two bits)."""
+    """Client sub-commands in a block upload (the lowest two bits of a request)."""
 
     END = 1
     ACKNOWLEDGE = 2
@@ -59,34 +59,34 @@ class _Client(IntEnum):
 
 
 class _Upload(Enum):
-    """Event for which a block upload waits."""
+    """Event that a block upload is waiting for."""
 
     START = auto()
     TIME = auto()
-    """The time at which the next segment is due."""
+    """The next segment becomes due."""
     ACKNOWLEDGEMENT = auto()
     END = auto()
 
 
 @dataclass(frozen=True, slots=True)
 class Upload:
-    """Value of a block upload, and the options that the client requested."""
+    """Value to be sent by a block upload, and the options that the client requested."""
 
     data: bytes
-    """The value."""
+    """Value to be sent."""
     block_size: int
-    """Segments per block until the client requests another number."""
+    """Number of segments per block, which the client can change in each acknowledgement."""
     crc: bool
-    """Whether the client offers a CRC."""
+    """Whether the client supports a CRC."""
 
 
 class BlockUpload(Transfer):
-    """Block upload, which sends the response to the initiate request itself.
+    """Block upload; its constructor sends the response to the initiate request.
 
     Args:
         channel: the server channel.
         target: the object.
-        upload: its value and the client's options.
+        upload: value of the object, and the options that the client requested.
         t_ns: when the initiate request was received, ns.
 
     Raises:
@@ -97,14 +97,15 @@ class BlockUpload(Transfer):
         super().__init__(channel, target, t_ns)
         data, crc = upload.data, upload.crc
         self._data, self._crc = data, crc
-        self._segments = max(1, -(-len(data) // SEGMENT_BYTES))  # an empty value also takes one segment
+        self._segments = max(1, -(-len(data) // SEGMENT_BYTES))  # even an empty value needs one segment
         self._block_size = _checked(upload.block_size)
-        self._first = 0  # segments sent before the current block
+        self._first = 0  # number of acknowledged segments before the current block
         self._pace_ns = SEGMENT_NS
-        self._sent = 0  # segments of the current block sent so far
+        self._sent = 0  # number of segments of the current block sent so far
         self._waits_for = _Upload.START
         self._previous, self._previous_ns = b"", t_ns
-        # Both sides must offer a CRC. Some clients expect a CRC they did not request if the server offers it.
+        # The server offers a CRC only if the client does: some clients expect a CRC whenever the server
+        # offers it, even if they have not requested one.
         channel.send(MULTIPLEXER_U32.pack(0xC2 | crc << 2, target.index, target.subindex, len(data)))
 
     def wants(self, request: bytes) -> bool:
@@ -129,7 +130,7 @@ class BlockUpload(Transfer):
         return False
 
     def on_timer(self, t_ns: int) -> None:
-        """Send the segments that are due at ``t_ns``, or abort if the client has been silent for too long."""
+        """Send the segments that are due at ``t_ns``, or abort if the client has not responded."""
         if self._waits_for is not _Upload.TIME:
             super().on_timer(t_ns)
         due_ns = max(self.deadline_ns, t_ns - (SEGMENTS_AT_ONCE - 1) * self._pace_ns)
@@ -152,7 +153,7 @@ class BlockUpload(Transfer):
         head = self._sent + 1 | (_LAST if last else 0)
         try:
             self._channel.send(bytes((head,)) + segment.ljust(SEGMENT_BYTES, b"\0"))
-        except BusError:  # the segment was not sent and is repeated
+        except BusError:  # the segment was not sent, so it will be sent again
             self._pace_ns = min(2 * self._pace_ns, SLOWEST_SEGMENT_NS)
             raise
         self._sent += 1
@@ -160,7 +161,7 @@ class BlockUpload(Transfer):
             self._waits_for = _Upload.ACKNOWLEDGEMENT
 
     def _acknowledge(self, received: int, block_size: int, t_ns: int) -> None:
-        """Continue after segment ``received`` of the block; later segments are sent again."""
+        """Continue after segment ``received`` of the current block, which the client received last."""
         if received > self._sent:
             raise Refused(AbortCode.INVALID_SEQUENCE)
         self._block_size = _checked(block_size)
@@ -176,20 +177,20 @@ class BlockUpload(Transfer):
 
 
 class BlockDownload(Transfer):
-    """Block download, which sends the response to the initiate request itself.
+    """Block download; its constructor sends the response to the initiate request.
 
-    Each block is acknowledged at its end with the number of the last segment before a gap. If a client does
-    not reach the end of a block, the transfer times out.
+    At the end of each block, the server acknowledges the last segment before any gap. If the end of a block
+    is lost, the transfer times out.
 
     Args:
         channel: the server channel.
         target: the object.
         announced: size announced by the client, bytes; None if it announced no size.
         t_ns: when the initiate request was received, ns.
-        crc: whether the client offers a CRC.
+        crc: whether the client supports a CRC.
 
     Raises:
-        Refused: if the object is not writable or does not accept that size.
+        Refused: if the object is not writable or does not accept a value of the announced size.
     """
 
     def __init__(
@@ -198,20 +199,21 @@ class BlockDownload(Transfer):
         super().__init__(channel, target, t_ns)
         self._incoming = Incoming(channel.store, target, announced)
         self._crc = crc
-        self._received = 0  # segments of the current block received without a gap
+        self._received = 0  # number of segments of the current block received without a gap
         self._last: bytes | None = (
-            None  # last segment of the transfer; the end request gives the number of its data bytes
+            None  # last segment of the transfer; only the end request contains the number of its data bytes
         )
-        self._previous = b""  # the last request, if it was acknowledged
+        self._previous = b""  # the last request if it was acknowledged, so that its repetition can be ignored
         channel.send(MULTIPLEXER_U32.pack(0xA0 | crc << 2, target.index, target.subindex, MAX_BLOCK_SEGMENTS))
 
     def wants(self, request: bytes) -> bool:
-        """Return whether a frame belongs to the transfer; during a block every frame is a segment."""
+        """Return whether a frame belongs to this transfer; within a block, every frame is a segment."""
         return self._last is None or _is_end(request) or request == self._previous
 
     def on_request(self, request: bytes, t_ns: int) -> bool:
         """Handle a frame that belongs to the transfer; return whether the transfer is over."""
-        if self._last is not None and _is_end(request):  # first: it may equal the previous frame
+        # Checked first, because an end request may equal the previous frame.
+        if self._last is not None and _is_end(request):
             self._end(request, self._last)
             return True
         if request == self._previous:

@@ -1,7 +1,8 @@
-"""SDO server (CiA 301 v4.2, 7.2.4.3): starts all transfers, and runs expedited and segmented transfers.
+"""SDO server (CiA 301 v4.2, 7.2.4.3), with expedited and segmented transfers.
 
-Block transfer is in :mod:`skinnode.node.sdo.block`. The canopen library's SDO server is not used, because it
-does not answer an unknown first command with an abort, and supports neither a time-out nor block transfer.
+Block transfers are in :mod:`skinnode.node.sdo.block`. The SDO server of the ``canopen`` library is not used,
+because it does not abort a transfer that starts with an unknown command, and because it supports neither a
+time-out nor block transfers.
 """
 
 from __future__ import annotations
@@ -18,7 +19,8 @@ from skinnode.node.sdo.block import BlockDownload, BlockUpload, Upload
 from skinnode.node.sdo.transfer import MULTIPLEXER, MULTIPLEXER_U32, Channel, Incoming, Target, Transfer
 
 TIMEOUT_NS: Final = 1_000_000_000
-"""Maximum pause of a client before its transfer is aborted, ns; CiA 301 does not define this time."""
+"""Maximum time between two requests of a client before its transfer is aborted, ns; CiA 301 does not define
+this time."""
 
 _TOGGLE: Final = 0x10
 
@@ -35,19 +37,19 @@ class _Client(IntEnum):
 
 
 _NAMELESS: Final = (0, 3, 5, 6)
-"""Command specifiers of requests that continue a transfer and do not name an object."""
+"""Command specifiers of requests that continue a transfer and therefore contain no index."""
 
 
 class SdoServer:
-    """SDO server with one channel to the object dictionary, which serves one transfer at a time.
+    """SDO server with one channel, which performs one transfer at a time.
 
-    A new initiate request ends an unfinished transfer, because it shows that the client has given up. An
-    error raised by ``send`` propagates to the caller, and the next call continues the transfer.
+    An initiate request ends an unfinished transfer, because it shows that the client has abandoned that
+    transfer. An error raised by ``send`` propagates to the caller; the next call then continues the transfer.
 
     Args:
         store: object dictionary.
         send: called with the eight bytes of each response.
-        timeout_ns: maximum client pause, ns.
+        timeout_ns: maximum time between two requests of a client, ns.
     """
 
     def __init__(
@@ -62,11 +64,11 @@ class SdoServer:
         return self._transfer.deadline_ns if self._transfer is not None else NO_DEADLINE_NS
 
     def reset(self) -> None:
-        """Drop a transfer in progress without sending an abort."""
+        """End a transfer in progress without sending an abort."""
         self._transfer = None
 
     def on_timer(self, t_ns: int) -> None:
-        """Continue a block upload at ``t_ns``, or abort the transfer of a silent client."""
+        """Continue a block upload if this is due at ``t_ns``, or abort a transfer that has timed out."""
         transfer = self._transfer
         if transfer is not None and t_ns >= transfer.deadline_ns:
             try:
@@ -75,7 +77,7 @@ class SdoServer:
                 self._abort(transfer.target, refused.code)
 
     def on_request(self, request: bytes, t_ns: int) -> None:
-        """Handle a client request. An abort receives no response.
+        """Handle a request from the client. An abort has no response.
 
         Args:
             request: eight bytes.
@@ -128,7 +130,7 @@ class SdoServer:
 
     def _start_upload(self, target: Target, data: bytes, t_ns: int) -> None:
         size = len(data)
-        if 1 <= size <= 4:  # an expedited response cannot distinguish 0 from 4 bytes
+        if 1 <= size <= 4:  # an expedited response cannot contain an empty value
             head = MULTIPLEXER.pack(0x43 | (4 - size) << 2, target.index, target.subindex)
             self._channel.send(head + data.ljust(4, b"\0"))
         else:
@@ -137,7 +139,7 @@ class SdoServer:
     def _block_upload(self, request: bytes, target: Target, t_ns: int) -> None:
         data = self._read(target)
         block_size, switch_threshold, crc = request[4], request[5], bool(request[0] & 4)
-        if 0 < len(data) <= switch_threshold:  # the client prefers a segmented transfer up to this size
+        if 0 < len(data) <= switch_threshold:  # up to this size, the client prefers a segmented transfer
             self._start_upload(target, data, t_ns)
         else:
             self._transfer = BlockUpload(self._channel, target, Upload(data, block_size, crc), t_ns)
@@ -150,7 +152,7 @@ class SdoServer:
             self._transfer = _Download(self._channel, target, announced, t_ns)
             return
         store = self._channel.store
-        # If the request gives no size, the length of the object applies, up to four bytes.
+        # If the request contains no size, the size is the length of the object, but at most four bytes.
         index, subindex = target.index, target.subindex
         size = 4 - (command >> 2 & 3) if size_given else min(store.lengths(index, subindex).most, 4)
         store.write(index, subindex, request[4 : 4 + size])
@@ -158,7 +160,7 @@ class SdoServer:
 
 
 class _Upload(Transfer):
-    """Segmented upload, seven bytes per request."""
+    """Segmented upload, which sends up to seven bytes of the value per request."""
 
     def __init__(self, channel: Channel, target: Target, data: bytes, t_ns: int) -> None:
         super().__init__(channel, target, t_ns)
@@ -184,7 +186,7 @@ class _Upload(Transfer):
 
 
 class _Download(Transfer):
-    """Segmented download, seven bytes per request."""
+    """Segmented download, which receives up to seven bytes of the value per request."""
 
     def __init__(self, channel: Channel, target: Target, announced: int | None, t_ns: int) -> None:
         super().__init__(channel, target, t_ns)

@@ -1,4 +1,4 @@
-"""Parts shared by all SDO transfers: channel, time-out, and the value collected by a download."""
+"""Classes that all SDO transfers share: channel, base class with time-out, and value of a download."""
 
 from __future__ import annotations
 
@@ -12,26 +12,26 @@ from skinnode.canopen.abort import AbortCode, Refused
 from skinnode.node.object_dictionary import ObjectStore
 
 MULTIPLEXER: Final = struct.Struct("<BHB")
-"""Command, index and sub-index, which begin an initiate request and its response."""
+"""Format of the first four bytes of an initiate request and its response: command, index and sub-index."""
 MULTIPLEXER_U32: Final = struct.Struct("<BHBI")
-"""Command, index, sub-index, and four more bytes that hold a size or an abort code."""
+"""Format of a message with command, index, sub-index, and a 32-bit size or abort code."""
 
 
 @dataclass(frozen=True, slots=True)
 class Channel:
-    """One SDO server channel."""
+    """SDO server channel of a node."""
 
     store: ObjectStore
     """Object dictionary."""
     send: Callable[[bytes], None]
-    """Function called with the eight bytes of each response."""
+    """Function that sends a response of eight bytes."""
     timeout_ns: int
-    """Maximum client pause, ns."""
+    """Maximum time between two requests of a client, ns."""
 
 
 @dataclass(frozen=True, slots=True)
 class Target:
-    """Object that a transfer reads or writes."""
+    """Index and sub-index that a transfer reads or writes."""
 
     index: int
     """Index of the object."""
@@ -40,7 +40,7 @@ class Target:
 
 
 class Transfer(ABC):
-    """Transfer that takes more than one request, and raises Refused to abort.
+    """Base class of transfers with more than one request. A transfer raises Refused to be aborted.
 
     Args:
         channel: the server channel.
@@ -64,10 +64,10 @@ class Transfer(ABC):
         """Handle a frame that belongs to the transfer; return whether the transfer is over."""
 
     def on_timer(self, t_ns: int) -> None:
-        """Abort the transfer, because the client has been silent for too long.
+        """Abort the transfer, because the client has sent no request before the time-out.
 
         Raises:
-            Refused: always; a transfer that sends on a timer overrides this method.
+            Refused: always; a transfer that also sends at timer events overrides this method.
         """
         raise Refused(AbortCode.TIMED_OUT)
 
@@ -76,7 +76,7 @@ class Transfer(ABC):
 
 
 class Incoming:
-    """Value of a download, collected until it is complete and then stored as a whole.
+    """Value that a download receives in parts and writes to the object as a whole.
 
     Args:
         store: object dictionary.
@@ -84,7 +84,7 @@ class Incoming:
         announced: size announced by the client, bytes; None if it announced no size.
 
     Raises:
-        Refused: if the object is not writable or does not accept that size.
+        Refused: if the object is not writable or does not accept a value of the announced size.
     """
 
     def __init__(self, store: ObjectStore, target: Target, announced: int | None) -> None:
@@ -94,10 +94,10 @@ class Incoming:
         if announced is not None:
             self._lengths.check(announced)
         self.data = bytearray()
-        """Bytes collected so far."""
+        """Bytes received so far."""
 
     def extend(self, part: bytes) -> None:
-        """Add a part.
+        """Append a part of the value.
 
         Raises:
             Refused: if the value is too long.
@@ -108,7 +108,7 @@ class Incoming:
             raise Refused(AbortCode.TOO_LONG)
 
     def store(self) -> None:
-        """Write the complete value.
+        """Write the complete value to the object.
 
         Raises:
             Refused: if the value is too short or not allowed.

@@ -11,7 +11,7 @@ multiplying our counts by 31 yields the cost with finite differences. Calls per 
 samples except the last, as in the paper. The accuracy is the RMS error ‖X − X*‖ / ‖X* − X(0)‖, averaged over
 the experiments that converged. The first-order optimality is computed for r = a F − 1, which is
 dimensionless, with lengths in pitches. MATLAB computes the optimality of F, which is larger by a factor of F²
-and depends on the unit of length. The paper does not state this unit.
+and depends on the unit of length, which the paper does not state.
 
 Settings: At the paper's press depth of 10 %, our Gauss-Newton never fails: on ``aligned`` with h = 0.3, 0.4 …
 1, it solves all 10 experiments with any number of steps. The hardest ``aligned`` setting at that depth is

@@ -181,7 +181,7 @@ def run(minutes: float, seed: int, report: Callable[[str], None]) -> dict[str, A
                     *sums.injected_otherwise(stats, injected),
                     *sums.received_otherwise(fleet, counter, before),
                 ]
-            time.sleep(CALM_S)  # until the host's last frames have reached the nodes
+            time.sleep(CALM_S)  # wait until the host's last frames have reached the nodes
         wrong += sums.sent_otherwise(fleet, counter)
     finally:
         kept.setLevel(level)

@@ -15,13 +15,13 @@ fails with a probability of 1e-4:
 - No coordinate exceeds z(n) or 5 standard deviations, whichever is larger. z(n) is the limit that any of n
   independent coordinates exceeds with probability 1e-4: 5.7 for 9,000 coordinates and 6.4 for 1e6. The
   limit is Bonferroni's bound; correlated coordinates only decrease the probability.
-- The number of seeds with a coordinate beyond 5 is within the limit of a binomial distribution. The
-  probability of the distribution is the expected number of such coordinates per seed (an upper bound). Seeds
-  are independent even though coordinates are not.
+- The number of seeds with an error beyond 5 standard deviations is within the limit of a binomial
+  distribution. The probability of the distribution is the expected number of such errors per seed (an upper
+  bound). Seeds are independent even though coordinates are not.
 
-If the second condition fails, every wire with an error beyond 5 is wrong. With exact data, there is no
-chance: the limit is 5 reported standard deviations or 1e-6 of the wire's largest displacement, whichever is
-larger.
+If the second condition fails, every wire with an error beyond 5 standard deviations is wrong. With exact
+data, chance plays no role: the limit is 5 reported standard deviations or 1e-6 of the wire's largest
+displacement, whichever is larger.
 """
 
 from __future__ import annotations
@@ -79,7 +79,7 @@ def limit_of(coordinates: int) -> float:
 
 
 def allowed_seeds(coordinates: int, seeds: int) -> int:
-    """Return the maximum number of seeds in which chance can explain a coordinate beyond 5."""
+    """Return the maximum number of seeds in which chance can explain an error beyond 5 deviations."""
     from scipy.stats import binom
 
     if seeds == 0:
@@ -101,7 +101,7 @@ class Tally:
     _reported: list[float] = field(default_factory=list)
     _worst_error: float = math.nan
     _deviations: list[tuple[float, int, int, int]] = field(default_factory=list)
-    """Wires with an error beyond 5, as (error in standard deviations or inf, seed, frame, wire)."""
+    """Wires with an error beyond :data:`LIMIT`: (error in deviations or inf, seed, frame, wire)."""
 
     def add(self, seed: int, solved: Solved, truth_m: Float) -> None:
         """Add a seed's result; frames whose true displacement ``truth_m`` (F, U, N, 3) is NaN are ignored."""

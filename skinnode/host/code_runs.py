@@ -30,15 +30,15 @@ or the crossing itself, is frozen. ``STEPS``: highest code of a measurement. ``F
 every code, 0 if unchanged codes were not sent and a repeated code is therefore no evidence."""
 MEASURED, CHANGED, RETURNED, LARGEST, RESERVED, LEAST, RELEASED, SUSPECT = range(8)
 """Indices of the results. ``MEASURED``, ``CHANGED`` and ``RETURNED``: number of crossings with a measurement,
-with a changed code, and with the code before the last change. ``LARGEST``: largest change of any code.
-``RESERVED``: number of crossings whose last code is reserved. ``LEAST``: smallest code. ``RELEASED``: number
-of changed crossings in parts detected as frozen. ``SUSPECT``: whether a further part may be frozen."""
+with a changed code, and with a code that returned to its previous value. ``LARGEST``: largest change of any
+code. ``RESERVED``: number of crossings whose last code is reserved. ``LEAST``: smallest code. ``RELEASED``:
+number of changed crossings in parts detected as frozen. ``SUSPECT``: whether a further part may be frozen."""
 
 LEAST_RUN: Final = 5
-"""Minimum run of a frozen crossing, of a frozen part without noise and of a frozen patch, scans. A frozen
-wire whose neighbours have changed needs only a run of one scan."""
+"""Minimum run of a frozen crossing, of a frozen part without noise and of a frozen patch, scans. For a wire
+whose neighbours have changed, a run of one scan is enough."""
 LEADS: Final = 3
-"""Minimum number of crossings with changed neighbours on a wire detected as frozen by movement."""
+"""Minimum number of crossings with changed neighbours for a wire with constant codes to count as frozen."""
 
 _Int = NDArray[np.int64]
 

@@ -1,10 +1,10 @@
 """Detect whether a patch's converter is running, from the conversion phase and from repeated codes.
 
 **Phase.** Some patches count their conversions and send the conversion phase
-(:attr:`~skinnode.protocol.summary.SummaryFlag.CONVERSIONS`). If two successive scans of such a patch have the
-same phase and the same codes, they contain the same conversion. After missed scans or a lost summary, an
-equal phase proves nothing, because any phase may follow. A different phase always proves that a conversion
-took place.
+(:attr:`~skinnode.protocol.summary.SummaryFlag.CONVERSIONS`). If two successive scans of a patch have the same
+phase and the same codes, they contain the same conversion. After missed scans or a lost summary, an equal
+phase proves nothing, because any phase may follow. A different phase always proves that a conversion took
+place.
 
 **Repeats.** Without a phase, the decision must be based on the codes. A run is a sequence of scans in which
 no code changes. A run counts as frozen if a live converter would produce the run with a probability below

@@ -58,7 +58,7 @@ WIRE_LEAD: Final = 64
 simulated presses."""
 _NEVER: Final = 2**62
 _OTHERS: Final = 0.75
-"""Minimum fraction of the other crossings that must have repeated for less than a quarter as long."""
+"""Minimum fraction of the other crossings whose runs are shorter than a quarter of the frozen part's run."""
 
 
 class FrozenParts:
@@ -87,8 +87,8 @@ class FrozenParts:
 
         Args:
             measured: Noise measured over recent windows, codes; 0 if no noise was measurable.
-            least: Smallest code of a scan. Its noise is the smallest, because noise is proportional to the
-                resistance.
+            least: Smallest code of a scan. The smallest code has the lowest noise, because noise is
+                proportional to the resistance.
         """
         ratio = max(self._scale.lo + least * self._scale.step, self._scale.step)
         self._log_stay = log_stay(ratio * max(self._stated / QUIETER, 0.5 * measured))
@@ -128,7 +128,7 @@ class FrozenParts:
     def _wire(
         self, known: NDArray[np.bool_], run: NDArray[np.int64], lead: NDArray[np.int64], at: Any, limit: int
     ) -> float | None:
-        """Return the log probability that a live wire repeats these codes; None if the wire is not frozen."""
+        """Return the log probability that a live wire repeats its codes so long; None if it is not frozen."""
         here = known[at]
         if not here.any() or (least := int(run[at][here].min())) < 1:
             return None

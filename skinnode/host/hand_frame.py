@@ -221,7 +221,7 @@ class HandSubscription:
     """Subscription to hand frames, read with ``for``, ``async for`` or :meth:`get`.
 
     A slow reader loses the oldest fields, which are counted in ``dropped``, and receives hand frames with
-    missing fields. Only one thread may read.
+    missing fields. Only one thread may read the subscription.
     """
 
     def __init__(self, fields: Subscription, gatherer: HandGatherer, timeout_s: float | None) -> None:

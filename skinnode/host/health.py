@@ -58,7 +58,7 @@ class Condition(enum.StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class PatchHealth:
-    """Health of a patch at one instant. An age is None if no such frame has been received."""
+    """Health of a patch at one instant. The age of a heartbeat or scan is None if none has been received."""
 
     patch: str
     node_id: int
@@ -91,7 +91,7 @@ class PatchHealth:
     wires: tuple[WireFault, ...] = ()
     """Faults of open, shorted, noisy and drifting wires."""
     alive: Alive = Alive.CANNOT_TELL
-    """Whether the patch's converter is running. If it is not running, the condition is ``frozen``."""
+    """Whether the patch's converter is running. If the value is ``no``, the condition is ``frozen``."""
     life: str = ""
     """Reason why the converter may not be running, in words; empty if it is running."""
     faults: tuple[DataFault, ...] = ()

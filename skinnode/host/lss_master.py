@@ -62,7 +62,9 @@ class LssFailed(BusError):
 
 
 class LssMaster:
-    """LSS master on one bus. Sends with ``send``; frames with COB-ID 0x7E4 go to :meth:`on_response`.
+    """LSS master on one bus.
+
+    Requests are sent with ``send``; responses (COB-ID 0x7E4) must be passed to :meth:`on_response`.
 
     Threads: only one thread at a time may use the master, except that concurrent calls to
     :meth:`give_node_id` are serialised. The mainline calls :meth:`on_response`.

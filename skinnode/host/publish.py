@@ -43,7 +43,7 @@ class Subscription:
 
     If the subscription's queue is full, its oldest field is dropped and counted in ``dropped``. The
     subscription ends with :meth:`close`, at the end of a ``with`` block, or when the last reference to it is
-    deleted. Any thread or event loop may read.
+    deleted. Any thread or event loop may read the subscription.
     """
 
     def __init__(self, capacity: int, timeout_s: float | None, patches: frozenset[str]) -> None:

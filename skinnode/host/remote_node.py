@@ -32,7 +32,7 @@ node-ID prolongs a failed bring-up by at least two such waits."""
 _MUTE_S: Final = 0.4
 _MUTE_SCANS: Final = 5
 """Time without a scan after which a node's configuration is read back: ``_MUTE_S`` seconds or ``_MUTE_SCANS``
-SYNC periods, whichever is longer. The stream must recover within a second."""
+SYNC periods, whichever is longer. The time is short, because the stream must recover within a second."""
 
 
 class RemoteNode:

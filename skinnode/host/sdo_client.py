@@ -95,7 +95,7 @@ class SkinNetwork(canopen.Network):
 class RemoteOd:
     """Object dictionary of a remote node, read and written by SDO.
 
-    Values have one of the types ``u8 u16 u32 f32``. ``abandoned`` is called after each segment. If the result
+    Values have one of the types ``u8 u16 u32 f32``. ``abandoned`` is called after each segment; if the result
     is True, the transfer is aborted and Abandoned is raised. A transfer is also retried after an exception
     that was not caused by a response from the node.
 
@@ -109,7 +109,7 @@ class RemoteOd:
     Raises:
         NodeTimeout: if the node does not respond; raised by all methods.
         SdoAbort: if the node aborts the transfer; raised by all methods.
-        NodeError: if a value is malformed, too long or without end; raised by all methods.
+        NodeError: if a value is malformed or too long, or a transfer takes too long; raised by all methods.
     """
 
     def __init__(

@@ -49,10 +49,10 @@ _TURN_S: Final = 0.02
 
 
 class Supervisor:
-    """Supervisor of all nodes, from construction until :meth:`close`. Also sends the host's heartbeats.
+    """Supervisor of all nodes, from construction until :meth:`close`.
 
-    Threads: one thread makes all decisions; a pool runs the jobs that wait for nodes; any thread may call
-    :meth:`stats`.
+    The supervisor also sends the host's heartbeats. Threads: one thread makes all decisions; a pool runs the
+    jobs that wait for nodes; any thread may call :meth:`stats`.
 
     Args:
         nodes: All nodes of the hand.

@@ -63,7 +63,7 @@ class Ticks:
 
 
 class SyncFollower:
-    """Follower of another producer, which stores its SYNC messages in ``ticks``. Mainline only."""
+    """Follower that stores another producer's SYNC messages in ``ticks``. Mainline only."""
 
     def __init__(self, ticks: Ticks) -> None:
         self._ticks = ticks

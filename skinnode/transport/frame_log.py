@@ -95,7 +95,7 @@ class FrameLog:
             os.fsync(self._file.fileno())
 
     def close(self) -> None:
-        """Close the file. Raises nothing, because earlier calls have already reported any write error."""
+        """Close the file. No exception is raised, because earlier calls have already reported any error."""
         with contextlib.suppress(OSError):
             self.flush(to_disk=True)
         with contextlib.suppress(OSError):

@@ -4,7 +4,7 @@
 
     runner (thread, CAN port) -> device (a frame to its service) -> one file per service -> device -> runner
 
-The sub-package ``patch`` is the application on top of the services: it samples the skin and sends scans.
+The sub-package ``patch`` is the application that uses these services: it samples the skin and sends scans.
 """
 
 from skinnode.canopen.lss import NOT_CONFIGURED

@@ -1,4 +1,4 @@
-"""Acquisition of codes from the analogue port: sampling and tare."""
+"""Acquisition of a patch's codes from its analogue port: sampling and tare."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from skinnode.protocol.profile import PatchProfile
 from skinnode.protocol.summary import PHASES
 
 TARE_READS: Final = 16
-"""Number of readings averaged for a baseline; its noise, a quarter of that of one reading, adds 3 % to the
-noise of R/R0."""
+"""Number of readings averaged for a baseline. The baseline's noise is a quarter of the noise of one reading,
+and increases the noise of R/R0 by 3 %."""
 
 
 class Acquisition:
-    """Acquisition stage that reads a source and keeps the last codes and the baseline.
+    """Acquisition of codes from a source; keeps the codes of the last scan and the baseline.
 
     Args:
         profile: sizes of the patch.
@@ -39,26 +39,27 @@ class Acquisition:
         self.profile, self._source, self.scale = profile, source, scale
         shape = profile.rows, profile.columns
         self.tared = baseline_ohm is not None
-        """Whether there is a baseline."""
+        """Whether the patch has a baseline."""
         given = (
             np.zeros(shape) if baseline_ohm is None else require_array("baseline_ohm", baseline_ohm, shape)
         )
         if (given < 0).any():
             raise ValueError(f"baseline_ohm: got {given.min()}, must not be negative")
         self.baseline_ohm: NDArray[np.float32] = given.astype(np.float32)
-        """(U, K) R0 as stored in the object dictionary, ohm; 0 where there is no R0."""
+        """(U, K) baseline R0 with the precision of the object dictionary, ohm; 0 where R0 is unknown."""
         self.codes: Codes = np.full(shape, scale.open, dtype=np.uint32)
-        """(U, K) codes of the last scan; all open before the first scan."""
+        """(U, K) codes of the last scan; before the first scan, all codes are open."""
         self.faults = WireFaults.none(profile)
         """Wire faults of the last scan."""
         self.phase = 0
         """Conversion phase of the last scan; 0 if the source does not count its conversions."""
-        self._conversions: int | None = None  # of the source, at the last scan
+        # Number of conversions that the source had completed at the last scan.
+        self._conversions: int | None = None
         self.selection = ChunkSelection(profile, scale)
-        """Selection of the chunks to send if only changed chunks are sent."""
+        """Selector of the chunks to send, for the send mode in which only changed chunks are sent."""
 
     def read(self, t_ns: int) -> Float:
-        """Return (U, K) resistances at ``t_ns``, ohm.
+        """Read the source and return (U, K) resistances at ``t_ns``, ohm.
 
         Raises:
             SourceFailed: if the source returns no valid reading.
@@ -66,7 +67,7 @@ class Acquisition:
         return read_source(self._source, (self.profile.rows, self.profile.columns), t_ns)
 
     def sample(self, t_ns: int, readings: int = 1) -> None:
-        """Take a scan by encoding the mean of one or more readings.
+        """Take a scan: read the source once or several times, and encode the mean.
 
         Args:
             t_ns: current time, ns.
@@ -86,7 +87,7 @@ class Acquisition:
         self.faults = find_faults(self.codes, self.scale)
 
     def _total(self, t_ns: int, readings: int) -> Float:
-        """Return the sum of the readings; NaN, which counts as open, where infinities cancel."""
+        """Return the (U, K) sum of several readings, ohm; NaN, which counts as open, for ∞ − ∞."""
         total = self.read(t_ns)
         with np.errstate(over="ignore", invalid="ignore"):
             for _ in range(readings - 1):
@@ -94,7 +95,7 @@ class Acquisition:
         return total
 
     def tare(self, t_ns: int, readings: int = TARE_READS) -> None:
-        """Make the current resistances the baseline. Crossings without a valid resistance keep their R0.
+        """Make the current resistances the baseline. A crossing without a valid resistance keeps its R0.
 
         Args:
             t_ns: current time, ns.
@@ -105,7 +106,7 @@ class Acquisition:
         """
         with np.errstate(
             over="ignore", under="ignore"
-        ):  # values that REAL32 cannot hold are not valid resistances
+        ):  # a value that overflows REAL32 is not a valid resistance
             mean = (self._total(t_ns, readings) / readings).astype(np.float32)
         measured = np.isfinite(mean) & (mean > 0)
         self.baseline_ohm = np.where(measured, mean, self.baseline_ohm)
@@ -113,13 +114,13 @@ class Acquisition:
         self.selection.forget()
 
     def set_baseline(self, row: int, column: int, value_ohm: float) -> None:
-        """Set one R0, ohm; the client must then set all others too, as the node no longer tares by itself."""
+        """Set R0 of one crossing, ohm. Afterwards, the node does not tare without a command."""
         self.baseline_ohm[row, column] = value_ohm
         self.tared = True
         self.selection.forget()
 
     def set_baselines(self, values_ohm: NDArray[np.float32]) -> None:
-        """Set the whole baseline, (U, K) ohm."""
+        """Set the baseline of all crossings, (U, K) ohm."""
         self.baseline_ohm = values_ohm
         self.tared = True
         self.selection.forget()

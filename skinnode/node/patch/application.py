@@ -1,7 +1,7 @@
-"""Patch application, which takes scans (at SYNC, on its own timer or on command), tares, and tests itself.
+"""Patch application, which takes scans (at SYNC, by timer or on command), tares, and performs self-tests.
 
-:mod:`skinnode.node.patch.objects` binds the manufacturer objects (0x2000 to 0x2301). The CANopen
-communication around the application is in :mod:`skinnode.node.device`.
+The module :mod:`skinnode.node.patch.objects` connects the manufacturer objects (0x2000 to 0x2301) to the
+application. The CANopen communication services are in :mod:`skinnode.node.device`.
 """
 
 from __future__ import annotations
@@ -35,14 +35,14 @@ from skinnode.protocol.summary import SummaryFlag, conversion_flags
 
 
 class PatchApplication:
-    """Application of one patch, as defined by :class:`~skinnode.node.application.Application`.
+    """Application of one patch, which implements :class:`~skinnode.node.application.Application`.
 
     Args:
         layout: electrodes of the patch.
         serial: serial number (0x2000:11), u32.
-        acquisition: codes and baseline of the patch.
-        services: the services of the device.
-        pacing: timer precision, which determines how precisely chunks are paced.
+        acquisition: acquisition of the patch's codes, with its baseline.
+        services: services that the device provides.
+        pacing: timer precision of the node, with which chunks are paced.
     """
 
     def __init__(
@@ -73,10 +73,11 @@ class PatchApplication:
         self._baseline_changed = False
         self._test = SELF_TEST_NEVER_RUN
         self.overruns = 0
-        """Number of scans skipped because two earlier scans were still unsent."""
+        """Number of scans skipped because two earlier scans had not been sent completely."""
         self.slow_overruns = 0
-        """Number of overruns caused by a slow computer or bus, not by a scan period that is too short."""
-        self._scan_ns = NO_DEADLINE_NS  # time of the next scan triggered by the node's own timer
+        """Number of scans skipped because the computer or the bus is too slow, not because the scan period is
+        too short."""
+        self._scan_ns = NO_DEADLINE_NS  # time of the next scan that the node's timer triggers
         describe(services.store, layout, acquisition.scale, serial)
         self._connect()
 
@@ -84,16 +85,16 @@ class PatchApplication:
 
     @property
     def deadline_ns(self) -> int:
-        """Time at which :meth:`on_timer` must next take or send a scan, ns."""
+        """Time at which :meth:`on_timer` must be called next to take or send a scan, ns."""
         return min(self._scan_ns, self.stream.deadline_ns)
 
     @property
     def baseline_ohm(self) -> Float:
-        """(U, K) R0 in use, ohm; 0 where there is none."""
+        """(U, K) baseline R0 in use, ohm; 0 where R0 is unknown."""
         return self._acquisition.baseline_ohm.astype(np.float64)
 
     def power_on(self, t_ns: int) -> None:
-        """Load the baseline from the memory, or tare if the memory holds none.
+        """Load the baseline from the memory; if there is none, tare unless a baseline was given.
 
         Args:
             t_ns: current time, ns.
@@ -107,7 +108,7 @@ class PatchApplication:
                 self._storage.keep_baseline()
 
     def reset(self) -> None:
-        """Restart the scan numbers, and report current faults again."""
+        """Restart the scan counter, and report faults that are still present again."""
         self._counter, self._late = -1, False
         self._wire_faults.reset()
         self._test = SELF_TEST_NEVER_RUN
@@ -124,7 +125,7 @@ class PatchApplication:
         self._plan()
 
     def on_sync(self, counter: int | None, turns: frozenset[int], t_ns: int) -> None:
-        """Take a scan at a SYNC in OPERATIONAL, unless the node scans on its own timer.
+        """Take a scan at a SYNC in OPERATIONAL, unless the node's timer triggers the scans.
 
         Args:
             counter: the SYNC counter; None if SYNC carries none.
@@ -132,13 +133,13 @@ class PatchApplication:
             t_ns: when the SYNC was received, ns.
         """
         scans = not self._period_ns
-        if not scans or self.stream.full:  # otherwise the new scan sends its summary at this SYNC
+        if not scans or self.stream.full:  # otherwise the new scan's summary is sent at this SYNC
             self.stream.on_sync(turns, t_ns)
         if scans:
             self._scan(self._following() if counter is None else counter, turns, t_ns)
 
     def on_timer(self, t_ns: int) -> None:
-        """Send the chunks and summaries that are due at ``t_ns``, and take a scan if one is due."""
+        """Send the chunks and summaries that are due at ``t_ns``, and take a scan if a scan is due."""
         self.stream.on_timer(t_ns)
         if t_ns >= self._scan_ns:
             self._scan_ns = max(self._scan_ns + self._period_ns, t_ns)
@@ -161,13 +162,13 @@ class PatchApplication:
         return None
 
     def _new_baseline(self) -> None:
-        """Save a complete new baseline, measured or written, without waiting for a save command."""
+        """Announce and save a complete new baseline, without waiting for a save command."""
         self._mark_baseline()
         self._storage.keep_baseline()
         self._storage.report(self._now())
 
     def _mark_baseline(self) -> None:
-        """Make the next summary announce that the baseline has changed."""
+        """Set the flag of the next summary that announces a new baseline."""
         self._baseline_changed = True
 
     # --- scans
@@ -176,7 +177,7 @@ class PatchApplication:
         return self._counter + 1 & 0xFF
 
     def _scan(self, counter: int, turns: frozenset[int], t_ns: int) -> None:
-        """Take a scan now and queue it, or count it as skipped if another scan is already waiting."""
+        """Take a scan now and queue it, or skip the scan if another scan is already waiting."""
         self._counter = counter
         if self.stream.full:
             self.overruns += 1
@@ -201,18 +202,18 @@ class PatchApplication:
             self._end_overrun(t_ns)
 
     def _end_overrun(self, t_ns: int) -> None:
-        """Report the end of an overrun: the queue has room for the next scan, or no scan is due."""
+        """Report the end of an overrun, because the queue has space again or scanning has stopped."""
         self._late = False
         self._emcy.clear(EmcyCode.CAN_OVERRUN, t_ns)
 
     def _sample(self, counter: int, t_ns: int) -> tuple[list[bytes], SummaryFlag, Codes]:
         """Take a scan.
 
-        Returns the chunks to send, the summary flags, and the (U, K) codes that a receiver of all chunks then
-        holds. Raises SourceFailed if the source returns no valid reading.
+        Returns the chunks to send, the summary flags, and the (U, K) codes that a receiver must then have.
+        Raises SourceFailed if the source returns no valid reading.
         """
         store, acquisition = self._store, self._acquisition
-        if not acquisition.tared:  # the source failed at power-on
+        if not acquisition.tared:  # the source failed when the node tried to tare at power-on
             self._tare(t_ns)
             self._new_baseline()
         with self.source.watch(t_ns):
@@ -258,7 +259,7 @@ class PatchApplication:
             case od.SELF_TEST if value not in (0, od.SELF_TEST_SIGNATURE):
                 raise Refused(AbortCode.CANNOT_STORE)
             case od.SINGLE_SCAN if value:
-                # If the SYNC counter numbers the scans, a receiver would mistake this scan for the scan of
+                # If the SYNC counter numbers the scans, this scan would have the same number as the scan at
                 # the next SYNC.
                 numbered_by_sync = not self._period_ns and self._store.integer(od.SYNC_COUNTER_OVERFLOW)
                 if numbered_by_sync or not self._operational:

@@ -1,4 +1,4 @@
-"""Selection of the chunks to send under the send policy "changed chunks only" (object 0x2020)."""
+"""Selection of the chunks to send, for the send mode in which only changed chunks are sent (0x2020:1)."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ class ChunkSelection:
     """Selector of the chunks whose codes have changed since they were last sent.
 
     Args:
-        profile: Sizes of the patch.
-        scale: Mapping of R/R0 to codes.
+        profile: sizes of the patch.
+        scale: the mapping of R/R0 to codes.
     """
 
     def __init__(self, profile: PatchProfile, scale: CodeScale) -> None:
@@ -23,25 +23,26 @@ class ChunkSelection:
         self._since_full = 0  # number of scans since the last full scan
         self._full_scan_due = True
         self.sent: Codes = np.full((profile.rows, profile.columns), scale.open, dtype=np.uint32)
-        """(U, K) codes last sent in each chunk; all open before the first scan."""
+        """(U, K) codes that each chunk contained when it was last sent; before the first scan, all codes are
+        open."""
 
     def forget(self) -> None:
-        """Make the next scan a full scan, because the receiver might not hold the codes sent earlier."""
+        """Make the next scan a full scan, because the receiver may not have the codes sent before."""
         self._full_scan_due = True
 
     def changed_chunks(self, codes: Codes, threshold: int, full_every: int) -> list[int] | None:
         """Return the indices of the chunks to send, and record them as sent.
 
-        A chunk is selected if one of its codes has changed by more than the threshold since the chunk was
-        last sent, or has changed to or from a reserved code.
+        A chunk is selected if, since the chunk was last sent, one of its codes has changed by more than the
+        threshold, or to or from a reserved code.
 
         Args:
             codes: (U, K) codes of the scan.
-            threshold: Largest code change that does not cause a chunk to be sent.
-            full_every: Number of scans from one full scan to the next; 0 for no full scans.
+            threshold: maximum change of a code that does not cause its chunk to be sent.
+            full_every: number of scans from one full scan to the next; 0 for no further full scans.
 
         Returns:
-            Indices in ascending order; None if a full scan is due.
+            Indices of the chunks in ascending order; None if a full scan is due.
         """
         self._since_full += 1
         if self._full_scan_due or (full_every and self._since_full >= full_every):

@@ -1,4 +1,4 @@
-"""Lookup of sources by name, so that a user can add a source to a node without changing this project."""
+"""Lookup of sources by name, so that users can add sources without changing this project."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from skinnode.node.patch.source import ResistanceSource, SourceFailed, read_sour
 from skinnode.process import clock
 
 GROUP: Final = "skinnode.sources"
-"""Entry-point group in which installed packages register named sources."""
+"""Entry-point group in which installed packages register sources by name."""
 
 
 def registered() -> dict[str, importlib.metadata.EntryPoint]:
-    """Return the registered sources, by name."""
+    """Return the entry points of the registered sources, by name."""
     return {point.name: point for point in importlib.metadata.entry_points(group=GROUP)}
 
 
@@ -35,22 +35,22 @@ def load(reference: str, option: str) -> Any:
         found: Any = importlib.import_module(module)
         for part in name.split("."):
             found = getattr(found, part)
-    except (Exception, SystemExit) as error:  # importing a module can raise any exception
+    except (Exception, SystemExit) as error:  # user code can raise any exception
         raise ConfigError(option, reference, f"MODULE:NAME that can be imported ({_line(error)})") from error
     return found
 
 
 def make_source(name: str, layout: PatchLayout, option: str = "source") -> ResistanceSource:
-    """Create a source for a patch, and read it once to detect faults before the node is on the bus.
+    """Create a source for a patch, and read it once, to detect faults before the node starts.
 
     Args:
-        name: entry point, or ``MODULE:NAME``, of a class or function that takes the layout and returns a
-            :class:`~skinnode.node.patch.source.ResistanceSource`.
+        name: name of an entry point, or ``MODULE:NAME``. It refers to a class or function that takes the
+            layout and returns a :class:`~skinnode.node.patch.source.ResistanceSource`.
         layout: the electrodes of the patch.
         option: option name shown in the error.
 
     Raises:
-        ConfigError: if the source does not exist or does not work.
+        ConfigError: if the source is not found, cannot be created or returns no valid reading.
     """
     points = registered()
     if ":" in name:

@@ -1,6 +1,6 @@
-"""A patch as a CANopen device.
+"""CANopen node of a patch.
 
-Combines the device of :mod:`skinnode.node.device` with the application of
+A patch node combines the device in :mod:`skinnode.node.device` with the application in
 :mod:`skinnode.node.patch.application`.
 """
 
@@ -24,21 +24,21 @@ from skinnode.protocol.profile import PatchProfile
 
 
 class PatchNode(CanopenDevice):
-    """CANopen node of one patch. The node sends nothing until :meth:`power_on`.
+    """CANopen node of one patch. The node sends nothing before :meth:`power_on`.
 
     Args:
-        node_id: 1 to 127, or 255 to obtain a node-ID by LSS. A node-ID that LSS stored in the memory takes
-            precedence.
+        node_id: 1 to 127, or 255 to wait until LSS assigns a node-ID. If the memory contains a node-ID stored
+            by LSS, that node-ID is used instead.
         layout: electrodes of the patch, which determine the sizes of the object dictionary.
         source: analogue port of the patch, read once per scan.
         send: called with the COB-ID and payload of each frame that the node sends, in order.
         profile: wire format of the patch; by default the layout's format with 16-bit codes.
         serial: serial number (0x1018:4 and 0x2000:11), u32.
-        baseline_ohm: (U, K) initial R0, ohm; None to tare at the first power-on. A baseline in the memory
-            takes precedence.
-        pacing: :data:`~skinnode.node.clock.EXACT` for a board, THRIFTY for many nodes on one machine.
-        memory: keeps configuration, baseline and node-ID across a power cycle; None to keep nothing,
-            which 0x1010 then indicates.
+        baseline_ohm: (U, K) initial R0, ohm; None to tare at the first power-on. If the memory contains a
+            baseline, that baseline is used instead.
+        pacing: :data:`~skinnode.node.clock.EXACT` for a node on its own board,
+            :data:`~skinnode.node.clock.THRIFTY` for many nodes on one computer.
+        memory: memory for configuration, baseline and node-ID; None for a node that loses them at power-off.
         set_bit_rate: changes the bit rate (bit/s) for LSS; None if the node cannot change it.
 
     Raises:
@@ -87,12 +87,12 @@ class PatchNode(CanopenDevice):
 
     @property
     def baseline_ohm(self) -> Float:
-        """(U, K) R0 in use, ohm; 0 where there is none."""
+        """(U, K) baseline R0 in use, ohm; 0 where R0 is unknown."""
         return self._patch.baseline_ohm
 
     @property
     def source_failures(self) -> int:
-        """Number of failures of the source."""
+        """Number of scans, tares and self-test readings that failed because of the source."""
         return self._patch.source.failures
 
     @property
@@ -107,15 +107,15 @@ class PatchNode(CanopenDevice):
 
     @property
     def memory_problem(self) -> str:
-        """Latest problem with the memory, in one line; empty if there was no problem."""
+        """Latest problem with the memory, in one line; empty if no problem has occurred."""
         return self._storage.problem
 
     @property
     def overruns(self) -> int:
-        """Number of scans skipped because two earlier scans were still unsent."""
+        """Number of scans skipped because two earlier scans had not been sent completely."""
         return self._patch.overruns
 
     @property
     def slow_overruns(self) -> int:
-        """Number of overruns caused by a slow computer or bus."""
+        """Number of scans skipped because the computer or the bus is too slow."""
         return self._patch.slow_overruns

@@ -1,27 +1,27 @@
-"""Scan stream, which sends each scan as chunks paced by their TPDO's inhibit time, then its summary.
+"""Scan stream, which sends the chunks of each scan at the pace of the inhibit time, and then the summary.
 
-The TPDO whose first object is 0x2010 carries the chunks of a scan if it is event-driven or was due at the
-SYNC that started the scan. TPDOs whose first object is 0x2011 carry the summary after the chunks:
-event-driven TPDOs immediately, synchronous TPDOs immediately if they were due at that SYNC, otherwise at the
-next SYNC at which they are due. Event-driven TPDOs of other objects are also sent after the chunks.
+A TPDO whose first mapped object is 0x2010 carries the chunks of a scan if it is event-driven, or if it was
+due at the SYNC that started the scan. TPDOs whose first mapped object is 0x2011 carry the summary after the
+chunks. An event-driven summary TPDO is sent immediately after the chunks. So is a synchronous summary TPDO
+that was due at that SYNC; otherwise, it is sent at the next SYNC at which it is due. Event-driven TPDOs with
+other objects are also sent after the chunks.
 
-Pacing. The standard defines the inhibit time as a minimum interval. On a general-purpose operating system, a
-thread wakes late, so with a strict minimum interval a scan would take longer than its SYNC period. The stream
-therefore compensates for lateness of up to ``catch_up_ns``, if necessary with several frames at once, but
-never exceeds the mean rate (generic cell rate algorithm, ITU-T I.371). With ``catch_up_ns = 0`` the minimum
-interval is strict.
+**Pacing.** The standard defines the inhibit time as a minimum interval between frames. On a general-purpose
+operating system, however, threads wake up late, so that with a strict minimum interval a scan could take
+longer than the SYNC period. The stream therefore makes up for delays of up to ``catch_up_ns``, if necessary
+by sending several frames at once. Its mean frame rate never exceeds the rate set by the inhibit time (generic
+cell rate algorithm, ITU-T I.371). If ``catch_up_ns`` is 0, the minimum interval is strict.
 
-The node receives the time of a SYNC, but cannot measure how long the subsequent sampling takes. The node
-therefore requests a timer event immediately after the first chunk of a scan. This event supplies the current
-time, from which the interval to the second chunk is measured.
+The caller passes the time of a SYNC to the node, but the node cannot measure the time that the subsequent
+sampling takes. The stream therefore requests a timer event immediately after the first chunk of a scan. This
+event provides the current time, from which the interval to the second chunk is measured.
 
-Synchronous TPDOs obey the synchronous window (0x1007): chunks and a summary not sent before the window closes
-are discarded. The window does not apply to event-driven TPDOs.
+**Synchronous window (0x1007).** Chunks and summaries in synchronous TPDOs are discarded if they have not been
+sent before the window closes. The window does not apply to event-driven TPDOs.
 
-A scan offered while another is being sent waits until that scan ends; only one scan can wait. Chunks of two
-scans are never interleaved. A scan that has begun is sent completely, with two exceptions: if the node leaves
-OPERATIONAL, the summary is not sent; if the chunk TPDO is disabled, the summary shows that chunks are
-missing.
+**Queue.** A scan waits while another scan is being sent; only one scan can wait. Chunks of two scans are
+never interleaved. If the node leaves OPERATIONAL, the scan being sent ends without a summary. If the chunk
+TPDO is disabled, the summary indicates that chunks are missing.
 """
 
 from __future__ import annotations
@@ -38,12 +38,13 @@ from skinnode.node.pdo.tpdo import Tpdo, TpdoEngine
 from skinnode.protocol.summary import SummaryFlag, pack_checked_summary, pack_summary, pack_summary_record
 
 _HELD_UP: Final = 0.1
-"""Fraction of the sending time that may be lost before chunks count as delayed; thread jitter costs less."""
+"""Maximum fraction of the sending time that may be lost to delays before the stream counts as held up; jitter
+of the thread causes smaller losses."""
 
 
 @dataclass(frozen=True, slots=True)
 class OutgoingScan:
-    """Scan that is ready to be sent."""
+    """Scan that is ready for sending."""
 
     counter: int
     """Scan counter, u8."""
@@ -52,9 +53,9 @@ class OutgoingScan:
     flags: int
     """Bits of :class:`~skinnode.protocol.summary.SummaryFlag`."""
     device_time_us: int
-    """Clock of the node, µs; wraps at 2³²."""
+    """Time of the scan on the node's clock, µs; wraps at 2³²."""
     check_of_codes: int | None = None
-    """CRC of the codes that a receiver holds after this scan; None for a summary without a check."""
+    """CRC over the codes that a receiver must have after this scan; None for a summary without a check."""
     turns: frozenset[int] = frozenset()
     """Numbers of the synchronous TPDOs that were due at the SYNC that started the scan."""
 
@@ -66,7 +67,7 @@ class ScanStream:
         store: object dictionary.
         tpdos: the TPDOs of the node.
         chunk: value of the chunk record (0x2010) until the first chunk is sent.
-        catch_up_ns: maximum lateness that is compensated, ns.
+        catch_up_ns: maximum delay that the stream makes up for, ns.
     """
 
     def __init__(self, store: ObjectStore, tpdos: TpdoEngine, chunk: bytes, catch_up_ns: int) -> None:
@@ -74,17 +75,17 @@ class ScanStream:
         self._whole_record = [(od.CHUNK, sub) for sub in range(1, store.integer(od.CHUNK, 0) + 1)]
         self._scan: OutgoingScan | None = None
         self._next_scan: OutgoingScan | None = None
-        self._carrier: Tpdo | None = None  # TPDO that carries the chunks of the scan being sent
+        self._carrier: Tpdo | None = None  # TPDO that carries the chunks of the current scan
         self._unsent: deque[bytes] = deque()
-        self._verbatim = False  # whether the carrier maps the whole record unchanged
+        self._verbatim = False  # whether the mapping of the carrier is the whole chunk record
         self._chunks_sent = 0
-        self._busy_ns = 0  # start of the current run of back-to-back scans
+        self._busy_ns = 0  # start of the current series of scans without a pause
         self._just_begun = False
-        self._paced_ns = 0  # sum of the inhibit times since the start of the run
+        self._paced_ns = 0  # sum of the inhibit times since the start of the series
         self.chunk = chunk
-        """Chunk record sent last."""
+        """Content of the chunk record (0x2010): the chunk sent last."""
         self.summary = bytes(12)
-        """Summary record (0x2011) of the last scan."""
+        """Content of the summary record (0x2011): the summary of the last scan."""
         self.scans_sent = 0
         """Number of scans sent completely."""
         tpdos.claim(od.CHUNK, self)
@@ -92,11 +93,11 @@ class ScanStream:
 
     @property
     def full(self) -> bool:
-        """Whether a scan is being sent and another is already waiting."""
+        """Whether a scan is being sent and another scan is already waiting."""
         return self._next_scan is not None
 
     def is_held_up(self, t_ns: int) -> bool:
-        """Return whether scans take longer to send than the inhibit time requires.
+        """Return whether the current scans take longer to send than the inhibit time requires.
 
         If so, the node's thread receives too little processor time, or the bus refuses frames.
         """
@@ -111,14 +112,14 @@ class ScanStream:
             return NO_DEADLINE_NS
         return 0 if self._carrier is None or self._just_begun else self._carrier.ready_ns
 
-    # --- callbacks as the owner of TPDOs
+    # --- methods that the TPDO engine calls
 
     def sends(self, tpdo: Tpdo) -> bool:
-        """Return whether a TPDO is currently carrying the chunks of a scan."""
+        """Return whether a TPDO is carrying the chunks of the current scan."""
         return tpdo is self._carrier
 
     def on_reload(self, tpdo: Tpdo) -> None:
-        """End a scan whose TPDO no longer carries chunks."""
+        """Drop the remaining chunks of the current scan if their TPDO was disabled or mapped differently."""
         if tpdo is not self._carrier:
             return
         if tpdo.parameters.enabled and tpdo.first_index == od.CHUNK:
@@ -130,18 +131,18 @@ class ScanStream:
     # --- events
 
     def stop(self) -> None:
-        """End a scan in progress without a summary, because the node has left OPERATIONAL."""
+        """Drop all scans, without a summary, because the node has left OPERATIONAL."""
         self._unsent.clear()
         self._scan = self._next_scan = self._carrier = None
 
     def on_sync(self, turns: Collection[int], t_ns: int) -> None:
-        """Send waiting summaries at a SYNC that does not start a scan."""
+        """Send the summaries that are due at a SYNC that does not start a scan."""
         for tpdo in self._tpdos.owned(od.SUMMARY):
             if tpdo.waiting and tpdo.number in turns:
                 self._tpdos.transmit(tpdo, t_ns)
 
     def offer(self, scan: OutgoingScan, t_ns: int) -> None:
-        """Send a scan, immediately or after the current scan. Must not be called while :attr:`full`.
+        """Send a scan, immediately or after the current scan. Must not be called if :attr:`full` is true.
 
         Args:
             scan: the scan.
@@ -156,7 +157,7 @@ class ScanStream:
             self._next_scan = scan
 
     def on_timer(self, t_ns: int) -> None:
-        """Send everything that is due at ``t_ns``."""
+        """Send the chunks and summaries that are due at ``t_ns``."""
         carrier = self._carrier
         if self._just_begun and carrier is not None:
             earliest_ns = t_ns - self._catch_up_ns + carrier.parameters.inhibit_ns
@@ -170,7 +171,7 @@ class ScanStream:
             following, self._next_scan = self._next_scan, None
             try:
                 self._end(ended, t_ns)
-            finally:  # a bus may refuse the summary
+            finally:  # the bus may refuse the summary
                 if following is not None:
                     self._begin(following, t_ns)
 
@@ -181,14 +182,14 @@ class ScanStream:
                 self._carrier, self._verbatim = tpdo, self._carries_record(tpdo)
                 tpdo.waiting = False
                 self._unsent.extend(scan.chunks)
-                tpdo.ready_ns = max(tpdo.ready_ns, t_ns)  # a pause must not be followed by a burst
+                tpdo.ready_ns = max(tpdo.ready_ns, t_ns)  # no burst after a pause
                 return
 
     def _carries_record(self, tpdo: Tpdo) -> bool:
         return [(each.index, each.subindex) for each in tpdo.parameters.mapping] == self._whole_record
 
     def _stream(self, t_ns: int) -> bool:
-        """Send the chunks that the pace allows, and return whether all chunks have been sent."""
+        """Send the chunks that are due, and return whether no chunk of the scan is left."""
         unsent, carrier = self._unsent, self._carrier
         if carrier is None:
             return True
@@ -202,7 +203,7 @@ class ScanStream:
             carrier.ready_ns = max(carrier.ready_ns, earliest_ns) + inhibit_ns
             self._paced_ns += inhibit_ns
             tpdos.emit(carrier, self.chunk if self._verbatim else tpdos.payload(carrier))
-            self._chunks_sent += 1  # counted only now, because the bus may refuse the chunk
+            self._chunks_sent += 1  # counted after sending, because the bus may refuse the chunk
         return not unsent
 
     def _end(self, scan: OutgoingScan, t_ns: int) -> None:

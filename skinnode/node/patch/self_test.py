@@ -1,7 +1,7 @@
-"""Self-test (0x2021:3), which checks a patch by reading its source several times.
+"""Self-test of a patch (0x2021:3), which reads the source several times and checks the readings.
 
-A software node has no board to test, so it tests its source. The skin must not be touched during the test, or
-the touch would be measured as noise.
+A software node has no board that it could test, so the self-test checks only the source. The skin must not be
+touched during the self-test, because a touch would be measured as noise.
 """
 
 from __future__ import annotations
@@ -18,20 +18,20 @@ from skinnode.protocol.codes import CodeScale, encode
 from skinnode.protocol.self_test import SelfTest, SelfTestFault
 
 READINGS: Final = 16
-"""Number of readings, the same as for a tare.
+"""Number of readings in a self-test; the same as for a tare.
 
-The standard deviation is then known to within 18 % (1/√30) for one crossing and to within 1 % for a patch of
-300 crossings.
+From 16 readings, the standard deviation of one crossing is known to within 18 % (1/√30), and that of a patch
+with 300 crossings to within 1 %.
 """
 
 NOISE_LIMIT: Final = 1e-3
-"""Relative noise of a reading above which the test fails; a hundred times the noise at which the solver's
-accuracy is specified."""
+"""Maximum relative noise of a reading that passes the self-test; a hundred times the noise for which the
+solver's accuracy is specified."""
 
 
-@np.errstate(over="ignore", invalid="ignore")  # only for values that no converter returns
+@np.errstate(over="ignore", invalid="ignore")  # overflow occurs only for values that no converter returns
 def self_test(read: Callable[[], Float], baseline_ohm: Float, scale: CodeScale) -> SelfTest:
-    """Test a patch.
+    """Perform a self-test of a patch.
 
     Args:
         read: returns (U, K) resistances in ohm, or raises SourceFailed.
@@ -39,7 +39,7 @@ def self_test(read: Callable[[], Float], baseline_ohm: Float, scale: CodeScale) 
         scale: the mapping of R/R0 to codes.
 
     Returns:
-        Result of the test.
+        Findings of the self-test.
     """
     readings: list[Float] = []
     for _ in range(READINGS):
@@ -75,7 +75,7 @@ def self_test(read: Callable[[], Float], baseline_ohm: Float, scale: CodeScale) 
 
 
 def _noise(readings: Float) -> float:
-    """Return the readings' relative standard deviation, RMS over the crossings; 0 without crossings."""
+    """Return the relative noise: RMS over all crossings of the readings' relative standard deviation."""
     if len(readings) < 2 or not readings.shape[1]:
         return 0.0
     relative = readings.std(axis=0, ddof=1) / readings.mean(axis=0)

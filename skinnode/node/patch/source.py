@@ -1,4 +1,4 @@
-"""Analogue port of a patch, implemented by a converter or by the simulator."""
+"""Analogue port of a patch: the interface of a resistance source, such as a converter or the simulator."""
 
 from __future__ import annotations
 
@@ -10,21 +10,21 @@ from skinnode.model.layout import Float, require_array
 
 
 class ResistanceSource(Protocol):
-    """Source of the resistances between upper and lower wires.
+    """Source of the resistances between a patch's upper and lower wires.
 
-    A source may also have an attribute ``conversions``: the number of conversions of the whole matrix that
-    the converter has completed, an integer of any size. The node reads it after :meth:`read`, and tells the
-    host in each summary whether the number has changed, so that the host detects a stopped converter at once.
-    Without this attribute, or while it is None, the host must infer that from the codes. A source must count
-    in the converter itself, not in :meth:`read`, and only if the converter completes at least one conversion
-    per scan.
+    A source may also have an attribute ``conversions``: an integer of any size, which is the number of
+    conversions of all crossings that the converter has completed. The node reads this number after
+    :meth:`read`, and each summary tells the host whether the number has changed, so that the host detects a
+    stopped converter immediately. If the attribute is missing or None, the host must detect a stopped
+    converter from the codes. The conversions must be counted in the converter itself, not in :meth:`read`. A
+    source may supply the number only if its converter completes at least one conversion per scan.
     """
 
     def read(self, t_ns: int) -> Float:
-        """Return (U, K) wire-to-wire resistances, ohm: infinite if a wire is open, 0 if it is shorted.
+        """Return (U, K) resistances, ohm: infinite if a crossing is open, 0 if it is shorted.
 
-        The node copies the array. An exception counts as a failure of the source; the node reports the
-        failure and reads again at the next scan.
+        The node copies the array. If this method raises an exception, the node reports a failure of the
+        source, and reads the source again at the next scan.
 
         Args:
             t_ns: current time on the monotonic clock, ns.
@@ -33,7 +33,7 @@ class ResistanceSource(Protocol):
 
 
 def conversions_of(source: ResistanceSource) -> int | None:
-    """Return the number of conversions that a source has completed; None if the source does not count.
+    """Return the number of conversions that a source has completed; None if it does not count conversions.
 
     Raises:
         SourceFailed: if the attribute raises an exception or is not an integer.
@@ -41,23 +41,23 @@ def conversions_of(source: ResistanceSource) -> int | None:
     try:
         count = getattr(source, "conversions", None)
         return None if count is None else operator.index(count)
-    except (Exception, SystemExit) as error:  # a source must not end the thread that reads it
+    except (Exception, SystemExit) as error:  # an error in a source must not end the thread that reads it
         what = " ".join(str(error).split())
         text = f"source.conversions: {type(error).__name__}: {what}".rstrip(": ")
         raise SourceFailed(SourceFault.RAISED, text) from error
 
 
 class SourceFault(IntEnum):
-    """Type of reading failure, sent as the first detail byte of the emergency message."""
+    """Type of a source failure, sent as the first detail byte of the emergency message."""
 
     RAISED = 1
     """The source raised an exception."""
     WRONG_ARRAY = 2
-    """The source returned something other than an array of numbers, or an array of the wrong shape."""
+    """The source did not return an array of numbers with the right shape."""
 
 
 class SourceFailed(Exception):
-    """Error raised if a reading fails. This error never leaves the node."""
+    """Error raised inside a node if a reading fails; the node handles every such error."""
 
     def __init__(self, fault: SourceFault, message: str) -> None:
         self.fault = fault
@@ -65,7 +65,7 @@ class SourceFailed(Exception):
 
 
 def read_source(source: ResistanceSource, shape: tuple[int, int], t_ns: int) -> Float:
-    """Read a source.
+    """Read a source and check the shape of the reading.
 
     Args:
         source: the source.
@@ -76,12 +76,12 @@ def read_source(source: ResistanceSource, shape: tuple[int, int], t_ns: int) -> 
         (U, K) float64, ohm; a copy.
 
     Raises:
-        SourceFailed: if the source raises an exception or returns anything but an array of that shape; the
-            message is one line.
+        SourceFailed: if the source raises an exception, or does not return an array of numbers with that
+            shape. The message has one line.
     """
     try:
         reading = source.read(t_ns)
-    except (Exception, SystemExit) as error:  # a source must not end the thread that reads it
+    except (Exception, SystemExit) as error:  # an error in a source must not end the thread that reads it
         what = " ".join(str(error).split())
         raise SourceFailed(
             SourceFault.RAISED, f"source.read(): {type(error).__name__}: {what}".rstrip(": ")

@@ -1,4 +1,4 @@
-"""Monitor that counts source failures and reports them by EMCY 0xFF00."""
+"""Monitor that counts failures of a patch's source and reports them by EMCY 0xFF00."""
 
 from __future__ import annotations
 
@@ -12,23 +12,23 @@ from skinnode.node.patch.source import SourceFailed, SourceFault
 
 
 class SourceMonitor:
-    """Monitor of a source's failures.
+    """Monitor that counts and reports failures of a source.
 
     Args:
         emcy: emergency producer.
-        on_failure: called after each failure.
+        on_failure: called after each failure of the source.
     """
 
     def __init__(self, emcy: EmcyProducer, on_failure: Callable[[], None]) -> None:
         self._emcy, self._on_failure = emcy, on_failure
         self._fault: SourceFault | None = None
         self.failures = 0
-        """Number of readings, tares and self-tests that failed."""
+        """Number of failed scans, tares and self-test readings."""
         self.error = ""
-        """Last failure, in one line; empty before the first failure."""
+        """Last failure of the source, in one line; empty before the first failure."""
 
     def reset(self, t_ns: int) -> None:
-        """Report a current failure again after a reset."""
+        """Report a failure that is still present again, after a reset."""
         if self._fault is not None:
             self._report(self._fault, t_ns)
 
@@ -44,7 +44,7 @@ class SourceMonitor:
         except SourceFailed as failure:
             self.failures += 1
             self.error = str(failure)
-            if failure.fault is not self._fault:  # report once, not at every scan
+            if failure.fault is not self._fault:  # a lasting failure is reported once, not at every scan
                 self._report(failure.fault, t_ns)
             self._on_failure()
             raise

@@ -1,4 +1,4 @@
-"""Open and shorted wires, found in the codes of a scan and reported by EMCY 0x5000."""
+"""Detection of open and shorted wires in the codes of a scan, and their report by EMCY 0x5000."""
 
 from __future__ import annotations
 
@@ -18,36 +18,36 @@ Mask = NDArray[np.bool_]
 
 @dataclass(frozen=True, slots=True)
 class WireFaults:
-    """Wires that have no usable crossing."""
+    """Wire faults of a patch: wires whose crossings are all open or all shorted."""
 
     upper_open: Mask
-    """(U,) upper wires that are open."""
+    """(U,) mask of the open upper wires."""
     upper_short: Mask
-    """(U,) upper wires that are shorted."""
+    """(U,) mask of the shorted upper wires."""
     lower_open: Mask
-    """(K,) lower wires that are open."""
+    """(K,) mask of the open lower wires."""
     lower_short: Mask
-    """(K,) lower wires that are shorted."""
+    """(K,) mask of the shorted lower wires."""
 
     @classmethod
     def none(cls, profile: PatchProfile) -> WireFaults:
-        """Return the result for a patch without wire faults."""
+        """Return wire faults in which no wire is open or shorted."""
         rows, columns = np.zeros(profile.rows, dtype=np.bool_), np.zeros(profile.columns, dtype=np.bool_)
         return cls(rows, rows, columns, columns)
 
     @property
     def masks(self) -> tuple[Mask, Mask, Mask, Mask]:
-        """Masks in the order upper open, upper shorted, lower open, lower shorted."""
+        """Masks by fault type: upper open, upper shorted, lower open, lower shorted."""
         return self.upper_open, self.upper_short, self.lower_open, self.lower_short
 
     @property
     def any(self) -> bool:
-        """Whether any wire is faulty."""
+        """Whether at least one wire is open or shorted."""
         return any(mask.any() for mask in self.masks)
 
 
 def find_faults(codes: Codes, scale: CodeScale) -> WireFaults:
-    """Return the wires whose crossings are all open, or all shorted.
+    """Return the wires whose crossings are all open, and those whose crossings are all shorted.
 
     Args:
         codes: (U, K) codes.
@@ -58,7 +58,7 @@ def find_faults(codes: Codes, scale: CodeScale) -> WireFaults:
 
 
 class WireFaultReporter:
-    """Reporter of the start and the end of wire faults.
+    """Reporter that sends emergency messages when wire faults begin and end.
 
     Args:
         profile: sizes of the patch.
@@ -70,16 +70,18 @@ class WireFaultReporter:
         self._reported = WireFaults.none(profile)
 
     def reset(self) -> None:
-        """Forget the reported faults after a reset."""
+        """Forget the faults reported so far, after a reset."""
         self._reported = WireFaults.none(self._profile)
 
     def report(self, faults: WireFaults, t_ns: int) -> None:
-        """Send one message with the first new fault (kind and wire number) and the number of faulty wires.
+        """Report new wire faults by one emergency message, or the end of all wire faults.
 
-        A pulled connector is one event, so it causes one message.
+        The message contains the type and wire number of the first new fault, and the number of faulty wires.
+        Several faults that begin together, for example because a connector was pulled, cause a single
+        message.
 
         Args:
-            faults: current faults.
+            faults: current wire faults.
             t_ns: current time, ns.
         """
         reported, self._reported = self._reported, faults

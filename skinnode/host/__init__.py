@@ -14,8 +14,8 @@ interface. Each bus has a ``link`` (port, receive queue, reopening) and a ``serv
     supervisor -> node_supervision (actions for each supervised node) -> remote_node, baseline_watch
     node_monitor (evidence about a node) -> health (condition) -> health_watch -> events
 
-The module ``sync`` sends SYNC, and ``nmt_master`` sends NMT commands. ``containment`` contains exceptions,
-and ``retry_pause`` determines the pauses between attempts. ``tap`` passes frames to recorders.
+The module ``sync`` sends SYNC, and ``nmt_master`` sends NMT commands. ``containment`` handles exceptions, and
+``retry_pause`` determines the pauses between attempts. ``tap`` passes frames to recorders.
 
 **Containment.** Exceptions do not end the host's threads. An exception raised while serving a patch makes
 that patch faulty and is recorded as the reason. The scans of a faulty patch are withheld, and the patch is

@@ -45,7 +45,7 @@ class Mainline:
         self._thread.start()
 
     def stop(self) -> None:
-        """End and join all threads of the mainline. Frames can still be sent; a second call is allowed."""
+        """End and join all threads of the mainline. Frames can still be sent after the call."""
         self._stop.set()
         self._thread.join()
         for link in self._links:

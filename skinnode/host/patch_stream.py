@@ -141,7 +141,7 @@ class PatchStream:
         self._workers, self._publisher, self._defects = output.workers, output.publisher, output.defects
         assembler.on_discarded = self._doubt
         self._unwatched: deque[tuple[int, Scan]] = deque()
-        # at most one scan; thread-safe
+        # contains at most one scan; thread-safe
         self._box: deque[tuple[Scan, ScanStamp, ScanSolver, Verdict]] = deque()
         self._token: deque[None] = deque([None])
         self.tap: StreamTap | None = None

@@ -1,4 +1,4 @@
-"""Decode the codes of a patch's scans to resistances, and solve them for fields."""
+"""Decode a patch's scans to resistances, and solve the resistances for fields."""
 
 from __future__ import annotations
 

@@ -137,7 +137,7 @@ def record(index: int, name: str, entries: Sequence[Entry], first: Entry | None 
         index: index of the record.
         name: name of the record.
         entries: entries from sub-index 1 on, in ascending order of sub-index.
-        first: entry at sub-index 0; None for the usual constant that contains the highest sub-index.
+        first: entry at sub-index 0; None for a constant entry that contains the highest sub-index.
     """
     first = first or highest(index, entries[-1].subindex)
     return Object(index, name, ObjectType.RECORD, (first, *entries))

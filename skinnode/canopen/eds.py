@@ -40,7 +40,7 @@ class DeviceInfo:
 
 @dataclass(frozen=True, slots=True)
 class Commissioning:
-    """Information about one node that a DCF contains in addition to the contents of an EDS."""
+    """Information about one node that a DCF contains, but an EDS does not."""
 
     node_id: int
     bitrate_kbps: int

@@ -103,10 +103,10 @@ _DATA_FAULTS: Final = {
     1: "the memory is unreadable",
     2: "the memory is damaged",
     3: "the memory belongs to another patch",
-    4: "an object refuses its stored value",
+    4: "an object does not accept its stored value",
     5: "could not be saved",
 }
-_SOURCE_FAULTS: Final = {1: "it failed", 2: "it returned an array of the wrong shape"}
+_SOURCE_FAULTS: Final = {1: "the source failed", 2: "the source returned an array of the wrong shape"}
 _REGISTER: Final = (
     "generic",
     "current",

@@ -164,8 +164,8 @@ SEND_MODE, SEND_THRESHOLD, SEND_REFRESH = 1, 2, 3
 ACQUISITION: Final = 0x2021
 ACQUISITION_PERIOD, ACQUISITION_AVERAGING, SELF_TEST, TARE, SINGLE_SCAN = 1, 2, 3, 4, 5
 COMMANDS: Final = frozenset({(ACQUISITION, SELF_TEST), (ACQUISITION, TARE), (ACQUISITION, SINGLE_SCAN)})
-"""Index and sub-index of each object that acts as a command when written. Such objects are not parameters, so
-they are neither saved nor verified."""
+"""Index and sub-index of each object that acts as a command when written. These command objects are not
+parameters, so a node neither saves nor verifies them."""
 TIME_OF_DAY: Final = 0x2022
 TIME_DAYS, TIME_MS, TIME_MESSAGES, TIME_DEVICE_US = 1, 2, 3, 4
 SELF_TEST_RESULT: Final = 0x2023

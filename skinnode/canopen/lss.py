@@ -6,7 +6,7 @@ from enum import IntEnum
 from typing import Final, NamedTuple
 
 NOT_CONFIGURED: Final = 0xFF
-"""Value that stands for a missing node-ID."""
+"""Node-ID value which means that a node has no node-ID."""
 
 BIT_RATES_BPS: Final = {
     0: 1_000_000,

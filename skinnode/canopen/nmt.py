@@ -94,7 +94,7 @@ def parse(data: bytes, node_id: int) -> NmtCommand | None:
     """Return the command in a frame with COB-ID 0; None if the frame addresses another node.
 
     Args:
-        data: the payload.
+        data: payload of the frame.
         node_id: the node-ID of this node.
 
     Raises:

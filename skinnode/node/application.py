@@ -13,7 +13,7 @@ from skinnode.node.storage import Storage
 
 
 class Application(Protocol):
-    """Application of a CANopen device. Its objects are part of the device's object dictionary."""
+    """Application of a CANopen device, whose object dictionary contains the application's objects."""
 
     @property
     def deadline_ns(self) -> int:
@@ -29,7 +29,7 @@ class Application(Protocol):
         ...
 
     def enter(self, *, operational: bool) -> None:
-        """Handle a change of the NMT state. The argument tells whether the new state is OPERATIONAL."""
+        """Handle a change of the NMT state; ``operational`` is true if the new state is OPERATIONAL."""
         ...
 
     def on_sync(self, counter: int | None, turns: frozenset[int], t_ns: int) -> None:

@@ -124,7 +124,7 @@ class CanopenDevice:
         self._reset(EVERYTHING, t_ns)
 
     def power_off(self) -> None:
-        """Switch the device off: it stops sending immediately."""
+        """Switch the device off, so that it stops sending immediately."""
         self._enter(NmtState.INITIALISING, self._now_ns)
         self._bit_rate_change.cancel()
         self._handlers = {}

@@ -36,7 +36,7 @@ class ErrorControl:
     """Error control services of a node.
 
     Args:
-        services: the resources that the node's services share.
+        services: resources that all services of the node share.
         listen: called when the result of :meth:`handlers` has changed.
         failed: called with the time of a heartbeat event or life guarding event, ns.
     """

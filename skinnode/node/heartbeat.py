@@ -20,7 +20,7 @@ silence."""
 
 
 class HeartbeatProducer:
-    """Schedule of a node's heartbeats, which shifts only if a heartbeat is late by one period or more."""
+    """Schedule of a node's heartbeats, which shifts if a heartbeat is late by at least one period."""
 
     def __init__(self) -> None:
         self.period_ns = 0

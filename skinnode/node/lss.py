@@ -123,10 +123,11 @@ class LssSlave:
         or if the request is not allowed in the current state. Such a frame may be intended for other slaves.
 
         After *activate bit timing*, the node stops sending immediately and changes its bit rate after one
-        delay. It may send again after a second delay, when all other nodes have changed their bit rates.
+        delay. The node may send again after a second delay, when all other nodes have changed their bit
+        rates.
 
         Args:
-            data: the payload.
+            data: payload of the frame.
 
         Returns:
             The response; None if the request has no response.

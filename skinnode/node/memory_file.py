@@ -31,8 +31,8 @@ class FileMemory:
     Saving takes a few milliseconds, during which the node and all other nodes on its thread are blocked.
 
     A ``FileMemory`` has exclusive access to its file from :meth:`claim` or the first :meth:`save` until
-    :meth:`close`, the end of a ``with`` block or the deletion of the object. It locks a separate file in the
-    same folder. The kernel releases this lock when the process ends, even if the process is killed.
+    :meth:`close`, the end of a ``with`` block or the deletion of the object. The lock is a kernel lock on a
+    separate file in the same folder, so it is released when the process ends, even if the process is killed.
 
     Saving writes a temporary file, flushes it to the storage medium and renames it. After a power failure or
     a killed process, the file therefore has either its old or its new content. Only the owner can read the

@@ -33,7 +33,7 @@ class NmtSlave:
         """Return the NMT command in a frame; None if the frame is malformed or addresses another node.
 
         Args:
-            data: the payload.
+            data: payload of the frame.
             node_id: node-ID of this node.
         """
         try:

@@ -40,7 +40,7 @@ class NodeRunner:
 
     A runner can be started only once. Bus errors do not stop a runner. From :meth:`start` to :meth:`stop`,
     only the runner's thread may use the nodes; other threads may read the nodes' counters. The runner does
-    not close the port. Its timers have the precision that the most demanding node requires.
+    not close the port. All timers have the precision that the most demanding node requires.
 
     Args:
         port: CAN port that all nodes share.
@@ -80,7 +80,7 @@ class NodeRunner:
     def start(self) -> None:
         """Start the thread, and return after all nodes have been powered on and have loaded their memories.
 
-        If an error ends the thread, :meth:`stop` raises it.
+        If an error ends the thread, :meth:`stop` raises this error.
         """
         self._thread.start()
         self._powered.wait()

@@ -39,7 +39,7 @@ class Storage:
     is a :class:`~skinnode.node.memory.Fault`.
 
     Args:
-        services: the resources that the node's services share.
+        services: resources that all services of the node share.
         memory: memory of the node; None if there is no memory, in which case 0x1010 and 0x1011 read 0 and
             refuse writes (CiA 301).
         patch: sizes and layout of the patch; see :class:`~skinnode.node.memory.Kept`.
@@ -85,7 +85,10 @@ class Storage:
             self.note(error.fault, why=str(error))
             return
         if kept is not None and kept.patch != patch:
-            self.note(Fault.FOREIGN, why=f"it belongs to another patch, {kept.patch!r}; this is {patch!r}")
+            self.note(
+                Fault.FOREIGN,
+                why=f"the content belongs to another patch, {kept.patch!r}; this patch is {patch!r}",
+            )
         elif kept is not None:
             self._kept = kept
 

@@ -79,7 +79,7 @@ class Sync:
     :meth:`on_timer` like a SYNC accepted by :meth:`accept`.
 
     Args:
-        services: the resources that the node's services share.
+        services: resources that all services of the node share.
     """
 
     def __init__(self, services: NodeServices) -> None:

@@ -1,7 +1,7 @@
 """TIME consumer, which receives the time of day (CiA 301 v4.2, 7.2.6 and object 0x1012).
 
-A node has no real-time clock. It stores the last time received, together with the time on its own clock at
-that moment. From these two times, it computes the current time of day (0x2022), and a host can convert the
+A node has no real-time clock. The node stores the last time received, together with the time on its own clock
+at that moment. From these two times, it computes the current time of day (0x2022), and a host can convert the
 device time of a scan to a date.
 """
 
@@ -52,7 +52,7 @@ class TimeConsumer:
         """Process a TIME message.
 
         Args:
-            data: the payload.
+            data: payload of the frame.
             t_ns: time of reception, ns.
 
         Returns:

@@ -316,7 +316,7 @@ class ScanAssembler:
     def _is_news(self, counter: int, t_ns: int, *, known: bool) -> bool:
         """Return whether a frame that does not fit the open scan starts a new scan; if not, count it.
 
-        The argument ``known`` tells whether the last scan contains an identical frame.
+        The argument ``known`` indicates whether the last scan contains an identical frame.
         """
         if not self._lowest <= counter < self._lowest + self._range:
             self._bad_counter += 1
@@ -432,7 +432,7 @@ class ScanAssembler:
     def _discard(self, *, doubt: bool = True) -> None:
         """Discard a scan and all codes kept for later scans.
 
-        The argument ``doubt`` tells whether the scan may have announced a new baseline.
+        The argument ``doubt`` indicates whether the scan may have announced a new baseline.
         """
         self._held.forget()
         if doubt and self.on_discarded is not None:

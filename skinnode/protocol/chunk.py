@@ -59,9 +59,9 @@ def unpack_chunk(data: bytes, bits: int = 16, *, cob_id: int = _COB_ID) -> Chunk
     """Unpack the payload of TPDO1.
 
     Args:
-        data: the payload.
+        data: payload of the frame.
         bits: width of a code, 16 or 24.
-        cob_id: COB-ID shown in the error.
+        cob_id: COB-ID to be shown in the error.
 
     Raises:
         CodecError: if the payload is not 8 bytes long.

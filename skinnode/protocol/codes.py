@@ -30,7 +30,7 @@ CODE_BITS: Final = (16, 24)
 
 @dataclass(frozen=True)
 class CodeScale:
-    """Mapping of R/R0 to codes. Its limits ``lo`` and ``hi`` have REAL32 precision, as in the dictionary.
+    """Mapping of R/R0 to codes. The limits ``lo`` and ``hi`` have REAL32 precision, as on the bus.
 
     Raises:
         ConfigError: if the code width is not 16 or 24 bits, or if 0 ≤ lo < hi < ∞ is not true.
@@ -106,7 +106,7 @@ def encode(resistance_ohm: ArrayLike, baseline_ohm: ArrayLike, scale: CodeScale)
     Args:
         resistance_ohm: resistances, ohm; any shape.
         baseline_ohm: R0 in ohm, with the same shape or broadcastable to it.
-        scale: the mapping of R/R0 to codes.
+        scale: mapping of R/R0 to codes.
 
     Returns:
         Codes with the same shape as ``resistance_ohm``.
@@ -128,7 +128,7 @@ def decode(codes: ArrayLike, baseline_ohm: ArrayLike, scale: CodeScale) -> tuple
     Args:
         codes: codes of any shape; :data:`MISSING` is allowed.
         baseline_ohm: R0 in ohm, with the same shape or broadcastable to it.
-        scale: the mapping of R/R0 to codes.
+        scale: mapping of R/R0 to codes.
 
     Returns:
         Resistances in ohm and a mask of the measurements, both with the same shape as ``codes``. The
@@ -143,7 +143,7 @@ class Decoder:
 
     Args:
         baseline_ohm: R0 in ohm, with the shape of the codes or broadcastable to it.
-        scale: the mapping of R/R0 to codes.
+        scale: mapping of R/R0 to codes.
     """
 
     def __init__(self, baseline_ohm: ArrayLike, scale: CodeScale) -> None:

@@ -42,7 +42,7 @@ def pack_command(
     Args:
         tare: whether to make the current resistances the baseline.
         single_scan: whether to take one scan immediately.
-        send_mode: send mode; every command sets it, and the node keeps it until the next command.
+        send_mode: send mode, which every command sets and which applies until the next command.
     """
     return _COMMAND.pack(od.TARE_SIGNATURE if tare else 0, single_scan, send_mode)
 
@@ -51,8 +51,8 @@ def unpack_command(data: bytes, *, cob_id: int = _COB_ID) -> Command:
     """Unpack the payload of RPDO1. Bytes beyond the six mapped bytes are ignored (CiA 301).
 
     Args:
-        data: the payload.
-        cob_id: COB-ID shown in the error.
+        data: payload of the frame.
+        cob_id: COB-ID to be shown in the error.
 
     Raises:
         CodecError: if the payload is shorter than six bytes.

@@ -42,8 +42,8 @@ class DeviceTimeTracker:
         """Return the 32-bit device time, µs, with its upper bits predicted from the last device time.
 
         The prediction is the last device time plus the time elapsed on the host's clock since then. The upper
-        bits of the first device time come from the host's clock. They are correct if node and host share a
-        clock and the summary arrives within three seconds of the scan.
+        bits of the first device time come from the host's clock. These bits are correct if node and host
+        share a clock and the summary arrives within three seconds of the scan.
 
         Args:
             low_us: device time from a checked summary, without its upper bits, µs.

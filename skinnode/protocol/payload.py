@@ -15,9 +15,9 @@ def require_length(data: bytes, length: int, cob_id: int, what: str) -> None:
     """Check the length of a payload.
 
     Args:
-        data: the payload.
+        data: payload of the frame.
         length: required length, bytes.
-        cob_id: COB-ID shown in the error.
+        cob_id: COB-ID to be shown in the error.
         what: name of the message, shown in the error.
 
     Raises:

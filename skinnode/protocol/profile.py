@@ -133,7 +133,7 @@ class PatchProfile:
 
     @property
     def lines(self) -> int:
-        """Number of code sequences that are split into chunks: one or, over CAN FD, one per upper wire."""
+        """Number of code sequences that are split into chunks: 1, or over CAN FD one per upper wire."""
         return 1 if self.bus == "classic" else self.rows
 
     @property

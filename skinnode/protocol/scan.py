@@ -24,8 +24,8 @@ class Scan:
     scan: int
     """Unwrapped scan counter, which starts at the first scan counter received and never decreases."""
     complete: bool
-    """Whether the codes are certain to equal the codes that the node packed. This requires that the node sent
-    all required chunks, that all of them arrived and, in a checked stream, that the check passed."""
+    """Whether the codes are certain to equal the codes that the node packed. A scan is complete if the node
+    sent all required chunks, if all of them arrived and, in a checked stream, if the check passed."""
     chunks_expected: int
     """Number of chunks sent, according to the summary; without a summary, the number of chunks in a full
     scan."""

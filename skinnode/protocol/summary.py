@@ -135,8 +135,8 @@ def unpack_summary(data: bytes, *, cob_id: int = _COB_ID) -> Summary:
     """Unpack a summary, with or without a check, from the payload of TPDO2.
 
     Args:
-        data: the payload.
-        cob_id: COB-ID shown in the error.
+        data: payload of the frame.
+        cob_id: COB-ID to be shown in the error.
 
     Raises:
         CodecError: if the payload is not 8 bytes long.

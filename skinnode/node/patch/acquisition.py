@@ -26,7 +26,7 @@ class Acquisition:
     Args:
         profile: sizes of the patch.
         source: analogue port of the patch.
-        scale: the mapping of R/R0 to codes.
+        scale: mapping of R/R0 to codes.
         baseline_ohm: (U, K) initial R0, ohm; None if there is no baseline yet.
 
     Raises:

@@ -128,12 +128,12 @@ class PatchApplication:
         """Take a scan at a SYNC in OPERATIONAL, unless the node's timer triggers the scans.
 
         Args:
-            counter: the SYNC counter; None if SYNC carries none.
+            counter: SYNC counter; None if the SYNC message contains no counter.
             turns: numbers of the synchronous TPDOs that are due.
-            t_ns: when the SYNC was received, ns.
+            t_ns: time at which the SYNC was received, ns.
         """
         scans = not self._period_ns
-        if not scans or self.stream.full:  # otherwise the new scan's summary is sent at this SYNC
+        if not scans or self.stream.full:  # if the new scan is not skipped, its summary is sent at this SYNC
             self.stream.on_sync(turns, t_ns)
         if scans:
             self._scan(self._following() if counter is None else counter, turns, t_ns)

@@ -14,7 +14,7 @@ class ChunkSelection:
 
     Args:
         profile: sizes of the patch.
-        scale: the mapping of R/R0 to codes.
+        scale: mapping of R/R0 to codes.
     """
 
     def __init__(self, profile: PatchProfile, scale: CodeScale) -> None:

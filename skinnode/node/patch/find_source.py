@@ -25,7 +25,7 @@ def load(reference: str, option: str) -> Any:
 
     Args:
         reference: ``MODULE:NAME``.
-        option: option name shown in the error.
+        option: name of the option, to be shown in the error.
 
     Raises:
         ConfigError: if the module cannot be imported or does not contain the name.
@@ -44,10 +44,10 @@ def make_source(name: str, layout: PatchLayout, option: str = "source") -> Resis
     """Create a source for a patch, and read it once, to detect faults before the node starts.
 
     Args:
-        name: name of an entry point, or ``MODULE:NAME``. It refers to a class or function that takes the
-            layout and returns a :class:`~skinnode.node.patch.source.ResistanceSource`.
+        name: name of an entry point, or ``MODULE:NAME``, for a class or function that takes the layout and
+            returns a :class:`~skinnode.node.patch.source.ResistanceSource`.
         layout: the electrodes of the patch.
-        option: option name shown in the error.
+        option: name of the option, to be shown in the error.
 
     Raises:
         ConfigError: if the source is not found, cannot be created or returns no valid reading.

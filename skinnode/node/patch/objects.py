@@ -25,7 +25,7 @@ def describe(store: ObjectStore, layout: PatchLayout, scale: CodeScale, serial: 
     Args:
         store: object dictionary.
         layout: electrodes of the patch.
-        scale: the mapping of R/R0 to codes.
+        scale: mapping of R/R0 to codes.
         serial: serial number, u32.
     """
     put = store.put

@@ -2,19 +2,19 @@
 
 A TPDO whose first mapped object is 0x2010 carries the chunks of a scan if it is event-driven, or if it was
 due at the SYNC that started the scan. TPDOs whose first mapped object is 0x2011 carry the summary after the
-chunks. An event-driven summary TPDO is sent immediately after the chunks. So is a synchronous summary TPDO
-that was due at that SYNC; otherwise, it is sent at the next SYNC at which it is due. Event-driven TPDOs with
-other objects are also sent after the chunks.
+chunks. An event-driven summary TPDO is sent immediately after the chunks. A synchronous summary TPDO is also
+sent immediately if it was due at the SYNC that started the scan; otherwise, it is sent at the next SYNC at
+which it is due. Event-driven TPDOs with other objects are also sent after the chunks.
 
 **Pacing.** The standard defines the inhibit time as a minimum interval between frames. On a general-purpose
 operating system, however, threads wake up late, so that with a strict minimum interval a scan could take
 longer than the SYNC period. The stream therefore makes up for delays of up to ``catch_up_ns``, if necessary
-by sending several frames at once. Its mean frame rate never exceeds the rate set by the inhibit time (generic
-cell rate algorithm, ITU-T I.371). If ``catch_up_ns`` is 0, the minimum interval is strict.
+by sending several frames at once. The mean frame rate never exceeds the rate that the inhibit time allows
+(generic cell rate algorithm, ITU-T I.371). If ``catch_up_ns`` is 0, the minimum interval is strict.
 
 The caller passes the time of a SYNC to the node, but the node cannot measure the time that the subsequent
 sampling takes. The stream therefore requests a timer event immediately after the first chunk of a scan. This
-event provides the current time, from which the interval to the second chunk is measured.
+timer event provides the current time, from which the interval to the second chunk is measured.
 
 **Synchronous window (0x1007).** Chunks and summaries in synchronous TPDOs are discarded if they have not been
 sent before the window closes. The window does not apply to event-driven TPDOs.
@@ -44,7 +44,7 @@ of the thread causes smaller losses."""
 
 @dataclass(frozen=True, slots=True)
 class OutgoingScan:
-    """Scan that is ready for sending."""
+    """Scan that is ready to be sent."""
 
     counter: int
     """Scan counter, u8."""

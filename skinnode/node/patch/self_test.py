@@ -36,7 +36,7 @@ def self_test(read: Callable[[], Float], baseline_ohm: Float, scale: CodeScale) 
     Args:
         read: returns (U, K) resistances in ohm, or raises SourceFailed.
         baseline_ohm: (U, K) R0, ohm.
-        scale: the mapping of R/R0 to codes.
+        scale: mapping of R/R0 to codes.
 
     Returns:
         Findings of the self-test.

@@ -51,7 +51,7 @@ def find_faults(codes: Codes, scale: CodeScale) -> WireFaults:
 
     Args:
         codes: (U, K) codes.
-        scale: the mapping of R/R0 to codes.
+        scale: mapping of R/R0 to codes.
     """
     is_open, is_short = codes == scale.open, codes == scale.short
     return WireFaults(is_open.all(axis=1), is_short.all(axis=1), is_open.all(axis=0), is_short.all(axis=0))

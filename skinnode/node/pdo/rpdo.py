@@ -53,9 +53,9 @@ class RpdoEngine:
     """Engine for all RPDOs of a node.
 
     Args:
-        services: the resources that the node's services share.
+        services: resources that all services of the node share.
         count: number of RPDOs.
-        window: the synchronous window.
+        window: synchronous window of the node.
     """
 
     def __init__(self, services: NodeServices, count: int, window: SyncWindow) -> None:

@@ -11,9 +11,9 @@ type       sent
            never before the inhibit time has passed
 =========  =======================================================================================
 
-An application can *claim* an object. It then sends all TPDOs whose first mapped object is this object, and
-SYNC and events do not trigger these TPDOs. For such TPDOs, the engine still counts SYNCs, answers remote
-frames and runs the event timer.
+An application can *claim* an object. The application then sends all TPDOs whose first mapped object is the
+claimed object, and SYNC and events do not trigger these TPDOs. The engine still counts SYNCs, answers remote
+frames and runs the event timers for claimed TPDOs.
 
 The processing time of a SYNC depends only on the number of enabled TPDOs that are sent or sampled at SYNC.
 The processing time of a timer event depends only on the number of TPDOs that are due.
@@ -100,7 +100,7 @@ class Tpdo:
         """Count a SYNC.
 
         Args:
-            counter: the SYNC counter; None if SYNC carries none.
+            counter: SYNC counter; None if the SYNC message contains no counter.
 
         Returns:
             Whether this synchronous TPDO is due at the SYNC.
@@ -126,7 +126,7 @@ class Owner(Protocol):
         ...
 
     def on_reload(self, tpdo: Tpdo) -> None:
-        """Handle a change of a TPDO's parameters, after which it may no longer belong to this owner."""
+        """Handle a change of a TPDO's parameters, after which the TPDO may have another owner."""
         ...
 
 
@@ -134,17 +134,16 @@ class TpdoEngine:
     """Engine for all TPDOs of a node.
 
     Args:
-        services: the resources that the node's services share.
+        services: resources that all services of the node share.
         count: number of TPDOs.
-        window: the synchronous window.
+        window: synchronous window of the node.
     """
 
     def __init__(self, services: NodeServices, count: int, window: SyncWindow) -> None:
         store = services.store
         self._store, self._send, self._now = store, services.send, services.now
         self.window = window
-        """Synchronous window, for the owners of TPDOs; the engine sends TPDOs without an owner right after
-        SYNC."""
+        """Synchronous window, in which TPDO owners must send their synchronous TPDOs."""
         self._claims: dict[int, Owner] = {}
         self._running = False
         self._timers = Timers()
@@ -231,7 +230,7 @@ class TpdoEngine:
         """Count a SYNC for all TPDOs, and determine which are due.
 
         Args:
-            counter: the SYNC counter; None if SYNC carries none.
+            counter: SYNC counter; None if the SYNC message contains no counter.
 
         Returns:
             Numbers of the synchronous TPDOs that are due.
@@ -248,7 +247,7 @@ class TpdoEngine:
 
         Args:
             turns: numbers of the synchronous TPDOs that are due.
-            t_ns: when the SYNC was received, ns.
+            t_ns: time at which the SYNC was received, ns.
         """
         for number in tuple(self._listening):
             tpdo = self._tpdos[number]

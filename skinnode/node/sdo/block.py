@@ -84,10 +84,10 @@ class BlockUpload(Transfer):
     """Block upload; its constructor sends the response to the initiate request.
 
     Args:
-        channel: the server channel.
-        target: the object.
+        channel: SDO server channel.
+        target: object to read or write.
         upload: value of the object, and the options that the client requested.
-        t_ns: when the initiate request was received, ns.
+        t_ns: time at which the initiate request was received, ns.
 
     Raises:
         Refused: if the block size is not 1 to 127.
@@ -109,11 +109,11 @@ class BlockUpload(Transfer):
         channel.send(MULTIPLEXER_U32.pack(0xC2 | crc << 2, target.index, target.subindex, len(data)))
 
     def wants(self, request: bytes) -> bool:
-        """Return whether a frame from the client belongs to this transfer."""
+        """Return whether a request from the client belongs to this transfer."""
         return request[0] >> 5 == 5 and request[0] & 3 != 0
 
     def on_request(self, request: bytes, t_ns: int) -> bool:
-        """Handle a frame that belongs to the transfer; return whether the transfer is over."""
+        """Process a request that belongs to this transfer; return whether the transfer has ended."""
         twice = request == self._previous and t_ns - self._previous_ns < TWICE_NS
         if twice and self._waits_for is not _Upload.ACKNOWLEDGEMENT:
             return False
@@ -183,10 +183,10 @@ class BlockDownload(Transfer):
     is lost, the transfer times out.
 
     Args:
-        channel: the server channel.
-        target: the object.
+        channel: SDO server channel.
+        target: object to read or write.
         announced: size announced by the client, bytes; None if it announced no size.
-        t_ns: when the initiate request was received, ns.
+        t_ns: time at which the initiate request was received, ns.
         crc: whether the client supports a CRC.
 
     Raises:
@@ -211,7 +211,7 @@ class BlockDownload(Transfer):
         return self._last is None or _is_end(request) or request == self._previous
 
     def on_request(self, request: bytes, t_ns: int) -> bool:
-        """Handle a frame that belongs to the transfer; return whether the transfer is over."""
+        """Process a request that belongs to this transfer; return whether the transfer has ended."""
         # Checked first, because an end request may equal the previous frame.
         if self._last is not None and _is_end(request):
             self._end(request, self._last)

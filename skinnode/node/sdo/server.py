@@ -168,11 +168,11 @@ class _Upload(Transfer):
         channel.send(MULTIPLEXER_U32.pack(0x41, target.index, target.subindex, len(data)))
 
     def wants(self, request: bytes) -> bool:
-        """Return whether a frame from the client belongs to this transfer."""
+        """Return whether a request from the client belongs to this transfer."""
         return request[0] >> 5 == _Client.UPLOAD_SEGMENT
 
     def on_request(self, request: bytes, t_ns: int) -> bool:
-        """Handle a frame that belongs to the transfer; return whether the transfer is over."""
+        """Process a request that belongs to this transfer; return whether the transfer has ended."""
         if request[0] & _TOGGLE != self._toggle:
             raise Refused(AbortCode.TOGGLE_BIT)
         segment = self._data[self._at : self._at + SEGMENT_BYTES]
@@ -195,11 +195,11 @@ class _Download(Transfer):
         channel.send(MULTIPLEXER_U32.pack(0x60, target.index, target.subindex, 0))
 
     def wants(self, request: bytes) -> bool:
-        """Return whether a frame from the client belongs to this transfer."""
+        """Return whether a request from the client belongs to this transfer."""
         return request[0] >> 5 == _Client.DOWNLOAD_SEGMENT
 
     def on_request(self, request: bytes, t_ns: int) -> bool:
-        """Handle a frame that belongs to the transfer; return whether the transfer is over."""
+        """Process a request that belongs to this transfer; return whether the transfer has ended."""
         command = request[0]
         if command & _TOGGLE != self._toggle:
             raise Refused(AbortCode.TOGGLE_BIT)

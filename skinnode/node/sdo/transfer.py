@@ -43,9 +43,9 @@ class Transfer(ABC):
     """Base class of transfers with more than one request. A transfer raises Refused to be aborted.
 
     Args:
-        channel: the server channel.
-        target: the object.
-        t_ns: when the initiate request was received, ns.
+        channel: SDO server channel.
+        target: object to read or write.
+        t_ns: time at which the initiate request was received, ns.
     """
 
     def __init__(self, channel: Channel, target: Target, t_ns: int) -> None:
@@ -57,11 +57,11 @@ class Transfer(ABC):
 
     @abstractmethod
     def wants(self, request: bytes) -> bool:
-        """Return whether a frame from the client belongs to this transfer."""
+        """Return whether a request from the client belongs to this transfer."""
 
     @abstractmethod
     def on_request(self, request: bytes, t_ns: int) -> bool:
-        """Handle a frame that belongs to the transfer; return whether the transfer is over."""
+        """Process a request that belongs to this transfer; return whether the transfer has ended."""
 
     def on_timer(self, t_ns: int) -> None:
         """Abort the transfer, because the client has sent no request before the time-out.
@@ -80,7 +80,7 @@ class Incoming:
 
     Args:
         store: object dictionary.
-        target: the object.
+        target: object to read or write.
         announced: size announced by the client, bytes; None if it announced no size.
 
     Raises:

@@ -54,6 +54,8 @@ OF_WIRES: Final = (
 )
 """Faults that name a wire, alternately an upper and a lower one."""
 _RATES: Final = ("emcy_per_s", "babble_per_s", "restart_every_s")
+_MOST: Final = {"drift_per_s": 1.0, "warmer_k": 100.0}
+"""Largest absolute value of faults that have a sign."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -170,6 +172,17 @@ class Faults:
     """This lower wire and the next are connected in each other's place."""
     flipped: float = 0.0
     """Fraction of the readings in which one bit of one code is flipped before the node computes its check."""
+    drift_per_s: float = 0.0
+    """Relative drift of every resistance per second, from -1 to 1. The drift starts at zero with the fault
+    and vanishes with it; resistances stay between a tenth and ten times their values."""
+    warmer_k: float = 0.0
+    """Step in the temperature of the patch, K, from -100 to 100. Every resistance changes by the temperature
+    coefficient of the patch, ``Imperfections.temperature_per_k``."""
+    error_passive: bool = False
+    """The node's controller is error-passive, which the node reports as emergency 0x8120."""
+    duplicate_node_id: bool = False
+    """A second node with the same node-ID boots, answers and obeys; its skin is at rest. The node leaves when
+    the fault ends."""
     restart_every_s: float = 0.0
     """Seconds between spontaneous resets of the node; 0 for never."""
     emcy_per_s: float = 0.0
@@ -188,13 +201,22 @@ class Faults:
         for name in OF_WIRES:
             if (wire := getattr(self, name)) is not None and wire < 0:
                 raise ConfigError(name, wire, "an integer of at least 0")
+        self._check_crossing()
+        self._check_numbers()
+
+    def _check_crossing(self) -> None:
         if (self.stuck_upper is None) != (self.stuck_lower is None):
             given = {"stuck_upper": self.stuck_upper, "stuck_lower": self.stuck_lower}
             name = next(name for name, wire in given.items() if wire is not None)
             raise ConfigError(name, given[name], "both stuck_upper and stuck_lower, which name a crossing")
+
+    def _check_numbers(self) -> None:
         for name in _RATES:
             if not 0.0 <= getattr(self, name) < math.inf:
                 raise ConfigError(name, getattr(self, name), "a number of at least 0")
+        for name, most in _MOST.items():
+            if not -most <= getattr(self, name) <= most:
+                raise ConfigError(name, getattr(self, name), f"a number from {-most:g} to {most:g}")
 
 
 @dataclass(slots=True)
@@ -242,7 +264,17 @@ class Injected:
     """Readings with a faulty wire or crossing: open, shorted, noisy, frozen, stuck or crossed."""
     flipped: int = 0
     """Readings in which one bit of one code was flipped."""
+    drifted: int = 0
+    """Readings with drift."""
+    warmed: int = 0
+    """Readings at another temperature."""
     unplugged: int = 0
+    error_passive: int = 0
+    """Number of times that the controller became error-passive."""
+    twins: int = 0
+    """Number of times that a second node with the same node-ID appeared."""
+    twin_frames: int = 0
+    """Frames sent by second nodes."""
     restarts: int = 0
     """Resets caused by ``restart_every_s``."""
     impostures: int = 0
@@ -252,7 +284,7 @@ class Injected:
     scans_spoilt: int = 0
     """Scans with missing or wrong chunks: lost, late, short, remote, miscounted or corrupted."""
     pdos: int = 0
-    """Data frames put on the bus with the COB-ID of a chunk or summary."""
+    """Data frames with the COB-ID of a chunk or summary put on the bus, also by second nodes."""
 
 
 NO_FAULTS: Final = Faults()

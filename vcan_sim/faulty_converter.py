@@ -12,7 +12,10 @@ from skinnode.node.patch.source import ResistanceSource, conversions_of
 from skinnode.protocol.codes import CodeScale, encode
 from vcan_sim.faults import OF_WIRES, Faults
 from vcan_sim.injector import Injector
+from vcan_sim.skin.imperfections import EXACT
 
+MOST_DRIFT: Final = 10.0
+"""Largest and inverse smallest ratio by which resistances drift."""
 WIRE_NOISE: Final = 3e-3
 """Relative standard deviation of a resistance measured through a bad contact."""
 
@@ -20,7 +23,9 @@ WIRE_NOISE: Final = 3e-3
 class FaultyConverter:
     """A converter whose readings may be frozen, wrong, or taken through faulty wires.
 
-    The wires are intact while the node boots, so that its tare at power-on is valid.
+    The wires are intact while the node boots, so that its tare at power-on is valid. Drift and temperature
+    act on the tare too. They scale the readings, as they scale every path of the patch if its read-out is
+    ideal.
 
     Args:
         source: Resistances that an intact converter would measure.
@@ -28,9 +33,10 @@ class FaultyConverter:
         booting: Function that returns whether the node is booting.
         baseline_ohm: Function that returns R0 (U, K) in ohm, by which the node computes codes.
         scale: Scale of the node's codes.
+        temperature_per_k: Relative change in every resistance per kelvin.
     """
 
-    def __init__(
+    def __init__(  # noqa: PLR0913 - what the converter of a node consists of
         self,
         source: ResistanceSource,
         injector: Injector,
@@ -38,9 +44,12 @@ class FaultyConverter:
         booting: Callable[[], bool],
         baseline_ohm: Callable[[], Float],
         scale: CodeScale,
+        temperature_per_k: float = EXACT.temperature_per_k,
     ) -> None:
         self._source, self._injector, self._booting = source, injector, booting
         self._baseline_ohm, self._scale = baseline_ohm, scale
+        self._temperature_per_k = temperature_per_k
+        self._drift, self._drifted_to_ns = 0.0, 0
         self._reading: Float | None = None
         self._conversions: int | None = None
         self._held: dict[tuple[str, object], Float] = {}  # by fault: the reading at its onset
@@ -56,9 +65,26 @@ class FaultyConverter:
         if self._injector.faults.frozen and self._reading is not None:
             self._injector.injected.frozen += 1
         else:
-            self._reading = self._flip(self._through_wires(self._source.read(t_ns)))
+            self._reading = self._flip(self._through_wires(self._shifted(self._source.read(t_ns), t_ns)))
             self._conversions = conversions_of(self._source)
         return self._reading
+
+    def _shifted(self, read: Float, t_ns: int) -> Float:
+        """Return a reading of a patch that drifts or has another temperature."""
+        faults, injected = self._injector.faults, self._injector.injected
+        factor = 1.0
+        if faults.drift_per_s:
+            since_ns = self._drifted_to_ns or t_ns
+            self._drift += faults.drift_per_s * (t_ns - since_ns) * 1e-9
+            self._drifted_to_ns = t_ns
+            factor *= min(max(1.0 + self._drift, 1.0 / MOST_DRIFT), MOST_DRIFT)
+            injected.drifted += 1
+        else:
+            self._drift, self._drifted_to_ns = 0.0, 0
+        if faults.warmer_k:
+            factor *= 1.0 + self._temperature_per_k * faults.warmer_k
+            injected.warmed += 1
+        return read if factor == 1.0 else factor * read
 
     def _through_wires(self, read: Float) -> Float:
         faults = self._injector.faults

@@ -9,19 +9,23 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Final, Protocol
 
+import numpy as np
+
 from skinnode.canopen import indices as od
 from skinnode.canopen.nmt import NmtCommand
 from skinnode.errors import BusError
-from skinnode.model.layout import PatchLayout
+from skinnode.model.layout import Float, PatchLayout
 from skinnode.node import NmtState, PatchNode
 from skinnode.node.clock import THRIFTY, Pacing
 from skinnode.node.patch.source import ResistanceSource
 from skinnode.protocol.codes import CodeScale
 from skinnode.protocol.profile import PatchProfile
+from skinnode.transport.bus_state import BusState
 from vcan_sim.faults import LOST_IN, LOST_OUT, NO_FAULTS, Faults, Injected
 from vcan_sim.faulty_converter import FaultyConverter
 from vcan_sim.faulty_scans import FaultyScans
 from vcan_sim.injector import Injector
+from vcan_sim.skin.imperfections import EXACT
 from vcan_sim.tally import Kind, Tally, kind_of
 
 BABBLE_COB_ID: Final = 0x3F0
@@ -34,6 +38,25 @@ _STORM: Final = bytes.fromhex("0fff810000000000")
 """EMCY 0xFF0F with the generic and manufacturer-specific bits of the error register set."""
 _MOST_AT_ONCE: Final = 32
 """Maximum number of overdue periodic events of one kind that are caught up; further events are dropped."""
+
+
+TWIN_SERIAL: Final = 0x8000_0000
+"""Bit in which the serial number of the second node of ``duplicate_node_id`` differs from the node's."""
+
+
+class Resting:
+    """Resistances of a patch that nothing touches.
+
+    Args:
+        baseline_ohm: (U, K) resistances at rest, ohm; resistances of 1 ohm if there is no baseline yet.
+    """
+
+    def __init__(self, baseline_ohm: Float) -> None:
+        self._ohm = np.where(baseline_ohm > 0.0, baseline_ohm, 1.0)
+
+    def read(self, t_ns: int) -> Float:
+        """Return the resistances (U, K), ohm."""
+        return self._ohm
 
 
 class Emit(Protocol):
@@ -55,6 +78,7 @@ class FaultyNode(PatchNode):
         serial: Serial number.
         profile: Protocol of the node.
         faults: Initial faults; their seed stays in force.
+        temperature_per_k: Relative change in every resistance per kelvin.
     """
 
     def __init__(  # noqa: PLR0913 - the arguments of PatchNode and three more
@@ -68,6 +92,7 @@ class FaultyNode(PatchNode):
         serial: int,
         profile: PatchProfile,
         faults: Faults = NO_FAULTS,
+        temperature_per_k: float = EXACT.temperature_per_k,
     ) -> None:
         self._injector = Injector(faults, node_id)
         self._emit, self._on_sent = emit, on_sent
@@ -79,7 +104,10 @@ class FaultyNode(PatchNode):
             put=self._put,
             counter_overflow=lambda: self._store.integer(od.SYNC_COUNTER_OVERFLOW),
         )
-        self._unplugged = self._stormed = False
+        self._unplugged = self._stormed = self._passive = False
+        self._controller = BusState.ACTIVE  # without faults
+        self._twin: PatchNode | None = None
+        self._layout, self._serial = layout, serial
         self._due_ns = dict.fromkeys(("restart", "emcy", "babble"), 0)
         self.converter = FaultyConverter(
             source,
@@ -87,6 +115,7 @@ class FaultyNode(PatchNode):
             booting=lambda: self.nmt_state is NmtState.INITIALISING,
             baseline_ohm=lambda: self.baseline_ohm,
             scale=CodeScale(profile.code_bits),
+            temperature_per_k=temperature_per_k,
         )
         super().__init__(
             node_id,
@@ -120,7 +149,12 @@ class FaultyNode(PatchNode):
     # --- frames and time passed to the node
 
     def on_frame(self, can_id: int, data: bytes, t_ns: int, remote: bool = False) -> None:
-        """Pass a frame to the node, unless a fault drops it."""
+        """Pass a frame to the node, unless a fault drops it, and to a second node with the same node-ID."""
+        self._hear(can_id, data, t_ns, remote)
+        if self._twin is not None:
+            self._twin.on_frame(can_id, data, t_ns, remote)
+
+    def _hear(self, can_id: int, data: bytes, t_ns: int, remote: bool) -> None:
         if self.faults.unplugged != self._unplugged:
             self._plug(t_ns)
         kind = kind_of(can_id, data, remote)
@@ -149,10 +183,15 @@ class FaultyNode(PatchNode):
 
     def on_timer(self, t_ns: int) -> None:
         """Do everything due at ``t_ns``: the node's own work and the periodic events."""
+        self._meet_twin(t_ns)
         if self.faults.unplugged != self._unplugged:
             self._plug(t_ns)
         if self._unplugged:
             return
+        if self.faults.error_passive != self._passive:
+            self._passive = self.faults.error_passive
+            self.injected.error_passive += self._passive
+            self.on_bus(self._controller, t_ns)
         super().on_timer(t_ns)
         self._reset_if_due(t_ns)
         self._do_due_events(t_ns)
@@ -160,10 +199,16 @@ class FaultyNode(PatchNode):
     def next_deadline_ns(self) -> int | None:
         """Return the time at which :meth:`on_timer` is due; None if nothing is due before the next frame."""
         faults = self.faults
-        if faults.unplugged != self._unplugged:
+        if faults.unplugged != self._unplugged or faults.duplicate_node_id != (self._twin is not None):
             return 0
-        if self._unplugged:
-            return None
+        of_twin = None if self._twin is None else self._twin.next_deadline_ns()
+        own = None if self._unplugged else self._own_deadline_ns(faults)
+        return min((each for each in (own, of_twin) if each is not None), default=None)
+
+    def _own_deadline_ns(self, faults: Faults) -> int | None:
+        """Return the time at which the node itself has something to do."""
+        if faults.error_passive != self._passive:
+            return 0
         own = super().next_deadline_ns()
         due = [self._due_ns[name] for name, period_ns in _periods_ns(faults).items() if period_ns]
         if self._stormed and not faults.emcy_per_s:
@@ -171,6 +216,31 @@ class FaultyNode(PatchNode):
         if not due or self.nmt_state is NmtState.INITIALISING:
             return own
         return min(due) if own is None else min(own, *due)
+
+    def on_bus(self, state: BusState, t_ns: int) -> None:
+        """Handle a change of the CAN controller's state, which a fault may make error-passive."""
+        self._controller = state
+        passive = self._passive and state is not BusState.OFF
+        super().on_bus(BusState.PASSIVE if passive else state, t_ns)
+
+    def _meet_twin(self, t_ns: int) -> None:
+        """Start or end the second node with the same node-ID, and do what it has to do."""
+        if self.faults.duplicate_node_id and self._twin is None:
+            self._twin = PatchNode(
+                self.node_id,
+                self._layout,
+                Resting(self.baseline_ohm),
+                send=self._from_twin,
+                serial=self._serial ^ TWIN_SERIAL,
+                profile=self.profile,
+                pacing=SIMULATED,
+            )
+            self.injected.twins += 1
+            self._twin.power_on(t_ns)
+        elif not self.faults.duplicate_node_id:
+            self._twin = None
+        if self._twin is not None:
+            self._twin.on_timer(t_ns)
 
     def _plug(self, t_ns: int) -> None:
         self._unplugged = self.faults.unplugged
@@ -278,6 +348,21 @@ class FaultyNode(PatchNode):
             raise
         self.tally.emitted[kind] += 1
         return True
+
+    def _from_twin(self, can_id: int, data: bytes) -> None:
+        """Put a frame of the second node on the bus; the node itself hears its error control messages."""
+        kind = kind_of(can_id, data)
+        self.tally.handed[kind] += 1
+        try:
+            self._emit(can_id, data)
+        except BusError:
+            self.tally.refused[kind] += 1
+            raise
+        self.tally.emitted[kind] += 1
+        self.injected.twin_frames += 1
+        self.injected.pdos += can_id in (self._chunk_id, self._summary_id)
+        if can_id == od.heartbeat_cob_id(self.node_id) and not (self._unplugged or self.faults.deaf):
+            super().on_frame(can_id, data, self._now_ns)
 
     @property
     def _is_cut_off(self) -> bool:

@@ -415,6 +415,7 @@ class _Station:
             serial=config.node_id if config.serial is None else config.serial,
             profile=self._profile,
             faults=self._faults,
+            temperature_per_k=self.source.skin.imperfections.temperature_per_k,
         )
         return self._node
 

@@ -18,6 +18,7 @@ from vcan_sim.fault_text import parse_changes, parse_values, text_of
 from vcan_sim.faults import NO_FAULTS, Faults
 from vcan_sim.fleet import Fleet
 from vcan_sim.scenes import load_scene, parse_scene, schedule_of
+from vcan_sim.tally import Kind
 from vcan_sim.testing import eventually
 from vcan_sim.virtual_time import VirtualClock
 
@@ -223,6 +224,59 @@ def test_a_scheduled_change_that_contradicts_is_refused(virtual: VirtualClock) -
         (_, text), *_ = [event for event in events(fleet) if "late" in event[1]]
     assert text.startswith("palm:late=0.5 on, refused: ")
     assert "at most 1 together" in text
+
+
+def test_a_patch_drifts_and_warms(virtual: VirtualClock) -> None:
+    """The node sends R / R0: 1 + 0.1 t while it drifts, and 1.02 at ten kelvin."""
+    plan = scene(
+        {"where": "palm", "fault": "drift_per_s=0.1", "start_s": 0.5, "end_s": 1.5},
+        {"where": "palm", "fault": "warmer_k=10.0", "start_s": 2.0, "end_s": 3.0},
+    )
+    ratios: dict[float, float] = {}
+    with Fleet(HAND, scene=plan) as fleet, sk.Host.from_config(HAND):
+        for scene_s in (0.4, 1.0, 1.49, 1.6, 1.9, 2.5, 3.1):
+            until(fleet, scene_s)
+            node: Any = fleet._stations["palm"]._node
+            ratios[scene_s] = float((node.converter._reading / node.baseline_ohm).mean())
+        injected = fleet.injected("palm")
+    step = 0.1 * PERIOD_MS * 1e-3
+    assert [ratios[t] for t in (0.4, 1.6, 1.9, 3.1)] == pytest.approx([1.0] * 4, abs=1e-4)
+    assert ratios[1.0] == pytest.approx(1.05, abs=2 * step)
+    assert ratios[1.49] == pytest.approx(1.099, abs=2 * step)
+    assert ratios[2.5] == pytest.approx(1.02, abs=1e-4)
+    assert abs(injected.drifted - 1000 / PERIOD_MS) <= 1
+    assert abs(injected.warmed - 1000 / PERIOD_MS) <= 1
+
+
+def test_an_error_passive_controller_is_reported(virtual: VirtualClock) -> None:
+    plan = scene({"where": "palm", "fault": "error_passive", "start_s": 0.5, "end_s": 1.0})
+    with Fleet(HAND, scene=plan) as fleet, sk.Host.from_config(HAND) as host:
+        until(fleet, 0.7)
+        newest = host.health("palm").reason
+        assert fleet.tally("palm").emitted[Kind.EMCY] == 1
+        until(fleet, 1.2)
+        assert fleet.tally("palm").emitted[Kind.EMCY] == 2  # error reset
+        assert fleet.injected("palm").error_passive == 1
+        assert host.health("palm").condition == "operational"
+    assert "0x8120" in newest
+
+
+def test_a_second_node_with_the_node_id(virtual: VirtualClock) -> None:
+    plan = scene({"where": "palm", "fault": "duplicate_node_id", "start_s": 0.5, "end_s": 2.0})
+    with Fleet(HAND, scene=plan) as fleet, sk.Host.from_config(HAND) as host:
+        until(fleet, 0.4)
+        assert fleet.injected("palm").twin_frames == 0
+        until(fleet, 2.1)
+        injected = fleet.injected("palm")
+        assert injected.twins == 1
+        node = fleet._stations["palm"]._node
+        assert node is not None
+        assert node.rival_frames > 0
+        assert injected.twin_frames > 10
+        until(fleet, 4.0)
+        assert fleet.injected("palm").twin_frames == injected.twin_frames
+        assert host.health("palm").condition == "operational"
+    assert fleet.tally("palm").discrepancies() == []
 
 
 def test_a_fleet_that_stops_before_its_scene_begins(virtual: VirtualClock) -> None:

@@ -43,6 +43,8 @@ def faults() -> str:
             value = "fraction of the readings"
         elif name in OF_WIRES:
             value = "number of a wire"
+        elif name.endswith("_k"):
+            value = "kelvin"
         elif name.endswith("_s"):
             value = "seconds" if name.startswith("restart") else "per second"
         rows.append((md.code(name), value, docs.get(name, "Does not arrive.")))

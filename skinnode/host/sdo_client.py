@@ -202,8 +202,7 @@ class RemoteOd:
         """Write a value that is already encoded."""
 
         def ask() -> None:
-            # type: ignore[no-untyped-call]
-            with Download(self._client, index, subindex, len(data)) as stream:
+            with Download(self._client, index, subindex, len(data)) as stream:  # type: ignore[no-untyped-call]
                 _send(stream, data)
 
         self._transfer(index, subindex, "write", ask)

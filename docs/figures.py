@@ -79,17 +79,20 @@ def systems(figures: dict[str, Any]) -> str:
         *(f"tall, × {factor}" for factor in (1, 10, 100)),
         *("falsely claimed", "solved, not claimed", "calls of r / J"),
     ]
-    return f"{machine(figures)} {of['square']} square and {of['tall']} tall problems.\n\n" + table(head, rows)
+    return f"{machine(figures)} There are {of['square']} square and {of['tall']} tall problems.\n\n" + table(
+        head, rows
+    )
 
 
 def path(figures: dict[str, Any]) -> str:
     paper = figures["paper"]
     calls, errors = paper["table2_function_calls_per_step"], paper["table3_accuracy_percent"]
     parts = [
-        f"{machine(figures)} {figures['experiments']} random presses per setting, one wire, 30 unknowns. "
-        "*Plain*: as in the paper, `Uniform(plain=True)`; *ours*: `Uniform()`. A call evaluates F with J; "
-        "calls are per step; with finite differences, as in the paper, each call counts as 31. *Lost*: wires "
-        "not CONVERGED; the error is the mean over the others."
+        f"{machine(figures)} Each setting has {figures['experiments']} random presses of one wire with 30 "
+        "unknowns. *Plain* is the paper's tracker, `Uniform(plain=True)`; *ours* is `Uniform()`. One call "
+        "evaluates F with J, and the tables list calls per step; with finite differences, as in the paper, "
+        "each call counts as 31. A wire is *lost* if it is not CONVERGED; the error is the mean over the "
+        "other wires."
     ]
     for setting in figures["settings"]:
         rows = []
@@ -113,7 +116,7 @@ def path(figures: dict[str, Any]) -> str:
     ten = "; ".join(f"{row['what']}: {row['ms']:.2f} ms" for row in figures["ten_steps"])
     worst = max(row["error"] for row in figures["ten_steps"])
     parts.append(
-        f"Ten-step path of one wire at the first setting, to {percent(worst)}: {ten}. "
+        f"Time for a ten-step path of one wire at the first setting, to an error of {percent(worst)}: {ten}. "
         "The paper reports 2.03 s."
     )
     wrong = sum(row["wrong"] for setting in figures["settings"] for row in _all_rows(setting))
@@ -326,7 +329,10 @@ def exact_data(figures: dict[str, Any]) -> str:
 
 
 def trust(figures: dict[str, Any]) -> str:
-    command = f"Output of `skinnode bench trust --seed {figures['seed']}`. {machine(figures)}"
+    command = (
+        f"The results below are the output of `skinnode bench trust --seed {figures['seed']}`. "
+        f"{machine(figures)}"
+    )
     return f"{command}\n\n```text\n" + "\n".join(trust_report.lines(figures)) + "\n```"
 
 

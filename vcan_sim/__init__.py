@@ -2,14 +2,16 @@
 
 ::
 
-    scene (true deformation) -> skin (the patch as made and read out) -> sensor (readings, wire faults)
+    scene (true deformation) -> skin (the patch as manufactured and read out) -> sensor (readings, wire
+    faults)
         -> faulty_node (the real node) -> faulty_scans (scan faults) -> fleet (all nodes on their buses)
         -> command (vcan-sim)
 
-The scene of a patch is a stroke of ``scene`` or, from a scene file, of ``scenes``. ``contact`` has contact
-mechanics on a bonded layer, apart from all models of the product; ``scenes`` uses it. ``smooth`` has smooth
-ramps. ``virtual_time`` is a clock that jumps from event to event. ``timed_bus`` is a CAN bus with exact
-times, arbitration, errors and error counters; ``timed_interface`` is its interface for python-can in virtual
-time, and ``trace`` records it. ``pytest_plugin`` and ``testing`` serve tests of other programs. ``faults``
-declares the faults, ``injector`` draws and counts faults, ``tally`` counts frames by kind.
+A patch's scene comes from module ``scene`` (random strokes) or, with a scene file, from ``scenes``.
+``contact`` computes contact mechanics on a bonded layer for ``scenes``, independently of all models in
+``skinnode``. ``smooth`` defines smooth ramps. ``virtual_time`` is a clock that jumps from event to event.
+``timed_bus`` is a CAN bus with exact times, arbitration, errors and error counters; ``timed_interface`` is
+the python-can interface to this bus in virtual time, and ``trace`` records its frames. ``pytest_plugin`` and
+``testing`` provide fixtures and helpers for tests of other programs. ``faults``
+declares the faults, ``injector`` draws and counts faults, and ``tally`` counts frames by kind.
 """

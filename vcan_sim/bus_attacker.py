@@ -1,4 +1,4 @@
-"""Faults of a bus, as data, and counts of the injected faults."""
+"""Faults that can be injected into a bus, as data, and counts of the injected faults."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ class BusFaults:
     """Faults of one bus; none by default."""
 
     seed: int = 1
-    """Seed of the random draws."""
+    """Seed of the random draws of faults."""
     bus_off: bool = False
-    """The controller of the nodes is bus-off: the nodes send and receive nothing."""
+    """Whether the nodes' controller is bus-off; the nodes then send and receive no frames."""
 
 
 @dataclass(slots=True)
@@ -21,7 +21,7 @@ class InjectedOnBus:
     """Number of times that each fault was injected into one bus."""
 
     bus_off: int = 0
-    """Times that the controller of the nodes went bus-off."""
+    """Number of times that the nodes' controller went bus-off."""
 
 
 NO_BUS_FAULTS: Final = BusFaults()

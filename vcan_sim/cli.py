@@ -1,6 +1,6 @@
 """Entry point of ``vcan-sim``.
 
-The command is in :mod:`vcan_sim.command`, the exit statuses in :mod:`skinnode.cli._exit_status`.
+The command is defined in :mod:`vcan_sim.command`, the exit statuses in :mod:`skinnode.cli._exit_status`.
 """
 
 from __future__ import annotations
@@ -12,12 +12,12 @@ from skinnode.cli._exit_status import main_of
 
 
 def main(argv: Sequence[str] | None = None) -> NoReturn:
-    """Run ``vcan-sim`` with ``argv``, or with the arguments of the process."""
+    """Run ``vcan-sim`` with ``argv``, or with the process's arguments if ``argv`` is None."""
     main_of("vcan_sim.command", argv)
 
 
 def __getattr__(name: str) -> Any:
-    """Provide ``app``, the typer application."""
+    """Import the typer application ``app`` on first access."""
     if name == "app":
         from vcan_sim.command import app
 

@@ -29,7 +29,7 @@ app = typer.Typer(
 
 
 @app.command()
-def simulate(  # noqa: PLR0913 - Typer makes a command's options of its arguments
+def simulate(  # noqa: PLR0913 - Typer derives a command's options from its arguments
     hand: Annotated[Path, typer.Argument(help="The hand to simulate.", metavar="HAND.toml")],
     interface: OtherInterface = None,
     channel: OtherChannel = None,
@@ -85,10 +85,10 @@ def simulate(  # noqa: PLR0913 - Typer makes a command's options of its argument
 
 
 def _preview(hand: HandConfig, scene: Path | None, plot: Path) -> None:
-    """Plot a scene to a file.
+    """Plot a scene to an image file.
 
     Raises:
-        ConfigError: There is no scene, matplotlib is missing, or the file cannot be written.
+        ConfigError: If there is no scene, matplotlib is missing, or the file cannot be written.
     """
     from skinnode.errors import ConfigError
     from skinnode.files.plot_file import require_matplotlib
@@ -103,7 +103,7 @@ def _preview(hand: HandConfig, scene: Path | None, plot: Path) -> None:
 
 
 def _watch(fleet: Fleet, wait: Callable[[float], bool], seconds: float | None) -> None:
-    """Print a line every second until ``wait`` returns True, time is up, or a node thread has failed."""
+    """Print a status line every second until ``wait`` returns True, time is up, or a node thread fails."""
     start = clock.monotonic()
     before = fleet.report()
     silent_until_s = 0.0
@@ -154,7 +154,7 @@ def _summary(reports: Sequence[NodeReport]) -> str:
 
 
 def _injected(fleet: Fleet) -> list[str]:
-    """Return the counts of injected faults, one line per patch."""
+    """Return one line per patch with the counts of its injected faults."""
     lines = []
     for patch in fleet.patches:
         counts = dataclasses.asdict(fleet.injected(patch))

@@ -1,4 +1,4 @@
-"""Event loop of :mod:`asyncio` that runs by the clock of its thread: virtual time, or the system's."""
+"""Event loop for :mod:`asyncio` that uses the clock of its thread: a virtual clock or the system clock."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ Ts = TypeVarTuple("Ts")
 
 
 def run(main: Coroutine[Any, Any, T]) -> T:
-    """Run a coroutine like :func:`asyncio.run`, by the clock of the current thread.
+    """Run a coroutine like :func:`asyncio.run`, with the clock of the current thread.
 
-    In virtual time the loop waits for callbacks from other threads of the program and for times. It looks for
-    data at its sockets and pipes each time it runs, but does not wait for them.
+    In virtual time, the event loop waits only for timers and for callbacks from other threads of the program.
+    The loop polls its sockets and pipes each time it runs, but does not wait for them.
 
     Args:
-        main: The coroutine.
+        main: Coroutine to run.
 
     Returns:
-        What the coroutine returns.
+        Result of the coroutine.
     """
     virtual = not isinstance(clock.current(), clock.SystemClock)
     with asyncio.Runner(loop_factory=VirtualEventLoop if virtual else None) as runner:
@@ -32,7 +32,7 @@ def run(main: Coroutine[Any, Any, T]) -> T:
 
 
 class VirtualEventLoop(asyncio.SelectorEventLoop):
-    """Event loop of a thread that runs in virtual time."""
+    """:mod:`asyncio` event loop for a thread that runs in virtual time."""
 
     def __init__(self) -> None:
         self._woken = clock.event()
@@ -45,14 +45,14 @@ class VirtualEventLoop(asyncio.SelectorEventLoop):
     def call_soon_threadsafe(
         self, callback: Callable[[*Ts], object], *args: *Ts, context: Context | None = None
     ) -> asyncio.Handle:
-        """Call a function soon, at the request of any thread of the program."""
+        """Schedule a call of a function in this event loop, from any thread of the program."""
         handle = super().call_soon_threadsafe(callback, *args, context=context)
         self._woken.set()
         return handle
 
 
 class _Selector(selectors.DefaultSelector):
-    """Selector that waits for an event instead of its files."""
+    """Selector that waits for an event instead of waiting for its file descriptors."""
 
     def __init__(self, wait: Callable[[float | None], bool], clear: Callable[[], None]) -> None:
         super().__init__()

@@ -1,4 +1,4 @@
-"""Thread that starts and ends the faults of a scene at their times."""
+"""Thread that starts and ends a scene's faults at the scheduled scene times."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ from vcan_sim.fleet_faults import FleetFaults
 
 
 class FaultPlayer:
-    """Plays a schedule from :meth:`begin` to :meth:`stop`.
+    """Player that applies a fault schedule to a fleet, from :meth:`begin` to :meth:`stop`.
 
     Args:
-        schedule: The schedule.
+        schedule: Faults of the scene and their times.
         faults: Faults of the fleet, which the player changes.
     """
 
     def __init__(self, schedule: FaultSchedule, faults: FleetFaults) -> None:
         self._schedule, self._faults = schedule, faults
         self._inbox = clock.queue()
-        """Receives the monotonic time at which the scene begins, ns; None to stop."""
+        """Queue that receives the monotonic time at which the scene begins, ns, and None to stop."""
         self._active: tuple[TimedFault, ...] = ()
         self._thread = clock.thread(self._run, "faults of the scene")
 
@@ -29,7 +29,7 @@ class FaultPlayer:
         self._thread.start()
 
     def begin(self, origin_ns: int) -> None:
-        """Begin the scene; called once.
+        """Start the schedule at scene time 0. Call this method only once.
 
         Args:
             origin_ns: Monotonic time of scene time 0, ns.
@@ -37,7 +37,7 @@ class FaultPlayer:
         self._inbox.put(origin_ns)
 
     def stop(self) -> None:
-        """End the thread. Faults that are active stay."""
+        """Stop the thread. Active faults remain active."""
         self._inbox.put(None)
         self._thread.join()
 
@@ -59,7 +59,7 @@ class FaultPlayer:
         self._inbox.get()
 
     def _follow(self, t_s: float) -> None:
-        """Bring the faults to their state at a scene time."""
+        """Start and end faults as scheduled for scene time ``t_s``."""
         before, self._active = self._active, self._schedule.active(t_s)
         ended = [each for each in before if each not in self._active]
         started = [each for each in self._active if each not in before]

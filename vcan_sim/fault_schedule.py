@@ -1,4 +1,4 @@
-"""Faults that start and end at times of a scene, as pure data."""
+"""Schedule of faults that start and end at given scene times, as pure data."""
 
 from __future__ import annotations
 
@@ -10,39 +10,39 @@ from typing import Final
 from vcan_sim.fault_text import Value
 
 CLOSE_S: Final = 1e-9
-"""Largest rounding error of a scene time, s: a fault whose start is that near is active."""
+"""Maximum rounding error of a scene time, s; a fault that starts within this time counts as active."""
 
 
 @dataclass(frozen=True, slots=True)
 class TimedFault:
-    """Faults of one patch or bus from one time to another."""
+    """Faults of one patch or bus that are active from a start time to an end time."""
 
     number: int
-    """Position among the ``[[faults]]`` of the scene."""
+    """Index of the fault among the scene's ``[[faults]]`` tables."""
     place: str
-    """Name of the patch or bus."""
+    """Name of the faulty patch or bus."""
     on_bus: bool
     start_s: float
-    """Scene time of the start, s."""
+    """Scene time at which the fault starts, s."""
     end_s: float
-    """Scene time of the end, s; infinity if the fault does not end."""
+    """Scene time at which the fault ends, s; infinity if it does not end."""
     values: Mapping[str, Value] = field(hash=False)
     """Values of the faults, by name."""
 
 
 @dataclass(frozen=True, slots=True)
 class FaultSchedule:
-    """Faults of a scene."""
+    """Scheduled faults of a scene."""
 
     faults: tuple[TimedFault, ...] = ()
     repeat_s: float | None = None
-    """Period of the scene, s; None if it plays once."""
+    """Period of the scene, s; None if the scene plays once."""
 
     def active(self, t_s: float) -> tuple[TimedFault, ...]:
         """Return the faults that are active at a scene time, in the order of the scene.
 
         Args:
-            t_s: Scene time, s; before 0 nothing is active.
+            t_s: Scene time, s; no fault is active before 0.
         """
         if t_s < -CLOSE_S:
             return ()
@@ -50,7 +50,7 @@ class FaultSchedule:
         return tuple(each for each in self.faults if each.start_s - CLOSE_S <= at_s < each.end_s - CLOSE_S)
 
     def next_change_s(self, t_s: float) -> float | None:
-        """Return the scene time of the first start or end after a time, s; None if there is none.
+        """Return the scene time, s, of the next start or end of a fault after ``t_s``; None if there is none.
 
         Args:
             t_s: Scene time, s.
@@ -63,7 +63,7 @@ class FaultSchedule:
         return (t_s - at_s) + min(later) if later else None
 
     def _within(self, t_s: float) -> float:
-        """Return a scene time within the first period."""
+        """Map a scene time to the first period of the scene."""
         if self.repeat_s is None:
             return t_s
         at_s = math.fmod(max(t_s, 0.0), self.repeat_s)

@@ -1,4 +1,4 @@
-"""Faults as text, such as ``palm:lost=0.1,frozen`` or ``can0:bus_off``: parsed and printed.
+"""Parsing and printing of faults in text form, such as ``palm:lost=0.1,frozen`` or ``can0:bus_off``.
 
 ::
 
@@ -20,15 +20,15 @@ from vcan_sim.bus_attacker import NO_BUS_FAULTS, BusFaults
 from vcan_sim.faults import NO_FAULTS, Faults
 
 NONE: Final = "none"
-"""Word that ends all faults of a place, or the fault of a wire."""
+"""Keyword that ends all faults of a patch or bus, or the fault of a wire."""
 
 Value = int | float | bool | None
 AnyFaults = TypeVar("AnyFaults", Faults, BusFaults)
 
 OF_PATCHES: Final = {each.name: each.default for each in dataclasses.fields(Faults)}
-"""Defaults of the faults of a patch, by name."""
+"""Default values of a patch's faults, by name."""
 OF_BUSES: Final = {each.name: each.default for each in dataclasses.fields(BusFaults)}
-"""Defaults of the faults of a bus, by name."""
+"""Default values of a bus's faults, by name."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,15 +36,15 @@ class FaultChange:
     """Change of the faults of one patch or bus."""
 
     place: str
-    """Name of the patch or bus."""
+    """Name of the patch or bus whose faults change."""
     on_bus: bool
     values: Mapping[str, Value] = field(default_factory=dict)
     """New values of the faults, by name."""
     clears: bool = False
-    """Whether all earlier faults of the place end."""
+    """Whether all earlier faults of the patch or bus end."""
 
     def of(self, faults: AnyFaults) -> AnyFaults:
-        """Return the faults after this change of ``faults``.
+        """Apply this change to ``faults`` and return the result.
 
         Raises:
             ConfigError: If a value is out of range, or the values contradict each other.
@@ -56,13 +56,13 @@ class FaultChange:
 def parse_changes(
     texts: Sequence[str], patches: Sequence[str], buses: Sequence[str], key: str = "--fault"
 ) -> list[FaultChange]:
-    """Return the changes that some texts describe, in their order.
+    """Parse texts that describe faults, and return the changes in the same order.
 
     Args:
         texts: Texts such as ``palm:lost=0.1,frozen``, ``can0:bus_off``, ``palm:none`` or ``none``.
-        patches: Names of the hand's patches; a bus with the name of a patch cannot be named.
+        patches: Names of the hand's patches. If a patch and a bus share a name, the name refers to the patch.
         buses: Names of the hand's buses.
-        key: Name of the option, for messages.
+        key: Name of the command-line option, for error messages.
 
     Raises:
         ConfigError: If a place is not in the hand, a fault is unknown there, or a value has the wrong type.
@@ -83,12 +83,12 @@ def parse_changes(
 
 
 def parse_values(text: str, *, on_bus: bool, key: str = "--fault") -> dict[str, Value]:
-    """Return the values of faults by name, such as those of ``lost=0.01,silent``.
+    """Parse faults without a place, such as ``lost=0.01,silent``, and return their values by name.
 
     Args:
-        text: Names with their values, separated by commas; at least one.
-        on_bus: Whether these are faults of a bus.
-        key: Name of the option, for messages.
+        text: Names of faults with their values, separated by commas; at least one fault.
+        on_bus: Whether the text describes faults of a bus.
+        key: Name of the command-line option, for error messages.
 
     Raises:
         ConfigError: If a fault is unknown or a value has the wrong type.
@@ -97,7 +97,7 @@ def parse_values(text: str, *, on_bus: bool, key: str = "--fault") -> dict[str, 
 
 
 def text_of(faults: Faults | BusFaults) -> str:
-    """Return faults as text that :func:`parse_values` reads, without the seed; ``none`` if there are none."""
+    """Return faults in the text form of :func:`parse_values`, without the seed; ``none`` if empty."""
     defaults = OF_BUSES if isinstance(faults, BusFaults) else OF_PATCHES
     shown = [
         name_and_value(name, getattr(faults, name))
@@ -108,7 +108,7 @@ def text_of(faults: Faults | BusFaults) -> str:
 
 
 def name_and_value(name: str, value: Value) -> str:
-    """Return a fault as text: its name, and its value unless that is True."""
+    """Return a fault in text form: its name, followed by its value unless the value is True."""
     return name if value is True else f"{name}={_shown(value)}"
 
 
@@ -133,7 +133,7 @@ def _change(place: str, listed: str, key: str, *, on_bus: bool) -> FaultChange:
 
 
 def _everywhere(listed: str, patches: Sequence[str], buses: Sequence[str], key: str) -> Iterator[FaultChange]:
-    """Yield the changes of a text without a place: the name of a fault says where it belongs."""
+    """Yield the changes of a text without a place; each fault's name determines whether it is on buses."""
     parts = _parts(listed, key)
     clears = NONE in parts
     values = _values([part for part in parts if part != NONE], OF_PATCHES | OF_BUSES, key)
@@ -176,5 +176,5 @@ def _allowed(kind: type) -> str:
 
 
 def none_of(*, on_bus: bool) -> Faults | BusFaults:
-    """Return the faults of a patch or a bus that has none."""
+    """Return an empty set of faults for a patch or a bus."""
     return NO_BUS_FAULTS if on_bus else NO_FAULTS

@@ -1,4 +1,4 @@
-"""Converter with faults in its wires and in itself."""
+"""Simulated converter with faults of its wires and of the converter itself."""
 
 from __future__ import annotations
 
@@ -15,28 +15,28 @@ from vcan_sim.injector import Injector
 from vcan_sim.skin.imperfections import EXACT
 
 MOST_DRIFT: Final = 10.0
-"""Largest and inverse smallest ratio by which resistances drift."""
+"""Maximum ratio, and inverse of the minimum ratio, by which resistances drift."""
 WIRE_NOISE: Final = 3e-3
 """Relative standard deviation of a resistance measured through a bad contact."""
 
 
 class FaultyConverter:
-    """A converter whose readings may be frozen, wrong, or taken through faulty wires.
+    """Converter whose readings may be frozen, wrong, or taken through faulty wires.
 
-    The wires are intact while the node boots, so that its tare at power-on is valid. Drift and temperature
-    act on the tare too. They scale the readings, as they scale every path of the patch if its read-out is
-    ideal.
+    The wires are intact while the node boots, so that the tare at power-on is valid. Drift and temperature
+    also act on the tare. They scale the readings; with an ideal read-out, this is equivalent to scaling every
+    path of the patch.
 
     Args:
         source: Resistances that an intact converter would measure.
         injector: The node's faults, random generator and counts.
         booting: Function that returns whether the node is booting.
-        baseline_ohm: Function that returns R0 (U, K) in ohm, by which the node computes codes.
+        baseline_ohm: Function that returns the node's baseline R0 (U, K) in ohm, used for computing codes.
         scale: Scale of the node's codes.
         temperature_per_k: Relative change in every resistance per kelvin.
     """
 
-    def __init__(  # noqa: PLR0913 - what the converter of a node consists of
+    def __init__(  # noqa: PLR0913 - all parts of a node's converter
         self,
         source: ResistanceSource,
         injector: Injector,
@@ -52,11 +52,11 @@ class FaultyConverter:
         self._drift, self._drifted_to_ns = 0.0, 0
         self._reading: Float | None = None
         self._conversions: int | None = None
-        self._held: dict[tuple[str, object], Float] = {}  # by fault: the reading at its onset
+        self._held: dict[tuple[str, object], Float] = {}  # reading at the start of each fault
 
     @property
     def conversions(self) -> int | None:
-        """Number of conversions; a frozen converter completes none. None if conversions are not counted."""
+        """Number of completed conversions, constant while the converter is frozen; None if not counted."""
         return None if self._injector.faults.uncounted else self._conversions
 
     def read(self, t_ns: int) -> Float:
@@ -70,7 +70,7 @@ class FaultyConverter:
         return self._reading
 
     def _shifted(self, read: Float, t_ns: int) -> Float:
-        """Return a reading of a patch that drifts or has another temperature."""
+        """Apply drift and a change of temperature to a reading."""
         faults, injected = self._injector.faults, self._injector.injected
         factor = 1.0
         if faults.drift_per_s:
@@ -111,7 +111,7 @@ class FaultyConverter:
         return read
 
     def _hold(self, read: Float, faults: Faults) -> None:
-        """Replace what is frozen or stuck by its reading at the onset of the fault."""
+        """Replace the readings of frozen wires and stuck crossings by those at the start of the fault."""
         stuck = None if faults.stuck_upper is None else (faults.stuck_upper, faults.stuck_lower)
         held: dict[tuple[str, object], Float] = {}
         for name, place, ohm in (
@@ -126,7 +126,7 @@ class FaultyConverter:
         self._held = held
 
     def _flip(self, read: Float) -> Float:
-        """Return a reading of which one bit of one code may be flipped."""
+        """Flip one bit of one code in a reading, if the fault ``flipped`` is drawn."""
         if not self._injector.draw(self._injector.faults.flipped) or self._booting():
             return read
         random, scale, baseline_ohm = self._injector.random, self._scale, self._baseline_ohm()

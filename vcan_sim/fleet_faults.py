@@ -1,7 +1,7 @@
-"""What is injected into a fleet now: the only owner of that state, with a log of its changes.
+"""State of the faults injected into a fleet, with a log of its changes.
 
-Three sources change it: :meth:`vcan_sim.fleet.Fleet.inject`, texts (``vcan-sim inject``) and the schedule of
-a scene. Each change is checked before it takes effect, and a call changes everything or nothing.
+Faults are changed by :meth:`vcan_sim.fleet.Fleet.inject`, by texts (``vcan-sim inject``) and by a scene's
+schedule. Each change is checked before it takes effect, and each call applies all of its changes or none.
 """
 
 from __future__ import annotations
@@ -29,19 +29,19 @@ from vcan_sim.faults import NO_FAULTS, Faults
 
 @dataclass(frozen=True, slots=True)
 class FaultEvent:
-    """Start or end of a fault."""
+    """Log entry for the start or end of a fault."""
 
     time_ns: int
-    """Time since 1970, ns."""
+    """Time of the event since 1970, ns."""
     place: str
-    """Name of the patch or bus."""
+    """Name of the faulty patch or bus."""
     fault: str
     value: Value
     """Value of the fault that starts or ends."""
     on: bool
-    """Whether the fault starts."""
+    """Whether the fault starts rather than ends."""
     refused: str = ""
-    """Reason for which a scheduled change did not take effect; empty if it did."""
+    """Reason why a scheduled change did not take effect; empty if the change took effect."""
 
     def __str__(self) -> str:
         what = f"{self.place}:{name_and_value(self.fault, self.value)} {'on' if self.on else 'off'}"
@@ -50,9 +50,9 @@ class FaultEvent:
 
 @dataclass(frozen=True, slots=True)
 class Places:
-    """Patches and buses of a fleet, and what to do with their faults.
+    """Patches and buses of a fleet, with functions that check and set their faults.
 
-    ``check`` functions raise ConfigError if a place cannot have the faults.
+    The ``check`` functions raise ConfigError if the patch or bus cannot have the faults.
     """
 
     patches: Sequence[str]
@@ -64,7 +64,7 @@ class Places:
 
 
 class FleetFaults:
-    """Faults of a fleet's patches and buses. Any thread may call the methods.
+    """Faults of a fleet's patches and buses. The methods may be called from any thread.
 
     Args:
         places: Patches and buses of the fleet.
@@ -85,21 +85,21 @@ class FleetFaults:
     # --- what is injected
 
     def patch(self, name: str) -> Faults:
-        """Return the present faults of a patch."""
+        """Return the current faults of a patch."""
         return self._of_patches[name]
 
     def bus(self, name: str) -> BusFaults:
-        """Return the present faults of a bus."""
+        """Return the current faults of a bus."""
         return self._of_buses[name]
 
     def texts(self) -> list[str]:
-        """Return one text for each patch or bus that has faults, such as ``palm:lost=0.1``."""
+        """Return the current faults as one text per faulty patch or bus, such as ``palm:lost=0.1``."""
         found = [(name, text_of(faults)) for name, faults in (self._of_patches | self._of_buses).items()]
         return [f"{place}:{text}" for place, text in found if text != NONE]
 
     @property
     def log(self) -> tuple[FaultEvent, ...]:
-        """Every start and end of a fault so far, oldest first."""
+        """All starts and ends of faults so far, oldest first."""
         return tuple(self._log)
 
     def forget_log(self) -> None:
@@ -109,26 +109,27 @@ class FleetFaults:
     # --- changes
 
     def inject(self, *texts: str, key: str = "--fault") -> None:
-        """Change faults as texts say; faults that they do not name stay.
+        """Change faults as described by texts; faults that no text names do not change.
 
         Args:
             *texts: Texts such as ``palm:unplugged`` or ``palm:none``; see :mod:`vcan_sim.fault_text`.
-            key: Name of the option, for messages.
+            key: Name of the command-line option, for error messages.
 
         Raises:
-            ConfigError: If a text is invalid. Nothing has changed then.
+            ConfigError: If a text is invalid. In this case no fault changes.
         """
         places = self._places
         self._change(parse_changes(texts, places.patches, places.buses, key))
 
     def set_patches(self, faults: Mapping[str, Faults]) -> None:
-        """Replace the faults of some patches.
+        """Replace the faults of one or more patches.
 
         Args:
             faults: New faults by patch.
 
         Raises:
-            ConfigError: If a patch is not in the hand, or cannot have the faults. Nothing has changed then.
+            ConfigError: If a patch is not in the hand or cannot have the faults. In this case no fault
+                changes.
         """
         for name in faults:
             if name not in self._places.patches:
@@ -144,7 +145,8 @@ class FleetFaults:
             faults: New faults.
 
         Raises:
-            ConfigError: If the bus is not in the hand, or cannot have the faults. Nothing has changed then.
+            ConfigError: If the bus is not in the hand or cannot have the faults. In this case no fault
+                changes.
         """
         if name not in self._places.buses:
             raise ConfigError("bus", name, f"a bus of the hand: {', '.join(self._places.buses)}")
@@ -152,13 +154,13 @@ class FleetFaults:
             self._replace({}, {name: faults})
 
     def follow(self, ended: Iterable[TimedFault], started: Iterable[TimedFault]) -> None:
-        """End some faults of a schedule and start others.
+        """End and start scheduled faults.
 
         A change that contradicts faults from another source is logged as refused.
 
         Args:
-            ended: Faults that end; a place's other faults stay.
-            started: Faults that start.
+            ended: Scheduled faults that end; other faults of the same patch or bus do not change.
+            started: Scheduled faults that start.
         """
         by_place: dict[tuple[str, bool], dict[str, Value]] = {}
         for each in ended:
@@ -191,7 +193,7 @@ class FleetFaults:
             self._replace(patches, buses)
 
     def _replace(self, patches: Mapping[str, Faults], buses: Mapping[str, BusFaults]) -> None:
-        """Check all new faults, then apply and log them. Called with the lock held."""
+        """Check all new faults, then apply and log them. The caller must hold the lock."""
         for name, faults in patches.items():
             self._places.check_patch(name, faults)
         for name, of_bus in buses.items():
@@ -206,7 +208,7 @@ class FleetFaults:
             self._places.set_bus(name, of_bus)
 
     def _note(self, place: str, before: Faults | BusFaults, after: Faults | BusFaults) -> None:
-        """Log what a replacement of faults starts and ends."""
+        """Log the starts and ends of faults due to a replacement."""
         now_ns = clock.time_ns()
         on_bus = isinstance(after, BusFaults)
         for name in OF_BUSES if on_bus else OF_PATCHES:

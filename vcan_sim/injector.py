@@ -1,4 +1,4 @@
-"""Fault injector of one node: its current faults, the random generator and the counts."""
+"""Fault injector of one node: current faults, random generator and counts."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from vcan_sim.tally import Tally
 
 
 class Injector:
-    """Draws faults, determined by a seed and the order of calls, and counts them.
+    """Fault injector that draws and counts a node's faults, determined by a seed and the order of calls.
 
     :attr:`faults` can be replaced at any time from any thread.
 
     Args:
-        faults: Initial faults; their seed stays in force.
-        node_id: Node-ID; makes nodes with the same seed draw different faults.
+        faults: Initial faults; their seed remains in use when the faults are replaced.
+        node_id: Node-ID, so that nodes with the same seed draw different faults.
     """
 
     def __init__(self, faults: Faults, node_id: int) -> None:
@@ -28,7 +28,7 @@ class Injector:
         return share > 0.0 and bool(self.random.random() < share)
 
     def draw_one(self, names: tuple[str, ...]) -> str:
-        """Return one of the faults, each with the probability given by its fraction, or an empty string."""
+        """Draw the name of one fault, each with its fraction as probability; an empty string for no fault."""
         faults = self.faults
         if faults is NO_FAULTS:
             return ""
@@ -40,12 +40,12 @@ class Injector:
         return ""
 
     def loses(self, fault: str | None) -> bool:
-        """Return whether this fault drops a frame, and count the drop."""
+        """Draw whether a fault drops a frame, and count the dropped frame."""
         if fault is None or not self.draw(getattr(self.faults, fault)):
             return False
         self.count(fault)
         return True
 
     def count(self, fault: str) -> None:
-        """Count a fault as injected."""
+        """Count one injection of a fault."""
         setattr(self.injected, fault, getattr(self.injected, fault) + 1)

@@ -1,12 +1,12 @@
-"""Deformation of the skin: a sphere presses, slides and lifts repeatedly, and the rubber follows.
+"""Scene of random strokes: a sphere repeatedly presses, slides and lifts, and deforms the skin.
 
 The displacement of the electrodes is the closed-form solution for a sliding Hertz contact on a half-space
-(:class:`skinnode.model.elastic.HertzContact`), so the truth has no grid and does not depend on a solver's
-discretisation. A scene is a pure function of scene time: it can be evaluated at any time, in any order, and
-the same seed gives the same scene.
+(:class:`skinnode.model.elastic.HertzContact`), so the ground truth has no grid and does not depend on a
+solver's discretisation. A scene is a pure function of scene time: it can be evaluated at any times in any
+order, and the same seed produces the same scene.
 
-The onset of sliding is simplified: shear grows in proportion to the pressure, from zero to full friction,
-while the sphere accelerates; a real contact slips from its rim inwards (Cattaneo, Mindlin).
+The onset of sliding is simplified: while the sphere accelerates, the ratio of shear to pressure grows from
+zero to the coefficient of friction. A real contact slips from its rim inwards (Cattaneo, Mindlin).
 """
 
 from __future__ import annotations
@@ -24,17 +24,18 @@ from skinnode.model.layout import Float, PatchLayout
 from vcan_sim.smooth import GLIDE_RAMP, ease, glide
 
 LEAD_S: Final = 0.8
-"""Duration of rest before the first press, s; leaves time to measure the baseline and to open a viewer."""
+"""Duration of rest before the first press, s, for measuring the baseline and opening a viewer."""
 
 PRESS, SLIDE, LIFT = 0.36, 0.40, 0.14
-"""Fractions of a cycle; the skin is at rest for the remainder. In a 4 s cycle a press takes 1.4 s."""
+"""Durations of press, slide and lift as fractions of a cycle; the skin is at rest for the remainder. In a 4 s
+cycle, a press takes 1.4 s."""
 
 _GOLDEN: Final = 0.5 * (math.sqrt(5.0) - 1.0)
 
 
 @dataclass(frozen=True, slots=True)
 class Stroke:
-    """One press, slide and lift of a sphere. ``heading`` is a unit vector; times run from contact, s."""
+    """Stroke of a sphere: press, slide and lift. ``heading`` is a unit vector; times start at contact, s."""
 
     radius_m: float
     depth_m: float
@@ -47,7 +48,7 @@ class Stroke:
     lift_s: float
 
     def contact(self, rubber: Rubber, t_s: float) -> HertzContact | None:
-        """Return the contact at ``t_s``, or None if the sphere does not touch the skin."""
+        """Return the contact ``t_s`` seconds into the stroke; None if the sphere does not touch the skin."""
         lifting = t_s - self.press_s - self.slide_s
         depth = self.depth_m * ease(t_s / self.press_s) * (1.0 - ease(lifting / self.lift_s))
         if depth <= 0.0:
@@ -66,14 +67,14 @@ class Stroke:
 
 @dataclass(frozen=True)
 class Scene:
-    """Strokes of a sphere over one patch.
+    """Scene in which a sphere makes random strokes over one patch.
 
     Args:
-        layout: The patch at rest. Its electrodes lie on the surface of the rubber; a curved skin is treated
-            as its projection onto the x-y plane.
-        simulation: Seed, sphere, depth, friction, speed and timing.
+        layout: Layout of the patch at rest. The upper electrodes are on the surface of the rubber; a curved
+            skin is treated as its projection onto the x-y plane.
+        simulation: Seed, sphere radius, depth, friction, speed and timing of the strokes.
         number: Number of the patch in the hand. Each patch has its own strokes and phase.
-        rubber: Material of the skin. The force depends on its Young's modulus, the displacement does not.
+        rubber: Material of the skin. Its Young's modulus affects the force but not the displacement.
     """
 
     layout: PatchLayout
@@ -83,7 +84,7 @@ class Scene:
 
     @property
     def lead_s(self) -> float:
-        """Scene time of the first touch, s. Patches differ by up to a quarter of a cycle."""
+        """Scene time of the first touch, s, which differs between patches by up to a quarter of a cycle."""
         return LEAD_S + 0.25 * self.simulation.cycle_s * math.fmod(self.number * _GOLDEN, 1.0)
 
     def stroke(self, index: int) -> Stroke:
@@ -99,7 +100,7 @@ class Scene:
         slide_m = min(options.slide_speed_m_per_s * (1.0 - GLIDE_RAMP) * slide_s, room)
         way = slide_m * heading
         first, last = low - np.minimum(way, 0.0), high - np.maximum(way, 0.0)
-        start = random.uniform(first, np.maximum(first, last))  # rounding may put `first` above `last`
+        start = random.uniform(first, np.maximum(first, last))  # rounding may make `first` exceed `last`
         return Stroke(
             radius_m=options.indenter_radius_m,
             depth_m=options.depth * self.layout.height_m,
@@ -121,7 +122,7 @@ class Scene:
         return () if contact is None else (contact,)
 
     def upper_m(self, t_s: float) -> Float:
-        """Return the electrodes (U, N, 3) in m at scene time ``t_s``; ``layout.upper_m`` while at rest."""
+        """Return the upper electrodes (U, N, 3), m, at a scene time; ``layout.upper_m`` itself at rest."""
         contacts = self.contacts(t_s)
         if not contacts:
             return self.layout.upper_m
@@ -136,8 +137,8 @@ class Scene:
     def _field_m(self) -> tuple[Float, Float]:
         """Corners of the rectangle to which the centre of the sphere is confined.
 
-        The rectangle lies one pitch inside the outermost electrodes, or shrinks to their midpoint on a
-        smaller patch.
+        The rectangle is one pitch inside the outermost electrodes, or shrinks to their midpoint if the patch
+        is too small.
         """
         low, high = self._surface_m.min(axis=0), self._surface_m.max(axis=0)
         inset = np.minimum(self.layout.pitch_m, 0.5 * (high - low))

@@ -1,4 +1,4 @@
-"""Counts of frames by kind, to compare what simulated nodes sent with what a host received."""
+"""Counts of frames by kind, for comparing what simulated nodes sent with what a host received."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ _HEARTBEAT: Final = od.heartbeat_cob_id(0)
 def kind_of(can_id: int, data: bytes, remote: bool = False) -> Kind:
     """Return the kind of a frame with an 11-bit identifier.
 
-    Remote frames are a separate kind. A frame of the wrong length has the kind given by its COB-ID.
+    Remote frames are a separate kind. The COB-ID determines the kind even if the frame has the wrong length.
     """
     if remote:
         return Kind.REMOTE
@@ -67,23 +67,23 @@ def kind_of(can_id: int, data: bytes, remote: bool = False) -> Kind:
 class Tally:
     """Counts of one node's frames, by kind.
 
-    Sent frames: ``handed = emitted + lost + silenced + refused + waiting``; received frames:
+    For sent frames, ``handed = emitted + lost + silenced + refused + waiting``. For received frames,
     ``heard = taken + lost_in + unheard``.
     """
 
     def __init__(self) -> None:
         self.handed: Counter[Kind] = Counter()
-        """Frames to send, from the node or from a fault that adds frames."""
+        """Frames to send, from the node itself or from a fault that adds frames."""
         self.emitted: Counter[Kind] = Counter()
         """Frames put on the bus."""
         self.lost: Counter[Kind] = Counter()
         """Frames dropped by a fault on the way to the bus."""
         self.silenced: Counter[Kind] = Counter()
-        """Frames held back while the node was silent, unplugged or being reset."""
+        """Frames not sent because the node was silent, unplugged or being reset."""
         self.refused: Counter[Kind] = Counter()
         """Frames that the bus refused."""
         self.waiting: Counter[Kind] = Counter()
-        """Frames held back to be sent later: late chunks, and chunks that swap places with a frame."""
+        """Frames that wait to be sent later: late chunks, and chunks that swap places with the next frame."""
         self.heard: Counter[Kind] = Counter()
         """Frames that reached the node's controller."""
         self.taken: Counter[Kind] = Counter()
@@ -94,7 +94,7 @@ class Tally:
         """Frames missed while the node was deaf or unplugged."""
 
     def discrepancies(self) -> list[str]:
-        """Return one line for each kind of frame with inconsistent counts. Call when the node is idle."""
+        """Return one line per kind of frame with inconsistent counts. Call this when the node is idle."""
         out = self.emitted + self.lost + self.silenced + self.refused + self.waiting
         into = self.taken + self.lost_in + self.unheard
         found = [

@@ -1,4 +1,4 @@
-"""Waiting in tests, by the clock of the test: virtual or the system's."""
+"""Functions for waiting in tests, with the clock of the test: a virtual clock or the system clock."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ from skinnode.process import clock
 def eventually(
     condition: Callable[[], object], within_s: float = 10.0, *, every_s: float = 0.01, what: str = ""
 ) -> None:
-    """Wait until a condition holds.
+    """Wait until a condition is true.
 
     Args:
-        condition: Function without arguments; its result counts as true or false.
+        condition: Function without arguments whose result is interpreted as true or false.
         within_s: Maximum wait, s.
-        every_s: Time between two calls of the condition, s.
-        what: What is waited for, for the message.
+        every_s: Time between two calls of ``condition``, s.
+        what: Description of the condition, for the error message.
 
     Raises:
-        AssertionError: The condition does not hold in time.
+        AssertionError: If the condition is not true within ``within_s``.
     """
     end_s = clock.monotonic() + within_s
     while not condition():
@@ -32,13 +32,13 @@ def eventually(
 
 @contextmanager
 def within(seconds: float) -> Iterator[None]:
-    """Require that a ``with`` block ends in time. It is not interrupted.
+    """Check that a ``with`` block ends within a maximum duration, without interrupting the block.
 
     Args:
         seconds: Maximum duration, s.
 
     Raises:
-        AssertionError: The block took longer.
+        AssertionError: If the block takes longer.
     """
     begin_s = clock.monotonic()
     yield

@@ -1,4 +1,4 @@
-"""Traces of the frames on a bus, in the format of ``candump -L``."""
+"""Traces of the frames on a bus, in the log format of ``candump -L``."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from vcan_sim.timed_bus import CanFrame, Delivered, Event
 from vcan_sim.timed_interface import Segment
 
 _POLL_S: Final = 0.05
-"""Maximum wait for a frame, s; also the longest wait of :meth:`Listener.__exit__`."""
+"""Maximum time to wait for a frame, s; :meth:`Listener.__exit__` also waits at most this long."""
 
 
 class Trace:
-    """Record of every frame on a timed bus from now on, with the time of the frame's end.
+    """Record of every frame on a timed bus from now on, with the time at which the frame ended.
 
     Args:
-        of: The bus.
+        of: Bus to record.
     """
 
     def __init__(self, of: Segment) -> None:
@@ -30,11 +30,11 @@ class Trace:
         of.listeners.append(self._on_event)
 
     def __len__(self) -> int:
-        """Return the number of frames."""
+        """Return the number of recorded frames."""
         return len(self._lines)
 
     def text(self) -> str:
-        """Return one line per frame, such as ``(1600000000.000310) can0 080#01``."""
+        """Return the trace with one line per frame, such as ``(1600000000.000310) can0 080#01``."""
         return "".join(self._lines)
 
     def _on_event(self, event: Event) -> None:
@@ -43,13 +43,13 @@ class Trace:
 
 
 class Listener:
-    """Record of every frame that an endpoint of its own receives on a bus, in a ``with`` block.
+    """Record of every frame on a bus during a ``with`` block, received by a separate endpoint.
 
     Args:
-        bus: The bus.
+        bus: Bus to record.
 
     Raises:
-        BusError: The bus cannot be opened.
+        BusError: If the bus cannot be opened.
     """
 
     def __init__(self, bus: BusConfig) -> None:
@@ -60,7 +60,7 @@ class Listener:
         self._thread = clock.thread(self._run, f"trace {bus.name}")
 
     def text(self) -> str:
-        """Return one line per frame, such as ``(1600000000.000310) vcan0 080#01``."""
+        """Return the trace with one line per frame, such as ``(1600000000.000310) vcan0 080#01``."""
         return "".join(self._lines)
 
     def __enter__(self) -> Self:

@@ -1,6 +1,6 @@
 """Faults that can be injected into a node, as data, and counts of the injected faults.
 
-A chunk has at most one fault, so that the counts can be compared with a receiver's.
+Each chunk has at most one fault, so that the counts can be compared with the counters of a receiver.
 """
 
 from __future__ import annotations
@@ -52,15 +52,15 @@ OF_WIRES: Final = (
     "crossed_upper",
     "crossed_lower",
 )
-"""Faults that name a wire, alternately an upper and a lower one."""
+"""Faults whose value is the number of a wire, alternately an upper and a lower wire."""
 _RATES: Final = ("emcy_per_s", "babble_per_s", "restart_every_s")
 _MOST: Final = {"drift_per_s": 1.0, "warmer_k": 100.0}
-"""Largest absolute value of faults that have a sign."""
+"""Maximum absolute value of each signed fault."""
 
 
 @dataclass(frozen=True, slots=True)
 class Faults:
-    """Faults of one node; none by default.
+    """Faults of one simulated node; by default there are none.
 
     Raises:
         ConfigError: If a fraction is not between 0 and 1, the fractions of chunks or of scans add up to more
@@ -68,7 +68,7 @@ class Faults:
     """
 
     seed: int = 1
-    """Seed of the random draws; the same seed and the same frames give the same faults."""
+    """Seed of the random draws; the same seed and the same frames produce the same faults."""
 
     # --- fractions of the chunks
     lost: float = 0.0
@@ -85,9 +85,9 @@ class Faults:
     miscounted: float = 0.0
     """The chunk carries the counter of another scan."""
     miscounted_by: int | None = None
-    """Error of the ``miscounted`` counter, modulo 256; None for a random error."""
+    """Error of the scan counter in a ``miscounted`` chunk, modulo 256; None for a random error."""
     corrupted: float = 0.0
-    """One code differs from the code packed by the node; length and counters are correct."""
+    """One code in the chunk differs from the code packed by the node; length and counters are correct."""
 
     # --- fractions of the scans
     torn: float = 0.0
@@ -96,13 +96,14 @@ class Faults:
     reset: float = 0.0
     """The node is reset after half of its chunks, as by a watchdog."""
     displaced: float = 0.0
-    """A chunk carries the counter of the next scan, whose own chunk with that index is lost."""
+    """A chunk carries the counter of the next scan, and the chunk with the same index in the next scan is
+    lost."""
     understated: float = 0.0
-    """A chunk is lost; the summary claims that only changed chunks were sent, and counts one chunk fewer. The
-    check, if the summary carries one, is correct for that summary. If the node really sends only changed
-    chunks in this scan, the chunk is simply lost."""
+    """A chunk is lost, and the summary claims that only changed chunks were sent and counts one chunk fewer.
+    If the summary carries a check, the check is correct for this summary. If the node really sends only
+    changed chunks in this scan, the summary is not falsified, and the chunk is only lost."""
     unchecked: float = 0.0
-    """The summary carries no check, as in revision 1.0."""
+    """The summary carries no check, as in protocol revision 1.0."""
     struck: int | None = None
     """Index of the chunk that ``displaced`` and ``understated`` affect; None for a random chunk."""
 
@@ -110,7 +111,7 @@ class Faults:
     sync_lost: float = 0.0
     """The node does not receive a SYNC."""
     long: float = 0.0
-    """A heartbeat has one byte too many. (Chunks and summaries already fill their frames.)"""
+    """A heartbeat is one byte too long. (Chunks and summaries already fill their frames.)"""
     nmt_lost: float = 0.0
     """The node does not receive an NMT command."""
     sdo_request_lost: float = 0.0
@@ -132,9 +133,9 @@ class Faults:
 
     # --- active while they are set
     silent: bool = False
-    """No frame from the node arrives."""
+    """No frame from the node reaches the bus."""
     deaf: bool = False
-    """The node receives nothing because its receiver is stuck."""
+    """The node receives no frames because its receiver is stuck."""
     frozen: bool = False
     """The converter keeps returning the same values, and counts no conversions."""
     uncounted: bool = False
@@ -146,7 +147,7 @@ class Faults:
     wrong_layout: bool = False
     """The node reports a different layout hash."""
     open_upper: int | None = None
-    """This upper wire is broken. Wires are numbered from 0 and are intact while a node tares at power-on."""
+    """This upper wire is broken. Wires are numbered from 0 and are intact during the tare at power-on."""
     open_lower: int | None = None
     """This lower wire is broken."""
     shorted_upper: int | None = None
@@ -162,33 +163,35 @@ class Faults:
     frozen_lower: int | None = None
     """This lower wire keeps the resistances that it has when the fault begins."""
     stuck_upper: int | None = None
-    """With ``stuck_lower``: the crossing of these two wires keeps the resistance that it has when the fault
-    begins."""
+    """Upper wire of a stuck crossing; ``stuck_lower`` is its lower wire. The crossing keeps the resistance
+    that it has when the fault begins."""
     stuck_lower: int | None = None
-    """See ``stuck_upper``."""
+    """Lower wire of the stuck crossing; see ``stuck_upper``."""
     crossed_upper: int | None = None
-    """This upper wire and the next are connected in each other's place."""
+    """This upper wire and the next upper wire are exchanged."""
     crossed_lower: int | None = None
-    """This lower wire and the next are connected in each other's place."""
+    """This lower wire and the next lower wire are exchanged."""
     flipped: float = 0.0
     """Fraction of the readings in which one bit of one code is flipped before the node computes its check."""
     drift_per_s: float = 0.0
-    """Relative drift of every resistance per second, from -1 to 1. The drift starts at zero with the fault
-    and vanishes with it; resistances stay between a tenth and ten times their values."""
+    """Relative drift of every resistance per second, from -1 to 1. The accumulated drift is zero when the
+    fault starts, and returns to zero when the fault ends. Resistances stay within 0.1 to 10 times their
+    values."""
     warmer_k: float = 0.0
-    """Step in the temperature of the patch, K, from -100 to 100. Every resistance changes by the temperature
-    coefficient of the patch, ``Imperfections.temperature_per_k``."""
+    """Step change in the temperature of the patch, K, from -100 to 100. Every resistance changes according to
+    the temperature coefficient of the patch, ``Imperfections.temperature_per_k``."""
     error_passive: bool = False
     """The node's controller is error-passive, which the node reports as emergency 0x8120."""
     duplicate_node_id: bool = False
-    """A second node with the same node-ID boots, answers and obeys; its skin is at rest. The node leaves when
-    the fault ends."""
+    """A second node with the same node-ID boots and responds to all commands; its skin is at rest. The second
+    node disappears when the fault ends."""
     restart_every_s: float = 0.0
-    """Seconds between spontaneous resets of the node; 0 for never."""
+    """Time between spontaneous resets of the node, s; 0 for no resets."""
     emcy_per_s: float = 0.0
-    """Emergency messages per second; after the last of them, one more message reports *error reset*."""
+    """Number of emergency messages per second; after the last of them, a further message reports *error
+    reset*."""
     babble_per_s: float = 0.0
-    """Frames per second with COB-ID 0x3F0, which no device uses."""
+    """Number of frames per second with COB-ID 0x3F0, which no device uses."""
 
     def __post_init__(self) -> None:
         for name in _SHARES:
@@ -221,7 +224,7 @@ class Faults:
 
 @dataclass(slots=True)
 class Injected:
-    """Number of times that each fault was injected into one node."""
+    """Number of times that each fault has been injected into one node."""
 
     lost: int = 0
     duplicated: int = 0
@@ -232,13 +235,13 @@ class Injected:
     miscounted: int = 0
     torn: int = 0
     torn_chunks: int = 0
-    """Chunks sent in the first halves of torn scans."""
+    """Number of chunks sent in the first halves of torn scans."""
     summary_lost: int = 0
     reset: int = 0
-    """Resets in the middle of a scan."""
+    """Number of resets in the middle of a scan."""
     corrupted: int = 0
     displaced: int = 0
-    """Scans in which a chunk was sent with the counter of the next scan."""
+    """Number of scans in which a chunk was sent with the counter of the next scan."""
     understated: int = 0
     unchecked: int = 0
     sync_lost: int = 0
@@ -253,55 +256,56 @@ class Injected:
     emcy_lost: int = 0
     command_lost: int = 0
     silenced: int = 0
-    """Frames not sent because the node was silent, unplugged or about to be reset."""
+    """Number of frames not sent because the node was silent, unplugged or about to be reset."""
     unheard: int = 0
-    """Frames that the node missed because it was deaf or unplugged."""
+    """Number of frames that the node missed because it was deaf or unplugged."""
     frozen: int = 0
-    """Readings that repeated the previous reading."""
+    """Number of readings that repeated the previous reading."""
     uncounted: int = 0
-    """Readings by a converter that does not count its conversions."""
+    """Number of readings by a converter that does not count its conversions."""
     miswired: int = 0
-    """Readings with a faulty wire or crossing: open, shorted, noisy, frozen, stuck or crossed."""
+    """Number of readings with a faulty wire or crossing: open, shorted, noisy, frozen, stuck or crossed."""
     flipped: int = 0
-    """Readings in which one bit of one code was flipped."""
+    """Number of readings in which one bit of one code was flipped."""
     drifted: int = 0
-    """Readings with drift."""
+    """Number of readings with resistance drift."""
     warmed: int = 0
-    """Readings at another temperature."""
+    """Number of readings at a changed temperature."""
     unplugged: int = 0
     error_passive: int = 0
     """Number of times that the controller became error-passive."""
     twins: int = 0
     """Number of times that a second node with the same node-ID appeared."""
     twin_frames: int = 0
-    """Frames sent by second nodes."""
+    """Number of frames sent by second nodes with the same node-ID."""
     restarts: int = 0
-    """Resets caused by ``restart_every_s``."""
+    """Number of resets caused by ``restart_every_s``."""
     impostures: int = 0
-    """Falsified responses about identity or layout."""
+    """Number of falsified responses about identity or layout."""
     emergencies: int = 0
     babbled: int = 0
     scans_spoilt: int = 0
-    """Scans with missing or wrong chunks: lost, late, short, remote, miscounted or corrupted."""
+    """Number of scans with missing or wrong chunks: lost, late, short, remote, miscounted or corrupted."""
     pdos: int = 0
-    """Data frames with the COB-ID of a chunk or summary put on the bus, also by second nodes."""
+    """Number of data frames with the COB-ID of a chunk or summary put on the bus, including those of second
+    nodes."""
 
 
 NO_FAULTS: Final = Faults()
 
 
 def check_wires(faults: Faults, patch: str, shape: tuple[int, int]) -> None:
-    """Check that a patch has the wires that faults name.
+    """Check that a patch has the wires named by its faults.
 
     Args:
-        faults: The faults.
+        faults: Faults of the patch.
         patch: Name of the patch.
-        shape: Number of its upper and of its lower wires.
+        shape: Numbers of upper and lower wires of the patch.
 
     Raises:
-        ConfigError: If the patch does not have a wire.
+        ConfigError: If the patch does not have a named wire.
     """
     for number, name in enumerate(OF_WIRES):
-        wires = shape[number % 2] - name.startswith("crossed")  # the last wire has no next one
+        wires = shape[number % 2] - name.startswith("crossed")  # the last wire has no next wire
         if (wire := getattr(faults, name)) is not None and wire >= wires:
             raise ConfigError(f"{patch}: {name}", wire, f"an integer from 0 to {wires - 1}")

@@ -1,7 +1,7 @@
-"""A real node with faults. Every frame between the node and its bus passes through this module.
+"""Node with injected faults. Every frame between the node and its bus passes through this module.
 
-Reading faults are in :mod:`vcan_sim.faulty_converter`, scan faults in :mod:`vcan_sim.faulty_scans`. Faults
-depend on a seed and the order of the frames, not on the clock, except for periodic events.
+Reading faults are in :mod:`vcan_sim.faulty_converter`, scan faults in :mod:`vcan_sim.faulty_scans`. Except
+for periodic events, faults depend only on a seed and the order of the frames, not on the clock.
 """
 
 from __future__ import annotations
@@ -31,53 +31,53 @@ from vcan_sim.tally import Kind, Tally, kind_of
 BABBLE_COB_ID: Final = 0x3F0
 SIMULATED: Final = Pacing(slack_ns=THRIFTY.slack_ns, catch_up_ns=40_000_000)
 """Pacing of a simulated node. The node may stall for half a SYNC period of the reference hand and still
-finish its scan in time, so that load on the machine does not appear as a fault of the node. Four nodes then
-send bursts of up to 270 frames, which fit into a socket's default receive buffer."""
+finish its scan in time, so that a busy machine does not appear as a fault of the node. After such a stall,
+four nodes send bursts of up to 270 frames, which fit into a socket's default receive buffer."""
 
 _STORM: Final = bytes.fromhex("0fff810000000000")
 """EMCY 0xFF0F with the generic and manufacturer-specific bits of the error register set."""
 _MOST_AT_ONCE: Final = 32
-"""Maximum number of overdue periodic events of one kind that are caught up; further events are dropped."""
+"""Maximum number of overdue periodic events of one kind that are made up for; further events are dropped."""
 
 
 TWIN_SERIAL: Final = 0x8000_0000
-"""Bit in which the serial number of the second node of ``duplicate_node_id`` differs from the node's."""
+"""Bit in which the serial numbers of the node and of the second node of ``duplicate_node_id`` differ."""
 
 
 class Resting:
-    """Resistances of a patch that nothing touches.
+    """Source of constant resistances, for an untouched patch.
 
     Args:
-        baseline_ohm: (U, K) resistances at rest, ohm; resistances of 1 ohm if there is no baseline yet.
+        baseline_ohm: (U, K) resistances at rest, ohm; values that are not positive are replaced by 1 ohm.
     """
 
     def __init__(self, baseline_ohm: Float) -> None:
         self._ohm = np.where(baseline_ohm > 0.0, baseline_ohm, 1.0)
 
     def read(self, t_ns: int) -> Float:
-        """Return the resistances (U, K), ohm."""
+        """Return the constant resistances (U, K), ohm."""
         return self._ohm
 
 
 class Emit(Protocol):
-    """Puts a frame on the bus, like :meth:`skinnode.transport.CanPort.send`."""
+    """Function that puts a frame on the bus, like :meth:`skinnode.transport.CanPort.send`."""
 
     def __call__(self, can_id: int, data: bytes, *, remote: bool = False) -> None:
-        """Put a frame on the bus. Raises BusError if the bus refuses the frame."""
+        """Put a frame on the bus. Raises BusError if the bus refuses it."""
 
 
 class FaultyNode(PatchNode):
-    """A :class:`PatchNode` with :attr:`faults`, which can be replaced at any time from any thread.
+    """:class:`PatchNode` with injected :attr:`faults`, which any thread can replace at any time.
 
     Args:
         node_id: Node-ID.
         layout: Layout of the patch.
         source: Resistances that the node's converter measures.
-        emit: Puts a frame on the bus.
-        on_sent: Called with the COB-ID of each frame from the node, after the frame was sent or lost.
+        emit: Function that puts a frame on the bus.
+        on_sent: Function called with the COB-ID of each frame from the node, after it was sent or lost.
         serial: Serial number.
-        profile: Protocol of the node.
-        faults: Initial faults; their seed stays in force.
+        profile: Protocol profile of the node.
+        faults: Initial faults; their seed remains in use when the faults are replaced.
         temperature_per_k: Relative change in every resistance per kelvin.
     """
 
@@ -149,7 +149,7 @@ class FaultyNode(PatchNode):
     # --- frames and time passed to the node
 
     def on_frame(self, can_id: int, data: bytes, t_ns: int, remote: bool = False) -> None:
-        """Pass a frame to the node, unless a fault drops it, and to a second node with the same node-ID."""
+        """Pass a received frame to the node, unless a fault drops it, and to any second node."""
         self._hear(can_id, data, t_ns, remote)
         if self._twin is not None:
             self._twin.on_frame(can_id, data, t_ns, remote)
@@ -176,13 +176,13 @@ class FaultyNode(PatchNode):
         self._reset_if_due(t_ns)
 
     def _concerns(self, kind: Kind, can_id: int) -> bool:
-        """Return whether the frame is addressed to the node; requests to other nodes do not count as lost."""
+        """Return whether a frame is addressed to the node; requests to other nodes do not count as lost."""
         if kind is Kind.SDO_REQUEST:
             return can_id == od.sdo_request_cob_id(self.node_id)
         return kind is not Kind.COMMAND or can_id == od.command_cob_id(self.node_id)
 
     def on_timer(self, t_ns: int) -> None:
-        """Do everything due at ``t_ns``: the node's own work and the periodic events."""
+        """Run everything due at ``t_ns``: the node's own timers and periodic events."""
         self._meet_twin(t_ns)
         if self.faults.unplugged != self._unplugged:
             self._plug(t_ns)
@@ -206,7 +206,7 @@ class FaultyNode(PatchNode):
         return min((each for each in (own, of_twin) if each is not None), default=None)
 
     def _own_deadline_ns(self, faults: Faults) -> int | None:
-        """Return the time at which the node itself has something to do."""
+        """Return the time, ns, at which the node's timers or periodic events are due; None if none is due."""
         if faults.error_passive != self._passive:
             return 0
         own = super().next_deadline_ns()
@@ -218,13 +218,13 @@ class FaultyNode(PatchNode):
         return min(due) if own is None else min(own, *due)
 
     def on_bus(self, state: BusState, t_ns: int) -> None:
-        """Handle a change of the CAN controller's state, which a fault may make error-passive."""
+        """Pass a change of the CAN controller's state to the node; a fault may change it to error-passive."""
         self._controller = state
         passive = self._passive and state is not BusState.OFF
         super().on_bus(BusState.PASSIVE if passive else state, t_ns)
 
     def _meet_twin(self, t_ns: int) -> None:
-        """Start or end the second node with the same node-ID, and do what it has to do."""
+        """Start or remove the second node with the same node-ID, and run its timers."""
         if self.faults.duplicate_node_id and self._twin is None:
             self._twin = PatchNode(
                 self.node_id,
@@ -266,7 +266,7 @@ class FaultyNode(PatchNode):
             if not period_ns:
                 self._due_ns[name] = 0
                 continue
-            if not self._due_ns[name]:  # just set
+            if not self._due_ns[name]:  # the fault has just been set
                 self._due_ns[name] = t_ns + period_ns
             for _ in range(_MOST_AT_ONCE):
                 if self._due_ns[name] > t_ns:
@@ -304,7 +304,7 @@ class FaultyNode(PatchNode):
         self._on_sent(can_id)
 
     def _put_or_lose(self, can_id: int, data: bytes) -> bool:
-        """Send or drop a frame other than a PDO. Returns whether the frame was sent."""
+        """Send or drop a frame that is not a PDO, and return whether it was sent."""
         kind = kind_of(can_id, data)
         self.tally.handed[kind] += 1
         if not self._is_cut_off and self._injector.loses(LOST_OUT.get(kind)):
@@ -317,7 +317,7 @@ class FaultyNode(PatchNode):
         return self._put(can_id, data)
 
     def _imposture(self, can_id: int, data: bytes) -> bytes:
-        """Return the response to an SDO upload, falsified if a fault requires a wrong identity or layout."""
+        """Return an outgoing frame; falsify SDO responses if a fault requires a wrong identity or layout."""
         faults = self.faults
         if not (faults.wrong_identity or faults.wrong_layout) or can_id != od.sdo_response_cob_id(
             self.node_id
@@ -335,7 +335,7 @@ class FaultyNode(PatchNode):
         return data
 
     def _put(self, can_id: int, data: bytes, *, remote: bool = False) -> bool:
-        """Put a frame on the bus unless the node is cut off from it. Returns whether the frame was sent."""
+        """Put a frame on the bus unless the node is cut off from the bus, and return whether it was sent."""
         kind = kind_of(can_id, data, remote)
         if self._is_cut_off:
             self.injected.silenced += 1
@@ -350,7 +350,7 @@ class FaultyNode(PatchNode):
         return True
 
     def _from_twin(self, can_id: int, data: bytes) -> None:
-        """Put a frame of the second node on the bus; the node itself hears its error control messages."""
+        """Put a frame of the second node on the bus; the node itself receives the second node's heartbeats."""
         kind = kind_of(can_id, data)
         self.tally.handed[kind] += 1
         try:
@@ -366,12 +366,12 @@ class FaultyNode(PatchNode):
 
     @property
     def _is_cut_off(self) -> bool:
-        """Whether the node is cut off, so that none of its frames reaches the bus."""
+        """Whether the node is cut off from the bus, so that its frames are not sent."""
         return self.faults.silent or self._unplugged or self._faulty_scans.reset_due
 
 
 def _periods_ns(faults: Faults) -> dict[str, int]:
-    """Return the period of each kind of periodic event, ns; 0 for never."""
+    """Return the period of each kind of periodic event, ns; 0 for no events."""
     rates = {"emcy": faults.emcy_per_s, "babble": faults.babble_per_s}
     periods = {name: round(1e9 / rate) if rate else 0 for name, rate in rates.items()}
     return {"restart": round(faults.restart_every_s * 1e9), **periods}

@@ -1,4 +1,4 @@
-"""Faults of scans, and of their chunks and summaries on the way from a node to its bus."""
+"""Faults of scans, chunks and summaries on the way from a node to its bus."""
 
 from __future__ import annotations
 
@@ -19,22 +19,23 @@ _SUMMARY_COUNTER_BYTE: Final = 0
 
 
 class Put(Protocol):
-    """Puts a frame on the bus unless the node is cut off from it, and returns whether it was sent."""
+    """Function that puts a frame on the bus unless the node is cut off, and returns whether it was sent."""
 
     def __call__(self, can_id: int, data: bytes, *, remote: bool = False) -> bool:
         """Put a frame on the bus. Raises BusError if the bus refuses the frame."""
 
 
 class FaultyScans:
-    """Sends the chunks and summaries of a node with faults.
+    """Sender that applies faults to the chunks and summaries of a node.
 
-    A scan has at most one scan fault. A chunk has at most one chunk fault, and none if its scan has a fault.
+    Each scan has at most one scan fault. A chunk has at most one chunk fault, and no chunk fault if its scan
+    has a fault.
 
     Args:
         injector: The node's faults, random generator and counts.
         node_id: Node-ID.
-        profile: Protocol of the node.
-        put: Puts a frame on the bus.
+        profile: Protocol profile of the node.
+        put: Function that puts a frame on the bus.
         counter_overflow: Function that returns the node's SYNC counter overflow value (0x1019).
     """
 
@@ -48,12 +49,12 @@ class FaultyScans:
         counter_overflow: Callable[[], int],
     ) -> None:
         self.reset_due = False
-        """Whether the node must be reset; until then no frame reaches the bus."""
+        """Whether the node must be reset; until the reset, none of its frames reaches the bus."""
         self._injector, self._profile = injector, profile
         self._put, self._counter_overflow = put, counter_overflow
         self._chunk_id, self._summary_id = od.chunk_cob_id(node_id), od.summary_cob_id(node_id)
         self._counter = -1  # counter of the scan being sent, as set by the node
-        self._chunks = 0  # chunks of that scan so far
+        self._chunks = 0  # number of chunks of that scan so far
         self._half = max(1, profile.n_chunks // 2)
         self._fate = ""  # fault of that scan: a name in OF_SCANS
         self._spoilt = False
@@ -71,13 +72,13 @@ class FaultyScans:
         return self._fate in ("torn", "displaced")
 
     def power_off(self) -> None:
-        """Drop the chunks that are waiting to be sent."""
+        """Drop all late and swapped chunks that wait to be sent."""
         tally = self._injector.tally
         tally.silenced[Kind.CHUNK] += tally.waiting.pop(Kind.CHUNK, 0)
         self._swapped, self._late = None, []
 
     def send_chunk(self, data: bytes) -> None:
-        """Send a chunk, with its own fault or that of its scan."""
+        """Send a chunk, with a chunk fault or with the fault of its scan."""
         counter = data[_CHUNK_COUNTER_BYTE]
         if counter != self._counter:
             self._begin_scan(counter)
@@ -97,7 +98,7 @@ class FaultyScans:
             self._release([] if swapped is None else [swapped])
 
     def send_summary(self, data: bytes) -> None:
-        """Send a summary, with the fault of its scan."""
+        """Send a summary, affected by the fault of its scan."""
         injected, tally = self._injector.injected, self._injector.tally
         if data[_SUMMARY_COUNTER_BYTE] != self._counter:  # a scan without chunks
             self._begin_scan(data[_SUMMARY_COUNTER_BYTE])
@@ -134,7 +135,7 @@ class FaultyScans:
             self._struck = int(self._injector.random.integers(chunks)) if struck is None else struck
 
     def _suffer_scan(self, data: bytes) -> bytes | None:
-        """Return a chunk with its scan's fault applied, or None if the chunk is lost."""
+        """Apply the fault of a scan to one of its chunks; return None if the chunk is lost."""
         injected = self._injector.injected
         if self._fate == "reset" and self._chunks > self._half and not self.reset_due:
             self.reset_due, self._fate = True, ""
@@ -154,19 +155,19 @@ class FaultyScans:
         return data
 
     def _following(self, counter: int) -> int:
-        """Return the counter that follows ``counter``."""
+        """Return the scan counter that follows ``counter``."""
         overflow = self._counter_overflow()
         return counter % overflow + 1 if overflow else counter + 1 & 0xFF
 
     def _untrue(self, data: bytes) -> bytes:
-        """Return the summary of an understated or unchecked scan."""
+        """Return the falsified summary of an understated or unchecked scan."""
         said, injected = unpack_summary(data), self._injector.injected
         if self._fate == "unchecked":
             injected.unchecked += 1
             return pack_summary(
                 said.scan, said.flags & ~SummaryFlag.CHECKED, said.chunks, said.device_time_us
             )
-        if len(self._packed) != self._profile.n_chunks:  # the codes in the other chunks are not known here
+        if len(self._packed) != self._profile.n_chunks:  # the codes of unsent chunks are unknown here
             return data
         injected.understated += 1
         head = said.scan, said.flags | SummaryFlag.CHANGED_ONLY, said.chunks - 1, said.device_time_us
@@ -181,13 +182,13 @@ class FaultyScans:
             self._send(self._chunk_id, data)
             return
         if not _CHUNK_FAULTS[fault](self, data):
-            return  # the node is cut off: the frame counts as silenced, whatever the fault
+            return  # the node is cut off: the frame counts as silenced, not as faulty
         self._injector.count(fault)
         if fault not in ("duplicated", "reordered") and not self._spoilt:
             self._spoilt = True
             self._injector.injected.scans_spoilt += 1
 
-    # Each returns whether the fault was injected.
+    # Each of these methods injects one chunk fault and returns whether it was injected.
 
     def _lose(self, data: bytes) -> bool:
         self._injector.tally.lost[Kind.CHUNK] += 1
@@ -232,10 +233,10 @@ class FaultyScans:
     # --- to the bus
 
     def _send(self, can_id: int, data: bytes, *, spoilt: bool = False) -> bool:
-        """Send a chunk or summary, and then the late chunks from earlier scans.
+        """Send a chunk or summary, then the late chunks from earlier scans, and return whether it was sent.
 
-        A receiver does not assign a ``spoilt`` frame to its scan, so late chunks stay queued after such a
-        frame. Returns whether the frame was sent.
+        A receiver cannot assign a ``spoilt`` frame to its scan, so late chunks stay queued after such a
+        frame.
         """
         if not self._put(can_id, data):
             return False
@@ -247,7 +248,7 @@ class FaultyScans:
         return True
 
     def _release(self, chunks: Sequence[bytes]) -> None:
-        """Send all queued chunks, even if the bus refuses one. Raises BusError if a chunk was refused."""
+        """Send all given chunks, even if the bus refuses one. Raises BusError if any chunk was refused."""
         failure: BusError | None = None
         for data in chunks:
             self._injector.tally.waiting[Kind.CHUNK] -= 1

@@ -1,4 +1,4 @@
-"""All simulated nodes of a hand, with one port and one thread per bus, started and stopped together."""
+"""Simulated nodes of a hand, with one port and one thread per bus, started and stopped together."""
 
 from __future__ import annotations
 
@@ -30,55 +30,56 @@ from vcan_sim.skin.imperfections import EXACT, Imperfections
 from vcan_sim.tally import Kind, Tally, kind_of
 
 PREPARED_S: Final = 120.0
-"""Scene time that is computed before the nodes start, s, so that the threads of the nodes need not wait for
-contact mechanics. Later steps are computed when they are needed."""
+"""Scene time that is computed before the nodes start, s, so that the nodes' threads need not wait for the
+contact mechanics. Later time steps are computed when they are first needed."""
 
 
 @dataclass(frozen=True, slots=True)
 class NodeReport:
-    """Counts of one simulated node since it started."""
+    """Counters of one simulated node since its start."""
 
     patch: str
     node_id: int
     nmt_state: NmtState
     frames_sent: int
     pdos_sent: int
-    """Number of frames with process data (chunks and summaries)."""
+    """Number of PDOs (chunks and summaries) sent."""
     scans_sent: int
-    """Scans sent completely."""
+    """Number of scans sent completely."""
     overruns: int
-    """Scans skipped because two earlier scans were still waiting to be sent."""
+    """Number of scans skipped because two earlier scans were still waiting to be sent."""
     slow_overruns: int
-    """Scans skipped because this machine was too busy."""
+    """Number of scans skipped because this machine was too busy."""
 
 
 class Fleet:
-    """A hand's patches as CANopen nodes, each with its own scene.
+    """Simulated patches of a hand, as CANopen nodes that each have their own scene.
 
-    A scene begins when its node has sent its first scan, so bring-up may take any length of time, and a tare
-    at power-on sees an untouched patch. :meth:`start` opens the buses and powers the nodes on. :meth:`stop`
-    sets the nodes to pre-operational and closes the buses. A ``with`` block does both.
+    A patch's scene begins when its node has sent the first scan, so bring-up may take any length of time, and
+    the patch is untouched during the tare at power-on. :meth:`start` opens the buses and powers the nodes on.
+    :meth:`stop` sets the nodes to pre-operational and closes the buses. A ``with`` block calls both methods.
 
     Args:
-        hand: Buses, patches and scene.
-        interface: python-can interface that overrides the hand file's.
-        channel: Channel that overrides the hand file's.
+        hand: Configuration with the buses, patches and simulation settings.
+        interface: python-can interface that overrides the interface in the hand file.
+        channel: Channel that overrides the channel in the hand file.
         faults: Initial faults of every node; see also :meth:`inject`.
         wire_up: Function that returns the source that a patch's converter reads; default: the simulated patch
             itself.
         unchecked: Names of patches with protocol revision 1.0, whose summaries carry no check.
-        imperfections: Departures of all patches from their layouts, or of each named patch. The draws differ
-            from patch to patch. Default: exact patches.
-        scene: Scene in place of the strokes of ``[simulation]``. Its time begins on all patches at once, when
-            the first node has sent its first scan. Its faults start and end at their times.
+        imperfections: Deviations from the layout, for all patches or by name of the patch. The random draws
+            differ from patch to patch. Default: exact patches.
+        scene: Scene that replaces the random strokes of ``[simulation]``. Scene time starts on all patches at
+            once, when the first node has sent its first scan. The faults of the scene start and end at scene
+            times.
 
     Raises:
-        ConfigError: A channel is given for a hand with several buses, imperfections name a patch that the
+        ConfigError: If a channel is given for a hand with several buses, imperfections name a patch that the
             hand does not have, the draws of a patch leave too small a gap between electrodes, a touch of
             the scene is impossible on its patch, or a fault is impossible at its place.
     """
 
-    def __init__(  # noqa: PLR0913 - keyword arguments, most of them rarely given
+    def __init__(  # noqa: PLR0913 - keyword arguments, most of which are rarely used
         self,
         hand: HandConfig,
         *,
@@ -112,7 +113,7 @@ class Fleet:
         self._running = ExitStack()
         self._segments = {bus.name: _Segment() for bus in self.hand.buses}
         self.faults: Final = FleetFaults(self._places(), faults)
-        """Faults of the patches and buses: what is injected now, and the log of its changes."""
+        """Currently injected faults of the patches and buses, with a log of their changes."""
         schedule = None if scene is None else schedule_of(scene, self.hand)
         self._player = FaultPlayer(schedule, self.faults) if schedule and schedule.faults else None
 
@@ -129,13 +130,13 @@ class Fleet:
         )
 
     def _skin(self, patch: PatchConfig, number: int) -> SkinMotion:
-        """Return the motion of a patch's skin."""
+        """Return the motion of a patch's skin, from the scene or from random strokes."""
         if self._scenes:
             return self._scenes[patch.name]
         return Scene(patch.layout.build(), self.hand.simulation, number)
 
     def _begin(self, source: SimulatedPatch) -> None:
-        """Start the motion of a patch's skin, or a scene on all patches, at the patch's newest reading."""
+        """Start a patch's strokes, or the scene on all patches, at the time of the patch's newest reading."""
         t_ns = source.last_read_ns
         with self._beginning:
             if self._player is not None and not source.started:
@@ -145,10 +146,10 @@ class Fleet:
                     each.start(t_ns)
 
     def start(self) -> None:
-        """Open the buses and power the nodes on, after the first two minutes of the scene are computed.
+        """Compute the first two minutes of the scene, open the buses and power the nodes on.
 
         Raises:
-            BusError: A bus cannot be opened. No bus is left open.
+            BusError: If a bus cannot be opened. In this case no bus is left open.
         """
         for scene in self._scenes.values():
             scene.prepare(PREPARED_S)
@@ -171,13 +172,13 @@ class Fleet:
     def stop(self) -> None:
         """Set the nodes to pre-operational, join the threads and close the buses. Can be called repeatedly.
 
-        Raises the error that ended a thread early, if any.
+        Raises the error of a thread that ended early, if any.
         """
         self._running.close()
 
     @property
     def failed(self) -> bool:
-        """Whether the thread of a bus has ended early; :meth:`stop` raises the error."""
+        """Whether a bus thread has ended early with an error, which :meth:`stop` raises."""
         return any(runner.failed for runner in self._runners)
 
     @property
@@ -186,18 +187,18 @@ class Fleet:
         return {name: station.source for name, station in self._stations.items()}
 
     def report(self) -> tuple[NodeReport, ...]:
-        """Return the counts of each node, in the order of the hand file."""
+        """Return the counters of each node, in the order of the hand file."""
         return tuple(station.report() for station in self._stations.values())
 
     def inject(self, faults: Faults, patch: str | None = None) -> None:
-        """Replace the faults of one patch or of all patches. The initial seed stays in force.
+        """Replace the faults of one patch or of all patches. The initial seed remains in use.
 
         Args:
             faults: New faults.
             patch: Name of the patch; None for all patches.
 
         Raises:
-            ConfigError: The hand does not have this patch, or a patch does not have the wire that a fault
+            ConfigError: If the hand does not have this patch, or a patch does not have the wire that a fault
                 names.
         """
         patches = self._stations if patch is None else (patch,)
@@ -211,16 +212,16 @@ class Fleet:
             faults: New faults.
 
         Raises:
-            ConfigError: The hand does not have this bus, or the bus cannot have these faults.
+            ConfigError: If the hand does not have this bus, or the bus cannot have these faults.
         """
         self.faults.set_bus(bus, faults)
 
     def injected(self, patch: str) -> Injected:
-        """Return the counts of the faults injected so far into a patch's node."""
+        """Return how often each fault has been injected into a patch's node."""
         return self._stations[patch].injected()
 
     def injected_bus(self, bus: str) -> InjectedOnBus:
-        """Return the counts of the faults injected so far into a bus."""
+        """Return how often each fault has been injected into a bus."""
         return self._segments[bus].injected()
 
     def tally(self, patch: str) -> Tally:
@@ -232,7 +233,7 @@ class Fleet:
         return self._ports[bus].passed
 
     def bus_off(self, bus: str, *, off: bool) -> None:
-        """Put the controller of the nodes on a bus into bus-off, or reconnect the controller."""
+        """Put the controller of a bus's nodes into the bus-off state, or end this state."""
         self.faults.set_bus(bus, replace(self.faults.bus(bus), bus_off=off))
 
     def truth_m(self, patch: str, device_time_us: int) -> Float:
@@ -243,15 +244,15 @@ class Fleet:
             device_time_us: Device time in the scan's summary, µs.
 
         Returns:
-            (U, N, 3) float64, m: positions of the electrodes as they lie, with the patch's imperfections.
+            (U, N, 3) float64, m: actual positions of the upper electrodes, with the patch's imperfections.
 
         Raises:
-            LookupError: The patch is not in the hand, or the scan was never sent or is too old.
+            LookupError: If the patch is not in the hand, or the scan was never sent or is too old.
         """
         return self._at_scan(patch, device_time_us, SimulatedPatch.truth_m)
 
     def displacement_m(self, patch: str, device_time_us: int) -> Float:
-        """Return the true displacement of the electrodes in a scan, which a host estimates.
+        """Return the true displacement of the upper electrodes in a scan, which a host estimates.
 
         Args:
             patch: Name of the patch.
@@ -261,7 +262,7 @@ class Fleet:
             (U, N, 3) float64, m: :meth:`truth_m` minus the positions of the same electrodes at rest.
 
         Raises:
-            LookupError: The patch is not in the hand, or the scan was never sent or is too old.
+            LookupError: If the patch is not in the hand, or the scan was never sent or is too old.
         """
         return self._at_scan(patch, device_time_us, SimulatedPatch.displacement_m)
 
@@ -280,11 +281,11 @@ class Fleet:
             device_time_us: Device time in the scan's summary, µs.
 
         Raises:
-            LookupError: The fleet has no scene, the patch is not in the hand, or the scan was never sent or
-                is too old.
+            LookupError: If the fleet has no scene, the patch is not in the hand, or the scan was never sent
+                or is too old.
         """
         if not self._scenes:
-            raise LookupError("this fleet has no scene; the strokes of [simulation] have truth_m only")
+            raise LookupError("this fleet has no scene; for the strokes of [simulation], use truth_m")
         source = self._stations[patch].source
         try:
             t_s = source.scene_s(source.read_ns(device_time_us))
@@ -305,7 +306,7 @@ class Fleet:
 def _by_patch(
     imperfections: Imperfections | Mapping[str, Imperfections], patches: list[str]
 ) -> Mapping[str, Imperfections]:
-    """Return the imperfections by patch. Raises ConfigError for a patch that the hand does not have."""
+    """Return the imperfections by patch name. Raises ConfigError if the hand does not have a named patch."""
     if isinstance(imperfections, Imperfections):
         return dict.fromkeys(patches, imperfections)
     for name in imperfections:
@@ -315,18 +316,18 @@ def _by_patch(
 
 
 class Passed:
-    """Counts of the data and remote frames that passed through an interface, by kind."""
+    """Counts of data and remote frames that passed through an interface to a bus, by kind."""
 
     def __init__(self) -> None:
         self.sent: Counter[Kind] = Counter()
         self.heard: Counter[Kind] = Counter()
-        """Frames passed to the nodes."""
+        """Frames received and passed to the nodes."""
         self.missed: Counter[Kind] = Counter()
-        """Frames on the bus while the controller was bus-off."""
+        """Frames missed because the controller was bus-off."""
 
 
 class FaultyPort(CanPort):
-    """A port whose controller may go bus-off; the port then sends nothing and misses every frame."""
+    """Port whose controller may go bus-off; the port then sends no frames and misses all received frames."""
 
     off = False
 
@@ -342,7 +343,7 @@ class FaultyPort(CanPort):
         self.passed.sent[kind_of(can_id, data, remote)] += 1
 
     def recv_batch(self, timeout_s: float, most: int = 1) -> list[Frame]:
-        """Receive frames. Raises BusError if the controller is bus-off."""
+        """Receive a batch of frames. Raises BusError if the controller is bus-off."""
         if self.off:
             while frames := super().recv_batch(0.0):
                 _count(frames, self.passed.missed)
@@ -359,19 +360,19 @@ def _count(frames: list[Frame], counter: Counter[Kind]) -> None:
 
 
 class _Segment:
-    """A bus of the hand, with its faults and their counts."""
+    """Bus of a simulated hand, with its faults and their counts."""
 
     def __init__(self) -> None:
         self._faults, self._counts = NO_BUS_FAULTS, InjectedOnBus()
         self._port: FaultyPort | None = None
 
     def connect(self, port: FaultyPort) -> None:
-        """Set the port of the nodes, once it is open."""
+        """Set the nodes' port after it has been opened."""
         self._port = port
         port.off = self._faults.bus_off
 
     def check(self, faults: BusFaults) -> None:
-        """Raise ConfigError if the bus cannot have the faults."""
+        """Raise ConfigError if this bus cannot have the faults."""
 
     def inject(self, faults: BusFaults) -> None:
         self._counts.bus_off += faults.bus_off and not self._faults.bus_off
@@ -384,7 +385,7 @@ class _Segment:
 
 
 class _Station:
-    """A node, its analogue front end and the counts of its frames."""
+    """Simulated node with its analogue front end and the counts of its frames."""
 
     def __init__(  # noqa: PLR0913 - the parts of a node
         self,
@@ -404,7 +405,7 @@ class _Station:
         self._frames = self._pdos = 0
 
     def connect(self, emit: Emit) -> FaultyNode:
-        """Return a new node of the patch that sends through ``emit``."""
+        """Create the patch's node, which sends its frames through ``emit``."""
         config = self._config
         self._node = FaultyNode(
             config.node_id,

@@ -1,4 +1,4 @@
-"""Turns the ``[[faults]]`` of a scene into a schedule, checked with the hand."""
+"""Convert a scene's ``[[faults]]`` tables into a fault schedule, and check the faults with the hand."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from vcan_sim.faults import NO_FAULTS, OF_WIRES, check_wires
 from vcan_sim.scenes.tables import FaultConfig, SceneConfig
 
 _WIRE: Final = re.compile(r"(?P<patch>.+) (?P<side>upper|lower) (?P<number>\d{1,4})")
-"""A wire of a patch in ``where``: ``palm upper 3``."""
+"""Pattern of a wire in the key ``where``, such as ``palm upper 3``."""
 
 
 def schedule_of(scene: SceneConfig, hand: HandConfig) -> FaultSchedule:
     """Return the schedule of a scene's faults.
 
     Args:
-        scene: The scene.
-        hand: The hand.
+        scene: Scene with faults.
+        hand: Hand whose patches and buses have the faults.
 
     Raises:
         ConfigError: If a fault names a patch, a wire or a bus that the hand does not have, is unknown or out
@@ -59,7 +59,7 @@ def _timed(number: int, fault: FaultConfig, hand: HandConfig, repeat_s: float | 
 
 
 def _place_and_text(fault: FaultConfig, hand: HandConfig) -> tuple[str, bool, str]:
-    """Return the patch or bus of a fault, whether it is a bus, and the text of the fault there."""
+    """Return the name of the faulty patch or bus, whether it is a bus, and the fault in text form."""
     patches, buses = [patch.name for patch in hand.patches], [bus.name for bus in hand.buses]
     if fault.where in patches:
         return fault.where, False, fault.fault
@@ -77,7 +77,7 @@ def _place_and_text(fault: FaultConfig, hand: HandConfig) -> tuple[str, bool, st
 
 
 def _check_alone(scene: SceneConfig, late: TimedFault, earlier: list[TimedFault]) -> None:
-    """Raise ConfigError if an earlier table sets the same fault at the same place and time."""
+    """Raise ConfigError if an earlier ``[[faults]]`` table sets the same fault at the same place and time."""
     for early in earlier:
         same = early.place == late.place and early.on_bus == late.on_bus and early.values.keys() & late.values
         if same and early.start_s < late.end_s and late.start_s < early.end_s:
@@ -90,7 +90,7 @@ def _check_alone(scene: SceneConfig, late: TimedFault, earlier: list[TimedFault]
 def _check_together(
     schedule: FaultSchedule, late: TimedFault, hand: HandConfig, shapes: dict[str, tuple[int, int]]
 ) -> None:
-    """Raise ConfigError if a fault and those that are active at its start contradict each other."""
+    """Raise ConfigError if a fault contradicts other faults that are active when it starts."""
     values: dict[str, Any] = {}
     for each in schedule.active(late.start_s):
         if (each.place, each.on_bus) == (late.place, late.on_bus):
@@ -105,7 +105,7 @@ def _check_together(
 
 
 def _with_place(scene: SceneConfig, number: int, error: ConfigError) -> ConfigError:
-    """Return an error about a fault with its place in the scene file."""
+    """Return an error about a fault, extended by the fault's position in the scene file."""
     key = f"faults[{number}].{'where' if error.key == 'where' else 'fault'}"
     shown = error.key.removeprefix("fault").strip()
     allowed = f"{shown}: {error.allowed}" if shown and error.key != "where" else error.allowed

@@ -272,17 +272,17 @@ _FaultText = Annotated[
 
 
 class FaultConfig(Table):
-    """Faults of a patch, of a wire or of a bus from one time to another."""
+    """Scheduled faults of a patch, a wire or a bus."""
 
     where: Annotated[str, Field(min_length=1, max_length=80), Allowed("the name of a patch, wire or bus")]
-    """Name of a patch or a bus, or a wire: ``palm upper 3``. Wires are numbered from 0."""
+    """Name of the faulty patch or bus, or a wire such as ``palm upper 3``. Wires are numbered from 0."""
     fault: _FaultText
     """Faults as in ``vcan-sim --fault``: ``unplugged``, ``lost=0.1``, or several separated by commas. For a
     wire: ``open``, ``shorted``, ``noisy``, ``frozen`` or ``crossed``."""
     start_s: _Time = 0.0
     """Scene time at which the faults start, s."""
     end_s: _Time | None = None
-    """Scene time at which the faults end, s; None: they last until the scene ends or repeats."""
+    """Scene time at which the faults end, s; None: the faults last until the scene ends or repeats."""
 
     @model_validator(mode="after")
     def _end_after_start(self) -> FaultConfig:

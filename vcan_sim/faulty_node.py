@@ -350,7 +350,7 @@ class FaultyNode(PatchNode):
         return True
 
     def _from_twin(self, can_id: int, data: bytes) -> None:
-        """Put a frame of the second node on the bus; the node itself receives the second node's heartbeats."""
+        """Put a frame of the second node on the bus; the node itself receives its heartbeats."""
         kind = kind_of(can_id, data)
         self.tally.handed[kind] += 1
         try:

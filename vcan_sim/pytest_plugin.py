@@ -1,4 +1,4 @@
-"""pytest plugin: a simulated hand, its host, its truth, its faults and its clock as fixtures.
+"""pytest plugin with fixtures for a simulated hand, its host, ground truth, faults and clock.
 
 ::
 
@@ -8,8 +8,9 @@
         field = host.fields(timeout_s=5).get()
         assert skin_truth(field).wrench[2] < 0
 
-The option ``--skin-bus`` chooses the bus of all tests: virtual time on a bus with exact times by default. A
-test that fails keeps its trace, its scene, its truth and a plot in a folder that the report names.
+The option ``--skin-bus`` selects the bus of all tests; by default, tests run in virtual time on a bus with
+exact times. If a test fails, the plugin saves the test's bus trace, scene, ground truth and a plot in a
+folder that the test report names.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import pytest
 
-if TYPE_CHECKING:  # numba and NumPy are not imported before a test needs them
+if TYPE_CHECKING:  # numba and NumPy are imported only when a test needs them
     from skinnode.config import HandConfig
     from skinnode.host import Host
     from skinnode.model.frames import FieldFrame
@@ -38,14 +39,14 @@ BUSES: Final = {
     "udp_multicast": ("udp_multicast", ""),
     "vcan0": ("socketcan", "vcan{}"),
 }
-"""Interface and channel of each choice of ``--skin-bus``: the number of the bus goes into the braces; an
-empty channel is one that nobody else uses."""
+"""Interface and channel for each choice of ``--skin-bus``. The number of the bus replaces the braces; an
+empty channel is replaced by a unique channel."""
 TRUTH_READINGS: Final = 200
-"""Number of the newest readings of each patch whose truth is kept of a test that fails."""
+"""Number of readings of each patch, newest last, whose ground truth is saved if a test fails."""
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    """Add the options of the plugin."""
+    """Add the command-line options of the plugin."""
     group = parser.getgroup("skinnode", "simulated robot skin")
     group.addoption(
         "--skin-bus",
@@ -62,14 +63,14 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Declare the marker of the plugin."""
+    """Declare the marker ``skin_bus``."""
     config.addinivalue_line(
         "markers", f"skin_bus(*buses): run this test only on these buses: {', '.join(BUSES)}"
     )
 
 
 def pytest_runtest_setup(item: pytest.Item) -> None:
-    """Skip a test that is not for the chosen bus."""
+    """Skip a test whose marker ``skin_bus`` does not list the selected bus."""
     chosen = item.config.getoption("--skin-bus")
     for marker in item.iter_markers("skin_bus"):
         for bus in marker.args:
@@ -80,11 +81,11 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
 
 
 class SkinTest:
-    """The simulated hand of one test.
+    """Simulated hand of one test, with its host and traces.
 
     Args:
-        bus: Choice of ``--skin-bus``.
-        open_until_end: Closed at the end of the test.
+        bus: Value of the option ``--skin-bus``.
+        open_until_end: Stack of context managers that is closed at the end of the test.
     """
 
     def __init__(self, bus: str, open_until_end: ExitStack) -> None:
@@ -97,13 +98,13 @@ class SkinTest:
     def start(
         self, hand: HandConfig | Path | str, scene: SceneConfig | Path | str | None, options: dict[str, Any]
     ) -> Fleet:
-        """Power the nodes of a hand on."""
+        """Power on the nodes of a simulated hand."""
         from skinnode.config import HandConfig, load_hand
         from vcan_sim.fleet import Fleet
         from vcan_sim.scenes import SceneConfig, load_scene
 
         if self.fleet is not None:
-            raise RuntimeError("skin_hand: called twice, a test has one hand")
+            raise RuntimeError("skin_hand: called twice, but a test can have only one hand")
         plan = self._on_bus(hand if isinstance(hand, HandConfig) else load_hand(Path(hand)))
         self.scene = scene if isinstance(scene, SceneConfig | None) else load_scene(scene, plan)
         for bus in plan.buses:
@@ -112,19 +113,19 @@ class SkinTest:
         return self.fleet
 
     def started(self, needs: str) -> Fleet:
-        """Return the running hand; ``needs`` is the fixture that needs it."""
+        """Return the running hand, which the fixture ``needs`` requires."""
         if self.fleet is None:
             raise RuntimeError(f"{needs}: there is no hand yet, call skin_hand first")
         return self.fleet
 
     def bring_up(self, options: dict[str, Any]) -> Host:
-        """Bring the hand up; it is shut down at the end of the test."""
+        """Start a host that brings the hand up; the host is closed at the end of the test."""
         from skinnode.host import Host
 
         return self._open.enter_context(Host.from_config(self.started("skin_host").hand, **options))
 
     def keep(self, folder: Path) -> list[str]:
-        """Write what is known of the test to files. Returns their names."""
+        """Save the trace, ground truth, scene and plot of the test, and return the names of the files."""
         folder.mkdir(parents=True, exist_ok=True)
         kept = ["trace.log"]
         (folder / "trace.log").write_text("".join(trace() for trace in self._traces), encoding="utf-8")
@@ -150,7 +151,7 @@ class SkinTest:
 
                 write_plot(self.scene, fleet.hand, folder / "scene.png")
                 kept.append("scene.png")
-            except ImportError:  # matplotlib is an extra
+            except ImportError:  # matplotlib is an optional dependency
                 pass
         return kept
 
@@ -165,13 +166,13 @@ class SkinTest:
         return hand.model_copy(update={"buses": tuple(buses)})
 
     def _own(self, name: str) -> str:
-        """Return a channel of which no other test knows."""
+        """Return a unique channel, which no other test uses."""
         if self.bus == "udp_multicast":
             return f"239.75.{random.randrange(256)}.{random.randrange(1, 255)}"
         return f"{name}-{uuid.uuid4().hex[:8]}"
 
     def _trace(self, bus: Any) -> Callable[[], str]:
-        """Record the frames of a bus; the function that is returned gives them as text."""
+        """Record the frames of a bus, and return a function that returns the trace as text."""
         from skinnode.process import clock
         from vcan_sim.trace import Listener, Trace
 
@@ -188,7 +189,7 @@ class SkinTest:
 
 
 class SkinFaults:
-    """Faults of the nodes of a test's hand."""
+    """Fixture object that injects faults into the nodes of a test's simulated hand."""
 
     def __init__(self, test: SkinTest) -> None:
         self._test = test
@@ -197,11 +198,11 @@ class SkinFaults:
         """Replace the faults of one patch, or of all patches.
 
         Args:
-            patch: Name of the patch.
+            patch: Name of the patch; None for all patches.
             **faults: Fields of :class:`vcan_sim.faults.Faults`, such as ``lost=0.01`` or ``unplugged=True``.
 
         Raises:
-            ConfigError: There is no such patch, or a fault is unknown or out of range.
+            ConfigError: If there is no such patch, or a fault is unknown or out of range.
         """
         from dataclasses import fields
 
@@ -228,7 +229,7 @@ _TEST: Final = pytest.StashKey[SkinTest]()
 
 @pytest.fixture
 def skin_clock(request: pytest.FixtureRequest) -> Iterator[Any]:
-    """The clock of the test: the module ``skinnode.process.clock``, in virtual time on the bus ``timed``."""
+    """Clock of the test: module ``skinnode.process.clock``, in virtual time with ``--skin-bus timed``."""
     from skinnode.process import clock
     from vcan_sim.virtual_time import VirtualClock
 
@@ -249,10 +250,10 @@ def _skin_test(request: pytest.FixtureRequest, skin_clock: Any) -> Iterator[Skin
 
 @pytest.fixture
 def skin_hand(_skin_test: SkinTest) -> Callable[..., Fleet]:
-    """Function that powers a simulated hand on: ``skin_hand(hand, scene=None, **options) -> Fleet``.
+    """Function that powers on a simulated hand: ``skin_hand(hand, scene=None, **options) -> Fleet``.
 
-    ``hand`` and ``scene`` are files or configurations; the options are those of
-    :class:`vcan_sim.fleet.Fleet`. The hand's buses are replaced by the bus of ``--skin-bus``.
+    ``hand`` and ``scene`` are files or configurations; the options are passed to
+    :class:`vcan_sim.fleet.Fleet`. The bus selected by ``--skin-bus`` replaces the buses of the hand file.
     """
 
     def start(
@@ -265,7 +266,7 @@ def skin_hand(_skin_test: SkinTest) -> Callable[..., Fleet]:
 
 @pytest.fixture
 def skin_host(_skin_test: SkinTest) -> Callable[..., Host]:
-    """Function that brings the hand up: ``skin_host(**options) -> Host``, options of ``Host.from_config``."""
+    """Function that brings up the hand: ``skin_host(**options) -> Host``, with options of ``from_config``."""
     return lambda **options: _skin_test.bring_up(options)
 
 
@@ -275,7 +276,7 @@ def skin_truth(_skin_test: SkinTest) -> Callable[[FieldFrame], PatchTruth]:
 
     def truth(field: FieldFrame) -> PatchTruth:
         if field.stamp is None:
-            raise ValueError("field: got one without a stamp, must be a field of a host")
+            raise ValueError("field: got a field without a stamp, must be a field from a host")
         fleet = _skin_test.started("skin_truth")
         return fleet.truth(field.stamp.patch, field.stamp.device_time_us)
 
@@ -284,7 +285,7 @@ def skin_truth(_skin_test: SkinTest) -> Callable[[FieldFrame], PatchTruth]:
 
 @pytest.fixture
 def skin_faults(_skin_test: SkinTest) -> SkinFaults:
-    """Faults to inject: ``inject(patch, lost=0.1)``, ``clear(patch)``, ``injected(patch)``."""
+    """Object that injects faults: ``inject(patch, lost=0.1)``, ``clear(patch)``, ``injected(patch)``."""
     return SkinFaults(_skin_test)
 
 
@@ -292,7 +293,7 @@ def skin_faults(_skin_test: SkinTest) -> SkinFaults:
 def pytest_runtest_makereport(
     item: pytest.Item, call: pytest.CallInfo[None]
 ) -> Generator[None, pytest.TestReport, pytest.TestReport]:
-    """Keep what is known of a simulated hand whose test fails, and name the files in the report."""
+    """Save the data of a simulated hand if its test fails, and list the files in the test report."""
     report = yield
     test = item.stash.get(_TEST, None)
     if test is not None and report.when == "call" and report.failed:

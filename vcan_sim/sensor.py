@@ -1,4 +1,4 @@
-"""Simulated resistances at a node's analogue inputs."""
+"""Simulated resistance readings of a patch, for a node's analogue inputs."""
 
 from __future__ import annotations
 
@@ -17,48 +17,49 @@ from vcan_sim.skin.imperfections import EXACT, Imperfections
 from vcan_sim.skin.patch import PhysicalPatch
 
 REMEMBERED_READINGS: Final = 4096
-"""Number of readings whose times are kept: more than five minutes of scans at 12.5 per second."""
+"""Number of readings whose times are stored: more than five minutes of scans at 12.5 per second."""
 
 Fault = Callable[[Float, int], Float]
-"""Function that takes the resistances (U, K) in ohm and the time in ns, and returns the resistances that the
-converter sees instead; inf means an open pair of wires, 0 a shorted pair."""
+"""Function from the resistances (U, K), ohm, and the time, ns, to the resistances that the converter measures
+instead; inf means an open pair of wires, 0 a shorted pair."""
 
 
 class SkinMotion(Protocol):
-    """Motion of a patch's skin: :class:`vcan_sim.scene.Scene` or :class:`vcan_sim.scenes.PatchScene`."""
+    """Motion of a patch's skin, from :class:`vcan_sim.scene.Scene` or :class:`vcan_sim.scenes.PatchScene`."""
 
     @property
     def layout(self) -> PatchLayout:
-        """The patch at rest."""
+        """Layout of the patch at rest."""
 
     @property
     def simulation(self) -> SimulationConfig:
-        """Seed and noise of the converter."""
+        """Simulation settings, with the seed and noise of the converter."""
 
     @property
     def number(self) -> int:
-        """Number of the patch in the hand; each patch has its own noise."""
+        """Number of the patch in the hand; each patch has different noise."""
 
     def upper_m(self, t_s: float) -> Float:
-        """Return the electrodes (U, N, 3), metres, at scene time ``t_s``; at rest, ``layout.upper_m``."""
+        """Return the upper electrodes (U, N, 3), m, at a scene time; ``layout.upper_m`` itself at rest."""
 
 
 class SimulatedPatch:
     """Resistances of a patch in a scene, as read by a noisy converter.
 
-    Implements :class:`skinnode.node.ResistanceSource`. The skin stays at rest until :meth:`start` sets the
-    scene's time origin, so that readings at power-on (a tare) see an untouched patch. The truth is a pure
-    function of time and is not stored: :meth:`truth_m` returns it for any time, and :meth:`read_ns` returns
-    the time of a scan.
+    This class implements :class:`skinnode.node.ResistanceSource`. The skin stays at rest until :meth:`start`
+    sets the scene's time origin, so that the patch is untouched during the tare at power-on. The ground truth
+    is a pure function of time and is not stored: :meth:`truth_m` returns the truth at any time, and
+    :meth:`read_ns` returns the time of a scan.
 
     Args:
         scene: Motion of the skin.
-        converter_noise: Standard deviation of a reading, relative to the resistance. Default: the scene's.
+        converter_noise: Standard deviation of a reading, relative to the resistance. Default: the value in
+            the scene's simulation settings.
         fault: Function applied to each reading, after the noise.
-        imperfections: Departures of the patch from its layout; drawn for the scene's number.
+        imperfections: Deviations of the patch from its layout; random draws depend on the patch number.
 
     Raises:
-        ConfigError: The draws leave too small a gap between an upper and a lower electrode.
+        ConfigError: If the draws leave too small a gap between an upper and a lower electrode.
     """
 
     def __init__(
@@ -72,19 +73,19 @@ class SimulatedPatch:
         self.scene = scene
         self.fault = fault
         self.reads = 0
-        """Number of readings so far, including readings for a tare."""
+        """Number of readings so far, including those for a tare."""
         self.last_read_ns = 0
         """Time of the newest reading, ns."""
         self._noise = scene.simulation.converter_noise if converter_noise is None else converter_noise
         self._random = np.random.default_rng([scene.simulation.seed, scene.number])
         self.skin: Final = PhysicalPatch(scene.layout, imperfections, scene.number)
-        """The patch as it was made."""
+        """Patch as manufactured, with its imperfections."""
         self._origin_ns: int | None = None
         self._read_ns: OrderedDict[int, int] = OrderedDict()
 
     @property
     def conversions(self) -> int:
-        """Number of conversions of the whole matrix so far: one per reading."""
+        """Number of conversions of the whole matrix so far, one for each reading."""
         return self.reads
 
     @property
@@ -99,7 +100,7 @@ class SimulatedPatch:
     def read(self, t_ns: int) -> Float:
         """Return the resistances (U, K) in ohm at ``t_ns``, with converter noise.
 
-        For a given seed the k-th reading always has the same noise, whenever it is taken.
+        For a given seed, the noise of the k-th reading is always the same, regardless of its time.
         """
         self.reads += 1
         self.last_read_ns = t_ns
@@ -114,11 +115,11 @@ class SimulatedPatch:
         """Return the time of a reading, ns.
 
         Args:
-            device_time_us: Lower 32 bits of the time of the reading on the node's clock, µs; the lowest 6
-                bits are ignored, because a checked summary does not carry them.
+            device_time_us: Lower 32 bits of the reading's time on the node's clock, µs. The lowest 6 bits are
+                ignored, because a checked summary does not contain them.
 
         Raises:
-            LookupError: There was no such reading, or it is too old.
+            LookupError: If there was no such reading, or the reading is too old.
         """
         try:
             return self._read_ns[(device_time_us & 0xFFFF_FFFF) // TIME_STEP_US]
@@ -128,15 +129,15 @@ class SimulatedPatch:
             ) from None
 
     def read_times_ns(self) -> list[int]:
-        """Return the times of the newest readings, ns, at most :data:`REMEMBERED_READINGS`, oldest first."""
+        """Return the times of the last :data:`REMEMBERED_READINGS` readings, ns, oldest first."""
         return list(self._read_ns.values())
 
     def truth_m(self, t_ns: int) -> Float:
         """Return the true electrode positions in a reading at ``t_ns``.
 
         Returns:
-            (U, N, 3) float64, m: positions of the electrodes as they lie, each upper wire at the time of its
-            own sample. With imperfections they differ from ``layout.upper_m`` at rest too; see
+            (U, N, 3) float64, m: actual positions of the upper electrodes, each wire at the time of its
+            sample. With imperfections, these positions differ from ``layout.upper_m`` even at rest; see
             :meth:`displacement_m`.
         """
         t_s = self.scene_s(t_ns)
@@ -146,8 +147,8 @@ class SimulatedPatch:
         """Return the true displacement of the electrodes in a reading at ``t_ns``.
 
         Returns:
-            (U, N, 3) float64, m: :meth:`truth_m` minus the positions of the same electrodes at rest. This is
-            what a solver estimates, because it compares readings with a tare.
+            (U, N, 3) float64, m: :meth:`truth_m` minus the positions of the same electrodes at rest. Solvers
+            estimate this displacement, because they compare readings with a baseline.
         """
         return np.asarray(self.truth_m(t_ns) - self.skin.rest_m)
 
@@ -162,10 +163,10 @@ class SimulatedPatch:
 
 
 def simulated(layout: PatchLayout) -> SimulatedPatch:
-    """Return a patch that a sphere presses: the source named ``simulated`` in ``skinnode node``.
+    """Return a simulated patch under random strokes: the source ``simulated`` of ``skinnode node``.
 
-    The scene starts immediately. The first touch occurs after 0.8 s, so that a tare at power-on sees an
-    untouched patch.
+    The scene starts immediately. The first touch occurs after 0.8 s, so that the patch is untouched during
+    the tare at power-on.
     """
     source = SimulatedPatch(Scene(layout))
     source.start(clock.monotonic_ns())

@@ -1,7 +1,7 @@
-"""python-can interface ``timed``: a CAN bus with exact times, in virtual time.
+"""python-can interface ``timed``: simulated CAN bus with exact times, in virtual time.
 
-Endpoints that open the same channel under the same virtual clock are stations of one
-:class:`~vcan_sim.timed_bus.TimedBus`. Any program that uses python-can can be one of them.
+Endpoints that open the same channel under the same virtual clock are stations on the same
+:class:`~vcan_sim.timed_bus.TimedBus`. Any program that uses python-can can open such an endpoint.
 """
 
 from __future__ import annotations
@@ -17,19 +17,20 @@ from vcan_sim.timed_bus import BitRates, CanFrame, Delivered, Event, StationOpti
 from vcan_sim.virtual_time import Mailbox, VirtualClock
 
 COALESCED_NS: Final = 1_000_000
-"""Least time between two wake-ups of a thread that reads frames, ns."""
+"""Minimum time between two wake-ups of a thread that reads frames, ns."""
 MOST_STATIONS: Final = 64
-"""Maximum number of endpoints that are ever opened on a bus."""
+"""Maximum total number of endpoints opened on a bus."""
 
 
 class Inbox:
-    """Frames that a station has received and not read.
+    """Queue of frames that a station has received but not read yet.
 
-    The first frame after a pause wakes the reader at once; the frames of the following
-    :data:`COALESCED_NS` wake it together, as interrupts of a busy controller are. A frame keeps its own time.
+    The first frame after a pause wakes the reader immediately. All frames of the following
+    :data:`COALESCED_NS` wake the reader only once, like coalesced interrupts of a busy controller. Each frame
+    keeps its own time stamp.
 
     Args:
-        clock: The clock by which the reader runs.
+        clock: Virtual clock of the reader.
     """
 
     def __init__(self, clock: VirtualClock) -> None:
@@ -37,7 +38,7 @@ class Inbox:
         self._quiet_until_ns, self._due = 0, False
 
     def put(self, message: can.Message) -> None:
-        """Append a frame. Called between the turns of the threads."""
+        """Append a frame. The virtual clock calls this method while no thread runs."""
         self._queue.store(message)
         if self._due:
             return
@@ -48,7 +49,7 @@ class Inbox:
             self._clock.call_at(self._quiet_until_ns, self._wake)
 
     def get(self, timeout_s: float | None) -> can.Message:
-        """Return the next frame; raises :class:`queue.Empty` if none arrives in time."""
+        """Return the next frame. Raises :class:`queue.Empty` if no frame arrives within the time-out."""
         return cast(can.Message, self._queue.get(timeout=timeout_s))
 
     def _wake(self) -> None:
@@ -57,15 +58,15 @@ class Inbox:
 
 
 class Segment:
-    """One bus and its endpoints.
+    """Simulated bus in virtual time, with its endpoints.
 
     Args:
         channel: Name of the bus.
-        clock: The clock by which it runs.
-        rates: Its bit rates.
+        clock: Virtual clock of the bus.
+        rates: Bit rates of the bus.
 
     Attributes:
-        listeners: Called with each event on the bus.
+        listeners: Functions that are called with each event on the bus.
     """
 
     def __init__(self, channel: str, clock: VirtualClock, rates: BitRates) -> None:
@@ -91,18 +92,18 @@ class Segment:
         return station
 
     def leave(self, station: int) -> None:
-        """Disconnect a station for good, once its frames have been sent, as a closed socket's are."""
+        """Disconnect a station permanently after its queued frames have been sent, like a closed socket."""
         self._leaving.add(station)
         self._disconnect()
         self._plan()
 
     def send(self, station: int, frame: CanFrame) -> None:
-        """Hand in a frame."""
+        """Queue a frame of a station for transmission."""
         self.bus.send(self.clock.now_ns, station, frame)
         self._plan()
 
     def inbox(self, station: int) -> Inbox:
-        """Return the frames that a station has received."""
+        """Return the queue of frames that a station has received."""
         return self._inboxes[station]
 
     def _plan(self) -> None:
@@ -137,7 +138,7 @@ class Segment:
         self._plan()
 
     def _disconnect(self) -> None:
-        """Disconnect the stations that leave and have nothing to send, or nobody to send it to."""
+        """Disconnect leaving stations that have no frames to send, or no other station to receive them."""
         for station in sorted(self._leaving):
             if not self.bus.waiting(station) or self._connected <= self._leaving:
                 self.bus.clear(self.clock.now_ns, station)
@@ -147,10 +148,10 @@ class Segment:
 
 
 def segment(channel: str, clock: VirtualClock, rates: BitRates) -> Segment:
-    """Return the bus with this name under a clock; the first call makes it.
+    """Return the bus named ``channel`` of a virtual clock; the first call creates the bus.
 
     Raises:
-        can.CanInitializationError: If the bus has other bit rates.
+        can.CanInitializationError: If the bus already exists with different bit rates.
     """
     name = f"bus {channel}"
     if name not in clock.shared:
@@ -162,19 +163,19 @@ def segment(channel: str, clock: VirtualClock, rates: BitRates) -> Segment:
 
 
 class TimedInterface(can.BusABC):
-    """Endpoint of a bus in virtual time.
+    """python-can endpoint of a simulated bus in virtual time.
 
     Args:
         channel: Name of the bus.
-        can_filters: Filters of received frames, as in python-can.
+        can_filters: Filters for received frames, as in python-can.
         bitrate: Nominal bit rate, bit/s.
         fd: Whether the bus carries CAN FD frames.
-        data_bitrate: Bit rate of the data phase, bit/s; default: the nominal one.
-        **options: Ignored.
+        data_bitrate: Bit rate of the data phase, bit/s; default: the nominal bit rate.
+        **options: Further options, which are ignored.
 
     Raises:
-        can.CanInitializationError: If the thread does not run in virtual time, or the bus has other bit
-            rates.
+        can.CanInitializationError: If the thread does not run in virtual time, or the bus already exists with
+            different bit rates.
     """
 
     def __init__(
@@ -199,7 +200,7 @@ class TimedInterface(can.BusABC):
         super().__init__(channel, can_filters)
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
-        """Hand in a frame; it is sent when it wins arbitration."""
+        """Queue a frame for transmission; the frame is sent when it wins arbitration."""
         if self._is_shutdown:
             raise can.CanOperationError(f"{self.channel_info} is closed")
         if msg.is_error_frame:
@@ -220,7 +221,7 @@ class TimedInterface(can.BusABC):
         )
 
     def recv(self, timeout: float | None = None) -> can.Message | None:
-        """Return the next frame, or None if none arrives within ``timeout`` seconds."""
+        """Return the next received frame, or None if no frame arrives within ``timeout`` seconds."""
         end_ns = None if timeout is None else self._clock.monotonic_ns() + round(timeout * 1e9)
         while True:
             if self._is_shutdown:
@@ -234,7 +235,7 @@ class TimedInterface(can.BusABC):
                 return message
 
     def shutdown(self) -> None:
-        """Leave the bus."""
+        """Close the endpoint and leave the bus."""
         if not self._is_shutdown:
             self._segment.leave(self._station)
         super().shutdown()

@@ -1,17 +1,17 @@
-"""Virtual time: a program whose threads run one at a time, by a clock that jumps from event to event.
+"""Virtual time: threads of a program run one at a time, with a clock that jumps from event to event.
 
-Each thread of the program is a real thread, but only one runs at any time: it runs until it waits (for an
-event, a queue, a lock, another thread or a time), and then passes the right to run to the thread that was
-made ready first. If no thread is ready, the clock jumps to the next time that a thread waits for. Computing
-takes no virtual time. The same program therefore runs in the same order at the same times, however fast the
-machine is, and a minute of waiting takes no time at all::
+Each thread of the program is a real thread, but only one thread runs at any time. A thread runs until it
+waits for an event, a queue, a lock, another thread or a time; then the thread that became ready first runs.
+If no thread is ready, the clock jumps to the next time at which a thread wakes up. Computation takes no
+virtual time. The same program therefore always runs in the same order at the same virtual times, regardless
+of the speed of the machine, and a minute of waiting takes no real time::
 
     with VirtualClock():
         with Fleet(hand), skinnode.Host(hand) as host:  # host and nodes on a bus with interface "timed"
             field = host.next_field(timeout_s=5.0)
 
-What waits outside :mod:`skinnode.process.clock` (a socket, a subprocess, an event of ``threading``) stops the
-whole program until it is over.
+Waiting by other means than :mod:`skinnode.process.clock`, such as on a socket, a subprocess or an event of
+``threading``, blocks the whole program.
 """
 
 from __future__ import annotations
@@ -34,33 +34,32 @@ START_NS: Final = 1_000_000_000_000
 START_WALL_NS: Final = 1_600_000_000_000_000_000
 """Time since 1970 at which a virtual clock starts, ns: 2020-09-13 12:26:40 UTC."""
 READINGS: Final = 10_000
-"""Maximum number of readings of the time between two waits of a thread."""
+"""Maximum number of times that a thread may read the clock between two waits."""
 POLL_S: Final = 1e-4
-"""Wait of a thread that polls the time, s."""
+"""Duration for which a thread that polls the clock is suspended, s."""
 
 
 class Deadlock(RuntimeError):
-    """Every thread waits for another one, and none for a time."""
+    """Deadlock: every thread waits for another thread, and no thread waits for a time."""
 
 
 class VirtualClock:
-    """Clock of a program in virtual time, for the ``with`` block of one thread and the threads it starts.
+    """Virtual clock for the thread that enters a ``with`` block and for all threads that it starts.
 
-    The program begins with the thread that enters the block. When the block ends, every thread that it
-    started must have ended.
+    When the block ends, all threads that were started in the block must have ended.
 
     Attributes:
-        shared: What belongs to the clock, by name: the buses of its programs.
+        shared: Objects that belong to the clock, by name: the simulated buses.
 
     Raises:
-        Deadlock: From the first thread, where it waits, if every thread waits for another one.
-        RuntimeError: On leaving the block, if threads are left.
+        Deadlock: In the first thread, while it waits, if every thread waits for another thread.
+        RuntimeError: On leaving the block, if any thread has not ended.
     """
 
     def __init__(self) -> None:
         self.shared: dict[str, object] = {}
         self._now_ns = START_NS
-        self._readings = 0  # of the time, since the running thread was last suspended
+        self._readings = 0  # readings of the clock since the running thread was last suspended
         self._ready: deque[_Turn] = deque()
         self._timers: list[tuple[int, int, int, _Turn | Callable[[], None]]] = []
         self._number = itertools.count()
@@ -85,14 +84,14 @@ class VirtualClock:
 
     @property
     def now_ns(self) -> int:
-        """Monotonic time, ns, for what does not run in a thread of the program."""
+        """Monotonic time, ns, for code that does not run in a thread of the program."""
         return self._now_ns
 
     def monotonic_ns(self) -> int:
-        """Return the monotonic time, ns.
+        """Return the monotonic virtual time, ns.
 
-        A thread that reads the time again and again without waiting waits for it to pass; it is suspended for
-        :data:`POLL_S` at each reading from the :data:`READINGS`-th on.
+        A thread that reads the clock repeatedly without waiting is assumed to poll: after :data:`READINGS`
+        readings, each further reading suspends the thread for :data:`POLL_S`.
         """
         self._readings += 1
         if self._readings > READINGS:
@@ -101,61 +100,61 @@ class VirtualClock:
         return self._now_ns
 
     def time_ns(self) -> int:
-        """Return the time since 1970, ns."""
+        """Return the virtual time since 1970, ns."""
         return START_WALL_NS - START_NS + self._now_ns
 
     def sleep(self, seconds: float, /) -> None:
-        """Suspend the current thread."""
+        """Suspend the current thread for a duration in virtual time."""
         if seconds < 0:
             raise ValueError("sleep length must be non-negative")
         self.wait(deque(), seconds)
 
     def call_at(self, t_ns: int, function: Callable[[], None]) -> None:
-        """Call a function at a time, between the turns of the threads. It must not wait.
+        """Schedule a function call at a virtual time, while no thread runs. The function must not wait.
 
         Args:
-            t_ns: Monotonic time, ns; a time that is over means now.
-            function: The function.
+            t_ns: Monotonic time of the call, ns; a time in the past means now.
+            function: Function to call.
         """
         heapq.heappush(self._timers, (t_ns, next(self._number), 0, function))
 
     # --- what threads wait for
 
     def event(self) -> threading.Event:
-        """Return an event that is not set."""
+        """Return an event in virtual time, which is not set."""
         return _Event(self)
 
     def queue(self) -> queues.Queue[Any]:
-        """Return an empty queue without a limit."""
+        """Return an empty, unbounded queue in virtual time."""
         return cast("queues.Queue[Any]", _Queue(self))
 
     def simple_queue(self) -> queues.SimpleQueue[Any]:
-        """Return an empty queue without a limit."""
+        """Return an empty, unbounded queue in virtual time."""
         return cast("queues.SimpleQueue[Any]", _Queue(self))
 
     def lock(self) -> _Lock:
-        """Return a lock."""
+        """Return a lock in virtual time."""
         return _Lock(self)
 
     def thread(self, target: Callable[..., object], name: str, args: tuple[Any, ...]) -> threading.Thread:
-        """Return a daemon thread that has not been started."""
+        """Return a daemon thread that runs in virtual time and has not been started."""
         return _Thread(self, target, name, args)
 
     def pool(self, threads: int, name: str) -> Executor:
-        """Return a pool of threads."""
+        """Return a pool of threads that run in virtual time."""
         return _Pool(self, threads, name)
 
     # --- turns
 
     def wait(self, waiting: deque[_Turn], seconds: float | None) -> bool:
-        """Suspend the current thread until :meth:`wake` is called with the same list, or the time is over.
+        """Suspend the current thread until :meth:`wake` is called with the same deque, or until a time-out.
 
         Args:
-            waiting: Turns of the threads that wait for the same thing.
+            waiting: Turns of the threads that wait for the same condition.
             seconds: Maximum wait, s; None: no limit.
 
         Returns:
-            Whether the thread was woken.
+            Whether :meth:`wake` woke the thread, rather than the time-out.
         """
         turn = self._running
         turn.woken, turn.waiting = False, waiting
@@ -167,7 +166,7 @@ class VirtualClock:
         return turn.woken
 
     def wake(self, waiting: deque[_Turn]) -> None:
-        """Make the thread ready that has waited longest."""
+        """Make the thread in ``waiting`` that has waited longest ready to run."""
         if waiting:
             turn = waiting.popleft()
             turn.woken = True
@@ -175,12 +174,12 @@ class VirtualClock:
             self._ready.append(turn)
 
     def begin(self, turn: _Turn) -> None:
-        """Make a new thread ready."""
+        """Make a new thread ready to run."""
         self._alive[turn] = None
         self._ready.append(turn)
 
     def end(self, turn: _Turn) -> None:
-        """Pass the right to run on for good."""
+        """Remove a thread that has ended, and let the next thread run."""
         del self._alive[turn]
         self._run(self._next())
 
@@ -198,7 +197,7 @@ class VirtualClock:
         turn.gate.release()
 
     def _next(self) -> _Turn:
-        """Return the turn of the next thread to run; advance the clock if none is ready."""
+        """Return the turn of the next thread to run; advance the clock if no thread is ready."""
         while not self._ready:
             if not self._timers:
                 names = ", ".join(repr(turn.name) for turn in self._alive)
@@ -209,7 +208,7 @@ class VirtualClock:
             due_ns, _, waits, what = heapq.heappop(self._timers)
             if isinstance(what, _Turn):
                 if what.waits != waits:
-                    continue  # woken before
+                    continue  # the thread was woken before its time-out
                 what.waits += 1
                 what.waiting.remove(what)
                 self._ready.append(what)
@@ -220,7 +219,7 @@ class VirtualClock:
 
 
 class _Turn:
-    """The right of one thread to run."""
+    """Scheduling state of one thread: its gate and its current wait."""
 
     def __init__(self, name: str) -> None:
         self.name = name
@@ -229,9 +228,9 @@ class _Turn:
         self.woken = False
         """Whether the last wait ended because the thread was woken."""
         self.waiting: deque[_Turn] = deque()
-        """Turns of the threads that wait for the same thing."""
+        """Turns of the threads that wait for the same condition."""
         self.waits = 0
-        """Number of waits that are over; a timer of an earlier wait is void."""
+        """Number of completed waits, by which timers of earlier waits are recognised as invalid."""
         self.error: Exception | None = None
 
 
@@ -259,7 +258,7 @@ class _Event(threading.Event):
 
 
 class _Queue:
-    """Queue with the methods of ``queue.Queue`` and ``queue.SimpleQueue``."""
+    """Queue in virtual time, with the methods of ``queue.Queue`` and ``queue.SimpleQueue``."""
 
     def __init__(self, of: VirtualClock) -> None:
         self._of = of
@@ -303,11 +302,11 @@ class Mailbox(_Queue):
     """Queue that can be filled without waking the thread that reads it."""
 
     def store(self, item: Any) -> None:
-        """Append an item without waking a thread; :meth:`wake` does that later."""
+        """Append an item without waking a thread; call :meth:`wake` later to wake the reader."""
         self.queue.append(item)
 
     def wake(self) -> None:
-        """Make the thread ready that has waited longest for an item, if there is one."""
+        """Wake the thread that has waited longest for an item, if the queue is not empty."""
         if self.queue:
             self._of.wake(self._waiting)
 
@@ -341,7 +340,7 @@ class _Lock:
 
 
 class _Pool(Executor):
-    """Pool with all threads from the start."""
+    """Thread pool in virtual time that starts all of its threads immediately."""
 
     def __init__(self, of: VirtualClock, threads: int, name: str) -> None:
         self._jobs: queues.SimpleQueue[tuple[Future[Any], Callable[[], Any]] | None] = of.simple_queue()
@@ -398,7 +397,7 @@ class _Thread(threading.Thread):
     def start(self) -> None:
         super().start()
         self._of.begin(self._turn)
-        self._of.sleep(0.0)  # a new thread usually runs until it waits before the next statement here
+        self._of.sleep(0.0)  # like a real thread, the new thread usually runs before the caller continues
 
     def run(self) -> None:
         self._turn.gate.acquire()

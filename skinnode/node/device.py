@@ -46,14 +46,14 @@ class CanopenDevice:
     """CANopen device with its communication services; it sends nothing before :meth:`power_on`.
 
     Args:
-        node_id: 1 to 127, or 255 to wait until LSS assigns a node-ID. If the memory contains a node-ID stored
-            by LSS, that node-ID is used instead.
+        node_id: 1 to 127, or 255 to wait until LSS assigns a node-ID; a node-ID that LSS has stored in the
+            memory takes precedence.
         objects: declarations of the node's object dictionary.
         application: called once, with the device's services, to create the application.
         send: called with the COB-ID and payload of each frame that the node sends, in order.
         serial: serial number (0x1018:4), u32.
         memory: memory for the values that survive a power cycle; None for a device without a memory.
-        kind: sizes and layout of the patch; the memory's content is used only if it has the same; see
+        kind: sizes and layout of the patch, with which the memory's content must agree; see
             :class:`~skinnode.node.memory.Kept`.
         set_bit_rate: changes the bit rate (bit/s) for LSS; None if the node cannot change it.
 

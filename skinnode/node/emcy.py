@@ -57,7 +57,7 @@ class EmcyProducer:
         return self._free_ns if self._waiting and self._allowed else NO_DEADLINE_NS
 
     def report_once(self, code: EmcyCode, detail: bytes, t_ns: int) -> None:
-        """Report an error without duration by two messages, one for the error and one for its end.
+        """Report a momentary error by two messages: one for the error, and one for its end.
 
         Args:
             code: error code.

@@ -102,11 +102,11 @@ class LssSlave:
 
         A pending node-ID that was not stored is lost. The caller must then call :meth:`reset_communication`.
 
-        Two open-source CiA 305 stacks behave in the same way. The stack c-open copies the persistent node-ID
-        to the pending node-ID in the NMT sub-state *reset application*, and the pending node-ID to the active
-        node-ID in *reset communication* (src/co_nmt.c). The stack CANopenNode initialises the pending node-ID
-        from non-volatile memory after *reset node*, and does not change it at *reset communication*
-        (305/CO_LSSslave.h).
+        Two open-source CiA 305 stacks behave in the same way. In the NMT sub-state *reset application*, the
+        stack c-open copies the persistent node-ID to the pending node-ID. In *reset communication*, it copies
+        the pending node-ID to the active node-ID (src/co_nmt.c). The stack CANopenNode initialises the
+        pending node-ID from non-volatile memory after *reset node*, and does not change it at *reset
+        communication* (305/CO_LSSslave.h).
         """
         self.pending_node_id = self._persistent_node_id
 

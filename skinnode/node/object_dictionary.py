@@ -2,10 +2,10 @@
 
 The declarations come from :mod:`skinnode.protocol.objects`, from which the EDS files are also generated. Each
 value is stored as the bytes sent on the bus (little-endian), so an SDO response contains a slice of a value,
-and a PDO is a concatenation of values. Services can register functions for an object: a function that
-computes the value when it is read (:meth:`ObjectStore.bind`), checks a value before a write
-(:meth:`ObjectStore.guard`) or is called after a write (:meth:`ObjectStore.watch`). The value of a DOMAIN can
-be stored outside the object dictionary (:meth:`ObjectStore.bind_domain`). A refused write does not change the
+and a PDO is a concatenation of values. Services can register functions for an object:
+:meth:`ObjectStore.bind` registers a function that computes the value, :meth:`ObjectStore.guard` a check
+before each write, and :meth:`ObjectStore.watch` a callback after each write. The value of a DOMAIN can be
+stored outside the object dictionary (:meth:`ObjectStore.bind_domain`). A refused write does not change the
 object.
 """
 

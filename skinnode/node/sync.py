@@ -119,8 +119,8 @@ class Sync:
     def enter(self, *, communicates: bool) -> None:
         """Handle a change of the NMT state.
 
-        SYNC is produced and consumed in PRE-OPERATIONAL and OPERATIONAL. The counter restarts at 1 when the
-        node enters these states from STOPPED or after boot-up.
+        SYNC is produced and consumed in PRE-OPERATIONAL and OPERATIONAL. The SYNC counter restarts at 1 when
+        the node enters one of these two states from any other state.
         """
         if communicates != self._communicates:
             self._communicates, self._wrong_length, self._period_ns = communicates, None, 0

@@ -10,9 +10,9 @@ if the counter range is short. With the usual range of 240 scans, a frame may th
 **Two scans with the same counter.** Two scans have the same counter if a node did not increment it, or if two
 nodes have the same node-ID. The assembler detects this if two frames with the same index and different
 content arrive. The other frames then cannot be assigned to either scan, so the assembler discards the whole
-scan. The assembler also discards a scan with missing frames if its chunks arrived more than two periods
-apart: the first chunk then carried the counter of a later scan, whose own chunks may arrive after the
-timeout. If two mixed scans have no chunk index in common, only the check detects the mixing.
+scan. The assembler also discards an incomplete scan whose chunks arrived more than two periods apart. The
+first chunk of such a scan had the counter of a later scan, whose own chunks may arrive after the timeout. If
+two mixed scans have no chunk index in common, only the check detects the mixing.
 
 **The check.** A summary with :attr:`~skinnode.protocol.summary.SummaryFlag.CHECKED` carries a CRC over all
 codes that the receiver must have after the scan (:mod:`skinnode.protocol.scan_check`). A failed check does
@@ -71,8 +71,8 @@ class ScanAssembler:
 
     Args:
         profile: sizes of the patch.
-        counter_overflow: value of 0x1019. If it is nonzero, the SYNC counter numbers the scans from 1 to this
-            value; if it is 0, the patch numbers its scans from 0 to 255.
+        counter_overflow: value of 0x1019, up to which the SYNC counter numbers the scans from 1; 0 if the
+            patch numbers its scans from 0 to 255.
         period_ns: time from one scan to the next, ns; determines the timeout.
         grace_ns: maximum wait for late frames after the summary or all chunks have arrived, ns.
         node_id: node-ID shown in the errors passed to ``on_reject``.
@@ -232,9 +232,9 @@ class ScanAssembler:
         """Discard the open scan, the last codes and the scan counter, as after a boot-up of the node.
 
         Args:
-            under_way: whether the node may already be sending scans. The first scan may then lack its first
-                chunks, which count as not received rather than lost.
-            checked: whether the node is known to send a check in every summary. If false, checks are required
+            under_way: whether the node may already be sending scans; if so, chunks missing at the start of
+                the first scan do not count as lost.
+            checked: whether the node is known to send a check in every summary; if false, checks are required
                 only after the first check that passes.
         """
         if self._counter != _NONE_OPEN:

@@ -24,8 +24,7 @@ DEFAULT_CODE_HI: Final = 1.25
 moves some electrodes apart and increases R."""
 DEFAULT_REFRESH_SCANS: Final = 10
 """Default number of scans from one full scan to the next, if only changed chunks are sent. At the default
-period, lost codes are sent again within 0.8 s, and the full scans cause a tenth of the traffic that
-continuous full scans would cause."""
+period, lost codes are sent again within 0.8 s, at a tenth of the traffic of continuous full scans."""
 
 
 def patch_objects(profile: PatchProfile) -> tuple[Object, ...]:

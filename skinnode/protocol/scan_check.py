@@ -34,9 +34,10 @@ def scan_check(check_of_codes: int, head: bytes) -> int:
     significant bit first, not inverted. The CRC of the ASCII digits ``123456789`` is 0x29B1. The CRC covers,
     in this order:
 
-    1. All U·K codes that a receiver must have after this scan, upper wire by upper wire, little-endian, with
-       2 bytes per 16-bit code or 3 bytes per 24-bit code. If only changed chunks are sent, the CRC covers the
-       codes last sent in each chunk, which may differ from the newest codes by up to the delta threshold.
+    1. All U·K codes that a receiver must have after this scan, upper wire by upper wire. Each code is
+       little-endian and has 2 bytes (16-bit codes) or 3 bytes (24-bit codes). If only changed chunks are
+       sent, the CRC covers the codes last sent in each chunk, which may differ from the newest codes by up to
+       the delta threshold.
     2. The argument ``head``, the first 6 bytes of the summary: scan counter, flags, number of chunks sent,
        device time. Codes of a different scan therefore fail the check.
 

@@ -27,15 +27,15 @@ class PatchNode(CanopenDevice):
     """CANopen node of one patch. The node sends nothing before :meth:`power_on`.
 
     Args:
-        node_id: 1 to 127, or 255 to wait until LSS assigns a node-ID. If the memory contains a node-ID stored
-            by LSS, that node-ID is used instead.
+        node_id: 1 to 127, or 255 to wait until LSS assigns a node-ID; a node-ID that LSS has stored in the
+            memory takes precedence.
         layout: electrodes of the patch, which determine the sizes of the object dictionary.
         source: analogue port of the patch, read once per scan.
         send: called with the COB-ID and payload of each frame that the node sends, in order.
         profile: wire format of the patch; by default the layout's format with 16-bit codes.
         serial: serial number (0x1018:4 and 0x2000:11), u32.
-        baseline_ohm: (U, K) initial R0, ohm; None to tare at the first power-on. If the memory contains a
-            baseline, that baseline is used instead.
+        baseline_ohm: (U, K) initial R0, ohm; None to tare at the first power-on; a baseline in the memory
+            takes precedence.
         pacing: :data:`~skinnode.node.clock.EXACT` for a node on its own board,
             :data:`~skinnode.node.clock.THRIFTY` for many nodes on one computer.
         memory: memory for configuration, baseline and node-ID; None for a node that loses them at power-off.

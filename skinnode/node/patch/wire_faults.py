@@ -1,4 +1,4 @@
-"""Detection of open and shorted wires in the codes of a scan, and their report by EMCY 0x5000."""
+"""Detection of open and shorted wires from the codes of a scan, and reporting by EMCY 0x5000."""
 
 from __future__ import annotations
 

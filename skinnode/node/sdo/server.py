@@ -1,8 +1,8 @@
 """SDO server (CiA 301 v4.2, 7.2.4.3), with expedited and segmented transfers.
 
-Block transfers are in :mod:`skinnode.node.sdo.block`. The SDO server of the ``canopen`` library is not used,
-because it does not abort a transfer that starts with an unknown command, and because it supports neither a
-time-out nor block transfers.
+Block transfers are in :mod:`skinnode.node.sdo.block`. The SDO server of the ``canopen`` library is not used:
+it does not abort a transfer that starts with an unknown command, and it supports neither a time-out nor block
+transfers.
 """
 
 from __future__ import annotations

@@ -1,19 +1,79 @@
-"""Faults that can be injected into a bus, as data, and counts of the injected faults."""
+"""Faults of a bus, as data, and the rogue device that sends what some of them need.
+
+The device has an endpoint of its own on the bus, so nodes and hosts hear it, and its frames compete with
+theirs.
+"""
 
 from __future__ import annotations
 
+import math
+import random
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Final
+
+from skinnode.canopen import indices as od
+from skinnode.canopen.nmt import NmtCommand
+from skinnode.config import BusConfig
+from skinnode.errors import BusError, ConfigError
+from skinnode.process import clock
+from skinnode.transport import CanPort
+from vcan_sim.timed_bus import CanFrame
+from vcan_sim.timed_bus.wire_frame import wire_frame
+
+FLOOD_COB_ID: Final = 0x001
+"""Identifier of the frames of ``starved``; only NMT commands have a higher priority."""
+FLOOD_DATA: Final = bytes([0x55] * 8)
+_INTERMISSION_BITS: Final = 3
+_TICK_NS: Final = 1_000_000
+"""Least time between two batches of frames, ns."""
+_AHEAD_NS: Final = 2 * _TICK_NS
+"""Time by which flood frames are handed in early, ns, so that a completely starved bus never idles."""
+_MOST_AT_ONCE: Final = 256
+"""Maximum number of overdue frames of one kind that are caught up; further frames are dropped."""
+_RETRY_S: Final = 0.05
+"""Pause after a bus error, s."""
+_SHARES: Final = ("starved", "disturbed")
+_RATES: Final = ("rogue_nmt_per_s", "rogue_sync_per_s")
+_COUNTERS: Final = 240
+"""Highest SYNC counter of the rogue master."""
 
 
 @dataclass(frozen=True, slots=True)
 class BusFaults:
-    """Faults of one bus; none by default."""
+    """Faults of one bus; none by default.
+
+    Raises:
+        ConfigError: If a fraction is not between 0 and 1, or a rate is negative.
+    """
 
     seed: int = 1
     """Seed of the random draws of faults."""
     bus_off: bool = False
-    """Whether the nodes' controller is bus-off; the nodes then send and receive no frames."""
+    """The controller of the nodes is bus-off: the nodes send and receive nothing."""
+    starved: float = 0.0
+    """Fraction of the bus time that another device takes with frames of COB-ID 0x001, the highest priority
+    after NMT."""
+    rogue_nmt_per_s: float = 0.0
+    """NMT commands of a second master per second, drawn at random, to all nodes or to one."""
+    rogue_sync_per_s: float = 0.0
+    """SYNC messages of a second master per second."""
+    disturbed: float = 0.0
+    """Fraction of the attempts to send a frame that an error frame destroys; only on the interface ``timed``.
+    The sender tries again."""
+
+    def __post_init__(self) -> None:
+        for name in _SHARES:
+            if not 0.0 <= getattr(self, name) <= 1.0:
+                raise ConfigError(name, getattr(self, name), "a fraction from 0 to 1")
+        for name in _RATES:
+            if not 0.0 <= getattr(self, name) < math.inf:
+                raise ConfigError(name, getattr(self, name), "a number of at least 0")
+
+    @property
+    def needs_attacker(self) -> bool:
+        """Whether a rogue device sends frames."""
+        return bool(self.starved or self.rogue_nmt_per_s or self.rogue_sync_per_s)
 
 
 @dataclass(slots=True)
@@ -21,7 +81,135 @@ class InjectedOnBus:
     """Number of times that each fault was injected into one bus."""
 
     bus_off: int = 0
-    """Number of times that the nodes' controller went bus-off."""
+    """Times that the controller of the nodes went bus-off."""
+    starved: int = 0
+    """Frames of the device that takes bus time."""
+    rogue_nmt: int = 0
+    """NMT commands of the second master."""
+    rogue_sync: int = 0
+    """SYNC messages of the second master."""
+    disturbed: int = 0
+    """Attempts that an error frame destroyed."""
 
 
 NO_BUS_FAULTS: Final = BusFaults()
+
+
+def check_bus(faults: BusFaults, bus: BusConfig) -> None:
+    """Check that a bus can have faults.
+
+    Args:
+        faults: The faults.
+        bus: The bus.
+
+    Raises:
+        ConfigError: If frames are to be disturbed on an interface other than ``timed``.
+    """
+    if faults.disturbed and bus.interface != "timed":
+        allowed = f"0 on interface {bus.interface!r}; only the interface timed has error frames"
+        raise ConfigError(f"{bus.name}: disturbed", faults.disturbed, allowed)
+
+
+class BusAttacker:
+    """Rogue device on a bus, with a thread from the first fault that needs it to :meth:`stop`.
+
+    Args:
+        bus: The bus.
+        node_ids: Node-IDs on the bus.
+        counts: Counts of the injected faults, which the thread increases.
+    """
+
+    def __init__(self, bus: BusConfig, node_ids: Sequence[int], counts: InjectedOnBus) -> None:
+        self._bus, self._node_ids, self._counts = bus, tuple(node_ids), counts
+        self._faults = NO_BUS_FAULTS
+        self._changed = clock.event()
+        self._stopping = False
+        self._thread = clock.thread(self._run, f"attacker {bus.name}")
+        bits = len(wire_frame(CanFrame(FLOOD_COB_ID, FLOOD_DATA)).bits) + _INTERMISSION_BITS
+        self._flood_ns = bits * 1e9 / bus.bitrate_bps
+        self._syncs = 0
+
+    def set(self, faults: BusFaults) -> None:
+        """Replace the faults; the thread starts when it is first needed."""
+        self._faults = faults
+        self._changed.set()
+        if faults.needs_attacker and self._thread.ident is None:
+            self._thread.start()
+
+    def stop(self) -> None:
+        """End the thread. Can be called once."""
+        self._stopping = True
+        self._changed.set()
+        if self._thread.ident is not None:
+            self._thread.join()
+
+    def _run(self) -> None:
+        while not self._stopping:
+            if not self._faults.needs_attacker:
+                self._changed.wait()
+                self._changed.clear()
+                continue
+            try:
+                with CanPort(self._bus) as port:
+                    self._attack(port)
+            except BusError:  # also of a bus that another fault has taken away
+                clock.sleep(_RETRY_S)
+
+    def _attack(self, port: CanPort) -> None:
+        """Send frames until the faults end."""
+        chance = random.Random(self._faults.seed)
+        due_ns: dict[str, float] = {}
+        while not self._stopping and self._faults.needs_attacker:
+            now_ns = clock.monotonic_ns()
+            periods_ns = self._periods_ns()
+            due_ns = {name: due_ns.get(name, now_ns + period) for name, period in periods_ns.items()}
+            for name, period_ns in periods_ns.items():
+                ahead_ns = _AHEAD_NS if name == "starved" else 0
+                due_ns[name] = self._send_due(port, name, chance, due_ns[name], period_ns, now_ns + ahead_ns)
+            while port.recv(0.0) is not None:  # a queue that nobody reads would fill
+                pass
+            first_ns = min(due_ns[name] - (_AHEAD_NS if name == "starved" else 0) for name in due_ns)
+            wait_ns = max(first_ns - clock.monotonic_ns(), _TICK_NS if "starved" in due_ns else 0)
+            self._changed.wait(max(wait_ns, 0) * 1e-9)
+            self._changed.clear()
+
+    def _periods_ns(self) -> dict[str, float]:
+        """Return the time between two frames of each kind that is sent, ns."""
+        faults, found = self._faults, {}
+        if faults.starved:
+            found["starved"] = self._flood_ns / faults.starved
+        if faults.rogue_nmt_per_s:
+            found["rogue_nmt"] = 1e9 / faults.rogue_nmt_per_s
+        if faults.rogue_sync_per_s:
+            found["rogue_sync"] = 1e9 / faults.rogue_sync_per_s
+        return found
+
+    def _send_due(  # noqa: PLR0913 - what a frame depends on
+        self,
+        port: CanPort,
+        name: str,
+        chance: random.Random,
+        due_ns: float,
+        period_ns: float,
+        until_ns: float,
+    ) -> float:
+        """Send the frames of one kind that are due until a time. Returns when the next one is due, ns."""
+        make: Callable[[random.Random], tuple[int, bytes]] = getattr(self, f"_{name}")
+        for _ in range(_MOST_AT_ONCE):
+            if due_ns > until_ns:
+                return due_ns
+            port.send(*make(chance))
+            setattr(self._counts, name, getattr(self._counts, name) + 1)
+            due_ns += period_ns
+        return max(due_ns, until_ns)
+
+    def _starved(self, _: random.Random) -> tuple[int, bytes]:
+        return FLOOD_COB_ID, FLOOD_DATA
+
+    def _rogue_nmt(self, chance: random.Random) -> tuple[int, bytes]:
+        command, node_id = chance.choice(list(NmtCommand)), chance.choice((0, *self._node_ids))
+        return od.NMT_COB_ID, bytes((command, node_id))
+
+    def _rogue_sync(self, _: random.Random) -> tuple[int, bytes]:
+        self._syncs += 1
+        return od.SYNC_COB_ID, bytes(((self._syncs - 1) % _COUNTERS + 1,))

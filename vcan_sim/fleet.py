@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Callable, Collection, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
@@ -11,23 +10,23 @@ from types import TracebackType
 from typing import Final, Self
 
 from skinnode.canopen.indices import chunk_cob_id, summary_cob_id
-from skinnode.config import BusConfig, HandConfig, PatchConfig
-from skinnode.errors import BusError, ConfigError
+from skinnode.config import HandConfig, PatchConfig
+from skinnode.errors import ConfigError
 from skinnode.model.layout import Float
 from skinnode.node import NmtState, NodeRunner
 from skinnode.node.patch.source import ResistanceSource
 from skinnode.protocol.profile import PatchProfile
-from skinnode.transport import CanPort, Frame
-from vcan_sim.bus_attacker import NO_BUS_FAULTS, BusFaults, InjectedOnBus
+from vcan_sim.bus_attacker import BusFaults, InjectedOnBus
 from vcan_sim.fault_player import FaultPlayer
 from vcan_sim.faults import NO_FAULTS, Faults, Injected, check_wires
+from vcan_sim.faulty_bus import FaultyBus, FaultyPort, Passed
 from vcan_sim.faulty_node import Emit, FaultyNode
 from vcan_sim.fleet_faults import FleetFaults, Places
 from vcan_sim.scene import Scene
 from vcan_sim.scenes import PatchTruth, SceneConfig, bind_scene, schedule_of
 from vcan_sim.sensor import SimulatedPatch, SkinMotion
 from vcan_sim.skin.imperfections import EXACT, Imperfections
-from vcan_sim.tally import Kind, Tally, kind_of
+from vcan_sim.tally import Tally
 
 PREPARED_S: Final = 120.0
 """Scene time that is computed before the nodes start, s, so that the nodes' threads need not wait for the
@@ -111,7 +110,10 @@ class Fleet:
         self._runners: list[NodeRunner] = []
         self._ports: dict[str, FaultyPort] = {}
         self._running = ExitStack()
-        self._segments = {bus.name: _Segment() for bus in self.hand.buses}
+        self._segments = {
+            bus.name: FaultyBus(bus, [patch.node_id for patch in self.hand.patches_on(bus.name)])
+            for bus in self.hand.buses
+        }
         self.faults: Final = FleetFaults(self._places(), faults)
         """Currently injected faults of the patches and buses, with a log of their changes."""
         schedule = None if scene is None else schedule_of(scene, self.hand)
@@ -160,6 +162,7 @@ class Fleet:
                 opened.callback(self._player.stop)
             for bus in self.hand.buses:
                 port = ports[bus.name] = opened.enter_context(FaultyPort(bus))
+                opened.callback(self._segments[bus.name].stop)
                 self._segments[bus.name].connect(port)
                 stations = [self._stations[patch.name] for patch in self.hand.patches_on(bus.name)]
                 runner = NodeRunner(port, [station.connect(port.send) for station in stations])
@@ -284,14 +287,31 @@ class Fleet:
             LookupError: If the fleet has no scene, the patch is not in the hand, or the scan was never sent
                 or is too old.
         """
-        if not self._scenes:
-            raise LookupError("this fleet has no scene; for the strokes of [simulation], use truth_m")
+        self._require_scene()
         source = self._stations[patch].source
         try:
-            t_s = source.scene_s(source.read_ns(device_time_us))
+            t_ns = source.read_ns(device_time_us)
         except LookupError as error:
             raise LookupError(f"{patch}: {error}") from None
+        return self.truth_at(patch, t_ns)
+
+    def truth_at(self, patch: str, t_ns: int) -> PatchTruth:
+        """Return the ground truth at a time, such as that of a frame.
+
+        Args:
+            patch: Name of the patch.
+            t_ns: Monotonic time, ns.
+
+        Raises:
+            LookupError: If the fleet has no scene, or the patch is not in the hand.
+        """
+        self._require_scene()
+        t_s = self._stations[patch].source.scene_s(t_ns)
         return self._scenes[patch].truth(-1.0 if t_s is None else t_s)
+
+    def _require_scene(self) -> None:
+        if not self._scenes:
+            raise LookupError("this fleet has no scene; for the strokes of [simulation], use truth_m")
 
     def __enter__(self) -> Self:
         self.start()
@@ -313,75 +333,6 @@ def _by_patch(
         if name not in patches:
             raise ConfigError("imperfections", name, f"a patch of the hand: {', '.join(patches)}")
     return imperfections
-
-
-class Passed:
-    """Counts of data and remote frames that passed through an interface to a bus, by kind."""
-
-    def __init__(self) -> None:
-        self.sent: Counter[Kind] = Counter()
-        self.heard: Counter[Kind] = Counter()
-        """Frames received and passed to the nodes."""
-        self.missed: Counter[Kind] = Counter()
-        """Frames missed because the controller was bus-off."""
-
-
-class FaultyPort(CanPort):
-    """Port whose controller may go bus-off; the port then sends no frames and misses all received frames."""
-
-    off = False
-
-    def __init__(self, config: BusConfig) -> None:
-        super().__init__(config)
-        self.passed = Passed()
-
-    def send(self, can_id: int, data: bytes, *, remote: bool = False) -> None:
-        """Send a frame. Raises BusError if the bus refuses the frame or the controller is bus-off."""
-        if self.off:
-            raise BusError(f"{self.config.name}: bus-off, 0x{can_id:03X} not sent")
-        super().send(can_id, data, remote=remote)
-        self.passed.sent[kind_of(can_id, data, remote)] += 1
-
-    def recv_batch(self, timeout_s: float, most: int = 1) -> list[Frame]:
-        """Receive a batch of frames. Raises BusError if the controller is bus-off."""
-        if self.off:
-            while frames := super().recv_batch(0.0):
-                _count(frames, self.passed.missed)
-            raise BusError(f"{self.config.name}: bus-off, nothing received")
-        frames = super().recv_batch(timeout_s, most)
-        _count(frames, self.passed.heard)
-        return frames
-
-
-def _count(frames: list[Frame], counter: Counter[Kind]) -> None:
-    for frame in frames:
-        if not (frame.error or frame.extended):
-            counter[kind_of(frame.can_id, frame.data, frame.remote)] += 1
-
-
-class _Segment:
-    """Bus of a simulated hand, with its faults and their counts."""
-
-    def __init__(self) -> None:
-        self._faults, self._counts = NO_BUS_FAULTS, InjectedOnBus()
-        self._port: FaultyPort | None = None
-
-    def connect(self, port: FaultyPort) -> None:
-        """Set the nodes' port after it has been opened."""
-        self._port = port
-        port.off = self._faults.bus_off
-
-    def check(self, faults: BusFaults) -> None:
-        """Raise ConfigError if this bus cannot have the faults."""
-
-    def inject(self, faults: BusFaults) -> None:
-        self._counts.bus_off += faults.bus_off and not self._faults.bus_off
-        self._faults = faults
-        if self._port is not None:
-            self._port.off = faults.bus_off
-
-    def injected(self) -> InjectedOnBus:
-        return replace(self._counts)
 
 
 class _Station:

@@ -20,7 +20,7 @@ from skinnode.compiled import jit
 from skinnode.host.patch_stream import PatchStream
 from skinnode.host.publish import Publisher
 from skinnode.model.frames import FieldFrame
-from vcan_sim.fleet import FaultyPort
+from vcan_sim.faulty_bus import FaultyPort
 
 
 def soak(tmp_path: Path, minutes: str) -> tuple[int, str, dict[str, Any]]:

@@ -9,7 +9,7 @@ from typing import Any, Final
 
 from skinnode.config import HandConfig
 from skinnode.errors import ConfigError
-from vcan_sim.bus_attacker import NO_BUS_FAULTS
+from vcan_sim.bus_attacker import NO_BUS_FAULTS, check_bus
 from vcan_sim.fault_schedule import FaultSchedule, TimedFault
 from vcan_sim.fault_text import parse_values
 from vcan_sim.faults import NO_FAULTS, OF_WIRES, check_wires
@@ -96,7 +96,7 @@ def _check_together(
         if (each.place, each.on_bus) == (late.place, late.on_bus):
             values |= each.values
     if late.on_bus:
-        dataclasses.replace(NO_BUS_FAULTS, **values)
+        check_bus(dataclasses.replace(NO_BUS_FAULTS, **values), hand.bus(late.place))
         return
     faults = dataclasses.replace(NO_FAULTS, **values)
     if late.place not in shapes:

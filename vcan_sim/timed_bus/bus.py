@@ -205,6 +205,17 @@ class TimedBus:
             raise ConfigError("disturbances.station", rule.station, allowed)
         self._disturbances.add(rule)
 
+    def undisturb(self, rule: Disturbance) -> None:
+        """Remove a rule that :meth:`disturb` added; the attempt in progress keeps its course.
+
+        Args:
+            rule: the rule, the same object.
+
+        Raises:
+            ValueError: if the rule is not in force.
+        """
+        self._disturbances.remove(rule)
+
     # --- time
 
     @property

@@ -117,7 +117,7 @@ class Disturbances:
     """
 
     def __init__(self, rules: Sequence[Disturbance] = ()) -> None:
-        self._rules: list[tuple[int, Rule]] = []
+        self._rules: list[tuple[Disturbance, int, Rule]] = []
         for rule in rules:
             self.add(rule)
 
@@ -131,7 +131,21 @@ class Disturbances:
             rule: disturbance rule to add.
         """
         station = -1 if rule.station is None else rule.station
-        self._rules.append((station, _compiled(rule)))
+        self._rules.append((rule, station, _compiled(rule)))
+
+    def remove(self, rule: Disturbance) -> None:
+        """Remove a rule.
+
+        Args:
+            rule: the rule, the same object.
+
+        Raises:
+            ValueError: if the rule is not in force.
+        """
+        kept = [each for each in self._rules if each[0] is not rule]
+        if len(kept) == len(self._rules):
+            raise ValueError(f"rule: got {rule}, must be a rule in force")
+        self._rules = kept
 
     def hit(self, attempt: Attempt) -> Hit | None:
         """Return the first bit of a transmission attempt that any rule disturbs, or None.
@@ -142,7 +156,7 @@ class Disturbances:
             attempt: transmission attempt to check.
         """
         hits = []
-        for station, rule in self._rules:
+        for _, station, rule in self._rules:
             bit = rule(attempt)
             if bit is not None:
                 hits.append(Hit(min(bit, attempt.n_bits() - 1), station))

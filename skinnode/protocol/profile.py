@@ -172,8 +172,8 @@ class PatchProfile:
     def default_inhibit_100us(self) -> int:
         """Default inhibit time of TPDO1 (0x1800:3), in units of 100 µs.
 
-        With this inhibit time, the chunks of a full scan take at most nine tenths of the default period. The
-        inhibit time is at most 1 ms.
+        With this inhibit time, a full scan of up to 720 chunks takes at most nine tenths of the default
+        period. The inhibit time is at most 1 ms.
         """
         return max(1, min(10, 9 * DEFAULT_PERIOD_MS // self.n_chunks))
 

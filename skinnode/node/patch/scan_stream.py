@@ -189,7 +189,7 @@ class ScanStream:
         return [(each.index, each.subindex) for each in tpdo.parameters.mapping] == self._whole_record
 
     def _stream(self, t_ns: int) -> bool:
-        """Send the chunks that are due, and return whether no chunk of the scan is left."""
+        """Send the chunks that are due; return whether all chunks of the scan have been sent or discarded."""
         unsent, carrier = self._unsent, self._carrier
         if carrier is None:
             return True

@@ -6,6 +6,7 @@ import re
 import tomllib
 from pathlib import Path
 
+import pytest
 import yaml
 
 ROOT = Path(__file__).parents[2]
@@ -74,3 +75,24 @@ def test_hooks_of_a_commit_are_programs_of_the_environment() -> None:
     assert repository["repo"] == "local"
     for hook in repository["hooks"]:
         assert hook["entry"].startswith((".venv/bin/", "tools/")), hook["id"]
+
+
+def additions() -> dict[str, tuple[str, list[str]]]:
+    """Example and files under *always* of each kind of addition, by heading."""
+    part = TEXT.split("## Where do I add …")[1].split("\n## ")[0]
+    found = {}
+    for section in part.split("\n### ")[1:]:
+        lines = dict(re.findall(r"^- (\w+): (.*?)(?=\n- |\Z)", section, flags=re.MULTILINE | re.DOTALL))
+        names = re.findall(r"`((?:skinnode|vcan_sim|docs|examples)/[\w/.-]+\.\w+)`", lines["Always"])
+        found[section.splitlines()[0]] = lines["Example"].strip(" `\n"), names
+    return found
+
+
+@pytest.mark.parametrize("heading", additions())
+def test_files_of_an_addition_mention_the_example(heading: str) -> None:
+    example, names = additions()[heading]
+    assert names
+    for name in names:
+        path = ROOT / name.replace("NAME", example)
+        text = path.read_text("utf-8")
+        assert path.stem == example or example.lower() in text.lower(), name

@@ -383,7 +383,7 @@ def test_model_error_covers_a_layer_of_another_thickness(staggered, thicker):
     rms = []
     for share in (0.0, 0.05):
         field = sk.Posterior(staggered, baseline_ohm=rest, model_error=share).update(frame)
-        assert field.trusted
+        assert field.trusted or not share  # a field that claims an exact layer may be distrusted
         rms.append(np.sqrt(np.mean(deviations(field, moved) ** 2)))
     assert rms[1] < 1.15 < 3 < rms[0]
 

@@ -1,6 +1,6 @@
 """Greedy search for the loads and the wrong readings that explain a frame.
 
-The matrix A = [I B] has one column for each of the m readings and one for the response to each of the 3Q
+The matrix A = [I B] has one column for each of the m readings and one for the response to each of the 4Q
 loads. The search needs Aᵀ P z and the diagonal of the Gram matrix E = Aᵀ P A. Adding a load or leaving out a
 reading is a rank-one update of the precision, P' = P − share · v vᵀ. Each such step stores one vector Aᵀ v,
 from which Aᵀ P z and the diagonal are updated, as in batch orthogonal matching pursuit. Of P', only the
@@ -166,7 +166,7 @@ def _best_group(  # noqa: PLR0913 - a kernel: arrays by name
 def _gram_row(  # noqa: PLR0913 - a kernel: arrays by name
     item: int, p: Float, moved: Float, gram: Float, response_t: Float, row: Float
 ) -> None:
-    """Write row ``item`` of E into ``row`` (m + 3Q,); use ``moved`` and ``gram`` unless they are empty."""
+    """Write row ``item`` of E into ``row`` (m + 4Q,); use ``moved`` and ``gram`` unless they are empty."""
     m = len(p)
     if item < m:
         for j in range(m):

@@ -7,7 +7,7 @@
         -> faulty_node (the real node) -> faulty_scans (scan faults) -> fleet (all nodes on their buses)
         -> command (vcan-sim)
 
-A patch's scene comes from module ``scene`` (random strokes) or, with a scene file, from ``scenes``.
+A patch's scene comes from the module ``scene`` (random strokes) or, with a scene file, from ``scenes``.
 ``contact`` computes contact mechanics on a bonded layer for ``scenes``, independently of all models in
 ``skinnode``. ``smooth`` defines smooth ramps. ``virtual_time`` is a clock that jumps from event to event.
 ``timed_bus`` is a CAN bus with exact times, arbitration, errors and error counters; ``timed_interface`` is

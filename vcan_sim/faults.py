@@ -73,104 +73,109 @@ class Faults:
     # --- fractions of the chunks
     lost: float = 0.0
     duplicated: float = 0.0
-    """The chunk is sent twice."""
+    """Fraction of the chunks that are sent twice."""
     reordered: float = 0.0
-    """The chunk swaps places with the next frame."""
+    """Fraction of the chunks that swap places with the next frame."""
     late: float = 0.0
-    """The chunk arrives after the first frame of the next scan."""
+    """Fraction of the chunks that arrive after the first frame of the next scan."""
     short: float = 0.0
-    """The chunk is one byte too short."""
+    """Fraction of the chunks that are one byte too short."""
     remote: float = 0.0
-    """A remote frame is sent instead of the chunk."""
+    """Fraction of the chunks that are replaced by a remote frame."""
     miscounted: float = 0.0
-    """The chunk carries the counter of another scan."""
+    """Fraction of the chunks that carry the counter of another scan."""
     miscounted_by: int | None = None
     """Error of the scan counter in a ``miscounted`` chunk, modulo 256; None for a random error."""
     corrupted: float = 0.0
-    """One code in the chunk differs from the code packed by the node; length and counters are correct."""
+    """Fraction of the chunks in which one code differs from the code packed by the node; length and counters
+    are correct."""
 
     # --- fractions of the scans
     torn: float = 0.0
-    """The scan stops after its first half, without a summary, and the next scan has the same counter."""
+    """Fraction of the scans that stop after their first half, without a summary; the next scan has the same
+    counter."""
     summary_lost: float = 0.0
     reset: float = 0.0
-    """The node is reset after half of its chunks, as by a watchdog."""
+    """Fraction of the scans in which the node is reset after half of the chunks, as by a watchdog."""
     displaced: float = 0.0
-    """A chunk carries the counter of the next scan, and the chunk with the same index in the next scan is
-    lost."""
+    """Fraction of the scans in which a chunk carries the counter of the next scan; the chunk with the same
+    index in the next scan is lost."""
     understated: float = 0.0
-    """A chunk is lost, and the summary claims that only changed chunks were sent and counts one chunk fewer.
-    If the summary carries a check, the check is correct for this summary. If the node really sends only
-    changed chunks in this scan, the summary is not falsified, and the chunk is only lost."""
+    """Fraction of the scans in which a chunk is lost, and the summary claims that only changed chunks were
+    sent and counts one chunk fewer. If the summary carries a check, the check is correct for this summary. If
+    the node really sends only changed chunks in this scan, the summary is not falsified, and the chunk is
+    only lost."""
     unchecked: float = 0.0
-    """The summary carries no check, as in protocol revision 1.0."""
+    """Fraction of the scans whose summary carries no check, as in protocol revision 1.0."""
     struck: int | None = None
     """Index of the chunk that ``displaced`` and ``understated`` affect; None for a random chunk."""
 
     # --- fractions of other frames
     sync_lost: float = 0.0
-    """The node does not receive a SYNC."""
+    """Fraction of the SYNCs that the node does not receive."""
     long: float = 0.0
-    """A heartbeat is one byte too long. (Chunks and summaries already fill their frames.)"""
+    """Fraction of the heartbeats that are one byte too long. (Chunks and summaries already fill their
+    frames.)"""
     nmt_lost: float = 0.0
-    """The node does not receive an NMT command."""
+    """Fraction of the NMT commands that the node does not receive."""
     sdo_request_lost: float = 0.0
-    """The node does not receive an SDO request."""
+    """Fraction of the SDO requests that the node does not receive."""
     sdo_response_lost: float = 0.0
-    """An SDO response does not arrive."""
+    """Fraction of the SDO responses that are lost."""
     lss_request_lost: float = 0.0
-    """The node does not receive an LSS request."""
+    """Fraction of the LSS requests that the node does not receive."""
     lss_response_lost: float = 0.0
-    """An LSS response does not arrive."""
+    """Fraction of the LSS responses that are lost."""
     heartbeat_lost: float = 0.0
-    """A heartbeat sent by the node, or addressed to it, does not arrive."""
+    """Fraction of the heartbeats, sent by the node or received by it, that are lost."""
     boot_up_lost: float = 0.0
-    """A boot-up message does not arrive."""
+    """Fraction of the boot-up messages that are lost."""
     emcy_lost: float = 0.0
-    """An emergency message, including *error reset*, does not arrive."""
+    """Fraction of the emergency messages, including *error reset*, that are lost."""
     command_lost: float = 0.0
-    """The node does not receive a command PDO, such as a tare."""
+    """Fraction of the command PDOs, such as a tare, that the node does not receive."""
 
     # --- active while they are set
     silent: bool = False
-    """No frame from the node reaches the bus."""
+    """Whether the node is silent: none of its frames reaches the bus."""
     deaf: bool = False
-    """The node receives no frames because its receiver is stuck."""
+    """Whether the node is deaf: it receives no frames, because its receiver is stuck."""
     frozen: bool = False
-    """The converter keeps returning the same values, and counts no conversions."""
+    """Whether the converter is frozen: it keeps returning the same values and counts no conversions."""
     uncounted: bool = False
-    """The converter does not count its conversions, so the host must infer from the codes whether it runs."""
+    """Whether the converter does not count its conversions, so that the host must infer from the codes
+    whether the converter is running."""
     unplugged: bool = False
-    """The node is disconnected from the bus and its supply; it boots when the fault ends."""
+    """Whether the node is disconnected from the bus and its supply; the node boots when the fault ends."""
     wrong_identity: bool = False
-    """The node reports a different product code."""
+    """Whether the node reports a wrong product code."""
     wrong_layout: bool = False
-    """The node reports a different layout hash."""
+    """Whether the node reports a wrong layout hash."""
     open_upper: int | None = None
-    """This upper wire is broken. Wires are numbered from 0 and are intact during the tare at power-on."""
+    """Number of a broken upper wire. Wires are numbered from 0 and are intact during the tare at power-on."""
     open_lower: int | None = None
-    """This lower wire is broken."""
+    """Number of a broken lower wire."""
     shorted_upper: int | None = None
-    """This upper wire touches all lower wires."""
+    """Number of an upper wire that touches all lower wires."""
     shorted_lower: int | None = None
-    """This lower wire touches all upper wires."""
+    """Number of a lower wire that touches all upper wires."""
     noisy_upper: int | None = None
-    """This upper wire has a bad contact, which adds noise of 0.3 % to each of its resistances."""
+    """Number of an upper wire with a bad contact, which adds noise of 0.3 % to each of its resistances."""
     noisy_lower: int | None = None
-    """This lower wire has a bad contact."""
+    """Number of a lower wire with a bad contact, which adds noise of 0.3 % to each of its resistances."""
     frozen_upper: int | None = None
-    """This upper wire keeps the resistances that it has when the fault begins."""
+    """Number of an upper wire that keeps the resistances it has when the fault begins."""
     frozen_lower: int | None = None
-    """This lower wire keeps the resistances that it has when the fault begins."""
+    """Number of a lower wire that keeps the resistances it has when the fault begins."""
     stuck_upper: int | None = None
-    """Upper wire of a stuck crossing; ``stuck_lower`` is its lower wire. The crossing keeps the resistance
-    that it has when the fault begins."""
+    """Number of the upper wire of a stuck crossing, which keeps the resistance it has when the fault begins;
+    ``stuck_lower`` is the lower wire."""
     stuck_lower: int | None = None
-    """Lower wire of the stuck crossing; see ``stuck_upper``."""
+    """Number of the lower wire of the stuck crossing; see ``stuck_upper``."""
     crossed_upper: int | None = None
-    """This upper wire and the next upper wire are exchanged."""
+    """Number of an upper wire that is exchanged with the next upper wire."""
     crossed_lower: int | None = None
-    """This lower wire and the next lower wire are exchanged."""
+    """Number of a lower wire that is exchanged with the next lower wire."""
     flipped: float = 0.0
     """Fraction of the readings in which one bit of one code is flipped before the node computes its check."""
     drift_per_s: float = 0.0
@@ -181,10 +186,10 @@ class Faults:
     """Step change in the temperature of the patch, K, from -100 to 100. Every resistance changes according to
     the temperature coefficient of the patch, ``Imperfections.temperature_per_k``."""
     error_passive: bool = False
-    """The node's controller is error-passive, which the node reports as emergency 0x8120."""
+    """Whether the node's controller is error-passive, which the node reports as emergency 0x8120."""
     duplicate_node_id: bool = False
-    """A second node with the same node-ID boots and responds to all commands; its skin is at rest. The second
-    node disappears when the fault ends."""
+    """Whether a second node with the same node-ID is on the bus. The second node boots, responds to all
+    commands, and reports skin at rest; it disappears when the fault ends."""
     restart_every_s: float = 0.0
     """Time between spontaneous resets of the node, s; 0 for no resets."""
     emcy_per_s: float = 0.0

@@ -52,7 +52,7 @@ class FaultyConverter:
         self._drift, self._drifted_to_ns = 0.0, 0
         self._reading: Float | None = None
         self._conversions: int | None = None
-        self._held: dict[tuple[str, object], Float] = {}  # reading at the start of each fault
+        self._held: dict[tuple[str, object], Float] = {}  # for each fault, the reading when it starts
 
     @property
     def conversions(self) -> int | None:

@@ -302,7 +302,7 @@ def table(**changes: Any) -> str:
         (table(fault="lost=1.5"), "3:1", ["lost", "1.5", "a fraction from 0 to 1"]),
         (table(fault="lost"), "3:1", ["lost", "a number"]),
         (table(fault=""), "3:1", ["faults[0].fault", "the text of a fault"]),
-        (table(fault="seed=3"), "3:1", ["'seed'", "the seed is not one"]),
+        (table(fault="seed=3"), "3:1", ["'seed'", "the seed is not a fault"]),
         (table(fault="stuck_upper=1"), "3:1", ["stuck_upper", "which name a crossing"]),
         (table(where="can0"), "3:1", ["'lost'", "bus_off"]),
         (table(end_s=0.5), "5:1", ["faults[0].end_s", "0.5", "later than start_s"]),

@@ -52,7 +52,7 @@ def _timed(number: int, fault: FaultConfig, hand: HandConfig, repeat_s: float | 
     place, on_bus, text = _place_and_text(fault, hand)
     values = parse_values(text, on_bus=on_bus, key="fault")
     if "seed" in values:
-        raise ConfigError("fault", "seed", "a fault; the seed is not one")
+        raise ConfigError("fault", "seed", "a fault; the seed is not a fault")
     end_s = repeat_s if fault.end_s is None else fault.end_s
     end_s = math.inf if end_s is None else end_s
     return TimedFault(number, place, on_bus, fault.start_s, end_s, values)

@@ -193,7 +193,7 @@ class TouchConfig(Table):
     yaw_rad: _Angle = 0.0
     """Rotation of the body about z, rad."""
     times: Annotated[int, Field(ge=1, le=1000), Allowed("an integer from 1 to 1000")] = 1
-    """Number of times to repeat the touch, for example for a series of taps."""
+    """Number of times that the touch is made, for example for a series of taps."""
     every_s: _Duration | None = None
     """Time from the start of one touch to the start of the next, s, if ``times`` is more than 1."""
     motions: Annotated[tuple[MotionConfig, ...], Field(strict=False)] = ()
@@ -225,7 +225,7 @@ class TouchConfig(Table):
     def _times_and_level(self) -> TouchConfig:
         if (self.depth_m is None) == (self.force_n is None):
             got = None if self.depth_m is None else self.force_n
-            raise ConfigError("force_n", got, "a force_n or a depth_m, one of the two")
+            raise ConfigError("force_n", got, "either force_n or depth_m")
         if self.to_s <= self.from_s:
             raise ConfigError("to_s", self.to_s, f"later than from_s, {self.from_s} s")
         if self.to_s - self.from_s < 2.0 * self.ramp_s * (1.0 - 1e-9):
@@ -332,7 +332,7 @@ class SceneConfig(Table):
         for i, fault in enumerate(self.faults):
             last_s, key = (fault.start_s, "start_s") if fault.end_s is None else (fault.end_s, "end_s")
             if self.repeat_s is not None and last_s > self.repeat_s:
-                raise ConfigError(f"faults[{i}].{key}", last_s, f"a time by repeat_s, {self.repeat_s} s")
+                raise ConfigError(f"faults[{i}].{key}", last_s, f"at most repeat_s, {self.repeat_s} s")
         return self
 
     @model_validator(mode="after")
@@ -349,7 +349,7 @@ class SceneConfig(Table):
                 raise ConfigError(f"touches[{i}].body", touch.body, allowed)
             end_s = touch.each[-1].to_s
             if self.repeat_s is not None and end_s > self.repeat_s:
-                raise ConfigError(f"touches[{i}].to_s", touch.to_s, f"an end by repeat_s, {self.repeat_s} s")
+                raise ConfigError(f"touches[{i}].to_s", touch.to_s, f"at most repeat_s, {self.repeat_s} s")
             self._check_motions(i, touch)
             for j, other in enumerate(self.touches[:i]):
                 if other.body == touch.body and _meet(touch, other):
@@ -365,12 +365,14 @@ class SceneConfig(Table):
             if motion.kind != "roll":
                 continue
             if body.shape not in ("sphere", "ridge"):
-                allowed = f"roll only for a sphere or a ridge; {body.name!r} is a {body.shape}"
+                allowed = (
+                    f"another kind; roll requires a sphere or a ridge, and {body.name!r} is a {body.shape}"
+                )
                 raise ConfigError(f"{key}[{j}].kind", motion.kind, allowed)
             x, y = motion.by_m or (0.0, 0.0)
             along = x * math.cos(touch.yaw_rad) + y * math.sin(touch.yaw_rad)
             if body.shape == "ridge" and (turns or abs(along) > 1e-3 * math.hypot(x, y)):
-                allowed = f"a way across the axis of the ridge, at yaw {touch.yaw_rad:g} rad without a turn"
+                allowed = f"a direction across the ridge, whose yaw is {touch.yaw_rad:g} rad, and no turn"
                 raise ConfigError(f"{key}[{j}].by_m", [x, y], allowed)
 
 

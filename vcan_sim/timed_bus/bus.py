@@ -281,7 +281,7 @@ class TimedBus:
                 f"interval: got {from_ns} to {to_ns} ns, must end after its start, by {now_ns} ns"
             )
         busy_ns = self._occupancy.busy_ns(from_ns, to_ns)
-        if self._flight is None and self._start is not None:  # the frame awaits the arbitration
+        if self._flight is None and self._start is not None:  # arbitration is pending
             busy_ns += max(0, to_ns - max(from_ns, self._rates.ceil_ns(self._start)))
         return busy_ns / (to_ns - from_ns)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping
 from contextlib import ExitStack
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from threading import Lock
 from types import TracebackType
 from typing import Final, Self
@@ -226,6 +226,17 @@ class Fleet:
     def injected_bus(self, bus: str) -> InjectedOnBus:
         """Return how often each fault has been injected into a bus."""
         return self._segments[bus].injected()
+
+    def counts(self) -> dict[str, dict[str, int]]:
+        """Return the counts of injected faults that are not zero, by patch and then by bus."""
+        found: dict[str, Injected | InjectedOnBus] = {
+            name: self.injected_bus(name) for name in self._segments
+        }
+        found = {**found, **{name: self.injected(name) for name in self._stations}}
+        return {
+            place: {name: count for name, count in asdict(found[place]).items() if count}
+            for place in (*self._stations, *self._segments)
+        }
 
     def tally(self, patch: str) -> Tally:
         """Return the live counts of the frames of a patch's node, by kind."""

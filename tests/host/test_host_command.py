@@ -24,7 +24,7 @@ from skinnode.host import Host
 from skinnode.process import clock
 from skinnode.transport import CanPort
 from skinnode.transport.receiver import drain
-from vcan_sim.command import _too_slow
+from vcan_sim.commands.run import _too_slow
 from vcan_sim.faults import NO_FAULTS, Faults
 from vcan_sim.fleet import Fleet
 from vcan_sim.sensor import SimulatedPatch

@@ -1,10 +1,10 @@
-"""``vcan-sim hand.toml``: run the patches of a hand as CANopen nodes, pressed by a simulated indenter."""
+"""``vcan-sim run hand.toml``: run the patches of a hand as CANopen nodes, pressed by a simulated indenter."""
 
 from __future__ import annotations
 
-import dataclasses
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -22,14 +22,8 @@ if TYPE_CHECKING:
 _WARN_AGAIN_S = 10.0
 """Minimum time between warnings about a busy machine, s."""
 
-app = typer.Typer(
-    pretty_exceptions_enable=False,
-    context_settings={"help_option_names": ["-h", "--help"]},
-)
 
-
-@app.command()
-def simulate(  # noqa: PLR0913 - Typer derives a command's options from its arguments
+def run(  # noqa: PLR0913 - Typer derives a command's options from its arguments
     hand: Annotated[Path, typer.Argument(help="The hand to simulate.", metavar="HAND.toml")],
     interface: OtherInterface = None,
     channel: OtherChannel = None,
@@ -43,7 +37,10 @@ def simulate(  # noqa: PLR0913 - Typer derives a command's options from its argu
         ),
     ] = None,
     scene: Annotated[
-        Path | None, typer.Option(help="Scene to play on the patches.", metavar="SCENE.toml")
+        Path | None,
+        typer.Option(
+            help="Scene to play on the patches: a file, or a name from `vcan-sim list`.", metavar="SCENE.toml"
+        ),
     ] = None,
     plot: Annotated[
         Path | None,
@@ -53,26 +50,28 @@ def simulate(  # noqa: PLR0913 - Typer derives a command's options from its argu
     """Simulate a hand's patches as CANopen nodes on a bus; a sphere presses each patch and slides over it.
 
     With a scene, its bodies touch the patches instead. Bring the nodes up by running `skinnode host` with the
-    same file in another terminal.
+    same file in another terminal. `vcan-sim inject` changes the faults meanwhile.
     """
     from skinnode.config import load_hand
     from skinnode.process.garbage_collection import without_long_collections
     from skinnode.process.signals import stop_on_signal
     from vcan_sim.fleet import Fleet
     from vcan_sim.scenes import load_scene
+    from vcan_sim.scenes.library import scene_file
 
     plan = load_hand(hand).on(interface, channel)
+    scene = None if scene is None else scene_file(scene)
     if plot is not None:
         _preview(plan, scene, plot)
         return
     simulated = Fleet(plan, scene=None if scene is None else load_scene(scene, plan))
     simulated.faults.inject(*fault or [])
-    with stop_on_signal() as stop, simulated as fleet, without_long_collections():
+    with stop_on_signal() as stop, simulated as fleet, _controlled(fleet), without_long_collections():
         where = ", ".join(f"{bus.name} ({bus.interface} {bus.channel})" for bus in plan.buses)
         patches = counted(len(plan.patches), "patch", "patches")
         _say(f"{patches} of {plan.name!r} on {where}; press Ctrl-C to stop")
         _watch(fleet, stop.wait, seconds)
-        injected = _injected(fleet) if fault else []
+        injected = _injected(fleet) if fleet.faults.log else []
     reports = fleet.report()
     _say(_summary(reports))
     if slow := sum(report.slow_overruns for report in reports):
@@ -154,13 +153,28 @@ def _summary(reports: Sequence[NodeReport]) -> str:
 
 
 def _injected(fleet: Fleet) -> list[str]:
-    """Return one line per patch with the counts of its injected faults."""
+    """Return the counts of injected faults, one line per patch, and per bus that had faults."""
     lines = []
-    for patch in fleet.patches:
-        counts = dataclasses.asdict(fleet.injected(patch))
-        shown = ", ".join(f"{count} {name}" for name, count in counts.items() if count)
-        lines.append(f"{patch}: {shown or 'nothing injected'}")
+    for place, counts in fleet.counts().items():
+        shown = ", ".join(f"{count} {name}" for name, count in counts.items())
+        if counts or place in fleet.patches:
+            lines.append(f"{place}: {shown or 'nothing injected'}")
     return lines
+
+
+@contextmanager
+def _controlled(fleet: Fleet) -> Iterator[None]:
+    """Let `vcan-sim inject` control the fleet; without a socket, the simulator runs all the same."""
+    from vcan_sim.control import ControlError, ControlServer
+
+    with ExitStack() as entered:
+        try:
+            entered.enter_context(ControlServer(fleet, fleet.hand.name))
+        except ControlError as error:
+            print(
+                f"note: `vcan-sim inject` cannot reach this simulator: {error}", file=sys.stderr, flush=True
+            )
+        yield
 
 
 def _say(line: str) -> None:

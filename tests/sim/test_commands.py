@@ -1,0 +1,216 @@
+"""``vcan-sim`` and a second process that controls it."""
+
+from __future__ import annotations
+
+import os
+import random
+import re
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from vcan_sim.control import ControlError, control_folder, running_simulator
+from vcan_sim.scenes import read_scene
+from vcan_sim.scenes.library import shipped_scenes
+
+COMMAND = [sys.executable, "-c", "from vcan_sim.cli import main; main()"]
+PATIENCE_S = 40.0
+HAND = """
+name = "gripper"
+
+[[buses]]
+name = "can0"
+interface = "udp_multicast"
+channel = "{channel}"
+
+[[patches]]
+name = "palm"
+node_id = 4
+layout = {{upper_wires = 4, upper_electrodes = 4, lower_wires = 12, lower_electrodes = 4}}
+tolerances = "exact"
+
+[[patches]]
+name = "thumb"
+node_id = 5
+layout = {{upper_wires = 4, upper_electrodes = 4, lower_wires = 12, lower_electrodes = 4}}
+tolerances = "exact"
+"""
+
+
+@pytest.fixture
+def environment(tmp_path: Path) -> dict[str, str]:
+    """A runtime folder that no other simulator uses."""
+    return os.environ | {"XDG_RUNTIME_DIR": str(tmp_path)}
+
+
+@pytest.fixture
+def hand(tmp_path: Path) -> Path:
+    file = tmp_path / "hand.toml"
+    channel = f"239.77.{random.randrange(256)}.{random.randrange(1, 255)}"
+    file.write_text(HAND.format(channel=channel))
+    return file
+
+
+class Simulator:
+    """A simulator in a process of its own."""
+
+    def __init__(self, environment: dict[str, str], *arguments: str) -> None:
+        self.environment = environment
+        self.process = subprocess.Popen(
+            [*COMMAND, *arguments],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            env=environment,
+        )
+        assert self.process.stdout is not None
+        first = self.process.stdout.readline()
+        assert "press Ctrl-C" in first, first + self.process.stdout.read()
+
+    def end(self) -> list[str]:
+        """End the simulator with Ctrl-C; the lines that it has printed since."""
+        self.process.send_signal(2)
+        out, _ = self.process.communicate(timeout=PATIENCE_S)
+        assert self.process.returncode == 0, out
+        return out.splitlines()
+
+    def kill(self) -> None:
+        self.process.kill()
+        self.process.wait()
+        assert self.process.stdout is not None
+        self.process.stdout.close()
+
+
+@pytest.fixture
+def start(environment: dict[str, str]) -> Iterator[Callable[..., Simulator]]:
+    started: list[Simulator] = []
+
+    def begin(*arguments: str) -> Simulator:
+        started.append(Simulator(environment, *arguments))
+        return started[-1]
+
+    yield begin
+    for simulator in started:
+        simulator.kill()
+
+
+def vcan_sim(environment: dict[str, str], *arguments: str) -> tuple[int, str, str]:
+    done = subprocess.run(
+        [*COMMAND, *arguments],
+        capture_output=True,
+        text=True,
+        env=environment,
+        timeout=PATIENCE_S,
+        check=False,
+    )
+    return done.returncode, done.stdout, done.stderr
+
+
+def until(condition: Callable[[], object]) -> None:
+    end_s = time.monotonic() + PATIENCE_S
+    while not condition():
+        assert time.monotonic() < end_s
+        time.sleep(0.1)
+
+
+def test_inject_from_a_second_process(
+    hand: Path, environment: dict[str, str], start: Callable[..., Simulator]
+) -> None:
+    simulator = start("run", str(hand))
+    status, out, err = vcan_sim(environment, "inject")
+    assert (status, err) == (0, "")
+    assert out.splitlines() == [f"{place}: none now; nothing so far" for place in ("palm", "thumb", "can0")]
+    status, out, err = vcan_sim(environment, "inject", "palm:unplugged", "can0:rogue_nmt_per_s=50")
+    assert (status, err) == (0, "")
+    assert out.startswith("palm: unplugged now; ")
+    assert "\ncan0: rogue_nmt_per_s=50.0 now; " in out
+
+    def counted() -> bool:
+        out = vcan_sim(environment, "inject")[1]
+        return "palm: unplugged now; " in out and bool(
+            re.search(r"1 unplugged", out) and re.search(r"[1-9]\d* rogue_nmt", out)
+        )
+
+    until(counted)
+    assert vcan_sim(environment, "inject", "none")[1].startswith("palm: none now; ")
+    said = simulator.end()
+    assert any(line.startswith("palm: ") and "1 unplugged" in line for line in said)
+    assert any(line.startswith("can0: ") and "rogue_nmt" in line for line in said)
+    status, out, err = vcan_sim(environment, "inject")
+    assert (status, out) == (2, "")
+    assert err == "error: no simulator is running; start one with: vcan-sim run HAND.toml\n"
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("plam:unplugged", "inject: got 'plam', allowed: a patch of the hand: palm, thumb; or a bus: can0"),
+        ("palm:lost=2", "lost: got 2.0, allowed: a fraction from 0 to 1"),
+        ("can0:disturbed=0.1", "only the interface timed"),
+    ],
+)
+def test_a_bad_text_is_one_line_and_status_2(
+    text: str, words: str, hand: Path, environment: dict[str, str], start: Callable[..., Simulator]
+) -> None:
+    start(str(hand))
+    status, out, err = vcan_sim(environment, "inject", "thumb:silent", text)
+    assert (status, out) == (2, "")
+    assert err.count("\n") == 1
+    assert words in err
+    assert "none now" in vcan_sim(environment, "inject")[1].splitlines()[1]
+
+
+def test_several_simulators_are_told_apart(
+    hand: Path, environment: dict[str, str], start: Callable[..., Simulator]
+) -> None:
+    first = start(str(hand))
+    other = hand.with_name("other.toml")
+    other.write_text(hand.read_text().replace("gripper", "foot"))
+    second = start(str(other))
+    status, _, err = vcan_sim(environment, "inject", "palm:silent")
+    assert status == 2
+    for simulator, name in ((first, "gripper"), (second, "foot")):
+        assert f"{simulator.process.pid} ({name})" in err
+    status, out, _ = vcan_sim(environment, "inject", "palm:silent", "--simulator", "foot")
+    assert (status, out.splitlines()[0].split(";")[0]) == (0, "palm: silent now")
+    out = vcan_sim(environment, "inject", "--simulator", str(first.process.pid))[1]
+    assert out.startswith("palm: none now")
+    second.kill()  # its socket stays, and is removed
+    out = vcan_sim(environment, "inject")[1]
+    assert out.startswith("palm: none now")
+    folder = Path(environment["XDG_RUNTIME_DIR"]) / "vcan-sim"
+    assert [path.stem for path in folder.iterdir()] == [str(first.process.pid)]
+    assert folder.stat().st_mode & 0o777 == 0o700
+
+
+def test_the_folder_must_be_the_users_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    (tmp_path / "vcan-sim").mkdir(mode=0o755)
+    with pytest.raises(ControlError, match="mode 700"):
+        control_folder()
+    (tmp_path / "vcan-sim").chmod(0o700)
+    assert control_folder() == tmp_path / "vcan-sim"
+    with pytest.raises(ControlError, match="no simulator is running"):
+        running_simulator()
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path / "nowhere"))
+    with pytest.raises(ControlError, match="nowhere"):
+        control_folder()
+
+
+def test_scenes_that_come_with_the_simulator(environment: dict[str, str]) -> None:
+    status, out, err = vcan_sim(environment, "list")
+    assert (status, err) == (0, "")
+    assert [line.split()[0] for line in out.splitlines()] == ["faults", "press", "taps"]
+    for path in shipped_scenes().values():
+        assert read_scene(path).name in out
+
+
+def test_help_names_the_commands(environment: dict[str, str]) -> None:
+    status, out, _ = vcan_sim(environment, "--help")
+    assert status == 0
+    for name in ("run", "inject", "list"):
+        assert name in out

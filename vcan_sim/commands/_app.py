@@ -1,0 +1,46 @@
+"""Typer application ``vcan-sim`` with its commands."""
+
+from __future__ import annotations
+
+from typing import Any, Final
+
+import typer
+from typer.core import TyperGroup
+
+from vcan_sim.commands import inject, list_scenes, run
+
+DEFAULT: Final = "run"
+"""Command that runs if none is named."""
+_OF_GROUP: Final = ("-h", "--help", "--install-completion", "--show-completion")
+
+
+class _Group(TyperGroup):
+    """Group of commands of which one need not be named."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Insert the name of the default command if no command is named."""
+        completes_first_word = ctx.resilient_parsing and not args
+        if not completes_first_word and (not args or args[0] not in (*self.commands, *_OF_GROUP)):
+            args = [DEFAULT, *args]
+        return super().parse_args(ctx, args)
+
+    def shell_complete(self, ctx: Any, incomplete: str) -> Any:
+        """Complete the first word: a command, or an option of the default command."""
+        own, of_default = (
+            super().shell_complete(ctx, incomplete),
+            self.commands[DEFAULT].shell_complete(ctx, incomplete),
+        )
+        known = {item.value for item in own}
+        return own + [item for item in of_default if item.value not in known]
+
+
+app = typer.Typer(
+    name="vcan-sim",
+    cls=_Group,
+    help="Simulated patches of a robot skin as CANopen nodes. Without a command: run.",
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+app.command(name="run")(run.run)
+app.command(name="inject")(inject.inject)
+app.command(name="list")(list_scenes.list_scenes)

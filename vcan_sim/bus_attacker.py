@@ -1,7 +1,7 @@
-"""Faults of a bus, as data, and the rogue device that sends what some of them need.
+"""Faults of a bus, as data, and a rogue device that sends the frames for some of these faults.
 
-The device has an endpoint of its own on the bus, so nodes and hosts hear it, and its frames compete with
-theirs.
+The rogue device has its own endpoint on the bus. Nodes and hosts receive its frames, which compete with their
+frames in arbitration.
 """
 
 from __future__ import annotations
@@ -22,26 +22,26 @@ from vcan_sim.timed_bus import CanFrame
 from vcan_sim.timed_bus.wire_frame import wire_frame
 
 FLOOD_COB_ID: Final = 0x001
-"""Identifier of the frames of ``starved``; only NMT commands have a higher priority."""
+"""Identifier of the flood frames of the fault ``starved``; only NMT commands have a higher priority."""
 FLOOD_DATA: Final = bytes([0x55] * 8)
 _INTERMISSION_BITS: Final = 3
 _TICK_NS: Final = 1_000_000
-"""Least time between two batches of frames, ns."""
+"""Minimum time between two batches of rogue frames, ns."""
 _AHEAD_NS: Final = 2 * _TICK_NS
-"""Time by which flood frames are handed in early, ns, so that a completely starved bus never idles."""
+"""Time by which flood frames are queued in advance, ns, so that a completely starved bus is never idle."""
 _MOST_AT_ONCE: Final = 256
-"""Maximum number of overdue frames of one kind that are caught up; further frames are dropped."""
+"""Maximum number of overdue rogue frames of one kind to send at once; further overdue frames are dropped."""
 _RETRY_S: Final = 0.05
-"""Pause after a bus error, s."""
+"""Pause of the rogue device after a bus error, s."""
 _SHARES: Final = ("starved", "disturbed")
 _RATES: Final = ("rogue_nmt_per_s", "rogue_sync_per_s")
 _COUNTERS: Final = 240
-"""Highest SYNC counter of the rogue master."""
+"""Maximum SYNC counter of the rogue master."""
 
 
 @dataclass(frozen=True, slots=True)
 class BusFaults:
-    """Faults of one bus; none by default.
+    """Faults of one bus; by default there are none.
 
     Raises:
         ConfigError: If a fraction is not between 0 and 1, or a rate is negative.
@@ -50,17 +50,17 @@ class BusFaults:
     seed: int = 1
     """Seed of the random draws of faults."""
     bus_off: bool = False
-    """The controller of the nodes is bus-off: the nodes send and receive nothing."""
+    """Whether the nodes' controller is bus-off; the nodes then send and receive no frames."""
     starved: float = 0.0
-    """Fraction of the bus time that another device takes with frames of COB-ID 0x001, the highest priority
-    after NMT."""
+    """Fraction of the bus time that a rogue device occupies with frames of COB-ID 0x001, which has the
+    highest priority after NMT."""
     rogue_nmt_per_s: float = 0.0
-    """NMT commands of a second master per second, drawn at random, to all nodes or to one."""
+    """Number of random NMT commands per second from a second master, to all nodes or to one node."""
     rogue_sync_per_s: float = 0.0
-    """SYNC messages of a second master per second."""
+    """Number of SYNC messages per second from a second master."""
     disturbed: float = 0.0
-    """Fraction of the attempts to send a frame that an error frame destroys; only on the interface ``timed``.
-    The sender tries again."""
+    """Fraction of the transmission attempts that an error frame destroys; only on the interface ``timed``.
+    The sender retransmits the frame."""
 
     def __post_init__(self) -> None:
         for name in _SHARES:
@@ -72,49 +72,49 @@ class BusFaults:
 
     @property
     def needs_attacker(self) -> bool:
-        """Whether a rogue device sends frames."""
+        """Whether the faults require a rogue device that sends frames."""
         return bool(self.starved or self.rogue_nmt_per_s or self.rogue_sync_per_s)
 
 
 @dataclass(slots=True)
 class InjectedOnBus:
-    """Number of times that each fault was injected into one bus."""
+    """Number of times that each fault has been injected into one bus."""
 
     bus_off: int = 0
-    """Times that the controller of the nodes went bus-off."""
+    """Number of times that the nodes' controller went bus-off."""
     starved: int = 0
-    """Frames of the device that takes bus time."""
+    """Number of flood frames sent to occupy the bus."""
     rogue_nmt: int = 0
-    """NMT commands of the second master."""
+    """Number of NMT commands sent by the second master."""
     rogue_sync: int = 0
-    """SYNC messages of the second master."""
+    """Number of SYNC messages sent by the second master."""
     disturbed: int = 0
-    """Attempts that an error frame destroyed."""
+    """Number of transmission attempts destroyed by an error frame."""
 
 
 NO_BUS_FAULTS: Final = BusFaults()
 
 
 def check_bus(faults: BusFaults, bus: BusConfig) -> None:
-    """Check that a bus can have faults.
+    """Check that a bus can have the given faults.
 
     Args:
-        faults: The faults.
-        bus: The bus.
+        faults: Faults to check.
+        bus: Configuration of the bus.
 
     Raises:
-        ConfigError: If frames are to be disturbed on an interface other than ``timed``.
+        ConfigError: If the fault ``disturbed`` is set on an interface other than ``timed``.
     """
     if faults.disturbed and bus.interface != "timed":
-        allowed = f"0 on interface {bus.interface!r}; only the interface timed has error frames"
+        allowed = f"0 on interface {bus.interface!r}; only the interface timed simulates error frames"
         raise ConfigError(f"{bus.name}: disturbed", faults.disturbed, allowed)
 
 
 class BusAttacker:
-    """Rogue device on a bus, with a thread from the first fault that needs it to :meth:`stop`.
+    """Rogue device on a bus; its thread runs from the first fault that requires it until :meth:`stop`.
 
     Args:
-        bus: The bus.
+        bus: Configuration of the bus.
         node_ids: Node-IDs on the bus.
         counts: Counts of the injected faults, which the thread increases.
     """
@@ -130,14 +130,14 @@ class BusAttacker:
         self._syncs = 0
 
     def set(self, faults: BusFaults) -> None:
-        """Replace the faults; the thread starts when it is first needed."""
+        """Replace the faults. The first fault that requires the rogue device starts its thread."""
         self._faults = faults
         self._changed.set()
         if faults.needs_attacker and self._thread.ident is None:
             self._thread.start()
 
     def stop(self) -> None:
-        """End the thread. Can be called once."""
+        """Stop the thread. This method can be called only once."""
         self._stopping = True
         self._changed.set()
         if self._thread.ident is not None:
@@ -152,11 +152,11 @@ class BusAttacker:
             try:
                 with CanPort(self._bus) as port:
                     self._attack(port)
-            except BusError:  # also of a bus that another fault has taken away
+            except BusError:  # another fault may have made the bus unavailable
                 clock.sleep(_RETRY_S)
 
     def _attack(self, port: CanPort) -> None:
-        """Send frames until the faults end."""
+        """Send rogue frames until the faults end."""
         chance = random.Random(self._faults.seed)
         due_ns: dict[str, float] = {}
         while not self._stopping and self._faults.needs_attacker:
@@ -166,7 +166,7 @@ class BusAttacker:
             for name, period_ns in periods_ns.items():
                 ahead_ns = _AHEAD_NS if name == "starved" else 0
                 due_ns[name] = self._send_due(port, name, chance, due_ns[name], period_ns, now_ns + ahead_ns)
-            while port.recv(0.0) is not None:  # a queue that nobody reads would fill
+            while port.recv(0.0) is not None:  # otherwise the receive queue would fill up
                 pass
             first_ns = min(due_ns[name] - (_AHEAD_NS if name == "starved" else 0) for name in due_ns)
             wait_ns = max(first_ns - clock.monotonic_ns(), _TICK_NS if "starved" in due_ns else 0)
@@ -174,7 +174,7 @@ class BusAttacker:
             self._changed.clear()
 
     def _periods_ns(self) -> dict[str, float]:
-        """Return the time between two frames of each kind that is sent, ns."""
+        """Return the time between two rogue frames of each kind, ns."""
         faults, found = self._faults, {}
         if faults.starved:
             found["starved"] = self._flood_ns / faults.starved
@@ -184,7 +184,7 @@ class BusAttacker:
             found["rogue_sync"] = 1e9 / faults.rogue_sync_per_s
         return found
 
-    def _send_due(  # noqa: PLR0913 - what a frame depends on
+    def _send_due(  # noqa: PLR0913 - all inputs of a frame
         self,
         port: CanPort,
         name: str,
@@ -193,7 +193,7 @@ class BusAttacker:
         period_ns: float,
         until_ns: float,
     ) -> float:
-        """Send the frames of one kind that are due until a time. Returns when the next one is due, ns."""
+        """Send the rogue frames of one kind that are due, and return the due time of the next frame, ns."""
         make: Callable[[random.Random], tuple[int, bytes]] = getattr(self, f"_{name}")
         for _ in range(_MOST_AT_ONCE):
             if due_ns > until_ns:

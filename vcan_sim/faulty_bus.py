@@ -1,4 +1,4 @@
-"""Nodes' side of a bus with faults: their port, the counts of its frames, and the faults of the bus."""
+"""Bus with faults, from the nodes' side: port of the nodes, counts of frames, and faults of the bus."""
 
 from __future__ import annotations
 
@@ -62,10 +62,10 @@ def _count(frames: list[Frame], counter: Counter[Kind]) -> None:
 
 
 class FaultyBus:
-    """A bus of the hand, with its faults and their counts.
+    """Bus of a simulated hand, with its faults and their counts.
 
     Args:
-        config: The bus.
+        config: Configuration of the bus.
         node_ids: Node-IDs on the bus.
     """
 
@@ -78,7 +78,7 @@ class FaultyBus:
         self._rule: RandomShare | None = None
 
     def connect(self, port: FaultyPort) -> None:
-        """Set the port of the nodes, once it is open; the faults take effect."""
+        """Set the nodes' port after it has been opened, and apply the faults."""
         self._port = port
         self._attacker = BusAttacker(self._config, self._node_ids, self._counts)
         virtual = clock.current()
@@ -90,7 +90,7 @@ class FaultyBus:
         self._apply()
 
     def stop(self) -> None:
-        """End all faults of the bus itself, so that others who use it are not affected any more."""
+        """End all faults that affect the bus itself, so that its other users are no longer affected."""
         if self._attacker is not None:
             self._attacker.stop()
             self._attacker = None
@@ -101,18 +101,18 @@ class FaultyBus:
         self._port = None
 
     def check(self, faults: BusFaults) -> None:
-        """Check faults. Raises ConfigError if the bus cannot have them."""
+        """Check faults. Raises ConfigError if this bus cannot have the faults."""
         check_bus(faults, self._config)
 
     def inject(self, faults: BusFaults) -> None:
-        """Replace the faults."""
+        """Replace the faults of the bus."""
         self._counts.bus_off += faults.bus_off and not self._faults.bus_off
         self._faults = faults
         if self._port is not None:
             self._apply()
 
     def injected(self) -> InjectedOnBus:
-        """Return the counts of the injected faults."""
+        """Return how often each fault has been injected into the bus."""
         return replace(self._counts)
 
     def _apply(self) -> None:
@@ -123,7 +123,7 @@ class FaultyBus:
         self._disturb(self._faults.disturbed)
 
     def _disturb(self, share: float) -> None:
-        """Let error frames destroy a share of the attempts from now on."""
+        """Start destroying a fraction of the transmission attempts by error frames; 0 stops this."""
         if self._segment is None or share == (0.0 if self._rule is None else self._rule.share):
             return
         if self._rule is not None:

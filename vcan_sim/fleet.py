@@ -307,7 +307,7 @@ class Fleet:
         return self.truth_at(patch, t_ns)
 
     def truth_at(self, patch: str, t_ns: int) -> PatchTruth:
-        """Return the ground truth at a time, such as that of a frame.
+        """Return the ground truth at a given time, such as the time of a frame.
 
         Args:
             patch: Name of the patch.

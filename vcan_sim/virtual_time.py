@@ -100,9 +100,9 @@ class VirtualClock:
         return self._now_ns
 
     def made_progress(self) -> None:
-        """Allow the current thread as many readings of the time again, as after a wait.
+        """Reset the number of clock readings of the current thread, as after a wait.
 
-        A thread that takes items from a queue does not poll: it ends once the queue is empty.
+        A thread that takes items from a queue is not polling: it stops when the queue is empty.
         """
         self._readings = 0
 

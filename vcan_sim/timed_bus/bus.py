@@ -206,13 +206,13 @@ class TimedBus:
         self._disturbances.add(rule)
 
     def undisturb(self, rule: Disturbance) -> None:
-        """Remove a rule that :meth:`disturb` added; the attempt in progress keeps its course.
+        """Remove a rule that :meth:`disturb` added. The transmission attempt in progress is not changed.
 
         Args:
-            rule: the rule, the same object.
+            rule: disturbance rule, the same object as in :meth:`disturb`.
 
         Raises:
-            ValueError: if the rule is not in force.
+            ValueError: if the rule is not active.
         """
         self._disturbances.remove(rule)
 

@@ -137,10 +137,10 @@ class Disturbances:
         """Remove a rule.
 
         Args:
-            rule: the rule, the same object.
+            rule: disturbance rule, the same object as in :meth:`add`.
 
         Raises:
-            ValueError: if the rule is not in force.
+            ValueError: if the rule is not active.
         """
         kept = [each for each in self._rules if each[0] is not rule]
         if len(kept) == len(self._rules):

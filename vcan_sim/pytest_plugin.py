@@ -124,6 +124,14 @@ class SkinTest:
 
         return self._open.enter_context(Host.from_config(self.started("skin_host").hand, **options))
 
+    def connect(self, bus: str | None = None) -> Any:
+        """Open an endpoint on a bus of the hand, which is closed at the end of the test."""
+        from skinnode.transport import CanPort
+
+        hand = self.started("skin_can").hand
+        config = hand.buses[0] if bus is None else hand.bus(bus)
+        return self._open.enter_context(CanPort(config)).can_bus
+
     def keep(self, folder: Path) -> list[str]:
         """Save the trace, ground truth, scene and plot of the test, and return the names of the files."""
         folder.mkdir(parents=True, exist_ok=True)
@@ -268,6 +276,16 @@ def skin_hand(_skin_test: SkinTest) -> Callable[..., Fleet]:
 def skin_host(_skin_test: SkinTest) -> Callable[..., Host]:
     """Function that brings up the hand: ``skin_host(**options) -> Host``, with options of ``from_config``."""
     return lambda **options: _skin_test.bring_up(options)
+
+
+@pytest.fixture
+def skin_can(_skin_test: SkinTest) -> Callable[..., Any]:
+    """Function that connects a master of your own: ``skin_can(bus=None) -> can.BusABC``, a python-can bus.
+
+    ``bus`` is the name of a bus of the hand; by default, it is the first bus. The endpoint is closed at the
+    end of the test.
+    """
+    return _skin_test.connect
 
 
 @pytest.fixture

@@ -161,6 +161,11 @@ class CanPort:
         return SocketReader(bus.socket) if self.config.interface == _SOCKETCAN else None
 
     @property
+    def can_bus(self) -> can.BusABC:
+        """The python-can bus of this endpoint, for a program that does not use the port otherwise."""
+        return self._bus
+
+    @property
     def reads_batches(self) -> bool:
         """Whether :meth:`recv_batch` may return more than one frame."""
         return self._reader is not None

@@ -320,6 +320,15 @@ class Fleet:
         t_s = self._stations[patch].source.scene_s(t_ns)
         return self._scenes[patch].truth(-1.0 if t_s is None else t_s)
 
+    def scene_s(self, t_ns: int) -> float | None:
+        """Return the scene time at a monotonic time, s; None before the first patch has started.
+
+        Args:
+            t_ns: Monotonic time, ns.
+        """
+        times = [patch.scene_s(t_ns) for patch in self.patches.values()]
+        return max((time for time in times if time is not None), default=None)
+
     def _require_scene(self) -> None:
         if not self._scenes:
             raise LookupError("this fleet has no scene; for the strokes of [simulation], use truth_m")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from types import TracebackType
 from typing import Final, Self
 
@@ -14,6 +15,9 @@ from vcan_sim.timed_interface import Segment
 
 _POLL_S: Final = 0.05
 """Maximum time to wait for a frame, s; :meth:`Listener.__exit__` also waits at most this long."""
+
+_LAST_FRAMES: Final = 10_000
+"""Maximum number of frames that a listener reads after its end, if frames keep arriving."""
 
 
 class Trace:
@@ -47,15 +51,20 @@ class Listener:
 
     Args:
         bus: Bus to record.
+        write: Called with each line, in the listener's thread; None to keep the lines for :meth:`text`.
+        channel: Channel in the lines; None for the bus's.
 
     Raises:
         BusError: If the bus cannot be opened.
     """
 
-    def __init__(self, bus: BusConfig) -> None:
-        self._port, self._channel = CanPort(bus), bus.channel
+    def __init__(
+        self, bus: BusConfig, write: Callable[[str], object] | None = None, channel: str | None = None
+    ) -> None:
+        self._port, self._channel = CanPort(bus), channel or bus.channel
         self._wall_ns = clock.time_ns() - clock.monotonic_ns()
         self._lines: list[str] = []
+        self._write = write or self._lines.append
         self._stop = clock.event()
         self._thread = clock.thread(self._run, f"trace {bus.name}")
 
@@ -76,13 +85,21 @@ class Listener:
 
     def _run(self) -> None:
         while not self._stop.is_set():
-            try:
-                frame = self._port.recv(_POLL_S)
-            except BusError:
-                self._stop.wait(_POLL_S)
-                continue
-            if frame is not None and not frame.error:
-                self._lines.append(_line(frame.t_ns + self._wall_ns, self._channel, _can_frame(frame)))
+            self._record(_POLL_S)
+        for _ in range(_LAST_FRAMES):
+            if not self._record(0.0):
+                return
+
+    def _record(self, timeout_s: float) -> bool:
+        """Record the next frame. Returns whether there was one."""
+        try:
+            frame = self._port.recv(timeout_s)
+        except BusError:
+            self._stop.wait(_POLL_S)
+            return False
+        if frame is not None and not frame.error:
+            self._write(_line(frame.t_ns + self._wall_ns, self._channel, _can_frame(frame)))
+        return frame is not None
 
 
 def _can_frame(frame: Frame) -> CanFrame:

@@ -201,6 +201,27 @@ def test_the_folder_must_be_the_users_own(tmp_path: Path, monkeypatch: pytest.Mo
         control_folder()
 
 
+def test_a_run_is_recorded_and_replayed(hand: Path, environment: dict[str, str]) -> None:
+    folder = hand.with_name("run")
+    record = ["run", str(hand), "--record", str(folder), "--fault", "palm:babble_per_s=50", "--seconds", "1"]
+    status, out, err = vcan_sim(environment, *record)
+    assert (status, err) == (0, "")
+    assert out.splitlines()[-1] == f"recorded to {folder}"
+    assert sorted(path.name for path in folder.iterdir()) == ["faults.jsonl", "trace.log", "truth.npz"]
+    frames = (folder / "trace.log").read_text().splitlines()
+    assert sum(" 3F0#" in line for line in frames) > 10
+    for recording in (folder, folder / "trace.log"):
+        status, out, err = vcan_sim(environment, "replay", str(recording), "--hand", str(hand))
+        assert (status, err) == (0, "")
+        assert f"sent {len(frames)} frames in " in out
+    status, out, err = vcan_sim(environment, *record)
+    assert (status, out) == (2, "")
+    assert err.startswith("error: --record: got ")
+    status, out, err = vcan_sim(environment, "replay", str(hand.parent))
+    assert (status, out) == (2, "")
+    assert err.startswith("error: RECORDING: got ")
+
+
 def test_scenes_that_come_with_the_simulator(environment: dict[str, str]) -> None:
     status, out, err = vcan_sim(environment, "list")
     assert (status, err) == (0, "")
@@ -212,5 +233,5 @@ def test_scenes_that_come_with_the_simulator(environment: dict[str, str]) -> Non
 def test_help_names_the_commands(environment: dict[str, str]) -> None:
     status, out, _ = vcan_sim(environment, "--help")
     assert status == 0
-    for name in ("run", "inject", "list"):
+    for name in ("run", "inject", "list", "replay"):
         assert name in out

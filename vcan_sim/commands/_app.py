@@ -7,7 +7,7 @@ from typing import Any, Final
 import typer
 from typer.core import TyperGroup
 
-from vcan_sim.commands import inject, list_scenes, run
+from vcan_sim.commands import inject, list_scenes, replay, run
 
 DEFAULT: Final = "run"
 """Command that runs if none is named."""
@@ -44,3 +44,4 @@ app = typer.Typer(
 app.command(name="run")(run.run)
 app.command(name="inject")(inject.inject)
 app.command(name="list")(list_scenes.list_scenes)
+app.command(name="replay")(replay.replay)

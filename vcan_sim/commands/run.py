@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from skinnode.config import HandConfig
     from skinnode.node import NmtState
     from vcan_sim.fleet import Fleet, NodeReport
+    from vcan_sim.scenes import SceneConfig
 
 _WARN_AGAIN_S = 10.0
 """Minimum time between warnings about a busy machine, s."""
@@ -46,6 +47,10 @@ def run(  # noqa: PLR0913 - Typer derives a command's options from its arguments
         Path | None,
         typer.Option(help="Plot the forces and pressures of the scene to FILE, and exit.", metavar="FILE"),
     ] = None,
+    record: Annotated[
+        Path | None,
+        typer.Option(help="Record trace, truth, faults and scene to a new folder.", metavar="FOLDER"),
+    ] = None,
 ) -> None:
     """Simulate a hand's patches as CANopen nodes on a bus; a sphere presses each patch and slides over it.
 
@@ -64,13 +69,20 @@ def run(  # noqa: PLR0913 - Typer derives a command's options from its arguments
     if plot is not None:
         _preview(plan, scene, plot)
         return
-    simulated = Fleet(plan, scene=None if scene is None else load_scene(scene, plan))
+    played = None if scene is None else load_scene(scene, plan)
+    simulated = Fleet(plan, scene=played)
     simulated.faults.inject(*fault or [])
-    with stop_on_signal() as stop, simulated as fleet, _controlled(fleet), without_long_collections():
+    with (
+        stop_on_signal() as stop,
+        _recorded(simulated, played, record) as poll,
+        simulated as fleet,
+        _controlled(fleet),
+        without_long_collections(),
+    ):
         where = ", ".join(f"{bus.name} ({bus.interface} {bus.channel})" for bus in plan.buses)
         patches = counted(len(plan.patches), "patch", "patches")
         _say(f"{patches} of {plan.name!r} on {where}; press Ctrl-C to stop")
-        _watch(fleet, stop.wait, seconds)
+        _watch(fleet, stop.wait, seconds, poll)
         injected = _injected(fleet) if fleet.faults.log else []
     reports = fleet.report()
     _say(_summary(reports))
@@ -81,6 +93,8 @@ def run(  # noqa: PLR0913 - Typer derives a command's options from its arguments
         )
     for line in injected:
         _say(line)
+    if record is not None:
+        _say(f"recorded to {record}")
 
 
 def _preview(hand: HandConfig, scene: Path | None, plot: Path) -> None:
@@ -101,7 +115,9 @@ def _preview(hand: HandConfig, scene: Path | None, plot: Path) -> None:
     _say(f"wrote {plot}")
 
 
-def _watch(fleet: Fleet, wait: Callable[[float], bool], seconds: float | None) -> None:
+def _watch(
+    fleet: Fleet, wait: Callable[[float], bool], seconds: float | None, poll: Callable[[], None]
+) -> None:
     """Print a status line every second until ``wait`` returns True, time is up, or a node thread fails."""
     start = clock.monotonic()
     before = fleet.report()
@@ -110,6 +126,7 @@ def _watch(fleet: Fleet, wait: Callable[[float], bool], seconds: float | None) -
         due = float(second) if seconds is None else min(second, seconds)
         if wait(max(0.0, start + due - clock.monotonic())) or fleet.failed:
             return
+        poll()
         now = fleet.report()
         _say(_progress(due, before, now))
         if due >= silent_until_s and (slow := _too_slow(before, now)):
@@ -160,6 +177,18 @@ def _injected(fleet: Fleet) -> list[str]:
         if counts or place in fleet.patches:
             lines.append(f"{place}: {shown or 'nothing injected'}")
     return lines
+
+
+@contextmanager
+def _recorded(fleet: Fleet, scene: SceneConfig | None, folder: Path | None) -> Iterator[Callable[[], None]]:
+    """Record the fleet if a folder is given; yield what to call every second."""
+    if folder is None:
+        yield lambda: None
+        return
+    from vcan_sim.recording import Recording
+
+    with Recording(folder, fleet, scene) as recording:
+        yield recording.poll
 
 
 @contextmanager

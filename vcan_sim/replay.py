@@ -1,0 +1,125 @@
+"""Plays a recorded trace on buses, with its timing."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+from skinnode.errors import BusError, ConfigError
+from skinnode.process import clock
+from skinnode.transport import CanPort
+from skinnode.transport.frame_log import LoggedFrame
+from skinnode.transport.frame_log_reader import FrameLogReader
+from vcan_sim.recording import TRACE
+from vcan_sim.tally import Kind, kind_of
+
+FROM_NODES: Final = frozenset(
+    {
+        Kind.EMCY,
+        Kind.CHUNK,
+        Kind.SUMMARY,
+        Kind.SDO_RESPONSE,
+        Kind.HEARTBEAT,
+        Kind.BOOT_UP,
+        Kind.LSS_RESPONSE,
+    }
+)
+"""Kinds of frames that nodes send; a host sends the others, and a heartbeat of its own."""
+_DRAINED_EVERY: Final = 64
+"""Number of frames sent between two readings of what the buses carry."""
+
+
+@dataclass(frozen=True, slots=True)
+class Replayed:
+    """Counts of a replay."""
+
+    sent: int
+    left_out: int
+    """Frames that were not to be sent, or that the endpoint cannot send: extended and error frames."""
+    refused: int
+    """Frames that the bus refused."""
+    seconds: float
+    """Duration, s."""
+
+
+def trace_of(recording: Path) -> Path:
+    """Return the trace of a recording.
+
+    Args:
+        recording: Folder of a recording, or a trace.
+
+    Raises:
+        ConfigError: If there is no such file.
+    """
+    file = recording / TRACE if recording.is_dir() else recording
+    if not file.is_file():
+        raise ConfigError("RECORDING", str(recording), f"a folder with a {TRACE}, or a trace")
+    return file
+
+
+def channels_in(trace: Path) -> list[str]:
+    """Return the channels in a trace, in the order of their first frames.
+
+    Args:
+        trace: The file.
+
+    Raises:
+        ConfigError: If the file cannot be read, or contains no frame.
+    """
+    found = list(dict.fromkeys(logged.channel for logged in FrameLogReader(trace)))
+    if not found:
+        raise ConfigError("RECORDING", str(trace), "a trace with at least one frame, as from candump -L")
+    return found
+
+
+def replay(
+    frames: Iterable[LoggedFrame],
+    ports: Mapping[str, CanPort],
+    *,
+    wait: Callable[[float], bool],
+    from_nodes: bool = False,
+) -> Replayed:
+    """Send frames at the times at which they were recorded.
+
+    Args:
+        frames: The frames, with their times. Frames that are out of order are sent at once.
+        ports: Open endpoint for each channel; frames of other channels are left out.
+        wait: Function that waits for some seconds, and returns True to end the replay.
+        from_nodes: Whether to send only the frames that nodes send.
+
+    Returns:
+        What was sent.
+    """
+    begin_ns, first_ns = clock.monotonic_ns(), None
+    sent = left_out = refused = 0
+    for logged in frames:
+        frame = logged.frame
+        first_ns = frame.t_ns if first_ns is None else first_ns
+        port = ports.get(logged.channel)
+        kind = kind_of(frame.can_id, frame.data, frame.remote)
+        if port is None or frame.extended or frame.error or (from_nodes and kind not in FROM_NODES):
+            left_out += 1
+            continue
+        left_s = (begin_ns + frame.t_ns - first_ns - clock.monotonic_ns()) * 1e-9
+        if left_s > 0.0 and wait(left_s):
+            break
+        try:
+            port.send(frame.can_id, frame.data, remote=frame.remote)
+            sent += 1
+        except BusError:
+            refused += 1
+        if (sent + refused) % _DRAINED_EVERY == 0:
+            for each in ports.values():
+                _drain(each)
+    return Replayed(sent, left_out, refused, (clock.monotonic_ns() - begin_ns) * 1e-9)
+
+
+def _drain(port: CanPort) -> None:
+    """Read what the bus carries, because a queue that nobody reads would fill."""
+    try:
+        while port.recv(0.0) is not None:
+            pass
+    except BusError:  # sending reports it
+        return

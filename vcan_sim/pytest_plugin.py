@@ -126,11 +126,11 @@ class SkinTest:
 
     def connect(self, bus: str | None = None) -> Any:
         """Open an endpoint on a bus of the hand, which is closed at the end of the test."""
-        from skinnode.transport import CanPort
+        from skinnode.transport import open_can_bus
 
         hand = self.started("skin_can").hand
         config = hand.buses[0] if bus is None else hand.bus(bus)
-        return self._open.enter_context(CanPort(config)).can_bus
+        return self._open.enter_context(open_can_bus(config))
 
     def keep(self, folder: Path) -> list[str]:
         """Save the trace, ground truth, scene and plot of the test, and return the names of the files."""

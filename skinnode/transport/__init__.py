@@ -8,7 +8,7 @@ No other package in the project uses python-can at run time.
 """
 
 from skinnode.transport.frame import Frame
-from skinnode.transport.port import CanPort
+from skinnode.transport.port import CanPort, open_can_bus
 from skinnode.transport.receiver import Intake, Receiver
 
-__all__ = ["CanPort", "Frame", "Intake", "Receiver"]
+__all__ = ["CanPort", "Frame", "Intake", "Receiver", "open_can_bus"]

@@ -101,6 +101,40 @@ class _Message(can.Message):
         return copy
 
 
+def open_can_bus(config: BusConfig) -> can.BusABC:
+    """Open an endpoint as a python-can bus, for a program that does not use :class:`CanPort`.
+
+    Args:
+        config: Interface, channel, bit rates and options of the bus.
+
+    Raises:
+        BusError: if the interface cannot be opened.
+    """
+    where = _where(config)
+    options: dict[str, Any] = {**config.options, "bitrate": config.bitrate_bps}
+    if config.interface == _VIRTUAL:
+        options["rx_queue_size"] = VIRTUAL_QUEUE_FRAMES
+    if config.interface == _MULTICAST or config.fd:
+        options["fd"] = True
+    if config.fd:
+        options["data_bitrate"] = config.data_bitrate_bps
+    if config.interface not in can.VALID_INTERFACES:
+        raise BusError(f"{where}: no such interface, allowed: {allowed_interfaces(config)}")
+    try:
+        bus = can.Bus(interface=config.interface, channel=config.channel, ignore_config=True, **options)
+    except Exception as error:  # drivers raise OSError, ImportError, TypeError and others
+        raise BusError(
+            f"{where}: cannot be opened ({_why(error)}), allowed: {_channel_hint(config)}"
+        ) from error
+    if config.interface in (_MULTICAST, _SOCKETCAN):
+        _tune_socket(bus.fileno())
+    return bus
+
+
+def _where(config: BusConfig) -> str:
+    return f"{config.name}: interface {config.interface!r}, channel {config.channel!r}"
+
+
 class CanPort:
     """Endpoint on a bus, open from construction until :meth:`close` or the end of a ``with`` block.
 
@@ -118,7 +152,7 @@ class CanPort:
 
     def __init__(self, config: BusConfig) -> None:
         self.config = config
-        self._where = f"{config.name}: interface {config.interface!r}, channel {config.channel!r}"
+        self._where = _where(config)
         self._longest = 64 if config.fd else 8
         self._closed = False
         self._link_gone: Exception | None = None
@@ -135,35 +169,12 @@ class CanPort:
         self._send_timeout_s = 0.0 if config.interface == _VIRTUAL else None
 
     def _open(self) -> can.BusABC:
-        config = self.config
-        options: dict[str, Any] = {**config.options, "bitrate": config.bitrate_bps}
-        if config.interface == _VIRTUAL:
-            options["rx_queue_size"] = VIRTUAL_QUEUE_FRAMES
-        if config.interface == _MULTICAST or config.fd:
-            options["fd"] = True
-        if config.fd:
-            options["data_bitrate"] = config.data_bitrate_bps
-        if config.interface not in can.VALID_INTERFACES:
-            raise BusError(f"{self._where}: no such interface, allowed: {allowed_interfaces(config)}")
-        try:
-            bus = can.Bus(interface=config.interface, channel=config.channel, ignore_config=True, **options)
-        except Exception as error:  # drivers raise OSError, ImportError, TypeError and others
-            raise BusError(
-                f"{self._where}: cannot be opened ({_why(error)}), allowed: {_channel_hint(config)}"
-            ) from error
-        if config.interface in (_MULTICAST, _SOCKETCAN):
-            _tune_socket(bus.fileno())
-        return bus
+        return open_can_bus(self.config)
 
     def _open_reader(self) -> SocketReader | None:
         """Return the reader that receives instead of python-can, or None if python-can receives."""
         bus: Any = self._bus  # python-can's SocketcanBus
         return SocketReader(bus.socket) if self.config.interface == _SOCKETCAN else None
-
-    @property
-    def can_bus(self) -> can.BusABC:
-        """The python-can bus of this endpoint, for a program that does not use the port otherwise."""
-        return self._bus
 
     @property
     def reads_batches(self) -> bool:

@@ -1,7 +1,7 @@
 """Control of a running simulator from another process, by JSON lines on a Unix socket.
 
-Each simulator has a socket of its own, ``PID.sock``, in a folder that only its user can enter. A request and
-its answer are one line each::
+Each simulator has its own socket, ``PID.sock``, in a folder that only its user can access. Each request and
+each answer is one line::
 
     {"faults": ["palm:unplugged"]}
     {"hand": "gripper", "now": ["palm:unplugged"], "counts": {"palm": {"unplugged": 1}, "can0": {}}}
@@ -27,19 +27,19 @@ from skinnode.errors import ConfigError, SkinError
 
 _LONGEST_LINE: Final = 1 << 16
 _ANSWER_S: Final = 10.0
-"""Maximum wait for an answer, s."""
+"""Maximum time to wait for a simulator's answer, s."""
 _POLL_S: Final = 0.2
-"""Interval at which the thread of a server checks whether it must end, s."""
+"""Interval at which a server thread checks whether it must stop, s."""
 KEY: Final = "inject"
-"""Name of the faults in messages."""
+"""Key that refers to the faults in error messages."""
 
 
 class ControlError(SkinError):
-    """There is no simulator to control, or it does not answer."""
+    """No simulator is running, or the simulator does not answer."""
 
 
 class Controlled(Protocol):
-    """What a control socket changes and shows: a fleet."""
+    """Interface of the fleet that a control socket changes and shows."""
 
     @property
     def faults(self) -> Any:
@@ -55,12 +55,12 @@ class Answer:
 
     hand: str
     now: tuple[str, ...]
-    """What is injected now: one text for each patch or bus that has faults."""
+    """Current faults: one text for each patch or bus that has faults."""
     counts: dict[str, dict[str, int]]
-    """Counts of what was injected so far, by patch and bus."""
+    """Counts of the faults injected so far, by patch and bus."""
 
     def lines(self) -> list[str]:
-        """Return one line per patch and bus: its present faults, and the counts so far."""
+        """Return one line per patch and bus, with its current faults and the counts so far."""
         now = dict(text.rpartition(":")[::2] for text in self.now)
         return [
             f"{place}: {now.get(place, 'none')} now; {_listed(counts)} so far"
@@ -73,10 +73,10 @@ def _listed(counts: dict[str, int]) -> str:
 
 
 def control_folder() -> Path:
-    """Return the folder of the control sockets, which only this user can enter; created if necessary.
+    """Return the folder of the control sockets, which only this user can access; create it if necessary.
 
     Raises:
-        ControlError: If the folder belongs to someone else, or cannot be created.
+        ControlError: If the folder belongs to another user or cannot be created.
     """
     base, user = os.environ.get("XDG_RUNTIME_DIR"), os.getuid()
     folder = Path(base) / "vcan-sim" if base else Path(tempfile.gettempdir()) / f"vcan-sim-{user}"
@@ -92,7 +92,7 @@ def control_folder() -> Path:
 
 
 class ControlServer:
-    """Control socket of this process, in a ``with`` block.
+    """Control socket of this process, open during a ``with`` block.
 
     Args:
         fleet: Fleet to control.
@@ -163,7 +163,7 @@ def running_simulator(wanted: str | None = None) -> Path:
     """Return the control socket of the running simulator.
 
     Args:
-        wanted: Process-ID, or name of the hand, of the simulator; None if there is only one.
+        wanted: Process-ID of the simulator, or name of its hand; None if only one simulator is running.
 
     Raises:
         ControlError: If no simulator runs, none is the wanted one, or several could be meant.
@@ -180,7 +180,7 @@ def running_simulator(wanted: str | None = None) -> Path:
 
 
 def request(path: Path, faults: list[str]) -> Answer:
-    """Change the faults of a simulator.
+    """Change the faults of a running simulator, by a request to its control socket.
 
     Args:
         path: Control socket of the simulator.
@@ -206,7 +206,7 @@ def request(path: Path, faults: list[str]) -> Answer:
 
 
 def _running() -> Iterator[tuple[Path, str]]:
-    """Yield the socket and the hand of each running simulator; remove sockets whose process has ended."""
+    """Yield each running simulator's socket and hand; remove the sockets of processes that have ended."""
     for path in sorted(control_folder().glob("*.sock")):
         try:
             yield path, request(path, []).hand

@@ -321,7 +321,7 @@ class Fleet:
         return self._scenes[patch].truth(-1.0 if t_s is None else t_s)
 
     def scene_s(self, t_ns: int) -> float | None:
-        """Return the scene time at a monotonic time, s; None before the first patch has started.
+        """Return the scene time, s, at a monotonic time; None before the scene has started on any patch.
 
         Args:
             t_ns: Monotonic time, ns.

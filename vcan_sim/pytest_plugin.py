@@ -125,7 +125,7 @@ class SkinTest:
         return self._open.enter_context(Host.from_config(self.started("skin_host").hand, **options))
 
     def connect(self, bus: str | None = None) -> Any:
-        """Open an endpoint on a bus of the hand, which is closed at the end of the test."""
+        """Open an endpoint on a bus of the hand; the endpoint is closed at the end of the test."""
         from skinnode.transport import open_can_bus
 
         hand = self.started("skin_can").hand
@@ -280,7 +280,7 @@ def skin_host(_skin_test: SkinTest) -> Callable[..., Host]:
 
 @pytest.fixture
 def skin_can(_skin_test: SkinTest) -> Callable[..., Any]:
-    """Function that connects a master of your own: ``skin_can(bus=None) -> can.BusABC``, a python-can bus.
+    """Function that opens a python-can bus for a user's own master: ``skin_can(bus=None) -> can.BusABC``.
 
     ``bus`` is the name of a bus of the hand; by default, it is the first bus. The endpoint is closed at the
     end of the test.

@@ -1,4 +1,4 @@
-"""Recording of a simulated run: trace, truth, faults and scene, as files beside each other in a new folder.
+"""Recording of a simulated run: bus trace, ground truth, faults and scene, as files in a new folder.
 
 ===============  =======================================================================================
 file             content
@@ -37,12 +37,12 @@ SCENE: Final = "scene.json"
 
 
 def channel_of(bus: str) -> str:
-    """Return the channel in a trace that stands for a bus: its name, in which blanks become underscores."""
+    """Return the channel name of a bus in traces: the name of the bus with underscores instead of blanks."""
     return re.sub(r"\s", "_", bus)
 
 
 class Recording:
-    """Recording of a fleet, in a ``with`` block that encloses that of the fleet.
+    """Recording of a fleet during a ``with`` block, which must enclose the ``with`` block of the fleet.
 
     Call :meth:`poll` at least every minute, because a patch remembers only its newest readings.
 
@@ -93,7 +93,7 @@ class Recording:
         np.savez_compressed(self._folder / TRUTH, **arrays)
 
     def poll(self) -> None:
-        """Add the truth of the scans and the faults since the last call."""
+        """Record the ground truth of all scans, and all changes of faults, since the last call."""
         if self._failure is not None:
             raise self._failure
         wall_ns = clock.time_ns() - clock.monotonic_ns()

@@ -1,4 +1,4 @@
-"""Plays a recorded trace on buses, with its timing."""
+"""Replay of a recorded bus trace on buses, with the original timing."""
 
 from __future__ import annotations
 
@@ -26,29 +26,30 @@ FROM_NODES: Final = frozenset(
         Kind.LSS_RESPONSE,
     }
 )
-"""Kinds of frames that nodes send; a host sends the others, and a heartbeat of its own."""
+"""Kinds of frames that nodes send. A host sends all other kinds, and may also send a heartbeat."""
 _DRAINED_EVERY: Final = 64
-"""Number of frames sent between two readings of what the buses carry."""
+"""Number of frames to send before the receive queues of the buses are emptied again."""
 
 
 @dataclass(frozen=True, slots=True)
 class Replayed:
-    """Counts of a replay."""
+    """Frame counts and duration of a replay."""
 
     sent: int
     left_out: int
-    """Frames that were not to be sent, or that the endpoint cannot send: extended and error frames."""
+    """Number of frames excluded from the replay, or not supported by the endpoint (extended and error
+    frames)."""
     refused: int
-    """Frames that the bus refused."""
+    """Number of frames that the bus refused."""
     seconds: float
-    """Duration, s."""
+    """Duration of the replay, s."""
 
 
 def trace_of(recording: Path) -> Path:
-    """Return the trace of a recording.
+    """Return the trace file of a recording.
 
     Args:
-        recording: Folder of a recording, or a trace.
+        recording: Folder of a recording, or a trace file.
 
     Raises:
         ConfigError: If there is no such file.
@@ -60,10 +61,10 @@ def trace_of(recording: Path) -> Path:
 
 
 def channels_in(trace: Path) -> list[str]:
-    """Return the channels in a trace, in the order of their first frames.
+    """Return the channel names in a trace, in the order of their first frames.
 
     Args:
-        trace: The file.
+        trace: Trace file.
 
     Raises:
         ConfigError: If the file cannot be read, or contains no frame.
@@ -81,16 +82,16 @@ def replay(
     wait: Callable[[float], bool],
     from_nodes: bool = False,
 ) -> Replayed:
-    """Send frames at the times at which they were recorded.
+    """Send recorded frames with their original timing.
 
     Args:
-        frames: The frames, with their times. Frames that are out of order are sent at once.
-        ports: Open endpoint for each channel; frames of other channels are left out.
-        wait: Function that waits for some seconds, and returns True to end the replay.
+        frames: Frames with their times. Frames that are out of order are sent immediately.
+        ports: Open endpoint for each channel; frames of other channels are not sent.
+        wait: Function that waits for a given number of seconds, and returns True to end the replay.
         from_nodes: Whether to send only the frames that nodes send.
 
     Returns:
-        What was sent.
+        Frame counts and duration of the replay.
     """
     begin_ns, first_ns = clock.monotonic_ns(), None
     sent = left_out = refused = 0
@@ -117,7 +118,7 @@ def replay(
 
 
 def _drain(port: CanPort) -> None:
-    """Read what the bus carries, because a queue that nobody reads would fill."""
+    """Discard all received frames, because the receive queue would otherwise fill up."""
     try:
         while port.recv(0.0) is not None:
             pass

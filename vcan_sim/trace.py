@@ -17,7 +17,7 @@ _POLL_S: Final = 0.05
 """Maximum time to wait for a frame, s; :meth:`Listener.__exit__` also waits at most this long."""
 
 _LAST_FRAMES: Final = 10_000
-"""Maximum number of frames that a listener reads after its end, if frames keep arriving."""
+"""Maximum number of frames that a listener still reads when it stops, in case frames keep arriving."""
 
 
 class Trace:
@@ -51,8 +51,9 @@ class Listener:
 
     Args:
         bus: Bus to record.
-        write: Called with each line, in the listener's thread; None to keep the lines for :meth:`text`.
-        channel: Channel in the lines; None for the bus's.
+        write: Function called with each line in the listener's thread; None to store the lines for
+            :meth:`text`.
+        channel: Channel name in the lines; None for the channel of the bus.
 
     Raises:
         BusError: If the bus cannot be opened.
@@ -91,7 +92,7 @@ class Listener:
                 return
 
     def _record(self, timeout_s: float) -> bool:
-        """Record the next frame. Returns whether there was one."""
+        """Record the next frame, and return whether a frame was received."""
         try:
             frame = self._port.recv(timeout_s)
         except BusError:

@@ -10,12 +10,12 @@ from typer.core import TyperGroup
 from vcan_sim.commands import inject, list_scenes, replay, run
 
 DEFAULT: Final = "run"
-"""Command that runs if none is named."""
+"""Name of the command that runs if the user names no command."""
 _OF_GROUP: Final = ("-h", "--help", "--install-completion", "--show-completion")
 
 
 class _Group(TyperGroup):
-    """Group of commands of which one need not be named."""
+    """Group of commands with a default command, whose name may be omitted."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Insert the name of the default command if no command is named."""

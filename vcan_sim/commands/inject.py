@@ -1,4 +1,4 @@
-"""``vcan-sim inject``: change the faults of a running simulator, and print what was injected so far."""
+"""``vcan-sim inject``: change the faults of a running simulator, and print the counts of injected faults."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ import typer
 Simulator = Annotated[
     str | None,
     typer.Option(
-        help="Process-ID or name of the hand of the simulator; needed if several run.", metavar="PID|HAND"
+        help="Process-ID of the simulator, or name of its hand; required if several simulators run.",
+        metavar="PID|HAND",
     ),
 ]
 
@@ -19,7 +20,7 @@ def inject(
         list[str] | None,
         typer.Argument(
             help="Faults such as palm:unplugged, palm:lost=0.1, can0:starved=0.5, palm:none or none. "
-            "Default: only print.",
+            "Default: print the faults without a change.",
             metavar="[[PLACE:]FAULTS]...",
         ),
     ] = None,
@@ -27,7 +28,7 @@ def inject(
 ) -> None:
     """Change the faults of a simulator that runs in another terminal, and print all faults and their counts.
 
-    The text of a fault is that of `vcan-sim run --fault`. Faults that are not named stay as they are.
+    Write faults as for `vcan-sim run --fault`. Faults that are not named do not change.
     """
     from vcan_sim.control import request, running_simulator
 

@@ -1,4 +1,4 @@
-"""``vcan-sim list``: the scenes that come with the simulator."""
+"""``vcan-sim list``: list the scenes that are shipped with the simulator."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from __future__ import annotations
 def list_scenes() -> None:
     """List the scenes that come with the simulator; `vcan-sim run --scene NAME` plays one.
 
-    The patches that a scene names must be in the hand.
+    The hand must have all patches that a scene names.
     """
     from vcan_sim.scenes.library import shipped_scenes
     from vcan_sim.scenes.tables import read_scene

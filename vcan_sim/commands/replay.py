@@ -1,4 +1,4 @@
-"""``vcan-sim replay``: play a recorded trace on a bus."""
+"""``vcan-sim replay``: replay a recorded bus trace on a bus."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def replay(
         bool, typer.Option("--from-nodes", help="Send only the frames that nodes send, for a host of yours.")
     ] = False,
 ) -> None:
-    """Play a recorded trace on a bus, with its timing.
+    """Replay a recorded bus trace on a bus, with its original timing.
 
     With --hand, the frames of each bus are sent on the bus of the hand with that name. Without, all frames
     are sent on one bus: --interface and --channel.
@@ -56,7 +56,7 @@ def replay(
 def _buses(
     trace: Path, hand: Path | None, interface: str | None, channel: str | None
 ) -> dict[str, BusConfig]:
-    """Return the bus for each channel of a trace.
+    """Return the bus on which to send the frames of each channel in a trace.
 
     Raises:
         ConfigError: If there is no bus for a channel, or one bus is given for several channels.

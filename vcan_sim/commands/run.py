@@ -49,7 +49,9 @@ def run(  # noqa: PLR0913 - Typer derives a command's options from its arguments
     ] = None,
     record: Annotated[
         Path | None,
-        typer.Option(help="Record trace, truth, faults and scene to a new folder.", metavar="FOLDER"),
+        typer.Option(
+            help="Record the bus trace, ground truth, faults and scene in a new folder.", metavar="FOLDER"
+        ),
     ] = None,
 ) -> None:
     """Simulate a hand's patches as CANopen nodes on a bus; a sphere presses each patch and slides over it.
@@ -170,7 +172,7 @@ def _summary(reports: Sequence[NodeReport]) -> str:
 
 
 def _injected(fleet: Fleet) -> list[str]:
-    """Return the counts of injected faults, one line per patch, and per bus that had faults."""
+    """Return one line with the counts of injected faults per patch, and per bus that had faults."""
     lines = []
     for place, counts in fleet.counts().items():
         shown = ", ".join(f"{count} {name}" for name, count in counts.items())
@@ -181,7 +183,7 @@ def _injected(fleet: Fleet) -> list[str]:
 
 @contextmanager
 def _recorded(fleet: Fleet, scene: SceneConfig | None, folder: Path | None) -> Iterator[Callable[[], None]]:
-    """Record the fleet if a folder is given; yield what to call every second."""
+    """Record the fleet if a folder is given; yield a function that must be called every second."""
     if folder is None:
         yield lambda: None
         return
@@ -193,7 +195,7 @@ def _recorded(fleet: Fleet, scene: SceneConfig | None, folder: Path | None) -> I
 
 @contextmanager
 def _controlled(fleet: Fleet) -> Iterator[None]:
-    """Let `vcan-sim inject` control the fleet; without a socket, the simulator runs all the same."""
+    """Open the socket by which `vcan-sim inject` controls the fleet; the simulator also runs without it."""
     from vcan_sim.control import ControlError, ControlServer
 
     with ExitStack() as entered:

@@ -1,7 +1,7 @@
 """Faults of a bus, as data, and a rogue device that sends the frames for some of these faults.
 
-The rogue device has its own endpoint on the bus. Nodes and hosts receive its frames, which compete with their
-frames in arbitration.
+The rogue device has its own endpoint on the bus. Nodes and hosts receive the rogue frames, and must win
+arbitration against them.
 """
 
 from __future__ import annotations

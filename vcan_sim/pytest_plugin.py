@@ -29,6 +29,7 @@ if TYPE_CHECKING:  # numba and NumPy are imported only when a test needs them
     from skinnode.config import HandConfig
     from skinnode.host import Host
     from skinnode.model.frames import FieldFrame
+    from vcan_sim.bus_attacker import InjectedOnBus
     from vcan_sim.faults import Injected
     from vcan_sim.fleet import Fleet
     from vcan_sim.scenes import PatchTruth, SceneConfig
@@ -197,39 +198,54 @@ class SkinTest:
 
 
 class SkinFaults:
-    """Fixture object that injects faults into the nodes of a test's simulated hand."""
+    """Fixture object that injects faults into the nodes and buses of a test's simulated hand."""
 
     def __init__(self, test: SkinTest) -> None:
         self._test = test
 
-    def inject(self, patch: str | None = None, **faults: Any) -> None:
-        """Replace the faults of one patch, or of all patches.
+    def inject(self, place: str | None = None, **faults: Any) -> None:
+        """Replace the faults of one patch, of one bus, or of all patches.
 
         Args:
-            patch: Name of the patch; None for all patches.
-            **faults: Fields of :class:`vcan_sim.faults.Faults`, such as ``lost=0.01`` or ``unplugged=True``.
+            place: Name of the patch or bus; None for all patches.
+            **faults: Fields of :class:`vcan_sim.faults.Faults`, such as ``lost=0.01`` or ``unplugged=True``;
+                for a bus, of :class:`vcan_sim.bus_attacker.BusFaults`.
 
         Raises:
-            ConfigError: If there is no such patch, or a fault is unknown or out of range.
+            ConfigError: If there is no such patch or bus, or a fault is unknown or out of range.
         """
         from dataclasses import fields
 
         from skinnode.errors import ConfigError, Shown
-        from vcan_sim import faults as declared
+        from vcan_sim.bus_attacker import BusFaults
+        from vcan_sim.faults import Faults
 
-        known = [field.name for field in fields(declared.Faults)]
+        fleet = self._test.started("skin_faults")
+        on_bus = place is not None and self._is_bus(place)
+        known = [field.name for field in fields(BusFaults if on_bus else Faults)]
         for name in faults:
             if name not in known:
                 raise ConfigError(name, Shown("an unknown fault"), f"one of {', '.join(known)}")
-        self._test.started("skin_faults").inject(declared.Faults(**faults), patch)
+        if on_bus and place is not None:
+            fleet.inject_bus(place, BusFaults(**faults))
+        else:
+            fleet.inject(Faults(**faults), place)
 
-    def clear(self, patch: str | None = None) -> None:
-        """End the faults of one patch, or of all patches."""
-        self.inject(patch)
+    def clear(self, place: str | None = None) -> None:
+        """End the faults of one patch, of one bus, or of all patches."""
+        self.inject(place)
 
     def injected(self, patch: str) -> Injected:
         """Return how often each fault has been injected into a patch's node."""
         return self._test.started("skin_faults").injected(patch)
+
+    def injected_bus(self, bus: str) -> InjectedOnBus:
+        """Return how often each fault has been injected into a bus."""
+        return self._test.started("skin_faults").injected_bus(bus)
+
+    def _is_bus(self, place: str) -> bool:
+        fleet = self._test.started("skin_faults")
+        return place not in fleet.patches and place in [bus.name for bus in fleet.hand.buses]
 
 
 _TEST: Final = pytest.StashKey[SkinTest]()

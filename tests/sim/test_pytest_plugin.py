@@ -68,6 +68,14 @@ def test_a_patch_that_is_unplugged_comes_back(host, skin_faults):
 
 
 @pytest.mark.skin_bus("timed")
+def test_a_bus_with_a_second_master(host, skin_faults, skin_clock):
+    skin_faults.inject("can0", rogue_sync_per_s=50.0)
+    skin_clock.sleep(1.0)
+    skin_faults.clear("can0")
+    assert 49 <= skin_faults.injected_bus("can0").rogue_sync <= 51
+
+
+@pytest.mark.skin_bus("timed")
 def test_a_minute_passes(host, skin_clock):
     begin_s = skin_clock.monotonic()
     skin_clock.sleep(20.0)
@@ -93,7 +101,7 @@ def run(folder: Path, *options: str) -> subprocess.CompletedProcess[str]:
 
 
 def test_the_same_suite_in_virtual_and_in_real_time(tmp_path: Path) -> None:
-    for options, passed, skipped in (((), 3, 0), (("--skin-bus=virtual",), 2, 1)):
+    for options, passed, skipped in (((), 4, 0), (("--skin-bus=virtual",), 2, 2)):
         done = run(tmp_path, *options)
         assert re.search(rf"1 failed, {passed} passed(, {skipped} skipped)? in", done.stdout), done.stdout
         assert bool(skipped) == ("--skin-bus is virtual" in done.stdout)

@@ -605,3 +605,16 @@ def test_counters_are_those_that_the_rules_give(rules: list[Disturbance], seed: 
             elif event.destroyed or n in event.detected_by:
                 rec[n] += 1
     assert shown == list(zip(tec, rec, strict=True))
+
+
+def test_a_rule_that_is_removed_disturbs_no_more() -> None:
+    rule, other = RandomShare(1.0, seed=1, can_id=0x123), RandomShare(1.0, seed=1, can_id=0x123)
+    bus = bus_of(3, rule)
+    bus.send(0, 0, FRAME)
+    assert errors(bus.advance(200 * US))
+    with pytest.raises(ValueError, match="a rule in force"):
+        bus.undisturb(other)  # equal, but another rule
+    bus.undisturb(rule)
+    late = bus.advance(FOREVER)
+    assert len(errors(late)) <= 1  # the attempt in progress
+    assert len(delivered(late)) == 1

@@ -167,7 +167,11 @@ COMMANDS: dict[str, Callable[[Place], list[list[str]]]] = {
         f"bench {name}": lambda place: [["--json", place.missing + "/x"], [WORSE]]
         for name in ("kernel", "solve", "path", "accuracy", "node", "pipeline", "soak", "stability", "trust")
     },
-    "vcan-sim": lambda place: [[place.missing], [place.broken_hand()], [place.hand(), "--fault", WORSE]],
+    "vcan-sim": lambda place: [
+        *[[place.missing], [place.broken_hand()], [place.hand(), "--fault", WORSE]],
+        *[["inject", WORSE], ["inject", "--simulator", WORSE]],
+        *[["replay", place.missing], ["replay", place.file("evil.log", f"(1.000000) {EVIL} 123#00\n")]],
+    ],
 }
 
 

@@ -22,9 +22,9 @@ class TimedFault:
     place: str
     """Name of the faulty patch or bus."""
     on_bus: bool
-    start_s: float
+    from_s: float
     """Scene time at which the fault starts, s."""
-    end_s: float
+    to_s: float
     """Scene time at which the fault ends, s; infinity if it does not end."""
     values: Mapping[str, Value] = field(hash=False)
     """Values of the faults, by name."""
@@ -47,7 +47,7 @@ class FaultSchedule:
         if t_s < -CLOSE_S:
             return ()
         at_s = self._within(t_s)
-        return tuple(each for each in self.faults if each.start_s - CLOSE_S <= at_s < each.end_s - CLOSE_S)
+        return tuple(each for each in self.faults if each.from_s - CLOSE_S <= at_s < each.to_s - CLOSE_S)
 
     def next_change_s(self, t_s: float) -> float | None:
         """Return the scene time, s, of the next start or end of a fault after ``t_s``; None if there is none.
@@ -56,7 +56,7 @@ class FaultSchedule:
             t_s: Scene time, s.
         """
         at_s = self._within(t_s) if t_s >= 0.0 else t_s
-        times = {time for each in self.faults for time in (each.start_s, each.end_s) if math.isfinite(time)}
+        times = {time for each in self.faults for time in (each.from_s, each.to_s) if math.isfinite(time)}
         if self.repeat_s is not None:
             times |= {time + self.repeat_s for time in times}
         later = [time for time in times if time > at_s + CLOSE_S]

@@ -125,8 +125,8 @@ def test_a_change_names_its_place() -> None:
 # --- schedule
 
 
-def timed(number: int, start_s: float, end_s: float) -> TimedFault:
-    return TimedFault(number, "palm", False, start_s, end_s, {"lost": 0.1})
+def timed(number: int, from_s: float, to_s: float) -> TimedFault:
+    return TimedFault(number, "palm", False, from_s, to_s, {"lost": 0.1})
 
 
 def test_a_schedule_says_what_is_active() -> None:
@@ -155,9 +155,9 @@ def test_a_schedule_repeats() -> None:
 
 def test_faults_start_and_end_at_their_times(virtual: VirtualClock) -> None:
     plan = scene(
-        {"where": "palm", "fault": "lost=1.0", "start_s": 0.5, "end_s": 1.0},
-        {"where": "thumb", "fault": "unplugged", "start_s": 1.5, "end_s": 2.0},
-        {"where": "palm upper 2", "fault": "open", "start_s": 2.5},
+        {"where": "palm", "fault": "lost=1.0", "from_s": 0.5, "to_s": 1.0},
+        {"where": "thumb", "fault": "unplugged", "from_s": 1.5, "to_s": 2.0},
+        {"where": "palm upper 2", "fault": "open", "from_s": 2.5},
     )
     with Fleet(HAND, scene=plan) as fleet, sk.Host.from_config(HAND) as host:
         until(fleet, 0.5)
@@ -188,7 +188,7 @@ def test_faults_start_and_end_at_their_times(virtual: VirtualClock) -> None:
 
 
 def test_an_unplugged_patch_falls_silent_at_once(virtual: VirtualClock) -> None:
-    plan = scene({"where": "palm", "fault": "unplugged", "start_s": 0.5, "end_s": 1.5})
+    plan = scene({"where": "palm", "fault": "unplugged", "from_s": 0.5, "to_s": 1.5})
     with Fleet(HAND, scene=plan) as fleet, sk.Host.from_config(HAND):
         until(fleet, 0.501)
         sent = fleet.tally("palm").emitted.total()
@@ -197,7 +197,7 @@ def test_an_unplugged_patch_falls_silent_at_once(virtual: VirtualClock) -> None:
 
 
 def test_faults_repeat_with_the_scene(virtual: VirtualClock) -> None:
-    plan = scene({"where": "palm", "fault": "frozen", "start_s": 0.1, "end_s": 0.2}, repeat_s=0.5)
+    plan = scene({"where": "palm", "fault": "frozen", "from_s": 0.1, "to_s": 0.2}, repeat_s=0.5)
     with Fleet(HAND, scene=plan) as fleet, sk.Host.from_config(HAND):
         until(fleet, 1.9)
         found = events(fleet)
@@ -206,7 +206,7 @@ def test_faults_repeat_with_the_scene(virtual: VirtualClock) -> None:
 
 
 def test_a_schedule_changes_its_own_faults_only(virtual: VirtualClock) -> None:
-    plan = scene({"where": "palm", "fault": "late=0.5", "start_s": 0.2, "end_s": 0.4})
+    plan = scene({"where": "palm", "fault": "late=0.5", "from_s": 0.2, "to_s": 0.4})
     with Fleet(HAND, scene=plan) as fleet, sk.Host.from_config(HAND):
         fleet.faults.inject("palm:sync_lost=0.1")
         until(fleet, 0.3)
@@ -216,7 +216,7 @@ def test_a_schedule_changes_its_own_faults_only(virtual: VirtualClock) -> None:
 
 
 def test_a_scheduled_change_that_contradicts_is_refused(virtual: VirtualClock) -> None:
-    plan = scene({"where": "palm", "fault": "late=0.5", "start_s": 0.2, "end_s": 0.4})
+    plan = scene({"where": "palm", "fault": "late=0.5", "from_s": 0.2, "to_s": 0.4})
     with Fleet(HAND, scene=plan) as fleet, sk.Host.from_config(HAND):
         fleet.faults.inject("palm:lost=0.9")
         until(fleet, 0.5)
@@ -229,8 +229,8 @@ def test_a_scheduled_change_that_contradicts_is_refused(virtual: VirtualClock) -
 def test_a_patch_drifts_and_warms(virtual: VirtualClock) -> None:
     """The node sends R / R0: 1 + 0.1 t while it drifts, and 1.02 at ten kelvin."""
     plan = scene(
-        {"where": "palm", "fault": "drift_per_s=0.1", "start_s": 0.5, "end_s": 1.5},
-        {"where": "palm", "fault": "warmer_k=10.0", "start_s": 2.0, "end_s": 3.0},
+        {"where": "palm", "fault": "drift_per_s=0.1", "from_s": 0.5, "to_s": 1.5},
+        {"where": "palm", "fault": "warmer_k=10.0", "from_s": 2.0, "to_s": 3.0},
     )
     ratios: dict[float, float] = {}
     with Fleet(HAND, scene=plan) as fleet, sk.Host.from_config(HAND):
@@ -249,7 +249,7 @@ def test_a_patch_drifts_and_warms(virtual: VirtualClock) -> None:
 
 
 def test_an_error_passive_controller_is_reported(virtual: VirtualClock) -> None:
-    plan = scene({"where": "palm", "fault": "error_passive", "start_s": 0.5, "end_s": 1.0})
+    plan = scene({"where": "palm", "fault": "error_passive", "from_s": 0.5, "to_s": 1.0})
     with Fleet(HAND, scene=plan) as fleet, sk.Host.from_config(HAND) as host:
         until(fleet, 0.7)
         newest = host.health("palm").reason
@@ -262,7 +262,7 @@ def test_an_error_passive_controller_is_reported(virtual: VirtualClock) -> None:
 
 
 def test_a_second_node_with_the_node_id(virtual: VirtualClock) -> None:
-    plan = scene({"where": "palm", "fault": "duplicate_node_id", "start_s": 0.5, "end_s": 2.0})
+    plan = scene({"where": "palm", "fault": "duplicate_node_id", "from_s": 0.5, "to_s": 2.0})
     with Fleet(HAND, scene=plan) as fleet, sk.Host.from_config(HAND) as host:
         until(fleet, 0.4)
         assert fleet.injected("palm").twin_frames == 0
@@ -286,7 +286,7 @@ def test_a_fleet_that_stops_before_its_scene_begins(virtual: VirtualClock) -> No
 
 
 def table(**changes: Any) -> str:
-    values = {"where": "palm", "fault": "lost=0.1", "start_s": 1.0, "end_s": 2.0} | changes
+    values = {"where": "palm", "fault": "lost=0.1", "from_s": 1.0, "to_s": 2.0} | changes
     lines = [f"{key} = {value!r}" for key, value in values.items() if value is not None]
     return "\n".join(["[[faults]]", *lines]) + "\n"
 
@@ -305,12 +305,12 @@ def table(**changes: Any) -> str:
         (table(fault="seed=3"), "3:1", ["'seed'", "the seed is not a fault"]),
         (table(fault="stuck_upper=1"), "3:1", ["stuck_upper", "which name a crossing"]),
         (table(where="can0"), "3:1", ["'lost'", "bus_off"]),
-        (table(end_s=0.5), "5:1", ["faults[0].end_s", "0.5", "later than start_s"]),
-        (table(start_s=-1.0), "4:1", ["faults[0].start_s", "-1.0", "from 0 to 86400"]),
-        (table(ends=3.0), "6:1", ["faults[0].ends", "unknown key", "end_s"]),
-        (table() + table(start_s=1.5), "9:1", ["faults[1].start_s", "faults[0]", "lost at 'palm'"]),
+        (table(to_s=0.5), "5:1", ["faults[0].to_s", "0.5", "later than from_s"]),
+        (table(from_s=-1.0), "4:1", ["faults[0].from_s", "-1.0", "from 0 to 86400"]),
+        (table(ends=3.0), "6:1", ["faults[0].ends", "unknown key", "to_s"]),
+        (table() + table(from_s=1.5), "9:1", ["faults[1].from_s", "faults[0]", "lost at 'palm'"]),
         (table(fault="lost=0.8") + table(fault="late=0.8"), "3:1", ["1.6", "at most 1 together"]),
-        ("repeat_s = 1.5\n" + table(), "6:1", ["faults[0].end_s", "2.0", "repeat_s"]),
+        ("repeat_s = 1.5\n" + table(), "6:1", ["faults[0].to_s", "2.0", "repeat_s"]),
         ("name = 'nothing'\n", "", ["touches", "nothing", "[[touches]] or [[faults]]"]),
     ],
 )
@@ -330,10 +330,10 @@ def test_a_bad_table_is_one_line_with_its_place(
 
 def test_the_faults_of_a_scene_are_its_schedule() -> None:
     plan = scene(
-        {"where": "palm lower 3", "fault": "noisy", "end_s": 2.0},
-        {"where": "can0", "fault": "bus_off", "start_s": 3.0},
+        {"where": "palm lower 3", "fault": "noisy", "to_s": 2.0},
+        {"where": "can0", "fault": "bus_off", "from_s": 3.0},
     )
     noisy, off = schedule_of(plan, HAND).faults
     assert (noisy.place, noisy.on_bus, dict(noisy.values)) == ("palm", False, {"noisy_lower": 3})
-    assert (noisy.start_s, noisy.end_s) == (0.0, 2.0)
-    assert (off.place, off.on_bus, off.end_s) == ("can0", True, float("inf"))
+    assert (noisy.from_s, noisy.to_s) == (0.0, 2.0)
+    assert (off.place, off.on_bus, off.to_s) == ("can0", True, float("inf"))

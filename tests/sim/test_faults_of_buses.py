@@ -154,7 +154,7 @@ def test_two_runs_are_identical() -> None:
 
 def test_a_scene_attacks_a_bus() -> None:
     plan = parse_scene(
-        {"faults": [{"where": "can0", "fault": "rogue_sync_per_s=100.0", "start_s": 0.5, "end_s": 1.0}]}
+        {"faults": [{"where": "can0", "fault": "rogue_sync_per_s=100.0", "from_s": 0.5, "to_s": 1.0}]}
     )
     with VirtualClock(), Fleet(hand(), scene=plan) as fleet, sk.Host.from_config(hand()):
         clock.sleep(3.0)

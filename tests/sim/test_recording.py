@@ -39,7 +39,7 @@ SCENE_OF_TEST = parse_scene(
                 "to_s": 1.5,
             }
         ],
-        "faults": [{"where": "palm", "fault": "lost=0.5", "start_s": 1.0, "end_s": 1.5}],
+        "faults": [{"where": "palm", "fault": "lost=0.5", "from_s": 1.0, "to_s": 1.5}],
     }
 )
 

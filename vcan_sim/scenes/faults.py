@@ -53,9 +53,9 @@ def _timed(number: int, fault: FaultConfig, hand: HandConfig, repeat_s: float | 
     values = parse_values(text, on_bus=on_bus, key="fault")
     if "seed" in values:
         raise ConfigError("fault", "seed", "a fault; the seed is not a fault")
-    end_s = repeat_s if fault.end_s is None else fault.end_s
-    end_s = math.inf if end_s is None else end_s
-    return TimedFault(number, place, on_bus, fault.start_s, end_s, values)
+    to_s = repeat_s if fault.to_s is None else fault.to_s
+    to_s = math.inf if to_s is None else to_s
+    return TimedFault(number, place, on_bus, fault.from_s, to_s, values)
 
 
 def _place_and_text(fault: FaultConfig, hand: HandConfig) -> tuple[str, bool, str]:
@@ -80,11 +80,11 @@ def _check_alone(scene: SceneConfig, late: TimedFault, earlier: list[TimedFault]
     """Raise ConfigError if an earlier ``[[faults]]`` table sets the same fault at the same place and time."""
     for early in earlier:
         same = early.place == late.place and early.on_bus == late.on_bus and early.values.keys() & late.values
-        if same and early.start_s < late.end_s and late.start_s < early.end_s:
+        if same and early.from_s < late.to_s and late.from_s < early.to_s:
             name = next(name for name in late.values if name in early.values)
             allowed = f"a time at which faults[{early.number}] does not inject {name} at {late.place!r}"
-            key = f"faults[{late.number}].start_s"
-            raise ConfigError(key, late.start_s, allowed, where=scene.where(key))
+            key = f"faults[{late.number}].from_s"
+            raise ConfigError(key, late.from_s, allowed, where=scene.where(key))
 
 
 def _check_together(
@@ -92,7 +92,7 @@ def _check_together(
 ) -> None:
     """Raise ConfigError if a fault contradicts other faults that are active when it starts."""
     values: dict[str, Any] = {}
-    for each in schedule.active(late.start_s):
+    for each in schedule.active(late.from_s):
         if (each.place, each.on_bus) == (late.place, late.on_bus):
             values |= each.values
     if late.on_bus:

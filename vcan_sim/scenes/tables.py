@@ -279,15 +279,15 @@ class FaultConfig(Table):
     fault: _FaultText
     """Faults as in ``vcan-sim --fault``: ``unplugged``, ``lost=0.1``, or several separated by commas. For a
     wire: ``open``, ``shorted``, ``noisy``, ``frozen`` or ``crossed``."""
-    start_s: _Time = 0.0
+    from_s: _Time = 0.0
     """Scene time at which the faults start, s."""
-    end_s: _Time | None = None
+    to_s: _Time | None = None
     """Scene time at which the faults end, s; None: the faults last until the scene ends or repeats."""
 
     @model_validator(mode="after")
     def _end_after_start(self) -> FaultConfig:
-        if self.end_s is not None and self.end_s <= self.start_s:
-            raise ConfigError("end_s", self.end_s, f"later than start_s, {self.start_s} s")
+        if self.to_s is not None and self.to_s <= self.from_s:
+            raise ConfigError("to_s", self.to_s, f"later than from_s, {self.from_s} s")
         return self
 
 
@@ -330,7 +330,7 @@ class SceneConfig(Table):
         if not (self.touches or self.faults):
             raise ConfigError("touches", NOTHING, "at least one [[touches]] or [[faults]]")
         for i, fault in enumerate(self.faults):
-            last_s, key = (fault.start_s, "start_s") if fault.end_s is None else (fault.end_s, "end_s")
+            last_s, key = (fault.from_s, "from_s") if fault.to_s is None else (fault.to_s, "to_s")
             if self.repeat_s is not None and last_s > self.repeat_s:
                 raise ConfigError(f"faults[{i}].{key}", last_s, f"at most repeat_s, {self.repeat_s} s")
         return self

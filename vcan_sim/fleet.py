@@ -67,7 +67,7 @@ class Fleet:
             itself.
         unchecked: Names of patches with protocol revision 1.0, whose summaries carry no check.
         imperfections: Deviations from the layout, for all patches or by name of the patch. The random draws
-            differ from patch to patch. Default: exact patches.
+            differ from patch to patch. Default: those of the scene.
         scene: Scene that replaces the random strokes of ``[simulation]``. Scene time starts on all patches at
             once, when the first node has sent its first scan. The faults of the scene start and end at scene
             times.
@@ -87,10 +87,12 @@ class Fleet:
         faults: Faults = NO_FAULTS,
         wire_up: Callable[[SimulatedPatch], ResistanceSource] = lambda patch: patch,
         unchecked: Collection[str] = (),
-        imperfections: Imperfections | Mapping[str, Imperfections] = EXACT,
+        imperfections: Imperfections | Mapping[str, Imperfections] | None = None,
         scene: SceneConfig | None = None,
     ) -> None:
         self.hand = hand.on(interface, channel)
+        if imperfections is None:
+            imperfections = EXACT if scene is None else scene.patch_imperfections()
         sizes = _by_patch(imperfections, [patch.name for patch in hand.patches])
         self._scenes = {} if scene is None else bind_scene(scene, self.hand)
         self._beginning = Lock()

@@ -6,6 +6,7 @@ import dataclasses
 import math
 import re
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,12 +15,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from skinnode.config import SimulationConfig
+from skinnode.config import SimulationConfig, parse_hand
 from skinnode.errors import ConfigError
 from skinnode.model.forward import resistance_ohm
 from skinnode.model.layout import PatchLayout
 from skinnode.model.tolerances import ORDINARY
+from vcan_sim.fleet import Fleet
 from vcan_sim.scene import Scene
+from vcan_sim.scenes import parse_scene, read_scene
 from vcan_sim.sensor import SimulatedPatch
 from vcan_sim.skin.history import STEP_S, THRESHOLDS
 from vcan_sim.skin.imperfections import EXACT, Imperfections
@@ -548,3 +551,70 @@ def test_a_bad_value_is_one_line(table: dict[str, Any], line: str) -> None:
 def test_an_unknown_key_is_refused() -> None:
     with pytest.raises(ConfigError, match=r"^imperfections\.thicknes: got an unknown key, allowed: a key of"):
         Imperfections.from_table({"thicknes": 0.1})
+
+
+TOUCH = {"where": "palm", "fault": "silent", "from_s": 1.0}
+"""A scene must have a touch or a fault."""
+
+
+@pytest.mark.parametrize(
+    ("given", "made"),
+    [
+        ({}, Imperfections()),
+        ({"imperfections": "ordinary"}, Imperfections.ordinary()),
+        ({"imperfections": {"ordinary": True, "seed": 3}}, Imperfections.ordinary(seed=3)),
+        ({"imperfections": {"placement": 0.01, "creep": [0.1, 0.2]}},
+         Imperfections(placement=0.01, creep=(0.1, 0.2))),
+    ],
+)  # fmt: skip
+def test_a_scene_names_the_imperfections_of_its_patches(given: dict[str, Any], made: Imperfections) -> None:
+    assert parse_scene({"faults": [TOUCH], **given}).patch_imperfections() == made
+
+
+def test_a_fleet_is_made_as_its_scene_says() -> None:
+    hand = parse_hand(
+        {"buses": [{"name": "can0", "interface": "virtual"}], "patches": [{"name": "palm", "node_id": 4}]}
+    )
+    scene = parse_scene({"faults": [TOUCH], "imperfections": "ordinary"})
+    rest_m = hand.patches[0].layout.build().upper_m
+    shifts = [
+        np.abs(Fleet(hand, scene=scene, **options).patches["palm"].skin.rest_m - rest_m)
+        for options in ({}, {"imperfections": Imperfections()})
+    ]  # fmt: skip
+    assert shifts[0].max() > 1e-6
+    assert shifts[1].max() == 0.0
+
+
+def test_the_text_form_of_the_command_line() -> None:
+    made = Imperfections.from_text("ordinary, placement=0.05, seed=3")
+    assert made == dataclasses.replace(Imperfections.ordinary(seed=3), placement=0.05)
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("perfect", "imperfections: got 'perfect', allowed: ordinary, or NAME=NUMBER"),
+        ("gain=much", "imperfections.gain: got 'much', allowed: a number from 0 to 0.25"),
+        ("bits=4", "imperfections.bits: got 4, allowed: 0, or an integer from 8 to 32"),
+        ("gian=0.1", "imperfections.gian: got an unknown key"),
+        ("gain=5", "imperfections.gain: got 5"),
+    ],
+)
+def test_a_bad_text_is_one_line(text: str, says: str) -> None:
+    with pytest.raises(ConfigError, match=re.escape(says)):
+        Imperfections.from_text(text)
+
+
+@pytest.mark.parametrize(
+    ("line", "says"),
+    [
+        ('imperfections = "perfect"', "scene.toml:1:1: imperfections: got 'perfect', allowed: \"ordinary\""),
+        ("[imperfections]\ngain = 5", "scene.toml:2:1: imperfections.gain: got 5"),
+        ("[imperfections]\nseed = 2\ngian = 1", "scene.toml:3:1: imperfections.gian: got an unknown key"),
+    ],
+)
+def test_bad_imperfections_of_a_scene_file_have_their_place(tmp_path: Path, line: str, says: str) -> None:
+    file = tmp_path / "scene.toml"
+    file.write_text(line + '\n[[faults]]\nwhere = "palm"\nfault = "silent"\n')
+    with pytest.raises(ConfigError, match=re.escape(says)):
+        read_scene(file)

@@ -20,7 +20,15 @@ from skinnode.config import HandConfig
 from skinnode.config.explain import allowed_in, tables_in
 from vcan_sim.scenes import SceneConfig
 
-_TYPES: Final = {str: "text", int: "integer", float: "number", bool: "boolean", Path: "path", dict: "table"}
+_TYPES: Final = {
+    str: "text",
+    int: "integer",
+    float: "number",
+    bool: "boolean",
+    Path: "path",
+    dict: "table",
+    Any: "text or table",
+}
 _UNITS: Final = {
     "n_per_m": "N/m",
     "ohm_per_m": "Ω/m",

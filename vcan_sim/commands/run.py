@@ -43,6 +43,13 @@ def run(  # noqa: PLR0913 - Typer derives a command's options from its arguments
             help="Scene to play on the patches: a file, or a name from `vcan-sim list`.", metavar="SCENE.toml"
         ),
     ] = None,
+    imperfections: Annotated[
+        str | None,
+        typer.Option(
+            help="Imperfections of all patches: ordinary, or sizes such as ordinary,placement=0.05,seed=3.",
+            metavar="ordinary|SIZES",
+        ),
+    ] = None,
     plot: Annotated[
         Path | None,
         typer.Option(help="Plot the forces and pressures of the scene to FILE, and exit.", metavar="FILE"),
@@ -65,6 +72,7 @@ def run(  # noqa: PLR0913 - Typer derives a command's options from its arguments
     from vcan_sim.fleet import Fleet
     from vcan_sim.scenes import load_scene
     from vcan_sim.scenes.library import scene_file
+    from vcan_sim.skin.imperfections import Imperfections
 
     plan = load_hand(hand).on(interface, channel)
     scene = None if scene is None else scene_file(scene)
@@ -72,7 +80,8 @@ def run(  # noqa: PLR0913 - Typer derives a command's options from its arguments
         _preview(plan, scene, plot)
         return
     played = None if scene is None else load_scene(scene, plan)
-    simulated = Fleet(plan, scene=played)
+    made = None if imperfections is None else Imperfections.from_text(imperfections)
+    simulated = Fleet(plan, scene=played, imperfections=made)
     simulated.faults.inject(*fault or [])
     with (
         stop_on_signal() as stop,

@@ -14,6 +14,7 @@ from skinnode.config.table import Allowed, Length, Name, Table, one_of
 from skinnode.config.toml_text import Document, read_toml
 from skinnode.errors import NOTHING, ConfigError
 from vcan_sim.scenes import shapes
+from vcan_sim.skin.imperfections import Imperfections
 
 BodyShape = Literal["sphere", "punch", "box_edge", "ridge", "fingertip"]
 MotionKind = Literal["slide", "shear", "roll", "turn", "walk", "press"]
@@ -305,6 +306,13 @@ class SceneConfig(Table):
     repeat_s: _Duration | None = None
     """Period after which the scene repeats, s; None: the scene plays once."""
     skin: SkinConfig = SkinConfig()
+    imperfections: Annotated[
+        Any,  # a union would show its members in the messages
+        Field(default_factory=dict),
+        Allowed('"ordinary", or a table of imperfections'),
+    ]
+    """Imperfections of all patches: ``"ordinary"`` for carefully manufactured patches, or a table of sizes,
+    in which ``ordinary = true`` and ``seed`` are also allowed; default: patches that equal their layouts."""
     bodies: Annotated[tuple[BodyConfig, ...], Field(strict=False), Allowed("tables [[bodies]]")] = ()
     """Rigid bodies of the scene."""
     touches: Annotated[tuple[TouchConfig, ...], Field(strict=False), Allowed("tables [[touches]]")] = ()
@@ -321,9 +329,25 @@ class SceneConfig(Table):
         """
         return {body.name: body for body in self.bodies}[name]
 
+    def patch_imperfections(self) -> Imperfections:
+        """Return the imperfections of the patches.
+
+        Raises:
+            ConfigError: If a key is unknown or a value is invalid.
+        """
+        given = {"ordinary": True} if self.imperfections == "ordinary" else self.imperfections
+        if not isinstance(given, Mapping):
+            raise ConfigError("imperfections", given, '"ordinary", or a table of imperfections')
+        return Imperfections.from_table(given)
+
     def where(self, key: str) -> str:
         """Return ``file:line:column`` of a dotted key, for error messages; empty if there is no file."""
         return self._read_of.where(key_path(key))
+
+    @model_validator(mode="after")
+    def _imperfections_are_possible(self) -> SceneConfig:
+        self.patch_imperfections()
+        return self
 
     @model_validator(mode="after")
     def _faults_in_time(self) -> SceneConfig:

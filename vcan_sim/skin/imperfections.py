@@ -177,6 +177,24 @@ class Imperfections:
         )
 
     @classmethod
+    def from_text(cls, text: str) -> Self:
+        """Return the imperfections named in a text such as ``ordinary,placement=0.05,seed=3``.
+
+        Raises:
+            ConfigError: If a name is unknown or a value is invalid.
+        """
+        values: dict[str, Any] = {}
+        for part in text.split(","):
+            name, equals, value = part.strip().partition("=")
+            if not equals:
+                if name != "ordinary":
+                    raise ConfigError("imperfections", part, "ordinary, or NAME=NUMBER, separated by commas")
+                values[name] = True
+                continue
+            values[name] = _value(value)
+        return cls.from_table(values)
+
+    @classmethod
     def from_table(cls, table: Mapping[str, Any], key: str = "imperfections") -> Self:
         """Return the imperfections defined by a TOML table.
 
@@ -204,6 +222,16 @@ class Imperfections:
             return dataclasses.replace(cls.ordinary() if start else cls(), **values)
         except ConfigError as error:
             raise ConfigError(f"{key}.{error.key}", error.got, error.allowed) from None
+
+
+def _value(text: str) -> int | float | str:
+    """Return the number that a text represents; other texts are returned unchanged."""
+    for kind in (int, float):
+        try:
+            return kind(text)
+        except ValueError:
+            pass
+    return text
 
 
 def _checked(name: str, value: object, least: float, greatest: float, unit: str) -> object:

@@ -110,27 +110,26 @@ def test_a_thin_bonded_film() -> None:
     scene = sphere({"depth_m": depth, "to_s": 0.8, "ramp_s": 0.2}, skin=skin, step_s=0.1, cells=40)
     force = -scene.truth(0.5).contacts[0].force_n[2]
     expected = math.pi * (1e6 / 3) * contact_m**6 / (32 * RADIUS_M * film_m**3)
-    assert force == pytest.approx(expected, rel=0.02)
+    assert force == pytest.approx(expected, rel=0.01)
 
 
 def test_a_flat_punch() -> None:
     """The force is 2 a E* δ (Johnson, eq. 3.36); the rim is round only to some cells."""
     punch = {"shape": "punch", "radius_m": 2e-3, "edge_radius_m": 1e-5, "friction": 0.0}
-    (contact,) = one(punch, {"depth_m": 1e-5}, skin=THICK).truth(0.6).contacts
-    assert contact.radius_m == pytest.approx(2e-3, rel=0.03)
-    expected = 2 * contact.radius_m * 1e6 / 0.75 * 1e-5
-    assert -contact.force_n[2] == pytest.approx(expected, rel=0.03)
+    (contact,) = one(punch, {"depth_m": 1e-5}, skin=THICK, cells=48).truth(0.6).contacts
+    assert contact.radius_m == pytest.approx(2e-3, rel=0.01)
+    assert -contact.force_n[2] == pytest.approx(2 * 2e-3 * 1e6 / 0.75 * 1e-5, rel=0.01)
 
 
 def test_a_long_ridge() -> None:
     """The middle of a cylinder has the pressure of a line contact, whose peak is √(E* P' / (π R))."""
     body = {"shape": "ridge", "radius_m": 5e-3, "length_m": 25e-3, "friction": 0.0}
     (contact,) = (
-        one(body, {"depth_m": 5e-5, "yaw_rad": math.pi / 2}, skin=THICK, cells=40).truth(0.6).contacts
+        one(body, {"depth_m": 5e-5, "yaw_rad": math.pi / 2}, skin=THICK, cells=48).truth(0.6).contacts
     )
     middle = contact.pressure_pa[:, contact.pressure_pa.shape[1] // 2]
     line_load = middle.sum() * contact.cell_m
-    assert middle.max() == pytest.approx(math.sqrt(1e6 / 0.75 * line_load / (math.pi * 5e-3)), rel=0.02)
+    assert middle.max() == pytest.approx(math.sqrt(1e6 / 0.75 * line_load / (math.pi * 5e-3)), rel=0.01)
     width, length = (np.ptp(contact.cells_m[contact.pressure_pa > 0], axis=0)).tolist()
     assert length > 20 * width / 2
 

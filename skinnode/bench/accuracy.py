@@ -15,10 +15,10 @@ from skinnode.text.json_values import plain
 RATIO_LIMIT: Final = 1.15
 COVERAGE_LIMITS: Final = (0.90, 0.98)
 ERROR_LIMITS: Final = {"staggered": 0.03, "aligned": 0.10}
-"""Maximum error of the posterior on each layout, for a 10 % press at h = 0.5 with relative noise 1e-5."""
+"""Maximum posterior error for each layout, with a 10 % press, h = 0.5 and a relative noise of 1e-5."""
 SCENES_A_CELL: Final = 25
-"""Number of scenes per coverage row divided by the number per cell of the noise and code tables. A cell needs
-few scenes, because each scene contributes 300 coordinates to the RMS error; the minimum is 3 scenes."""
+"""Ratio of the number of scenes per coverage row to the number of scenes per noise-table or code-table cell.
+Three scenes per cell are enough, because each scene contributes 300 coordinates to the RMS error."""
 
 
 def run(scenes: int, rounds: int) -> dict[str, Any]:
@@ -26,7 +26,7 @@ def run(scenes: int, rounds: int) -> dict[str, Any]:
 
     Args:
         scenes: Number of random scenes for each row of the coverage table.
-        rounds: Number of times that each solver is timed.
+        rounds: Number of timing rounds for each solver.
     """
     few = max(3, scenes // SCENES_A_CELL)
     coverage, parts = noise.coverage(scenes)
@@ -49,8 +49,8 @@ def run(scenes: int, rounds: int) -> dict[str, Any]:
 def requirements(figures: dict[str, Any]) -> list[dict[str, Any]]:
     """Return a row for each requirement: name, measured value, limit as text, and whether the limit is met.
 
-    Time requirements are marked ``absolute``. They depend on the machine, so the benchmark does not fail if a
-    time requirement is not met.
+    Time requirements are marked ``absolute``. Execution times depend on the machine, so an unmet time
+    requirement does not make the benchmark fail.
     """
     found = []
     for row in figures["noise"]:
@@ -99,7 +99,7 @@ def print_all(figures: dict[str, Any], echo: Callable[[str], object]) -> None:
 
 
 def _text(value: float | None) -> str:
-    """Format a fraction as a percentage, so that all rows of a column have the same unit."""
+    """Format a fraction as a percentage, or None as a dash."""
     return "-" if value is None else f"{100.0 * value:.3g}%"
 
 
@@ -118,7 +118,7 @@ def _print_front(panels: list[dict[str, Any]], echo: Callable[[str], object]) ->
 
 
 def best_of_each(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return each solver's fastest row that reaches ACCURACY, or else its most accurate row."""
+    """Return each solver's fastest row with an error up to ACCURACY, or its most accurate row if none."""
 
     def rank(row: dict[str, Any]) -> tuple[bool, float]:
         error = float("inf") if row["error"] is None else row["error"]

@@ -1,10 +1,10 @@
 """Measures error versus time for four wires: our solvers and their peers use the same compiled F and J.
 
-Only the four most deeply pressed wires of the patch are solved. The samples of the press are free of noise.
-Every solver starts from rest. A solver solves either the last sample alone or, as in the paper, all samples
-in sequence, each starting from the solution for the previous sample. Each solver is run with several
-tolerances, and each tolerance yields one data point. The time of ``solve_path`` includes work that the bare
-operators omit: setting up the patch, following the branch, and estimating the error.
+Only the patch's four middle wires, which are pressed most deeply, are solved. The simulated samples are
+noise-free. Every solver starts from rest. A solver solves either only the last sample or, as in the paper, a
+sequence of samples: the solution of each sample is the initial guess for the next sample. Each solver is run
+with several tolerances, and each run yields one data point. The time of ``solve_path`` includes work that the
+bare operators omit: setting up the patch, following the branch, and estimating the error.
 """
 
 from __future__ import annotations
@@ -28,14 +28,15 @@ from skinnode.solve.paths.step_control import Adaptive, Periodic, Schedule, Unif
 from skinnode.solve.wires.problem import PatchProblem
 
 SCENES: Final = (("staggered", 0.5, 0.3), ("staggered", 1.0, 0.3), ("aligned", 0.5, 0.1))
-"""Scenes as (preset, height in pitches, depth in heights): a press that all solvers solve from rest, a press
-that requires intermediate samples, and a press on the paper's own layout."""
+"""Scenes as (preset, height in pitches, depth in heights): a press that every solver solves from rest, a
+press that requires intermediate samples, and a press on the paper's layout."""
 TOLERANCES: Final = (1e-4, 1e-7, 1e-10, 1e-13)
 SAMPLES: Final = (1, 5, 10, 20)
 SOLVED: Final = 0.01
-"""Maximum error, relative to the displacement, at which a result counts as solved and is plotted."""
+"""Maximum error, relative to the displacement, of a result that is classified as solved and plotted."""
 ROUNDING: Final = 1e-11
-"""Error below which results count as equal; it is the rounding error in F times the condition number of J."""
+"""Error floor: smaller errors are treated as equal. The floor is the rounding error in F times the condition
+number of J."""
 LOOSE: Final = 1e-6
 """Solver tolerance for all samples except the last, as in the paper."""
 REPEATS: Final = 7
@@ -44,7 +45,7 @@ LONG_S: Final = 0.1
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """Four upper wires, with samples of a press on these wires."""
+    """Four upper wires and the samples of a press on these wires."""
 
     name: str
     layout: PatchLayout
@@ -54,18 +55,18 @@ class Scene:
     """(U, N, 3), true displacement at the last sample, metres."""
 
     def thinned(self, samples: int) -> Float:
-        """Return ``samples`` evenly spaced samples of the press, including the last sample."""
+        """Return ``samples`` evenly spaced samples of the press; the last sample is always included."""
         step = len(self.samples_ohm) // samples
         return self.samples_ohm[step - 1 :: step]
 
     def error(self, displacement_m: Float) -> float:
-        """Return the error of a displacement (U, N, 3) relative to the true displacement."""
+        """Return the error of a displacement (U, N, 3), relative to the size of the true displacement."""
         with np.errstate(over="ignore", invalid="ignore"):
             return float(np.linalg.norm(displacement_m - self.truth_m) / np.linalg.norm(self.truth_m))
 
 
 def scene_of(name: str, height: float, depth: float) -> Scene:
-    """Create the scene of a preset's four middle wires, pressed ``depth`` heights deep by a sphere."""
+    """Create a scene: a sphere presses a preset's four middle wires to ``depth`` times the layer height."""
     full = preset(name, height)
     layout = PatchLayout(full.upper_m[3:7], full.lower_m, full.resistivity_ohm_per_m)
     press = Press((18.3e-3, 17.1e-3), 10e-3, depth * full.height_m, (0.2, -0.1))
@@ -76,7 +77,7 @@ def scene_of(name: str, height: float, depth: float) -> Scene:
 
 
 def _timed_us(call: Callable[[], object]) -> float:
-    """Return the shortest of up to seven call times, because other programs can only increase a call time."""
+    """Return the shortest of up to seven call times (µs), because other programs can only lengthen a call."""
     times: list[float] = []
     while len(times) < REPEATS and sum(times) < LONG_S:
         start = time.perf_counter()
@@ -109,15 +110,13 @@ def _bare(scene: Scene, solve: Solve, samples: int, tolerance: float) -> tuple[f
                 x = solve(Case(problem, wire, frame, np.ascontiguousarray(x), truth[wire]), loose)
             found[wire] = x
 
-    with np.errstate(
-        all="ignore"
-    ):  # overflow is harmless here: a diverging solver is recognised by its error
+    with np.errstate(all="ignore"):  # a solver that diverges and overflows is recognised by its error
         us = _timed_us(paths) / len(found)
         return us, scene.error(problem.displacement_m(found))
 
 
 def pareto(rows: list[dict[str, Any]]) -> list[int]:
-    """Return the indices of the solved rows on the Pareto front of time and error, fastest first."""
+    """Return the indices of the solved rows on the time-error Pareto front, fastest first."""
     front: list[int] = []
     best = SOLVED
     for index in sorted(range(len(rows)), key=lambda i: (rows[i]["us"], rows[i]["error"])):
@@ -129,7 +128,7 @@ def pareto(rows: list[dict[str, Any]]) -> list[int]:
 
 
 def run() -> list[dict[str, Any]]:
-    """Measure all scenes; return rows with time, error, and whether the row is on the Pareto front."""
+    """Measure all scenes; return rows that state time, error, and membership in the Pareto front."""
     panels = []
     for setting in SCENES:
         scene = scene_of(*setting)
@@ -146,7 +145,7 @@ def _rows(scene: Scene) -> list[dict[str, Any]]:
     solvers = peers(PatchProblem.of(scene.layout))
     del solvers[
         "skinnode solve_system, Python callables"
-    ]  # these operators are already included; Python callables only add overhead
+    ]  # the same operators are also timed without Python callables
     for tolerance in TOLERANCES:
         for name, solve in solvers.items():
             for samples in (1, 10):
@@ -162,7 +161,7 @@ def _rows(scene: Scene) -> list[dict[str, Any]]:
 
 
 def _schedules(tolerance: float) -> dict[str, tuple[Schedule, int]]:
-    """Return the step controls by name, each with the number of samples that it uses."""
+    """Return a mapping from a name to a step control and its number of samples."""
     loose = max(tolerance, LOOSE)
     uniform = Uniform(intermediate_tolerance=loose, final_tolerance=tolerance)
     found: dict[str, tuple[Schedule, int]] = {

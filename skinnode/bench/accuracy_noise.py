@@ -1,8 +1,8 @@
-"""Measures error versus noise, code width and layout, and the calibration of standard deviations.
+"""Measures the error versus noise, code width and layout, and checks the calibration of standard deviations.
 
-Every scene is tracked for four frames from rest; only the last frame is scored. Errors and standard
-deviations are pooled over the scenes and the coordinates of converged wires, as RMS values relative to the
-displacement.
+Every scene consists of four tracked frames, starting at rest; only the last frame is scored. The reported
+errors and standard deviations are RMS values over all scenes and all coordinates of converged wires, divided
+by the RMS displacement.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ BITS: Final = (12, 14, 16, 24)
 LAYOUTS: Final = tuple((kind, height) for kind in ("staggered", "aligned") for height in (0.3, 0.5, 1.0))
 PRIOR_SHARES: Final = (0.0, 0.1, 0.2, 0.4, 0.6, 0.8, 1.0)
 FEWEST: Final = 1000
-"""Minimum number of coordinates for which a 99.9 % quantile is estimated."""
+"""Minimum number of coordinates for estimating a 99.9 % quantile."""
 SHARES: Final = np.array([0.0, 1 / 3, 2 / 3, 1.0])
 
 PROTOTYPE: Final = {
@@ -46,7 +46,7 @@ PROTOTYPE: Final = {
     ("aligned", 0.5): {"exact": {1e-5: 2.71}, "posterior": {4e-6: 0.05, 1e-5: 0.06, 1e-4: 0.20, 1e-3: 0.38}},
     ("aligned", 1.0): {"exact": {1e-5: 73.0}, "posterior": {4e-6: 0.14, 1e-5: 0.18, 1e-4: 0.24, 1e-3: 0.38}},
 }
-"""Relative RMS errors of the prototype for a sheared 10 % press by one Hertz-like indenter."""
+"""The prototype's relative RMS errors for a 10 % press with shear by one Hertz-like indenter."""
 
 
 @dataclass
@@ -63,7 +63,7 @@ class Pool:
     _size: float = 0.0
 
     def add(self, frame: FieldFrame, truth_m: Float) -> None:
-        """Add a scene's last frame, given its true displacement ``truth_m`` (U, N, 3)."""
+        """Add a scene's last frame and its true displacement ``truth_m`` (U, N, 3)."""
         used = np.array([status is Status.CONVERGED for status in frame.status])
         error, std = (frame.displacement_m - truth_m)[used], frame.displacement_std_m[used]
         self.scenes += 1
@@ -76,7 +76,7 @@ class Pool:
         self._size += float((truth_m[used] ** 2).sum())
 
     def row(self) -> dict[str, Any]:
-        """Return the pooled figures; errors are NaN if no wire converged."""
+        """Return the pooled statistics; errors are NaN if no wire converged."""
         size = self._size or math.nan
         return {
             "scenes": self.scenes,
@@ -90,14 +90,14 @@ class Pool:
 
 @dataclass
 class Parts:
-    """Compares the posterior's errors with its variance n + b, where n is due to noise and b to the prior."""
+    """Compares the posterior's errors with its variance n + b; n is due to the noise, b to the prior."""
 
     _error: list[Float] = field(default_factory=list)
     _noise: list[Float] = field(default_factory=list)
     _left: list[Float] = field(default_factory=list)
 
     def add(self, frame: FieldFrame, truth_m: Float) -> None:
-        """Add a scene, given its true displacement (U, N, 3), metres, unless all of its wires are held."""
+        """Add a scene with true displacement (U, N, 3), metres; skip the scene if all wires are held."""
         if frame.core_std_m is None or (frame.held is not None and frame.held.all()):
             return
         used = np.array([status is Status.CONVERGED for status in frame.status])
@@ -108,10 +108,10 @@ class Parts:
         self._left.append(left.ravel())
 
     def rows(self) -> list[dict[str, Any]]:
-        """Return one row of statistics for each interval of the prior's fraction b / (n + b).
+        """Return a row of statistics for each interval of b / (n + b), the prior's share of the variance.
 
-        Each row contains the RMS, quantiles and kurtosis of error / √(n + b), the RMS that n alone would
-        give, and the fraction of b that appears in the errors.
+        Each row contains the RMS, quantiles and kurtosis of error / √(n + b), the RMS expected from n alone,
+        and the fraction of b that the errors actually contain.
         """
         if not self._error:
             return []
@@ -134,7 +134,7 @@ class Parts:
 
 @dataclass
 class Bound:
-    """Accumulates the wires' Cramér-Rao bounds, computed at the true position without a prior."""
+    """Accumulates the wires' Cramér-Rao bounds, which are computed at the true positions without a prior."""
 
     _variance: float = 0.0
     _size: float = 0.0
@@ -148,16 +148,16 @@ class Bound:
 
     @property
     def share(self) -> float:
-        """RMS of the Cramér-Rao bound, relative to the RMS displacement."""
+        """RMS Cramér-Rao bound divided by the RMS displacement."""
         return math.sqrt(self._variance / self._size)
 
 
 @dataclass
 class Forces:
-    """Compares the contacts, forces and centroids of fields with the true loads.
+    """Compares each field's contacts, forces and centroids with the true loads.
 
-    Force errors are relative to the true normal force, and only scenes with a contact are included. Centroid
-    errors are in metres.
+    Force errors are relative to the true normal force. Scenes in which the solver found no contact are
+    omitted. Centroid errors are in metres.
     """
 
     found_right: int = 0
@@ -188,7 +188,7 @@ class Forces:
                 self._place.append((float(off), float(contacts[0].centroid_std_m[axis])))
 
     def row(self) -> dict[str, Any]:
-        """Return RMS errors, RMS standard deviations, and the fractions of errors inside 95 % intervals."""
+        """Return RMS errors, RMS standard deviations, and the coverage of the 95 % intervals."""
         figures: dict[str, Any] = {
             "contacts_right": self.found_right / self.scenes,
             "contacts_none": self.found_none / self.scenes,
@@ -216,21 +216,21 @@ def _case(kind: str, height: float) -> Case:
 
 
 class Follower:
-    """Solves streams on one layout with every method."""
+    """Solves the streams of one layout with every method."""
 
     def __init__(self, kind: str, height: float) -> None:
         self.case = _case(kind, height)
         self._solvers = {name: methods.solver_of(self.case, name) for name in METHODS}
 
     def last(self, taken: Stream) -> dict[str, FieldFrame]:
-        """Solve a stream with each method; return the fields of the last frame by method."""
+        """Solve a stream with each method; return a mapping from method to the field of the last frame."""
         return {
             name: methods.fields(self.case, name, solver, taken)[-1] for name, solver in self._solvers.items()
         }
 
 
 def _streams(case: Case, converter: Converter, scenes: int) -> Iterable[Stream]:
-    """Yield streams of 10 % presses; the presses depend only on the seed and the layout's size and height."""
+    """Yield streams of random 10 % presses; these depend only on the seed and the layout's dimensions."""
     for seed in range(scenes):
         rng = np.random.default_rng([seed, 10])
         press = pad_press(rng, case.skin.layout, 0.1)
@@ -238,9 +238,10 @@ def _streams(case: Case, converter: Converter, scenes: int) -> Iterable[Stream]:
 
 
 def pad_press(rng: np.random.Generator, layout: PatchLayout, depth: float) -> Press:
-    """Return a random press by a fingertip-sized body with a contact radius of 1.5 to 2.5 pitches.
+    """Return a random press by a fingertip-sized body whose contact radius is 1.5 to 2.5 pitches.
 
-    The press is comparable to the prototype's (see PROTOTYPE): the Cramér-Rao bounds of both presses agree.
+    The results are comparable with the prototype's (see PROTOTYPE), because both presses have the same
+    Cramér-Rao bounds.
     """
     press = random_press(rng, layout, depth)
     contact = rng.uniform(1.5, 2.5) * layout.pitch_m
@@ -294,7 +295,7 @@ COVERAGE: Final = (
 
 
 def _random_scene(rng: np.random.Generator, layout: PatchLayout) -> tuple[Press, ...]:
-    """Return one sharp or blunt press or, in 30 % of the scenes, one press in each half of the patch."""
+    """Return a press in each half of the patch (30 % of the scenes), or one sharp or blunt press."""
     depth = rng.uniform(0.05, 0.3, 2)
     if rng.random() >= 0.3:
         if rng.random() < 0.5:
@@ -315,8 +316,8 @@ def _random_scene(rng: np.random.Generator, layout: PatchLayout) -> tuple[Press,
 def coverage(scenes: int) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
     """Solve random scenes with both methods.
 
-    Returns: First, one row per layout, noise level and method, with forces for the posterior. Second,
-    statistics of the posterior's errors in all scenes, grouped by the prior's fraction of the variance.
+    Returns: First, one row per layout, noise level and method; a posterior's row includes force errors.
+    Second, statistics of the posterior's errors in all scenes, grouped by the prior's share of the variance.
     """
     rows, parts = [], Parts()
     for kind, height, sigma in COVERAGE:

@@ -1,4 +1,4 @@
-"""Measures the time per tracked frame, for the exact inverse and the posterior."""
+"""Measures the time per tracked frame of the exact inverse and of the posterior."""
 
 from __future__ import annotations
 
@@ -22,13 +22,14 @@ LIMITS_US: Final = {"exact": 500.0, "posterior, full frame": 5000.0, f"posterior
 
 
 class Cycle:
-    """Solves a press and its release frame by frame.
+    """Solves the frames of a press and its release one after another.
 
-    Each call solves all frames of the cycle, so that no measurement covers only the cheap frames.
+    Each call solves the whole cycle, so that every measurement includes both slow and fast frames.
 
     Args:
         solver: Solver to measure.
-        frames: Resistances (T, U, K) of the frames during the downward press, ohm.
+        frames: Resistances (T, U, K), ohm, while the press deepens; the release repeats them in reverse
+            order.
         valid: Mask (U, K) of the resistances to use; default: all.
     """
 
@@ -38,7 +39,7 @@ class Cycle:
         self._solver, self._valid = solver, valid
         self.frames = np.concatenate([frames, frames[-2:0:-1]])
         self.active: list[int] = []
-        """Number of wires that were solved (not held), one entry per frame."""
+        """Number of solved wires (wires that were not held), one entry per frame."""
 
     def __call__(self) -> None:
         """Solve all frames."""
@@ -55,11 +56,12 @@ def _frames(skin: Skin, press: Press, sigma: float) -> Float:
 
 
 def run(rounds: int) -> list[dict[str, Any]]:
-    """Time each solver; return the time in µs per frame, the limit, and the number of solved wires.
+    """Time each solver; return its time per frame (µs), its time limit, and its mean number of solved wires.
 
-    The time is the mean over the frames of a cycle and the median over the rounds. A real press always moves
-    more than three wires, because it moves the whole half-space. The benchmark therefore masks the
-    resistances of the other wires. Holding is disabled, so every frame is solved.
+    The time per frame is averaged over a cycle; the reported value is the median of all rounds. A real press
+    always moves more than three wires, because it deforms the whole half-space. To measure only three active
+    wires, the benchmark therefore masks the resistances of all other wires. Holding is disabled, so every
+    frame is solved.
     """
     skin = Skin(preset("staggered", 0.5))
     layout, rest = skin.layout, skin.rest_ohm

@@ -1,4 +1,4 @@
-"""Defines a hard case: a patch, the solver options that an informed user would set, and a stream per seed."""
+"""Defines a hard case: a patch, the options that an informed user would set, and one stream per seed."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ PATHS: Final = ("path gauss_newton", "path levenberg_marquardt", "path dogleg", 
 TRACKERS: Final = ("exact", "posterior", "auto")
 PITCH_M: Final = 4e-3
 FINE: Final = Converter(sigma=1e-5)
-"""Converter whose noise is roughly that of a 16-bit converter."""
+"""Converter with roughly the noise of a 16-bit converter."""
 STRIDE: Final = 4
-"""Number of samples of a path per frame that a tracker solves."""
+"""Stride at which a tracker takes its frames from the samples of a path."""
 DRIFT: Final = 0.02
 MODEL_ERROR: Final = 0.05
-"""Relative error in the change in R that the wrong models of case 13 predict. On a 30 % press, staggered,
-h = 0.5, the measured error of ‖ΔR‖ is 2.2 to 5 %. For a single pair of wires, the median error is 1 to 5 %
+"""Relative error of ΔR as predicted by the wrong models of case 13. For a 30 % press on ``staggered`` at h =
+0.5, the measured error of ‖ΔR‖ is 2.2 to 5 %. For the ΔR of a single wire pair, the median error is 1 to 5 %
 and the maximum error is 7 %."""
 
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """A hard case; ``make`` generates the stream of a seed from the seed's random generator."""
+    """A hard case; ``make`` generates a stream from a random generator, which is seeded for each stream."""
 
     number: int
     name: str
@@ -36,17 +36,17 @@ class Case:
     make: Callable[[np.random.Generator], Stream]
     methods: tuple[str, ...] = TRACKERS
     converter: Converter = FINE
-    """Converter that reads the streams; its noise is stated to the solver."""
+    """Converter that reads the resistances; the solver knows the converter's noise."""
     drift: str = "none"
     stride: int = 1
-    """Stride of the frames that a tracker solves; path methods use every frame of the stream."""
+    """Stride of the frames that a tracker solves; path methods solve every frame."""
     known_wrong: tuple[str, ...] = ()
-    """Methods known to produce wrong results in this case, as listed in ``docs/limits.md``. Their rows are
-    shown but do not make the benchmark fail."""
+    """Methods that are known to produce wrong results in this case (see ``docs/limits.md``). Wrong results of
+    these methods are shown, but do not make the benchmark fail."""
     model_error: float = 0.0
-    """Relative error of the predicted change in R, as stated to the solver."""
+    """Relative error of the predicted ΔR; passed to the solver as an option."""
     tolerances: Tolerances | None = None
-    """Manufacturing tolerances stated to the solver; None if not stated."""
+    """Manufacturing tolerances passed to the solver; None for the solver's default."""
 
 
 def preset(name: str, height: float) -> PatchLayout:
@@ -55,12 +55,12 @@ def preset(name: str, height: float) -> PatchLayout:
 
 
 def narrowed(layout: PatchLayout) -> PatchLayout:
-    """Return the layout reduced to five upper wires, which suffice because paths are solved wire by wire."""
+    """Reduce a layout to five upper wires, which suffice because paths are solved wire by wire."""
     return PatchLayout(layout.upper_m[[0, 2, 5, 8, 9]], layout.lower_m, layout.resistivity_ohm_per_m)
 
 
 def press_and_release(steps: int) -> Float:
-    """Return fractions of the full depth: zero, equal steps up to one, and finally zero."""
+    """Return depth fractions that rise from 0 to 1 in equal steps and then drop to 0."""
     return np.array([*np.linspace(0.0, 1.0, steps + 1), 0.0])
 
 
@@ -78,12 +78,12 @@ def pressing(  # noqa: PLR0913 - one argument per way to change a stream
 
     Args:
         skin: The patch.
-        depth: Depth of the press as a fraction of the layer height.
+        depth: Depth of the press divided by the layer height.
         converter: Converter that reads the resistances.
         shares: Fractions (T,) of the full depth, one per frame.
-        spoil: Function that returns the stream with errors inserted; default: no errors.
-        gain: Function that returns factors for the resistances, (T, U, K) or broadcastable to that shape;
-            default: 1.
+        spoil: Function that inserts errors into a stream and returns the result; default: no errors.
+        gain: Function that returns factors by which the resistances are multiplied; (T, U, K) or
+            broadcastable to that shape; default: 1.
         presses: Function that returns the presses; default: one random press.
     """
 

@@ -1,4 +1,4 @@
-"""Hard cases: streams on which solvers tend to fail. New cases are added as they are discovered.
+"""Hard cases: streams on which solvers tend to fail. A case is added for each newly found failure.
 
  1 symmetric layout, J rank-deficient         8 baseline drift, gain error, contact resistance
  2 thick layers                               9 wrong roots with zero residual
@@ -9,8 +9,8 @@
  7 open, shorted, missing, saturated         14 wrong data not marked invalid
 15 patches made to ordinary tolerances       16 the whole patch pressed
 
-A case consists of the patch model given to the solver, the options that an informed user would set, and a
-generator that returns a stream of frames, with true displacements, for each seed.
+A case consists of a patch model for the solver, the options that an informed user would set, and a generator.
+For each seed, the generator returns a stream of frames and the true displacements.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ from skinnode.model.layout import Float, PatchLayout
 
 
 def all_cases() -> list[Case]:
-    """Return all hard cases, in the order of the list in the module docstring."""
+    """Return all hard cases of ``skinnode bench stability``."""
     return [
         *_symmetric_and_thick(),
         *_deep(),
@@ -57,7 +57,7 @@ def all_cases() -> list[Case]:
 
 
 def _exact(number: int, name: str, layout: PatchLayout, depth: float, samples: int) -> Case:
-    """Return a case with a noise-free press, for all path methods and the exact tracker."""
+    """Return a case in which all path methods and the exact tracker solve a noise-free press."""
     skin = Skin(narrowed(layout))
     shares = np.linspace(0.0, 1.0, samples + 1)
     make = pressing(skin, depth, Converter(), shares)
@@ -113,7 +113,7 @@ def _sudden_and_close() -> Iterator[Case]:
 
 
 def _touching(skin: Skin) -> Callable[[np.random.Generator], tuple[Press, ...]]:
-    """Return a press that brings one electrode to 0.05 heights above the lower layer."""
+    """Return a generator of presses that leave an electrode only 0.05 layer heights above the lower layer."""
     layout = skin.layout
     gap = layout.upper_m[..., None, None, :2] - layout.lower_m[None, None, ..., :2]
     beside = np.linalg.norm(gap, axis=-1).min(axis=(2, 3))
@@ -165,7 +165,7 @@ def _spoilt(taken: Stream, frames: Float, valid: np.ndarray) -> Stream:
 
 
 def _open_lower(rng: np.random.Generator, taken: Stream, skin: Skin) -> Stream:
-    """Break a lower wire during the press, and repair it before the end."""
+    """Break a lower wire for three frames of the press, and mark its resistances invalid."""
     frames, valid, k = taken.frames_ohm.copy(), taken.valid.copy(), rng.integers(skin.layout.shape[1])
     frames[2:5, :, k], valid[2:5, :, k] = np.nan, False
     return _spoilt(taken, frames, valid)
@@ -195,7 +195,7 @@ def _missing_chunks(rng: np.random.Generator, taken: Stream, skin: Skin) -> Stre
 
 
 def _impossible(rng: np.random.Generator, taken: Stream, skin: Skin) -> Stream:
-    """Insert zero, negative, infinite and NaN values, not marked invalid, in the middle of the press."""
+    """Insert zero, negative, infinite and NaN values during the press without marking them invalid."""
     frames = taken.frames_ohm.copy()
     for t in (2, 3, 4):
         where = rng.choice(frames[t].size, 4, replace=False)
@@ -250,10 +250,10 @@ def _wrong_roots() -> Iterator[Case]:
 
 
 def _sheared() -> Iterator[Case]:
-    """Yield deep presses with a friction of 0.8, during which the true displacement passes through folds.
+    """Yield deep presses with a friction coefficient of 0.8; the true displacement passes folds of F.
 
-    The smooth root, which the posterior and the live trackers find, is then wrong on some wires. Only a path
-    contains the intermediate samples that reveal the error.
+    For some wires, the posterior and the live trackers then converge to a smooth but wrong root. Only path
+    methods use the intermediate samples that reveal this error.
     """
     for name, height in (("aligned", 0.5), ("aligned", 1.0), ("staggered", 1.0)):
         for contacts in (1, 2):
@@ -272,14 +272,14 @@ def _sheared() -> Iterator[Case]:
 
 
 def _dragged(press: Press, rng: np.random.Generator) -> Press:
-    """Return the press with an added shear traction: 0.8 times the pressure, in a random direction."""
+    """Return a copy of the press with a shear traction of 0.8 times the pressure in a random direction."""
     angle = rng.uniform(0.0, 2.0 * np.pi)
     traction = (0.8 * float(np.cos(angle)), 0.8 * float(np.sin(angle)))
     return Press(press.center_m, press.radius_m, press.depth_m, traction)
 
 
 def _swap(rng: np.random.Generator, layout: PatchLayout, share: float) -> Float:
-    """Rotate two adjacent electrodes of a wire about their midpoint; 180° restores the initial F."""
+    """Rotate two adjacent electrodes of a wire about their midpoint; F has the same value at 0° and 180°."""
     wire, first = rng.integers(layout.shape[0]), rng.integers(layout.upper_m.shape[1] - 1)
     middle = 0.5 * (layout.upper_m[wire, first] + layout.upper_m[wire, first + 1])
     angle = np.pi * share
@@ -292,7 +292,7 @@ def _swap(rng: np.random.Generator, layout: PatchLayout, share: float) -> Float:
 
 
 def _mirror(rng: np.random.Generator, layout: PatchLayout, share: float) -> Float:
-    """Move one electrode through the lower layer towards its mirror image, where F has its initial value."""
+    """Move an electrode through the lower layer to its mirror position, where F has its initial value."""
     moved = np.zeros(layout.upper_m.shape)
     wire, electrode = rng.integers(layout.shape[0]), rng.integers(layout.upper_m.shape[1])
     moved[wire, electrode, 2] = -2 * share * layout.height_m
@@ -304,10 +304,11 @@ def _after_detour(
     detour: Callable[[np.random.Generator, PatchLayout, float], Float],
     converter: Converter,
 ) -> Callable[[np.random.Generator], Stream]:
-    """Return a generator of streams in which a physically impossible motion precedes a real press.
+    """Return a generator of streams that begin with a physically impossible motion, followed by a real press.
 
-    The impossible motion ends at the rest resistances. Its frames have no true displacement, because F is the
-    same if two electrodes of a wire are swapped or one electrode is mirrored.
+    The impossible motion ends with every resistance back at its rest value. The true displacement is
+    undefined (NaN) during the motion, because swapping two electrodes of a wire or mirroring an electrode
+    leaves F unchanged.
     """
 
     def make(rng: np.random.Generator) -> Stream:
@@ -318,7 +319,7 @@ def _after_detour(
         frames, valid, noise = converter.read(resistance, skin.rest_ohm, rng)
         press = (random_press(rng, skin.layout, 0.2),)
         after = stream(skin, press, np.array([0.3, 0.6, 1.0, 0.0]), converter, rng)
-        odd[0], odd[1:-1], odd[-1] = 0.0, np.nan, 0.0  # the impossible motion ends at the rest resistances
+        odd[0], odd[1:-1], odd[-1] = 0.0, np.nan, 0.0  # all resistances are back at their rest values
         return Stream(
             np.concatenate([frames, after.frames_ohm]),
             np.concatenate([valid, after.valid]),
@@ -392,7 +393,7 @@ def _many_times(skin: Skin) -> Callable[[np.random.Generator], Stream]:
 
 
 def fingertip(radius_m: float = 20e-3) -> Skin:
-    """Return the staggered patch with h = 0.5 on a cylinder whose axis runs across the upper wires."""
+    """Return the staggered patch with h = 0.5, bent about an axis perpendicular to the upper wires."""
     flat = preset("staggered", 0.5)
     middle = float(flat.upper_m[..., 0].mean())
     turned = []
@@ -417,7 +418,7 @@ def _shapes() -> Iterator[Case]:
 
     yield Case(12, "fingertip, 30%", tip, pressing(tip, 0.3, FINE, shares, presses=on_tip))
     for lower, depth in ((3, 0.1), (6, 0.3)):
-        # one electrode per wire has no pitch along the wire, so the patch is a narrow line
+        # A patch with one electrode per wire is a narrow line.
         layout = PatchLayout.preset("staggered", upper_electrodes=1, lower_wires=lower)
         skin = Skin(layout)
 

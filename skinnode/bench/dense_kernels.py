@@ -1,8 +1,8 @@
-"""Compares our dense kernels with LAPACK, in a process that limits LAPACK to a single thread.
+"""Compares our dense kernels with LAPACK in a child process that limits LAPACK to a single thread.
 
-After each call, LAPACK's worker threads keep spinning for some time. If these threads share a core with the
-next candidate, that candidate takes up to three times as long. On a busy machine, the worker threads also
-wait for each other.
+After each call, LAPACK's worker threads keep spinning for some time. If a worker thread shares a core with
+the next kernel to be timed, that kernel takes up to three times as long. On a busy machine, the worker
+threads also have to wait for each other.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ ONE_THREAD: Final = {
 
 
 def measure(rounds: int) -> list[dict[str, Any]]:
-    """Time the dense kernels and their LAPACK peers; return one row per candidate, with µs per call."""
+    """Time our dense kernels and the LAPACK equivalents; return one row per kernel (µs per call)."""
     command = [sys.executable, "-m", "skinnode.bench.dense_kernels", str(rounds)]
     done = subprocess.run(command, env=os.environ | ONE_THREAD, stdout=subprocess.PIPE, check=True)
     rows: list[dict[str, Any]] = json.loads(done.stdout)
@@ -34,9 +34,10 @@ def measure(rounds: int) -> list[dict[str, Any]]:
 
 
 def dense_pairs() -> dict[str, dict[str, Callable[[], object]]]:
-    """Return the dense kernels and their LAPACK peers, for the 300 unknowns of ten wires of ten electrodes.
+    """Return our dense kernels and the LAPACK equivalents, for 300 unknowns (10 wires, 10 electrodes).
 
-    Each candidate uses its own axis order and works in place on buffers that are refilled before every call.
+    Each kernel uses its preferred memory order and works in place on buffers that are refilled before every
+    call.
     """
     from scipy.linalg import blas, lapack
 
@@ -84,7 +85,7 @@ def dense_pairs() -> dict[str, dict[str, Callable[[], object]]]:
 
 
 def main(rounds: int) -> None:
-    """Run the benchmark of the dense kernels and print its rows as JSON."""
+    """Benchmark the dense kernels and print the results as JSON."""
     rows = [
         {"what": what, "who": who, "us": timing.call_us, "ratio": timing.ratio}
         for what, candidates in dense_pairs().items()

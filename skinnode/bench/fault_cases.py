@@ -1,9 +1,9 @@
 """Hard cases 14 to 16 of ``skinnode bench stability``: wrong data, imperfect patches and wide touches.
 
-In case 14, the data are wrong but not marked invalid. Accuracy is claimed for a wire if it is CONVERGED and
-trusted. Only a tracker tests the data, so case 14 does not use the bare posterior. A tracker receives
-resistances and therefore cannot detect a frozen wire by its repeated codes, as the host does
-(:mod:`skinnode.host.frozen_parts`).
+In case 14, the data are wrong but not marked invalid. A solver claims to be accurate only for wires that are
+CONVERGED and trusted. Only trackers check their input data, so case 14 does not use the posterior without a
+tracker. The host detects a frozen wire by its repeated codes (:mod:`skinnode.host.frozen_parts`); a tracker
+receives only resistances and cannot perform this check.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ from skinnode.protocol.codes import CodeScale
 Spoil = Callable[[np.random.Generator, Stream, Skin], Stream]
 
 SHARES: Final = np.array([0.0, 0.0, 0.0, 0.0, 0.25, 0.5, 0.75, 1.0, 1.0, 1.0, 1.0, 0.6, 0.3, 0.0])
-"""Fractions of the full depth in case 14, one per frame."""
+"""Press depth in each frame of case 14, as a fraction of the full depth."""
 FAILS: Final = 5
-"""First frame with wrong data in case 14; the press has already begun."""
+"""Index of the first frame with wrong data in case 14; by then, the press has begun."""
 TESTED: Final = ("exact", "auto")
-"""Methods that are tested with the wrong data of case 14."""
+"""Methods that case 14 tests with wrong data."""
 KNOWN: Final = {
     ("upper wire frozen", "1e-5"),
     ("upper wire frozen", "1e-4"),
@@ -36,14 +36,13 @@ KNOWN: Final = {
     ("bits flipped", "1e-4"),
     ("lower wires crossed, tared", "1e-4"),
 }
-"""Faults and noise levels for which a few trusted wires are wrong; ``docs/limits.md`` explains the
-reasons."""
+"""Faults and noise levels known to make a few trusted wires wrong; ``docs/limits.md`` explains why."""
 UPPER, LOWER = 1, 2
-"""Axes of the upper and of the lower wires in an array (T, U, K)."""
+"""Axis indices of the upper and lower wires in an array (T, U, K)."""
 
 
 def fault_cases() -> Iterator[Case]:
-    """Yield the cases with wrong data, with imperfectly made patches, and with wide or sheared touches."""
+    """Yield the cases with wrong data, imprecisely made patches, and wide or sheared touches."""
     yield from _wrong_data()
     yield from _tolerances()
     yield from _touches()
@@ -71,7 +70,7 @@ def _wrong_data() -> Iterator[Case]:
 def _tolerances() -> Iterator[Case]:
     layout = preset("staggered", 0.5)
     for off in (0.01, 0.02, 0.05):
-        # All streams of a case share the same shifts, because solvers are set up with the case's baseline.
+        # The shifts are the same in all streams of a case, because a case has only one baseline.
         rng = np.random.default_rng([15, round(1000 * off)])
         upper, lower = (off * PITCH_M * rng.standard_normal((count, 3)) for count in layout.shape)
         skin = Skin(layout, upper_shift_m=upper, lower_shift_m=lower)
@@ -108,12 +107,12 @@ def _spoilt(taken: Stream, frames: np.ndarray, valid: np.ndarray | None = None) 
 
 
 def _moved(taken: Stream, skin: Skin) -> np.ndarray:
-    """Return the relative change (U, K) that the press causes in the resistances."""
+    """Return the magnitude of the relative change (U, K) of the resistances due to the press."""
     return np.asarray(np.abs(taken.frames_ohm[8] / skin.rest_ohm - 1.0))
 
 
 def _wire(rng: np.random.Generator, taken: Stream, skin: Skin, axis: int) -> int:
-    """Choose one of the three wires that the press affects most."""
+    """Choose one of the three wires most affected by the press."""
     return int(rng.choice(np.argsort(_moved(taken, skin).max(axis=2 - axis))[-3:]))
 
 
@@ -150,7 +149,7 @@ def _flipped(rng: np.random.Generator, taken: Stream, skin: Skin) -> Stream:
 
 
 def _open(axis: int) -> Spoil:
-    """Break a wire, so that the converter input floats near the top of its range."""
+    """Return a function that breaks a wire: its readings then float near the top of the converter range."""
 
     def spoil(rng: np.random.Generator, taken: Stream, skin: Skin) -> Stream:
         frames, wire = taken.frames_ohm.copy(), int(rng.integers(taken.frames_ohm.shape[axis]))
@@ -164,7 +163,7 @@ def _open(axis: int) -> Spoil:
 
 
 def _shorted(axis: int) -> Spoil:
-    """Short two neighbouring wires, so that both read the two resistances in parallel."""
+    """Return a function that shorts two adjacent wires, which then read their resistances in parallel."""
 
     def spoil(rng: np.random.Generator, taken: Stream, skin: Skin) -> Stream:
         frames, wire = taken.frames_ohm.copy(), int(rng.integers(taken.frames_ohm.shape[axis] - 1))
@@ -176,7 +175,7 @@ def _shorted(axis: int) -> Spoil:
 
 
 def _crossed(axis: int) -> Spoil:
-    """Swap two neighbouring wires before the baseline is measured, so that their R/R₀ are swapped."""
+    """Return a function that swaps the R/R₀ of two adjacent wires, as if swapped before the baseline."""
 
     def spoil(rng: np.random.Generator, taken: Stream, skin: Skin) -> Stream:
         frames, wire = taken.frames_ohm.copy(), _wire(rng, taken, skin, axis)
@@ -190,7 +189,7 @@ def _crossed(axis: int) -> Spoil:
 
 
 def _half(rng: np.random.Generator, taken: Stream, skin: Skin) -> Stream:
-    """Drop a random half of the chunks of three codes in every frame."""
+    """Drop each chunk of three codes with a probability of 50 %."""
     valid = taken.valid.copy()
     lost = np.repeat(rng.random((len(valid), valid[0].size // 3)) < 0.5, 3, axis=1)
     valid &= ~lost.reshape(valid.shape)

@@ -23,14 +23,15 @@ from skinnode.solve.operators.work import LIMIT, Work, workspace
 from skinnode.solve.wires.problem import PatchProblem
 
 SHORT: Final = 1e-3
-"""Trust radius, pitches per coordinate; much smaller than a Newton step, so every operator must search."""
+"""Trust radius (pitches per coordinate), much shorter than a Newton step, so that every operator must shorten
+its step."""
 
 
 class NumpyWire:
-    """Computes F and Jᵀ of one wire as fast as NumPy allows: structure of arrays, preallocated buffers.
+    """Computes F and Jᵀ of one wire with fast NumPy code (structure of arrays, preallocated buffers).
 
-    Of the combinations of axis order and summation method that were tried, the class uses the fastest, which
-    takes 85 % of the time of the most obvious combination.
+    Several axis orders and summation methods were compared; the fastest combination, used here, takes 85 % of
+    the time of the most obvious one.
     """
 
     def __init__(self, lower: Float, electrodes: int) -> None:
@@ -63,9 +64,9 @@ class NumpyWire:
 
 
 def numpy_step(operator: str, wire: NumpyWire, x: Float, a: Float) -> Float:
-    """Evaluate r, take one step and evaluate r again, as :func:`compiled_steps` does; return the final r.
+    """Evaluate r, take one step and evaluate r again, like :func:`compiled_steps`; return the final r.
 
-    The Levenberg-Marquardt parameter, which the compiled step has to search for, is fixed here.
+    The Levenberg-Marquardt parameter is fixed in the NumPy step; the compiled step has to search for it.
     """
     f, jt = wire(x)
     r, j = relative_residual(a, f), (jt * a).T
@@ -90,7 +91,7 @@ def numpy_step(operator: str, wire: NumpyWire, x: Float, a: Float) -> Float:
                 )
         else:
             n = x.size
-            augmented = np.zeros((r.size + n, n + 1))  # yields Qᵀr without forming Q, in 70 % of the time
+            augmented = np.zeros((r.size + n, n + 1))  # yields Qᵀr 30 % faster than forming Q
             augmented[: r.size, :n] = j
             augmented[: r.size, n] = r
             np.fill_diagonal(augmented[r.size :], 0.1 * scale)
@@ -116,9 +117,10 @@ def _evaluate(x: Float, lower: Float, a: Float, r: Float, jt: Float) -> None:
 def compiled_steps(  # noqa: PLR0913 - a kernel takes its buffers
     operator: int, start: Float, lower: Float, a: Float, w: Work, jt_trial: Float
 ) -> None:
-    """Take one step of every wire from ``start`` (U, n), using the compiled parts of the driver.
+    """Take one step for every wire from ``start`` (U, n), with the compiled functions of the solver loop.
 
-    The driver itself, limited to one step, would compute a second step before checking the limit.
+    The complete solver loop cannot be timed instead: it computes a second step before it checks its step
+    limit.
     """
     for u in range(start.shape[0]):
         for j in range(w.x.size):
@@ -133,7 +135,7 @@ def compiled_steps(  # noqa: PLR0913 - a kernel takes its buffers
 
 
 def run(rounds: int) -> dict[str, Any]:
-    """Run the benchmark; return times in µs per wire (dense kernels: per call) and ratios to our kernels."""
+    """Run the benchmark; return times (µs) per wire or dense-kernel call, and their ratios to ours."""
     layout = PatchLayout.preset("staggered", pitch_m=4e-3, height_m=2e-3)
     problem = PatchProblem.of(layout)
     rng = np.random.default_rng(1)
@@ -179,7 +181,7 @@ def run(rounds: int) -> dict[str, Any]:
 
 
 def potential_of(x: Float, lower: Float) -> Float:
-    """Compute F of one wire with the compiled kernel."""
+    """Compute F for one wire with the compiled kernel."""
     f, jt = np.empty(lower.shape[2]), np.empty((x.size, lower.shape[2]))
     potential_jacobian(x, lower, f, jt)
     return f

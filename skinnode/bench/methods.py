@@ -1,4 +1,4 @@
-"""Sets up solvers for a hard case as an informed user would, and solves the case's streams with them."""
+"""Sets up the solvers of a hard case like an informed user would, and solves the case's streams."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ Method = Callable[[Stream], Solved]
 
 
 def set_up(case: Case, name: str) -> Method:
-    """Set up the method ``name`` for ``case``; the method starts each stream in its initial state."""
+    """Set up the method ``name`` for ``case``; the solver is reset before each stream."""
     if last_only(name):
         return functools.partial(_path, case, name.removeprefix("path "))
     solver = solver_of(case, name)
@@ -32,12 +32,12 @@ def set_up(case: Case, name: str) -> Method:
 
 
 def last_only(name: str) -> bool:
-    """Return whether a method returns an estimate only for the last frame of a stream."""
+    """Return whether a method solves only for the last frame of a stream (path methods)."""
     return name.startswith("path ")
 
 
 def _path(case: Case, how: str, stream: Stream) -> Solved:
-    """Solve a stream as a path; ``how`` is ``adaptive`` or the operator to apply to all samples."""
+    """Solve a stream as a path; ``how`` is ``adaptive`` or the name of the operator for all samples."""
     adaptive = how == "adaptive"
     path = solve_path(
         case.skin.layout,
@@ -46,7 +46,8 @@ def _path(case: Case, how: str, stream: Stream) -> Solved:
         schedule=Adaptive() if adaptive else Uniform(),
         baseline_ohm=case.skin.rest_ohm,
     )
-    # The error estimate is an upper bound, whereas an error may reach LIMIT standard deviations.
+    # Converts the error estimate to a standard deviation: an error up to LIMIT standard deviations is
+    # accepted, and the estimate is an upper bound.
     std = np.broadcast_to(path.error_estimate_m[:, None, None] / LIMIT, path.displacement_m.shape)
     return Solved(path.displacement_m[None], std[None], _converged(path.status)[None])
 
@@ -61,7 +62,7 @@ def fields(case: Case, name: str, solver: Tracker | Posterior, stream: Stream) -
 
 def solver_of(case: Case, name: str) -> Tracker | Posterior:
     """Create a solver for the case; ``name`` is ``exact``, ``posterior`` or ``auto``."""
-    # This noise is only a default: each frame is passed with its own noise.
+    # Default noise; every call of ``update`` overrides it with the noise of the frame.
     common: dict[str, Any] = {
         "relative_noise": case.converter.relative_std,
         "baseline_ohm": case.skin.rest_ohm,
@@ -80,7 +81,7 @@ def solver_of(case: Case, name: str) -> Tracker | Posterior:
 
 
 def _noise_for_exact(case: Case, stream: Stream) -> Float:
-    """Add drift and model errors to the noise, because the exact inverse models only independent noise."""
+    """Add drift and model errors to the noise; the exact inverse has no options for these errors."""
     change = np.nan_to_num(np.abs(stream.frames_ohm / case.skin.rest_ohm - 1.0), posinf=0.0)
     drift = 0.0 if case.drift == "none" else DRIFT
     return np.asarray(np.sqrt(stream.noise**2 + drift**2 + (case.model_error * change) ** 2))
@@ -95,7 +96,7 @@ def _solved(frames: list[FieldFrame]) -> Solved:
 
 
 def _claimed(frame: FieldFrame) -> NDArray[np.bool_]:
-    """Return a mask (U,) of the wires that are CONVERGED and, if trust was assessed, trusted."""
+    """Return a mask (U,) of the wires that are both CONVERGED and trusted (if trust was assessed)."""
     converged = _converged(frame.status)
     return converged if frame.wires_trusted is None else converged & frame.wires_trusted
 

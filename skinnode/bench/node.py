@@ -1,9 +1,9 @@
-"""Measures a node: chunk pacing, time from SYNC to first chunk, heartbeat on a full bus, and µs per frame.
+"""Measures a node: chunk pacing, delay from SYNC to first chunk, heartbeat jitter, and CPU time per frame.
 
-The time of a frame is the time at which the node passes the frame to its interface, on the monotonic clock
-that also stamps SYNC. Another thread of the same process sends SYNC and load through a second endpoint, so
-the interpreter lock affects the result. Other processes on the machine affect the result even more. For
-results as on an idle machine, run ``chrt -f 20 skinnode bench node``.
+A frame is timestamped when the node passes it to the CAN interface; SYNC is timestamped with the same
+monotonic clock. Another thread of the same process sends SYNC and background frames through a second
+endpoint, so contention for the interpreter lock affects the results. Other processes on the machine affect
+the results even more. To reduce their effect, run ``chrt -f 20 skinnode bench node``.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ from skinnode.transport import CanPort
 
 NODE_ID: Final = 4
 FULL_BUS_HZ: Final = 8_000
-"""Frame rate that fills a bus at 1 Mbit/s, Hz, with eight data bytes per frame."""
+"""Rate of frames with eight data bytes that fully loads a 1 Mbit/s bus, Hz."""
 SCAN_PERIOD_S: Final = 0.1
 BEAT_MS: Final = 10
-_BURST_S: Final = 1e-3  # no thread can wake 8000 times per second, so frames are sent in bursts
+_BURST_S: Final = 1e-3  # burst interval; a thread cannot reliably wake 8000 times per second
 _MOST_S: Final = (
-    5e-3  # frames that are later than this are dropped, because a full real bus could not catch up
+    5e-3  # maximum backlog; older frames are dropped, because a fully loaded bus could not catch up
 )
 
 Row = dict[str, Any]
@@ -49,13 +49,13 @@ class _Still:
 
 
 class _Rig:
-    """A node and a bus manager, set up for one measurement."""
+    """Test rig for one measurement: a node and a bus manager."""
 
     def __init__(self, config: BusConfig, pacing: Pacing) -> None:
         layout = PatchLayout.preset("staggered")
         self.manager, self._port = CanPort(config), CanPort(config)
         self.sent: list[tuple[int, int]] = []
-        """COB-ID and time of each frame that the node has sent."""
+        """COB-ID and send time (ns) of each frame sent by the node."""
         node = PatchNode(NODE_ID, layout, _Still(layout), send=self._send, pacing=pacing)
         self.inhibit_ns = node.profile.default_inhibit_100us * 100_000
         self._runner = NodeRunner(self._port, [node])
@@ -81,19 +81,19 @@ class _Rig:
         return self._port.received
 
     def take(self) -> None:
-        """Discard the frames received from the node, because a full queue would block the node."""
+        """Empty the manager's receive queue, because a full queue would block the node."""
         while self.manager.recv(0.0) is not None:
             pass
 
 
 def run(seconds: float, rounds: int, interface: str, channel: str | None) -> dict[str, Any]:
-    """Measure chunk pacing, heartbeats and the cost of frames; return all rows.
+    """Measure chunk pacing, heartbeats and the time to handle a frame; return all results.
 
     Args:
         seconds: Duration of each measurement on the bus.
-        rounds: Number of times that each kind of frame is timed.
+        rounds: Number of timing rounds for each kind of frame.
         interface: python-can interface.
-        channel: Channel of the interface; None for an unused name.
+        channel: Channel of the interface; None to choose an unused channel name.
     """
     config = BusConfig(interface=interface, channel=channel or uuid.uuid4().hex)
     with without_long_collections():
@@ -107,7 +107,7 @@ def run(seconds: float, rounds: int, interface: str, channel: str | None) -> dic
 
 
 def _row(what: str, late_ns: Float, goal_ms: float, load_hz: float = 0.0) -> Row:
-    """Return a result row, given signed deviations from the nominal time, ns."""
+    """Summarise deviations from the nominal time (ns, signed) in a result row."""
     late_ms = np.abs(late_ns) / 1e6
     p50, p99, most = np.percentile(late_ms, [50, 99, 100]).tolist() if len(late_ms) else [None] * 3
     spread = {"p50_ms": p50, "p99_ms": p99, "max_ms": most}
@@ -168,9 +168,9 @@ def _load(rig: _Rig, rate_hz: int, stop: threading.Event) -> None:
 
 
 def handlers() -> dict[str, Callable[[], object]]:
-    """Return one function per kind of frame; a call makes a node without a bus handle one such frame.
+    """Return a function for each kind of frame that makes a node without a bus handle such a frame.
 
-    Each function also queries the node's next deadline, as the thread that runs a node does.
+    Each function also queries the node's next deadline, like the thread of a :class:`NodeRunner`.
     """
     layout = PatchLayout.preset("staggered")
     node = PatchNode(NODE_ID, layout, _Still(layout), send=lambda _can_id, _data: None, pacing=EXACT)
@@ -188,7 +188,7 @@ def handlers() -> dict[str, Callable[[], object]]:
             now_ns = node.next_deadline_ns() or now_ns
             node.on_timer(now_ns)
 
-    # Map the error register to TPDO3, and let the node send TPDO3 on remote request.
+    # Map the error register to TPDO3, and configure TPDO3 for transmission on remote request.
     sdo = od.sdo_request_cob_id(NODE_ID)
     for request in ("23021a0108000110", "2f021a0001000000", "2f021802fd000000", "2302180184030000"):
         give(sdo, bytes.fromhex(request))

@@ -1,24 +1,25 @@
-"""Repeats the paper's path experiments and compares the results with its published values (``paper.toml``).
+"""Repeats the paper's path experiments, and compares the results with the published values (``paper.toml``).
 
 Each experiment uses one upper wire of 10 electrodes (30 unknowns), without the other wires of the patch. A
-sphere with a radius of 6 to 12 mm presses on rubber (Hertz's closed form with friction) at a random point in
-the middle of the patch; the wire nearest to that point is solved. The downward motion consists of 1000
-samples, of which n evenly spaced samples are used.
+sphere with a radius of 6 to 12 mm is pressed into rubber at a random point near the middle of the patch; the
+displacement is Hertz's closed form with friction. The wire nearest to that point is solved. The downward
+motion consists of 1000 samples; a path of n steps uses n evenly spaced samples.
 
-Counts: The paper counts function calls with finite-difference Jacobians, each of which costs 30 calls in
-addition to the call of F itself. Our analytic F and J together cost about as much as two evaluations of F;
-multiplying our counts by 31 yields the cost with finite differences. Calls per step are averaged over all
-samples except the last, as in the paper. The accuracy is the RMS error ‖X − X*‖ / ‖X* − X(0)‖, averaged over
-the experiments that converged. The first-order optimality is computed for r = a F − 1, which is
-dimensionless, with lengths in pitches. MATLAB computes the optimality of F, which is larger by a factor of F²
-and depends on the unit of length, which the paper does not state.
+Counts: The paper counts calls of F. Its Jacobians are finite differences, so each Jacobian requires 30
+additional calls. Our code evaluates F and an analytic J together, at about twice the cost of F alone. One
+such evaluation replaces 31 calls, so our counts are multiplied by 31 for comparison with the paper. Like in
+the paper, the number of calls per step is averaged over all samples except the last. The accuracy is the
+relative error ‖X − X*‖ / ‖X* − X(0)‖, averaged over the experiments that converged. The first-order
+optimality is that of the dimensionless residual r = a F − 1, with lengths in pitches. MATLAB's optimality is
+that of F: larger by a factor of F² and dependent on the unit of length, which the paper does not state.
 
 Settings: At the paper's press depth of 10 %, our Gauss-Newton never fails: on ``aligned`` with h = 0.3, 0.4 …
-1, it solves all 10 experiments with any number of steps. The hardest ``aligned`` setting at that depth is
-therefore h = 1. At h = 0.7 and 30 %, Gauss-Newton fails as reported in the paper: in 6 of 10 experiments with
-5 steps and in 2 experiments with 10 steps, but never with 20 or more steps. The setting h = 0.7 and 30 % was
-found by a search over h = 0.3 … 1 and depths of 15 … 30 %. At h = 1 and 25 %, 5 experiments fail with 5 steps
-and 3 with 10 steps, but there levenberg_marquardt also fails with more steps.
+1, all 10 experiments are solved with any number of steps. The ``aligned`` setting for a depth of 10 % is
+therefore h = 1, the hardest. With h = 0.7 and a depth of 30 %, Gauss-Newton fails as often as in the paper:
+in 6 of 10 experiments with 5 steps, in 2 of 10 with 10 steps, and in none with 20 or more steps. This setting
+was found by a search over h = 0.3 … 1 and depths of 15 … 30 %. With h = 1 and a depth of 25 %, Gauss-Newton
+fails in 5 experiments with 5 steps and in 3 with 10 steps, but Levenberg-Marquardt also fails with more
+steps.
 """
 
 from __future__ import annotations
@@ -42,7 +43,7 @@ from skinnode.solve.paths.path import PathResult, solve_path
 from skinnode.solve.paths.step_control import Adaptive, Periodic, Schedule, Uniform, shortest_cycle
 
 SETTINGS: Final = (("staggered", 0.5, 0.1), ("aligned", 1.0, 0.1), ("aligned", 0.7, 0.3))
-"""Settings as (preset, height in pitches, depth of the press as a fraction of the height)."""
+"""Settings as (preset, height in pitches, press depth divided by the height)."""
 PITCH_M: Final = 4e-3
 SAMPLES: Final = 1000
 SEED: Final = 2018
@@ -57,12 +58,13 @@ LABELS: Final = {
     "gauss_newton": "Gauss-Newton",
     "dogleg": "dogleg",
 }
-"""Display names of the operators, in the order of the rows in the paper's tables."""
+"""Display names of the operators, in the row order of the paper's tables."""
 UNKNOWNS: Final = 30
 DIFFERENCES: Final = UNKNOWNS + 1
-"""Number of calls of F needed to compute F and J by forward differences."""
+"""Number of calls of F per evaluation of F and its forward-difference Jacobian."""
 WRONG: Final = 1e-4
-"""Relative error above which a CONVERGED wire counts as wrong; exact data give at most 1e-8."""
+"""Relative error above which a CONVERGED wire is classified as wrong; a correct solution has an error below
+1e-8."""
 
 
 def printed() -> dict[str, Any]:
@@ -73,7 +75,7 @@ def printed() -> dict[str, Any]:
 
 @dataclass(frozen=True, eq=False)
 class Experiment:
-    """Press of a single wire."""
+    """A press and the resistances of one wire along it."""
 
     layout: PatchLayout
     """Layout of the single wire."""
@@ -103,7 +105,7 @@ def preset(name: str, height: float) -> PatchLayout:
 
 
 def experiments(layout: PatchLayout, depth: float, count: int) -> list[Experiment]:
-    """Generate ``count`` random presses, each ``depth`` layer heights deep."""
+    """Generate experiments with ``count`` random presses to ``depth`` times the layer height."""
     rng = np.random.default_rng(SEED)
     span = layout.upper_m[..., :2].max(axis=(0, 1))
     made = []
@@ -147,7 +149,7 @@ def run(count: int) -> dict[str, Any]:
 
 def _setting(made: list[Experiment]) -> dict[str, Any]:
     first = made[0]
-    first.solve(Uniform())  # the first solve also loads the kernels, so it must not be timed
+    first.solve(Uniform())  # exclude the time to load the kernels from the measurements
     operators, ours = (
         {operator: [_row(made, Uniform(plain=plain), operator, n) for n in STEPS] for operator in LABELS}
         for plain in (True, False)
@@ -171,7 +173,7 @@ def _setting(made: list[Experiment]) -> dict[str, Any]:
 
 
 def _row(made: list[Experiment], schedule: Schedule, operator: str, samples: int) -> dict[str, Any]:
-    """Solve all experiments with a step control; return its mean cost and accuracy."""
+    """Solve all experiments with one step control; return the mean cost and the accuracy."""
     paths, times = [], []
     for one in made:
         start = time.perf_counter()
@@ -211,7 +213,7 @@ def _mean(values: Sequence[float]) -> float | None:
 
 
 def _path_rows(path: PathResult) -> slice:
-    """Return the slice of the path's own rows, without cycle search, second attempts and checks."""
+    """Return the slice of rows that belong to the path, without cycle search, second attempts and checks."""
     at = path.position[path.searched :, 0]
     return slice(path.searched, path.searched + int(np.argmax(at == np.nanmax(at))) + 1)
 
@@ -221,7 +223,7 @@ def _final(path: PathResult) -> float:
 
 
 def _calls(made: list[Experiment], samples: int) -> list[float]:
-    """Return the data of figure 8: mean number of calls at each step except the last."""
+    """Return the data of figure 8: mean number of calls in each step except the last."""
     paths = [one.solve(Uniform(plain=True), samples=samples) for one in made]
     return [float(each) for each in np.mean([path.evaluations[: samples - 1, 0] for path in paths], axis=0)]
 
@@ -233,7 +235,7 @@ def _optimality(one: Experiment, samples: int, tolerance: float) -> list[float]:
 
 
 def _cycle(made: list[Experiment], samples: int, tolerance: float) -> float | None:
-    """Return the median cycle length of all experiments with a cycle; None if no experiment has a cycle."""
+    """Return the median length of the cycles found in the experiments; None if none has a cycle."""
     cycles = []
     for one in made:
         path = one.solve(Uniform(plain=True, intermediate_tolerance=tolerance), samples=samples)
@@ -244,7 +246,7 @@ def _cycle(made: list[Experiment], samples: int, tolerance: float) -> float | No
 
 
 def _iterations(made: list[Experiment], samples: int) -> dict[str, Any]:
-    """Return the data of figure 11: operator steps on the whole path and, for one experiment, by sample."""
+    """Return the data of figure 11: operator steps per path and, for the first experiment, per sample."""
     uniform = [one.solve(Uniform(plain=True), samples=samples) for one in made]
     periodic = [one.solve(Periodic(plain=True), samples=samples) for one in made]
     return {
@@ -258,7 +260,7 @@ def _iterations(made: list[Experiment], samples: int) -> dict[str, Any]:
 
 
 def _last_step(one: Experiment, periodic: bool) -> list[float]:
-    """Return the data of figure 12: optimality at the last of 50 samples, before and after each iteration."""
+    """Return the data of figure 12: optimality at the start and after each iteration of the last step."""
     cycle = one.solve(Periodic(plain=True), samples=50).cycle if periodic else None
 
     def schedule(most: int) -> Schedule:
@@ -283,23 +285,23 @@ def optimality(layout: PatchLayout, upper_m: Float, frame_ohm: Float) -> float:
 
 
 def correction(layout: PatchLayout, upper_m: Float, frame_ohm: Float) -> float:
-    """Return the largest magnitude of a component of the next Newton step, in pitches."""
+    """Return the largest absolute component of the next Newton step, in pitches."""
     r, slopes = _linear(layout, upper_m, frame_ohm)
     return float(np.abs(np.linalg.solve(slopes, r)).max())
 
 
 def _linear(layout: PatchLayout, upper_m: Float, frame_ohm: Float) -> tuple[Float, Float]:
-    """Return the residual r (K,) and the Jacobian J (K, 3N) of the single wire."""
+    """Return the residual r (K,) of the first wire, and its Jacobian J (K, 3N)."""
     a = frame_ohm[0] / layout.resistivity_ohm_per_m
     r = a * potential_per_m(layout, upper_m)[0] - 1.0
     return r, jacobian(layout, upper_m)[0].reshape(len(a), -1) * a[:, None] * layout.pitch_m
 
 
 def _ten_steps() -> list[dict[str, Any]]:
-    """Measure the time and error of the ten-step path on ``staggered``.
+    """Measure the time and error of a ten-step path on the layout ``staggered``.
 
-    A single wire is solved with each operator and with our own step control. The last row is for one wire in
-    a patch of ten wires.
+    A single wire is solved with each operator, and with our default step control. The last row contains the
+    time per wire when the whole patch of ten wires is solved.
     """
     layout = preset(*SETTINGS[0][:2])
     one = experiments(layout, SETTINGS[0][2], 1)[0]
@@ -331,9 +333,9 @@ def _ten_steps() -> list[dict[str, Any]]:
 
 
 def _surface() -> dict[str, Any]:
-    """Return the data of figure 13: surface of the whole patch at the hardest setting, µm.
+    """Return the data of figure 13: surface of the whole patch in the hardest setting, µm.
 
-    The patch is solved with 5 and with 20 samples as in the paper, and with our step control.
+    The patch is solved in 5 and in 20 steps like in the paper, and with our adaptive step control.
     """
     name, height, depth = SETTINGS[-1]
     layout = preset(name, height)
@@ -373,7 +375,7 @@ Say = Callable[[str], None]
 
 
 def print_all(figures: dict[str, Any], say: Say) -> None:
-    """Print the tables and the figure data, each value next to the corresponding value from the paper."""
+    """Print the tables and the figure data, with the paper's values for comparison."""
     paper, count = figures["paper"], figures["experiments"]
     say(f"Means of {count} experiments; one wire, {UNKNOWNS} unknowns; tolerances 1e-6 and 1e-12.")
     say("As in the paper: Uniform(plain=True). Ours: Uniform(), with extrapolation and a second attempt.")
@@ -405,7 +407,7 @@ def _rows(setting: dict[str, Any]) -> list[dict[str, Any]]:
 
 
 def _accuracy(row: dict[str, Any], count: int) -> str:
-    """Format the mean error of the converged experiments, and the number of experiments that failed."""
+    """Format the mean error of the converged experiments and the number of failed experiments."""
     if row["failed"] == count:
         return f"failed {count}/{count}"
     text = f"{row['accuracy_percent']:.0e} %"

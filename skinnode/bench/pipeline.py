@@ -1,8 +1,8 @@
 """Measures a host's throughput, latency and CPU time per thread group, for several numbers of buses.
 
-The host is that of ``skinnode host``. The host is a guest on the buses of a robot, and another process
-replays the robot's master and nodes (:mod:`skinnode.bench.load`). Frames arrive on a real CAN interface, or
-over UDP through the receiver for SocketCAN (see :mod:`skinnode.transport.datagram`).
+The host is configured as a guest, so it does not manage the buses. A child process replays the frames of the
+robot's master and nodes (:mod:`skinnode.bench.load`). The frames are transferred over a CAN interface or over
+UDP; UDP frames are received with the SocketCAN receiver (see :mod:`skinnode.transport.datagram`).
 """
 
 from __future__ import annotations
@@ -36,8 +36,8 @@ CLASSIC_MS: Final = 50
 """SYNC period with classic CAN, ms; four patches of 101 frames send 8,080 frames/s plus heartbeats."""
 FD_MS: Final = 25
 STAGGER_MS: Final = 3.0
-"""Offset between the SYNCs of successive buses when staggered, ms; the four patches on one bus are then
-solved before the scans of the next bus are complete."""
+"""Offset between the SYNCs of successive buses in scenes with staggered SYNCs, ms. The offset is long enough
+to solve the four patches on a bus before the scans on the next bus are complete."""
 SCENES: Final = (
     (False, True, 0.0),
     (False, True, STAGGER_MS),
@@ -46,9 +46,10 @@ SCENES: Final = (
     (True, True, STAGGER_MS),
     (True, False, 0.0),
 )
-"""Scenes as (whether CAN FD is used, whether the patches are touched, offset between SYNCs in ms)."""
+"""Scenes as (CAN FD or not, patches touched or not, offset between SYNCs in ms)."""
 DEADLINE_US: Final = 1000
-"""Deadline for solving a scan, µs; an exact inverse takes 200 µs, or 13 ms if the posterior must check it."""
+"""Deadline for solving a scan, µs. An exact inverse takes 200 µs, but 13 ms if the posterior is needed to
+verify it."""
 RECEIVE_US: Final = 5.0
 LATENCY_MS: Final = 5.0
 SETTLE_S: Final = 5.0
@@ -70,11 +71,11 @@ def run(  # noqa: PLR0913 - the options of the command
 
     Args:
         seconds: Duration of each measurement.
-        short: Whether to measure only the rows for which there is a requirement.
+        short: Whether to measure only the rows that have a requirement.
         interface: ``udp`` or ``socketcan``.
         channel: Channel of the ``socketcan`` interface.
-        all_cores: Whether host and load generator may use all cores; otherwise each is bound to a single
-            core.
+        all_cores: Whether the host and the load generator may use all cores; if False, each is bound to a
+            core of its own.
         report: Function that receives each row as soon as it is complete.
 
     Returns:
@@ -151,7 +152,7 @@ def _hand(  # noqa: PLR0913 - the properties in which hands differ
             "stream": {"capacity_fields": 100_000},
         }
     )
-    # Skip validation, which rejects this bus load because frames of maximum length would not fit.
+    # Skip validation: it would reject this bus load, because it assumes frames of maximum length.
     full = tuple(bus.model_copy(update={"max_load": 2.0}) for bus in hand.buses)
     return hand.model_copy(update={"buses": full})
 
@@ -169,7 +170,7 @@ def _measure(hand: HandConfig, generator: Generator) -> Row:
     generator.send_heartbeats(names)
     with Host.from_config(hand, open_port=open_port) as host, _Reader(host.fields()) as reader:
         begin_ns = generator.begin()
-        time.sleep(LEAD_S / 2)  # wait for the last heartbeats sent before the replay
+        time.sleep(LEAD_S / 2)  # wait until the last heartbeat sent before the replay has been received
         read_before = _read(host)
         before, begin_s = _cpu_s(), time.monotonic()
         sent = generator.wait()
@@ -217,13 +218,13 @@ def _spread(late_ms: list[float]) -> dict[str, float | None]:
 
 
 def lost(row: Row) -> int:
-    """Return the total number of frames, chunks and scans lost between load generator and fields."""
+    """Return the total number of frames, chunks and scans lost on the way from generator to field."""
     frames = row["sent"] - row["received"] + row["queue_dropped"]
     return int(frames + row["chunks_lost"] + row["scans_missed"] + row["scans"] - row["fields"])
 
 
 def hand_name(row: Row) -> str:
-    """Return a short description of the hand for which a row was measured."""
+    """Return a short description of a row's hand."""
     kind = "CAN FD" if row["fd"] else "classic"
     scene = "touched" if row["touched"] else "at rest"
     apart = f", {row['stagger_ms']:g} ms apart" if row["stagger_ms"] else ""
@@ -231,7 +232,7 @@ def hand_name(row: Row) -> str:
 
 
 def _must(rows: list[Row]) -> list[Row]:
-    """Check the requirements, which apply to the largest hands with touched patches."""
+    """Check the requirements, which apply only to hands with at least four buses and touched patches."""
     must = []
     for row in rows:
         if row["buses"] < 4 or not row["touched"]:
@@ -255,7 +256,7 @@ class _Reader:
         self._thread = threading.Thread(target=self._run, name="subscriber", daemon=True)
 
     def since(self, begin_ns: int) -> tuple[list[float], list[float]]:
-        """Return the latencies of fields and of their delivery, ms, for scans that end after ``begin_ns``."""
+        """Return the publication and delivery latencies (ms) of all scans that end after ``begin_ns``."""
         stamps = [(stamp, read_ns) for stamp, read_ns in self._stamps if stamp.t_receive_ns >= begin_ns]
         published = [(stamp.t_solved_ns - stamp.t_receive_ns) * 1e-6 for stamp, _ in stamps]
         return published, [(read_ns - stamp.t_receive_ns) * 1e-6 for stamp, read_ns in stamps]

@@ -1,4 +1,5 @@
-"""Plots of benchmark results; these modules require matplotlib.
+"""Plots benchmark results; requires matplotlib.
 
-``ratios`` plots the benchmarks ``kernel`` and ``solve``; the other modules are named after their benchmarks.
+``ratios`` plots the benchmarks ``kernel`` and ``solve``. Each other module has the name of the benchmark that
+it plots.
 """

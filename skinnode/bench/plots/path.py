@@ -13,7 +13,7 @@ COLOURS: Final = ("tab:blue", "tab:orange", "tab:green", "tab:red")
 
 
 def draw(file: Path, figures: dict[str, Any]) -> None:
-    """Plot three rows: cost of the steps, optimality along the path, and recovered surface."""
+    """Plot cost per step (top row), optimality along the path (middle), and recovered surface (bottom)."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -52,7 +52,7 @@ def _draw_calls(axes: Any, setting: dict[str, Any]) -> None:
 
 
 def _draw_iterations(axes: Any, setting: dict[str, Any], paper: dict[str, Any]) -> None:
-    """Plot the cumulative number of iterations along the path of the first press."""
+    """Plot the cumulative iteration count along the path for the first press."""
     for colour, marker, size, steps in ((COLOURS[0], "s", 8, "50"), (COLOURS[1], "o", 4, "100")):
         data = setting["figure11"][steps]
         each = np.array(data["uniform_each"])
@@ -73,7 +73,7 @@ def _draw_iterations(axes: Any, setting: dict[str, Any], paper: dict[str, Any]) 
 
 
 def _draw_table(axes: Any, setting: dict[str, Any], paper: dict[str, Any]) -> None:
-    """Plot the time per path versus the number of steps, together with the paper's times."""
+    """Plot the time per path versus the number of steps, for our solvers and for the paper."""
     table = paper["table4_dogleg"]
     axes.loglog(table["steps"], table["runtime_s"], "s-", color="0.5", label="paper (dogleg)")
     for colour, key, label in (

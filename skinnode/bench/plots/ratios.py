@@ -1,4 +1,4 @@
-"""Plots ``skinnode bench kernel`` and ``skinnode bench solve``: times, and their ratios to ours."""
+"""Plots the results of ``skinnode bench kernel`` and ``skinnode bench solve``: times and time ratios."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def _bars(axes: Any, rows: list[dict[str, Any]], heights: list[float], ours: lis
 
 
 def draw_kernel(file: Path, figures: dict[str, Any]) -> None:
-    """Plot one group of bars per operation, with ratios to the time of the compiled kernel."""
+    """Plot a group of bars for each operation; each bar's ratio is relative to the compiled kernel."""
     heights, rows, heads = [], figures["rows"], []
     height = 0.0
     for what, group in groupby(rows, key=lambda row: row["what"]):
@@ -71,7 +71,7 @@ def draw_kernel(file: Path, figures: dict[str, Any]) -> None:
 
 
 def draw_solve(file: Path, figures: dict[str, Any]) -> None:
-    """Plot each solver's time per wire, fastest first, labelled with the error reached."""
+    """Plot each solver's time per wire, fastest first; label each bar with the error of the result."""
     rows = sorted(figures["rows"], key=lambda row: (row["us"] is None, row["us"] or 0.0))
     heights = [float(i) for i in range(len(rows))]
     ours = [row["who"].startswith("skinnode") for row in rows]

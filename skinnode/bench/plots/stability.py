@@ -1,4 +1,4 @@
-"""Plots the hard cases: verdicts by case and method, and error versus reported uncertainty."""
+"""Plots the hard cases: verdicts for each case and method, and error versus reported uncertainty."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def draw(file: Path, figures: dict[str, Any]) -> None:
 
 
 def _verdicts(axes: Any, rows: list[dict[str, Any]], names: list[str]) -> None:
-    """Plot the fractions of the verdicts, one bar per case and method; the ``wrong`` part is enlarged."""
+    """Plot a stacked bar of verdict fractions for each case and method; ``wrong`` is drawn enlarged."""
     place = {name: number for number, name in enumerate(names)}
     column = {method: number for number, (_, method) in enumerate(COLUMNS)}
     for row in rows:
@@ -91,7 +91,7 @@ def _scatter(axes: Any, rows: list[dict[str, Any]]) -> None:
         if not points:
             continue
         reported, error, wrong = np.array(points).T
-        label = "path (reported: a fifth of the error estimate)" if kind == "path" else kind
+        label = "path solver (reported value: error estimate / 5)" if kind == "path" else kind
         axes.scatter(reported, error, s=14, color=colour, label=label, alpha=0.8, lw=0)
         bad = wrong > 0
         axes.scatter(reported[bad], error[bad], s=46, facecolors="none", edgecolors=VERDICTS[2][1], lw=1)
@@ -111,7 +111,7 @@ def _scatter(axes: Any, rows: list[dict[str, Any]]) -> None:
 
 
 def _list(axes: Any, wrong: list[dict[str, Any]], most: int) -> None:
-    """List the rows with the largest errors as text."""
+    """Write a text list of the rows with the largest errors."""
     axes.axis("off")
     worst = sorted(wrong, key=lambda row: -row["wrong"] / row["wires"])
     lines = [named(row) for row in worst[:most]]

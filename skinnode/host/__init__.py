@@ -14,17 +14,17 @@ interface. Each bus has a ``link`` (port, receive queue, reopening) and a ``serv
     supervisor -> node_supervision (actions for each supervised node) -> remote_node, baseline_watch
     node_monitor (evidence about a node) -> health (condition) -> health_watch -> events
 
-The module ``sync`` sends SYNC, and ``nmt_master`` sends NMT commands. ``containment`` handles exceptions, and
-``retry_pause`` determines the pauses between attempts. ``tap`` passes frames to recorders.
+The module ``sync`` sends SYNC, and ``nmt_master`` sends NMT commands. The module ``containment`` handles
+exceptions, ``retry_pause`` sets the pauses between attempts, and ``tap`` passes frames to recorders.
 
-**Containment.** Exceptions do not end the host's threads. An exception raised while serving a patch makes
-that patch faulty and is recorded as the reason. The scans of a faulty patch are withheld, and the patch is
-brought up again after a pause. The pause is 0.1 s and doubles with each defect, up to 1 s; a boot-up of the
-node ends the pause. After an exception raised while serving a bus, the bus pauses, or its interface is closed
-and reopened, with pauses of the same length. If an exception is raised while serving a subscriber, a callback
-or a tap, only the item for that recipient is lost. All exceptions are counted by subject
-(``Host.stats().defects``), published as events, and logged once for each distinct message; see
-:mod:`skinnode.host.containment`.
+**Containment.** Exceptions do not end the host's threads. If an exception is raised while serving a patch,
+the patch is marked faulty, and the exception is recorded as the reason. The scans of a faulty patch are
+withheld, and the patch is brought up again after a pause. The pause starts at 0.1 s and doubles after each
+exception, up to 1 s; a boot-up message from the node ends the pause early. After an exception raised while
+serving a bus, the host either stops serving the bus for a pause of the same length, or closes and reopens the
+bus interface. If an exception is raised while serving a subscriber, a callback or a tap, only the item for
+that recipient is lost. All exceptions are counted by subject (``Host.stats().defects``) and published as
+events. Each distinct exception message is logged once; see :mod:`skinnode.host.containment`.
 
 ==========  ==============================  ==============================  ==============================
 thread      calls                           an exception there affects      recovers

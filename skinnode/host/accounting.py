@@ -1,6 +1,6 @@
-"""Check that a host's counters add up: every received frame must be passed on or counted as lost.
+"""Check that a host's counters add up: every received frame must have been passed on or counted as lost.
 
-Counters are not read at the same instant, so the sums agree only if the host is closed or idle.
+The host's counters are read one after another, so their sums agree only if the host is closed or idle.
 """
 
 from __future__ import annotations
@@ -13,7 +13,8 @@ from skinnode.text.words import counted
 
 
 def discrepancies(stats: HostStats) -> list[str]:
-    """Return one line for each counter that differs from its sum; an empty list if all counters agree.
+    """Return one line for each host counter that differs from the sum of its parts; an empty list if none
+    differs.
 
     ===========  ==========================================================================================
     bus          frames read = received + ignored + error frames + dropped + waiting
@@ -44,7 +45,9 @@ def discrepancies(stats: HostStats) -> list[str]:
 
 
 def losses_of_bus(bus: BusStats) -> dict[str, str]:
-    """Return a phrase for each nonzero loss or error counter of a bus, by counter name."""
+    """Return a dict from the name of each nonzero loss or error counter of a bus to a phrase with its
+    value.
+    """
     counts = (
         ("dropped", "frame dropped", "frames dropped"),
         ("kernel_dropped", "frame dropped by the kernel", "frames dropped by the kernel"),
@@ -56,7 +59,7 @@ def losses_of_bus(bus: BusStats) -> dict[str, str]:
 
 
 def losses_of_stream(stream: StreamStats) -> dict[str, str]:
-    """Return a phrase for each nonzero loss counter of a patch, by counter name."""
+    """Return a dict from the name of each nonzero loss counter of a patch to a phrase with its value."""
     assembler = stream.assembler
     counts = (
         ("scans_torn", "scan torn", "scans torn"),
@@ -70,7 +73,9 @@ def losses_of_stream(stream: StreamStats) -> dict[str, str]:
 
 
 def frames_counted(assembler: AssemblerStats) -> int:
-    """Return the total number of chunks and summaries counted by an assembler."""
+    """Return the number of chunks and summaries that a scan assembler has received, including rejected
+    frames.
+    """
     return (
         assembler.chunks_accepted
         + assembler.summaries_accepted

@@ -1,10 +1,9 @@
 """Predict when a patch's next scan will end, so that the receiver can let frames accumulate until then.
 
 On a fully loaded bus, a scan does not always end one period after the previous scan. If heartbeats delay the
-frames from several nodes, the end may alternate between two instants within the period. In
-``bench pipeline``, every fifth scan ended 12 ms later than the others; without heartbeats, the end did not
-alternate. The prediction therefore includes each instant within the period at which one of the most recent
-scans ended.
+frames from several nodes, scans may end alternately at two phases of the scan period. In ``bench pipeline``,
+every fifth scan ended 12 ms later than the others; without heartbeats, all scans ended at the same phase. The
+prediction therefore covers every phase of the period at which a recent scan has ended.
 """
 
 from __future__ import annotations
@@ -13,16 +12,19 @@ from collections import deque
 from typing import Final
 
 REMEMBERED: Final = 8
-"""Number of most recent scan ends used for the prediction."""
+"""Number of recent scans whose end times are used to predict the end of the next scan."""
 APART_NS: Final = 1_000_000
-"""Maximum difference between two scan ends that count as the same instant within the period, ns. Stuff bits
-and the SYNC producer's clock cause smaller differences."""
+"""Maximum difference (ns) between two scan ends that are treated as the same phase of the scan period.
+Differences caused by stuff bits and by the SYNC producer's clock are smaller.
+"""
 MOST: Final = 3
-"""Maximum number of predicted instants; if recent scans ended at more instants, no prediction is made."""
+"""Maximum number of predicted end times; if recent scans ended at more phases of the period, no prediction is
+made.
+"""
 
 
 class ArrivalPredictor:
-    """Predictor of the end of a patch's next scan, given the scan period. Owned by one thread."""
+    """Predictor of the time at which a patch's next scan will end. Not thread-safe."""
 
     def __init__(self, period_ns: int) -> None:
         self._period_ns = period_ns
@@ -34,13 +36,13 @@ class ArrivalPredictor:
         Args:
             t_ns: Monotonic time at which the scan ended, ns.
 
-        Returns:
-            Possible monotonic end times in ascending order, ns; empty if no prediction is possible.
+        Returns:             Possible end times of the next scan (monotonic, ns, ascending); empty if no
+            prediction is possible.
         """
         period_ns, ends = self._period_ns, self._ends
         ends.appendleft(t_ns)
         due: list[int] = []
-        for end_ns in ends:  # newest first: the newest end is the best predictor
+        for end_ns in ends:  # newest first, because the newest end predicts best
             due_ns = end_ns + ((t_ns - end_ns + period_ns // 2) // period_ns + 1) * period_ns
             for other_ns in due:
                 if -APART_NS < due_ns - other_ns < APART_NS:

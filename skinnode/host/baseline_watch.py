@@ -1,4 +1,4 @@
-"""Reread the baseline and the error register of running nodes if they may have changed."""
+"""Reread a running node's baseline or error register if the value may have changed."""
 
 from __future__ import annotations
 
@@ -17,25 +17,26 @@ from skinnode.process import clock
 _log = logging.getLogger(__name__)
 
 _DOUBT_NS: Final = 2_000_000_000
-"""Minimum interval between readings of a baseline that may have changed unnoticed, ns."""
+"""Minimum interval (ns) between two reads of a baseline that may have changed without an announcement."""
 
 _REGISTER_NS: Final = 500_000_000
-"""Minimum interval between readings of a nonzero error register, ns. The emergency message that clears an
-error may be lost, but the patch must count as operational within a second after the end of the error. The
-register readings require four SDO frames per second."""
+"""Minimum interval (ns) between two reads of a nonzero error register. A patch must be reported as
+operational within a second after its error ends, even if the emergency message that clears the error is lost.
+The reads add four SDO frames per second to the bus load.
+"""
 
 
 class BaselineWatch:
-    """Reader of the baselines and error registers of running nodes. Owned by the supervisor's thread.
+    """Reader of the baselines and error registers of running nodes. Used only by the supervisor's thread.
 
-    SDO transfers run on ``pool``, with at most one job per node at a time.
+    SDO transfers run as jobs on ``pool``; each node has at most one job at a time.
     """
 
     def __init__(self, pool: Executor) -> None:
         self._pool = pool
 
     def look(self, node: Supervised, now_ns: int) -> None:
-        """Reread the baseline if the node announced a new baseline, or may have done so in a lost summary.
+        """Reread a node's baseline if the node has announced a new baseline or a summary was lost.
 
         After an announcement, scans are withheld until the new baseline has been read.
         """
@@ -70,7 +71,7 @@ class BaselineWatch:
             return
 
         def read() -> Joined | None:
-            with contextlib.suppress(BusError, ConfigError):  # the register will be read again
+            with contextlib.suppress(BusError, ConfigError):  # the register is read again later
                 remote.renew_register()
             return None
 
@@ -78,13 +79,13 @@ class BaselineWatch:
         node.job = self._pool.submit(read)
 
     def _take_baseline(self, node: Supervised, job: Future[Joined | None], now_ns: int) -> None:
-        if job.exception() is None and job.result() is None:  # this job only read the error register
+        if job.exception() is None and job.result() is None:  # the finished job read only the error register
             return
         remote, stream = node.remote, node.remote.stream
         node.read_ns = now_ns + (LEAST_NS if stream.withholding else _DOUBT_NS)
         try:
             read = job.result()
-        except (BusError, ConfigError) as error:  # a node that has gone is detected by its missing heartbeats
+        except (BusError, ConfigError) as error:  # a missing node is detected by the heartbeat timeout
             stream.doubtful = True
             _log.warning("%s; reading its baseline again", error)
             return
@@ -97,15 +98,15 @@ class BaselineWatch:
         solver = read.solver
         if solver is not None:
             remote.link.call(lambda: stream.resume(solver, read.withholdings, anew=False), remote.defects)
-            node.announced = True  # set even if the announcement was in a lost summary
+            node.announced = True  # the announcement may have been in a lost summary
             note_baseline(node)
 
 
 def note_baseline(node: Supervised) -> None:
-    """Record the baseline with which scans are now solved, and count a new baseline.
+    """Record the baseline that the solver now uses, and increment the node's baseline count if it is new.
 
-    A new baseline may also be found during bring-up, after a failed reading or a change while the node was
-    absent.
+    A new baseline may also be found during bring-up, if an earlier read failed or the baseline changed while
+    the node was absent.
     """
     facts, before = node.remote.facts, node.baseline_ohm
     assert facts is not None  # called only after bring-up

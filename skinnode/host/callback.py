@@ -1,4 +1,6 @@
-"""Call a user's function with each field, on a separate thread, so that the calls delay no other work."""
+"""Call a user's function with each field on a separate thread, so that a slow function does not delay the
+host.
+"""
 
 from __future__ import annotations
 
@@ -17,15 +19,15 @@ from skinnode.process import clock
 _log = logging.getLogger(__name__)
 
 LAST_CALL_S: Final = 1.0
-"""Maximum wait for a running call while a callback or the host ends, s."""
+"""Maximum time (s) to wait for a running call when a callback or the host is closed."""
 
 
 class FieldCallback:
-    """Callback that passes each field to a user's function, until :meth:`close` or until the host closes.
+    """Callback that passes each field to a user's function until the callback or the host is closed.
 
-    If the function raises exceptions, they are counted, the first exception is logged with its traceback, and
-    later fields are still delivered. Threads: a dedicated thread calls the function; any thread may call the
-    methods.
+    Exceptions raised by the function are counted, and the first one is logged with its traceback; later
+    fields are still delivered. Threads: a dedicated thread calls the user's function; the callback's methods
+    may be called from any thread.
     """
 
     def __init__(
@@ -51,12 +53,16 @@ class FieldCallback:
         return self._failed
 
     def close(self) -> None:
-        """Stop the calls, and wait up to a second for a running call. The function itself may call this."""
+        """Stop calling the user's function, and wait up to a second for a running call. The user's function
+        may call ``close``.
+        """
         self._fields.end()
         self.join()
 
     def join(self) -> None:
-        """Wait up to a second for the last call to return, and log a warning if the call does not return."""
+        """Wait up to a second for the last call of the user's function to return, and log a warning if it
+        does not.
+        """
         if self._thread is threading.current_thread():
             return
         self._thread.join(LAST_CALL_S)
@@ -65,14 +71,16 @@ class FieldCallback:
 
     @property
     def ended(self) -> bool:
-        """Whether calls to the function have ended."""
+        """Whether the user's function will not be called again."""
         return not self._thread.is_alive()
 
     def _run(self) -> None:
         keep_on(self._turn, self._defects, "waiting for a field")
 
     def _turn(self) -> bool:
-        """Wait for the next field and pass it to the function. Returns False if no further fields follow."""
+        """Wait for the next field and pass it to the user's function. Return False if there are no more
+        fields.
+        """
         try:
             field = self._fields.take(None)
         except SkinError as error:  # every subscriber receives the error that stopped the host
@@ -90,14 +98,14 @@ class FieldCallback:
 
 
 class Callbacks:
-    """Callbacks of a host. Exceptions raised outside users' functions are reported to ``defects``."""
+    """Callbacks of a host. Exceptions from the host's own code are reported to ``defects``."""
 
     def __init__(self, defects: Defects | None = None) -> None:
         self._defects = defects
         self._all: list[FieldCallback] = []
 
     def add(self, function: Callable[[FieldFrame], object], fields: Subscription) -> FieldCallback:
-        """Start calling ``function`` with the fields of a subscription.
+        """Start a callback that passes a subscription's fields to ``function``.
 
         Raises:
             TypeError: if ``function`` is not callable, or is async.
@@ -112,7 +120,7 @@ class Callbacks:
         return callback
 
     def join(self) -> None:
-        """Wait for all callbacks to end. The callbacks' subscriptions must have ended before the call."""
+        """Wait for all callbacks to end. The caller must first end the callbacks' subscriptions."""
         for callback in self._all:
             callback.join()
 

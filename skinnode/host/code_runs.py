@@ -1,10 +1,11 @@
-"""Track how often each crossing's code has repeated, and how its neighbours changed meanwhile.
+"""Track how often each crossing's code has repeated, and how far the neighbours' codes changed in that time.
 
-A crossing's *run* is the number of scans in which its code has been repeated without a change. A crossing's
+A crossing's *run* is the number of consecutive scans that have repeated its code. A crossing's
 *lead* measures how far the codes of its neighbours have changed since the run began. The lead along the upper
 wire is the smaller of the changes of the two neighbours on the same upper wire, or 0 if the changes have
-different signs. The lead across is the same quantity for the two neighbours on the same lower wire. A
-crossing at the edge has the two nearest crossings on one side as neighbours.
+different signs. The lead along the lower wire (``ACROSS``) is defined in the same way for the two neighbours
+on the same lower wire. For a crossing at the edge, the neighbours are the two nearest crossings on the inner
+side.
 """
 
 from __future__ import annotations
@@ -18,33 +19,41 @@ from skinnode.compiled.jit import njit_brief, njit_part
 from skinnode.protocol.codes import MISSING as _MISSING
 
 LAST, BEFORE, RUN, NAMED, ALONG, ACROSS, _ANCHORS = range(7)
-"""Planes of the state array: last code (-1 before the first code), previous code, run, whether the crossing
-belongs to a part already detected as frozen, lead along the upper wire, lead across. Four further planes
-contain the neighbours' codes at the beginning of the run."""
+"""Planes of the state array: last code (-1 before the first code), previous code, run, flag of a crossing in
+a part already detected as frozen, lead along the upper wire, lead along the lower wire. Four further planes
+store the neighbours' codes from the scan in which the run began.
+"""
 _PLANES: Final = 10
 
 UPPER, LOWER, CROSSING, WIRE_LEAD, CROSSING_LEAD, STEPS, FRESH = range(7)
-"""Indices of the limits. ``UPPER``, ``LOWER`` and ``CROSSING``: minimum run of a frozen upper wire, lower
-wire and crossing. ``WIRE_LEAD`` and ``CROSSING_LEAD``: minimum lead of a crossing as evidence that its wire,
-or the crossing itself, is frozen. ``STEPS``: highest code of a measurement. ``FRESH``: 1 if the scan contains
-every code, 0 if unchanged codes were not sent and a repeated code is therefore no evidence."""
+"""Indices of the limits. ``UPPER``, ``LOWER`` and ``CROSSING``: minimum runs for which an upper wire, a lower
+wire and a crossing are considered frozen. ``WIRE_LEAD`` and ``CROSSING_LEAD``: minimum leads at which a
+repeated code is evidence of a frozen wire and of a frozen crossing. ``STEPS``: highest code that represents a
+measurement. ``FRESH``: 1 if the node sent every code of the scan; 0 if the node omitted unchanged codes, so
+that a repeated code is no evidence of a frozen part.
+"""
 MEASURED, CHANGED, RETURNED, LARGEST, RESERVED, LEAST, RELEASED, SUSPECT = range(8)
-"""Indices of the results. ``MEASURED``, ``CHANGED`` and ``RETURNED``: number of crossings with a measurement,
-with a changed code, and with a code that returned to its previous value. ``LARGEST``: largest change of any
-code. ``RESERVED``: number of crossings whose last code is reserved. ``LEAST``: smallest code. ``RELEASED``:
-number of changed crossings in parts detected as frozen. ``SUSPECT``: whether a further part may be frozen."""
+"""Indices of the results. ``MEASURED``: number of crossings with a measurement. ``CHANGED``: number of
+crossings whose code changed. ``RETURNED``: number of crossings whose code returned to its previous value.
+``LARGEST``: largest change of a code. ``RESERVED``: number of crossings whose last code is reserved.
+``LEAST``: smallest code. ``RELEASED``: number of changed crossings in parts detected as frozen. ``SUSPECT``:
+1 if another part may be frozen, otherwise 0.
+"""
 
 LEAST_RUN: Final = 5
-"""Minimum run of a frozen crossing, of a frozen part without noise and of a frozen patch, scans. For a wire
-whose neighbours have changed, a run of one scan is enough."""
+"""Minimum number of repeated scans after which a crossing, a noise-free part or a patch is considered frozen.
+A wire whose neighbours have changed is considered frozen after a single repeated scan.
+"""
 LEADS: Final = 3
-"""Minimum number of crossings with changed neighbours for a wire with constant codes to count as frozen."""
+"""Minimum number of a wire's crossings whose neighbours must have changed before the wire is considered
+frozen.
+"""
 
 _Int = NDArray[np.int64]
 
 
 def new_runs(shape: tuple[int, int]) -> _Int:
-    """Return the state array before the first scan, (10, U, K) int64."""
+    """Return a new (10, U, K) int64 state array, as needed before the first scan."""
     state = np.zeros((_PLANES, *shape), np.int64)
     state[LAST] = state[BEFORE] = -1
     return state
@@ -93,7 +102,7 @@ def follow(codes: NDArray[np.uint32], state: _Int, limits: _Int, found: _Int) ->
 
 @njit_part
 def _update_leads(state: _Int, steps: int) -> None:
-    """Update the leads, and store the neighbours' codes at the beginning of each run."""
+    """Update all leads; for each run that begins, store the neighbours' current codes."""
     rows, columns = state.shape[1], state.shape[2]
     for u in range(rows):
         for k in range(columns):
@@ -109,13 +118,13 @@ def _update_leads(state: _Int, steps: int) -> None:
 
 @njit_part
 def _one(here: int) -> int:
-    """Return the number of the first neighbour of a wire."""
+    """Return the index of a wire's first neighbour."""
     return 1 if here == 0 else here - 1
 
 
 @njit_part
 def _two(here: int, size: int) -> int:
-    """Return the number of the second neighbour of a wire, among ``size`` wires."""
+    """Return the index of a wire's second neighbour on a side with ``size`` wires."""
     if here == 0:
         return 2
     return size - 3 if here == size - 1 else here + 1
@@ -140,13 +149,15 @@ def _set_lead(state: _Int, u: int, k: int, axis: int, a: int, b: int, steps: int
 
 @njit_part
 def _counts(state: _Int, u: int, k: int, steps: int) -> bool:
-    """Return whether a crossing's last code is a measurement, and the crossing is not marked as frozen."""
+    """Return whether a crossing's last code is a measurement and the crossing is not marked as frozen."""
     return bool(0 <= state[LAST, u, k] <= steps and state[NAMED, u, k] == 0)
 
 
 @njit_part
 def _any_crossing(state: _Int, limits: _Int) -> bool:
-    """Return whether a crossing repeats its code while its neighbours change, or longer than most others."""
+    """Return whether a crossing's code stays constant while its neighbours' codes change, or for longer than
+    most other crossings' codes.
+    """
     known = still = longest = 0
     lead = limits[CROSSING_LEAD]
     for u in range(state.shape[1]):
@@ -164,7 +175,9 @@ def _any_crossing(state: _Int, limits: _Int) -> bool:
 
 @njit_part
 def _any_wire(state: _Int, limits: _Int) -> bool:
-    """Return whether a wire repeats its codes while its neighbours change, or longer than most crossings."""
+    """Return whether a wire's codes stay constant while its neighbours' codes change, or for longer than the
+    codes of most crossings.
+    """
     for side in range(2):
         wires, others = state.shape[1 + side], state.shape[2 - side]
         known = still = 0
@@ -189,7 +202,9 @@ def _any_wire(state: _Int, limits: _Int) -> bool:
 
 
 def compile_kernels() -> None:
-    """Compile the kernel for read-only codes, or load it from the cache, before the first scan arrives."""
+    """Compile the kernel for read-only code arrays, or load the compiled kernel from the cache, before the
+    first scan arrives.
+    """
     codes = np.zeros((1, 1), np.uint32)
     codes.setflags(write=False)
     follow(codes, new_runs((1, 1)), np.zeros(7, np.int64), np.zeros(8, np.int64))

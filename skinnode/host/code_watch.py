@@ -1,7 +1,7 @@
-"""Check the codes of a patch scan by scan: is its converter running, and which parts are faulty?
+"""Check the codes of each scan to detect a stopped converter and faulty parts of the patch.
 
-Before a scan is solved, :meth:`CodeWatch.judge` compares the scan's codes with the previous codes, in about
-5 µs. The resulting :class:`Verdict` states whether the field can be trusted
+Before a scan is solved, :meth:`CodeWatch.judge` compares the scan's codes with the previous codes; the
+comparison takes about 5 µs. The resulting :class:`Verdict` states whether the field can be trusted
 (:mod:`skinnode.host.converter_liveness`), which frozen crossings are left out of the field
 (:mod:`skinnode.host.frozen_parts`), and which wires are open or shorted according to their codes. After the
 fields of all patches have been published, :meth:`CodeWatch.on_scan` searches for noisy and drifting wires
@@ -36,21 +36,23 @@ class Verdict:
     """Result of checking the codes of a scan."""
 
     distrust: str = ""
-    """Reason why the scan's field must not be trusted, in words; empty if there is no reason."""
+    """Human-readable reason why the scan's field is not trusted; empty if the field is trusted."""
     faults: tuple[DataFault, ...] = ()
     """Faults found: frozen patch, frozen wires and crossings, open and shorted wires."""
     left_out: NDArray[np.bool_] | None = None
-    """(U, K) bool: crossings to leave out of the solve; None if all crossings are used."""
+    """(U, K) bool: True for each crossing to be left out of the solve; None if all crossings are used."""
 
     def admitted(self, scan: Scan) -> Scan:
-        """Return the scan with the left-out crossings marked as missing."""
+        """Return a copy of the scan in which the crossings left out of the solve are marked as missing."""
         if self.left_out is None:
             return scan
         codes = np.where(self.left_out, np.uint32(MISSING), scan.codes)
         return replace(scan, codes=codes, valid=scan.valid & ~self.left_out)
 
     def applied(self, field: FieldFrame) -> FieldFrame:
-        """Return the scan's field with these faults added; not trusted if the patch may be frozen."""
+        """Return the scan's field with the detected faults added; the field is marked as not trusted if the
+        patch may be frozen.
+        """
         if not (self.faults or self.distrust):
             return field
         faults = (*self.faults, *field.faults)
@@ -76,19 +78,19 @@ class CodeWatch:
         self._scale, self._relative_noise = scale, relative_noise
         self._windows = WireWindows(scale, relative_noise)
         self._life = ConverterLiveness(scale, relative_noise)
-        self._parts: FrozenParts | None = None  # created at the first scan, when the shape is known
+        self._parts: FrozenParts | None = None  # created at the first scan, which determines the array shape
         self._state = code_runs.new_runs((0, 0))
         self._found = np.zeros(8, np.int64)
         code_runs.compile_kernels()
         self._seen_windows = 0
         self._broken: tuple[WireFault, ...] = ()
-        # number of the first scan with each broken wire and, under the key None, with a frozen patch
+        # broken wire (None: the whole patch) -> number of the scan in which the fault was first found
         self._since: dict[WireFault | None, int] = {}
         self._verdict = FAULTLESS
 
     @property
     def alive(self) -> Alive:
-        """Whether the converter was running at the newest scan."""
+        """State of the patch's converter as of the newest scan."""
         return self._life.alive
 
     @property
@@ -98,12 +100,12 @@ class CodeWatch:
 
     @property
     def words(self) -> str:
-        """Reason why the converter may not be running, in words; empty if it is running."""
+        """Human-readable reason why the converter may not be running; empty if the converter is running."""
         return self._life.words
 
     @property
     def wires(self) -> tuple[WireFault, ...]:
-        """Faults of all open, shorted, noisy and drifting wires."""
+        """Faults found so far: open, shorted, noisy and drifting wires."""
         return tuple(sorted({*self._broken, *self._windows.wires}))
 
     def judge(self, scan: Scan, number: int | None = None) -> Verdict:
@@ -163,6 +165,6 @@ class CodeWatch:
         return Verdict(distrust, (*faults, *parts.faults), parts.left_out)
 
     def on_scan(self, scan: Scan) -> None:
-        """Include a scan in the search for noisy and drifting wires, after :meth:`judge`."""
+        """Add a scan to the search for noisy and drifting wires. Call :meth:`judge` with the scan first."""
         if scan.complete and not scan.flags & _CHANGED_ONLY:
             self._windows.on_scan(scan)

@@ -1,8 +1,9 @@
-"""Configure a node: wait for it, check its identity and layout, write its parameters, read its baseline.
+"""Configure a node: wait for its response, check its identity and layout, write its parameters, read its
+baseline.
 
-Nothing is written before the node's identity and layout have been found to match the hand file, because the
-node could be a different device, such as a motor drive. Every written value is read back. On a bus that
-another master runs, the host sends no NMT commands, does not change the SYNC parameters, and writes
+The host writes to a node only after checking its identity and layout against the hand file, because the node
+could be a different device, such as a motor drive. The host reads back every parameter that it writes. On a
+bus that another master runs, the host sends no NMT commands, does not change the SYNC parameters, and writes
 patch-specific parameters only if they differ. If the host is not allowed to send any frame (``guest_sends =
 "nothing"``), all information about the node comes from files.
 """
@@ -32,7 +33,9 @@ from skinnode.protocol.profile import PatchProfile
 from skinnode.text.words import counted
 
 BOOT_DEADLINE_S: Final = 3.0
-"""Maximum time until the first response from a node, s. Nodes boot and tare themselves within a second."""
+"""Maximum time (s) to wait for a node's first response. A node takes less than a second to boot and tare
+itself.
+"""
 
 HEARTBEATS_WATCHED: Final = 3
 """Number of consecutive heartbeats from the host that a node may miss before the node stops sending."""
@@ -44,7 +47,7 @@ _POLL_S: Final = 0.02
 class Configurator:
     """Configurator for the nodes on one bus.
 
-    Threads: several nodes may be configured in parallel, each by one thread.
+    Threads: several nodes may be configured in parallel, each on its own thread.
     """
 
     send: Callable[[int, bytes], None]
@@ -52,29 +55,28 @@ class Configurator:
     bus: BusConfig
     boot_deadline_s: float
     abandoned: Callable[[], bool]
-    """Function called repeatedly during configuration, which raises Abandoned if the function returns
-    True."""
+    """Function called repeatedly during configuration; if it returns True, the configuration stops and raises
+    Abandoned.
+    """
     on_answer: Callable[[PatchConfig], None]
-    """Function called for each node after the node's first response."""
+    """Function called once per node, after the node's first response."""
     search: Callable[[PatchConfig], object]
     """Function that searches for a silent node by its serial number."""
 
     def configure(self, patch: PatchConfig, profile: PatchProfile, remote: RemoteOd) -> NodeFacts:
         """Wait for the node, check its identity and configure it.
 
-        On a bus where the host is the master, the node is pre-operational afterwards.
+        If the host is the NMT master of the bus, the node is pre-operational after the call.
 
         Args:
             patch: Configuration of the patch from the hand file.
             profile: Wire format of the patch.
             remote: Object dictionary of the patch's node.
 
-        Raises:
-            NodeTimeout: if the node does not respond in time.
-            NodeError: if the node is not the patch in the hand file, or does not keep its configuration.
-            SdoAbort: if the node refuses a transfer.
-            ConfigError: if the baseline file does not match the patch.
-            Abandoned: if ``abandoned`` returned True.
+        Raises:             NodeTimeout: if the node does not respond before the timeout. NodeError: if the
+            node is not the patch in the hand file, or does not keep its configuration. SdoAbort: if the node
+            refuses a transfer. ConfigError: if the baseline file does not match the patch. Abandoned: if
+            ``abandoned`` returned True.
         """
         if not (self.bus.role == "master" or self.bus.guest_sends == "sdo"):
             return self._from_files(patch, profile)
@@ -100,7 +102,7 @@ class Configurator:
         )
 
     def _from_files(self, patch: PatchConfig, profile: PatchProfile) -> NodeFacts:
-        assert patch.baseline is not None  # ensured by the check of the hand file
+        assert patch.baseline is not None  # the hand file was checked when loaded
         baseline_ohm = load_baseline(patch.baseline, profile)
         scale, heartbeat_s = CodeScale(patch.code_bits), self.hand.bring_up.heartbeat_s
         return NodeFacts(patch, patch.layout.build(), profile, scale, baseline_ohm, None, heartbeat_s)
@@ -121,7 +123,7 @@ class Configurator:
                 )
 
     def _identify(self, patch: PatchConfig, remote: RemoteOd) -> tuple[int, int]:
-        """Check the node's identity. Returns the serial number and the revision number."""
+        """Check the node's identity. Return the node's serial number and revision number."""
         for subindex, what, expected in (
             (od.IDENTITY_VENDOR, "vendor-ID", od.VENDOR_ID),
             (od.IDENTITY_PRODUCT, "product code", od.PRODUCT_CODE),
@@ -160,7 +162,7 @@ class Configurator:
         return layout
 
     def _read_layout(self, patch: PatchConfig, profile: PatchProfile, remote: RemoteOd) -> PatchLayout:
-        """Return the layout that is defined by the electrode coordinates stored in the node."""
+        """Return the layout defined by the electrode coordinates that the node stores."""
         self._go_on()
         data = remote.read_block(od.COORDINATES)
         resistivity = remote.read(od.DESCRIPTOR, od.RESISTIVITY, "f32")
@@ -170,7 +172,9 @@ class Configurator:
             raise _mismatch(patch, "electrode coordinates", counted(len(data), "byte"), str(error)) from None
 
     def _configure_communication(self, remote: RemoteOd) -> None:
-        """Write the parameters that only a master may set: SYNC, and the monitored heartbeat."""
+        """Write the parameters that only a master may set: the SYNC parameters and the node's heartbeat
+        consumer entry.
+        """
         self._go_on()
         sync = self.hand.sync
         remote.write_checked(od.COB_ID_SYNC, 0, "u32", od.SYNC_COB_ID)
@@ -198,7 +202,9 @@ class Configurator:
     def _configure_patch(
         self, patch: PatchConfig, profile: PatchProfile, remote: RemoteOd, *, master: bool
     ) -> None:
-        """Write the patch-specific parameters, which define when the patch scans and how it sends."""
+        """Write the patch-specific parameters, which define when the patch scans and how it sends the
+        scans.
+        """
         sync = self.hand.sync
         if not master:
             overflow = remote.read(od.SYNC_COUNTER_OVERFLOW, 0, "u8")
@@ -228,7 +234,9 @@ class Configurator:
                 remote.write_checked(index, sub, size, value)
 
     def _check_mapping(self, patch: PatchConfig, profile: PatchProfile, remote: RemoteOd) -> None:
-        """Check that the PDO mapping is the mapping that the decoder expects for the node's revision."""
+        """Check that the node's PDO mapping matches the mapping that the decoder expects for the node's
+        revision.
+        """
         expected = {item.index: item for item in profile.objects()}
         for index in (od.TPDO1_MAPPING, od.TPDO2_MAPPING):
             count = int(expected[index][0].default or 0)
@@ -242,9 +250,10 @@ class Configurator:
                     raise _mismatch(patch, what, f"0x{mapped:08X}", f"0x{entry:08X}")
 
     def settle_baseline(self, patch: PatchConfig, profile: PatchProfile, remote: RemoteOd) -> Float:
-        """Return the node's baseline, after writing the baseline from the hand's baseline file if it differs.
+        """Return the node's baseline; if the hand file names a baseline file with other values, write those
+        values first.
 
-        A node that is still taring itself returns zeros, and must finish before the boot deadline.
+        A node returns zeros while it tares itself; the tare must finish before the boot deadline.
 
         Returns:
             (U, K) ohm: resistances at rest.
@@ -280,8 +289,8 @@ class Configurator:
         """Read the baseline as one block, or value by value if the node does not support block transfer.
 
         For 300 values, a block transfer requires 176 frames, and single reads require 600 frames. At 1
-        Mbit/s, the block transfer takes 86 ms at the node's own pace, and the single reads take 75 ms plus
-        300 response times. Single reads never occupy the whole bus.
+        Mbit/s, the block transfer takes 86 ms because the node sends its segments at a limited rate; the
+        single reads take 75 ms plus 300 response times. Single reads leave bus time for other frames.
         """
         try:
             data = remote.read_block(od.BASELINE_DOMAIN, 4 * profile.n_codes)
@@ -305,7 +314,7 @@ class Configurator:
 
 
 def is_configured(patch: PatchConfig, hand: HandConfig, remote: RemoteOd) -> bool:
-    """Return whether a node still has the parameters without which it does not send scans.
+    """Return whether a node still has the parameter values that it needs to send scans.
 
     The parameters are wrong if the node was reset unnoticed during bring-up, or if another master configured
     the node.
@@ -325,7 +334,8 @@ def is_configured(patch: PatchConfig, hand: HandConfig, remote: RemoteOd) -> boo
 
 
 def _open_window(remote: RemoteOd) -> None:
-    """Disable the synchronous window (0x1007), because a summary is sent only after its whole scan.
+    """Disable the synchronous window (0x1007): a node sends the summary after the whole scan, which may be
+    after the end of the window.
 
     A node without object 0x1007 has no synchronous window.
     """
@@ -339,8 +349,8 @@ def _open_window(remote: RemoteOd) -> None:
 def _watch_master(remote: RemoteOd, watched: int) -> None:
     """Make the node monitor the host's heartbeat, using entry 1 of object 0x1016.
 
-    The other entries stay unchanged, except that another entry with the host's node-ID is cleared, because a
-    node-ID may occur only once.
+    If another entry contains the host's node-ID, that entry is cleared, because a node-ID may occur only
+    once. All other entries stay unchanged.
     """
     try:
         remote.write_checked(od.HEARTBEAT_CONSUMER, 1, "u32", watched)

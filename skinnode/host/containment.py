@@ -1,7 +1,7 @@
 """Contain exceptions in the host's threads.
 
 An exception raised while serving one subject (a patch, a bus or a subscriber) is reported to that subject's
-:class:`Defects`, and does not affect other subjects. The operation is then retried. The table in
+:class:`Defects` and does not affect other subjects. The failed operation is then retried. The table in
 :mod:`skinnode.host` lists the effects of an exception in each thread.
 """
 
@@ -21,16 +21,18 @@ _log = logging.getLogger(__name__)
 
 _BRIEF_S: Final = 0.001
 _LONGEST_BRIEF_S: Final = 0.02
-"""First and longest pause after an exception in a loop that serves several subjects, s. The pauses are short,
-because the failure of one subject must not delay the others."""
+"""First and longest pause (s) after an exception in a loop that serves several subjects. The pauses are short
+because a failure in one subject must not delay the others.
+"""
 
 _COMPLAINTS: Final = 64
-"""Maximum number of logged messages remembered per subject. After this number of distinct messages, messages
-may be logged again."""
+"""Maximum number of logged messages remembered per subject. After this number of distinct messages, an
+earlier message may be logged again.
+"""
 
 
 def one_line(error: BaseException | None) -> str:
-    """Return the type and the message of an exception as one line."""
+    """Return an exception's type and message as one line."""
     text = " ".join(str(error).split())
     return f"{type(error).__name__}: {text}" if text else type(error).__name__
 
@@ -45,10 +47,10 @@ class DefectStats:
 
 
 class Defects:
-    """Collector of the exceptions raised while serving ``subject``; thread-safe.
+    """Thread-safe record of the exceptions raised while serving ``subject``.
 
-    The first occurrence of each distinct message is passed to ``on_new`` and logged, as one line at level
-    WARNING and with the traceback at level DEBUG.
+    When a distinct message first occurs, the message is passed to ``on_new``, logged as one line at level
+    WARNING, and logged with the traceback at level DEBUG.
     """
 
     def __init__(self, subject: str, on_new: Callable[[SkinError], object] = lambda error: None) -> None:
@@ -84,7 +86,7 @@ class Defects:
             self._logged.add(text)
         if known:
             return
-        with contextlib.suppress(Exception):  # the program's log handlers may raise
+        with contextlib.suppress(Exception):  # the application's log handlers may raise exceptions
             _log.warning("%s: %s; retrying", self.subject, text)
             _log.debug("%s: %s", self.subject, text, exc_info=error)
         failure = SkinError(f"{self.subject}: {text}")

@@ -13,8 +13,7 @@ from skinnode.text.words import counted
 
 
 def discrepancies(stats: HostStats) -> list[str]:
-    """Return one line for each host counter that differs from the sum of its parts; an empty list if none
-    differs.
+    """Return one line for each host counter that differs from the sum of its parts.
 
     ===========  ==========================================================================================
     bus          frames read = received + ignored + error frames + dropped + waiting
@@ -45,9 +44,7 @@ def discrepancies(stats: HostStats) -> list[str]:
 
 
 def losses_of_bus(bus: BusStats) -> dict[str, str]:
-    """Return a dict from the name of each nonzero loss or error counter of a bus to a phrase with its
-    value.
-    """
+    """Return a phrase for each nonzero loss or error counter of a bus; the keys are counter names."""
     counts = (
         ("dropped", "frame dropped", "frames dropped"),
         ("kernel_dropped", "frame dropped by the kernel", "frames dropped by the kernel"),
@@ -59,7 +56,7 @@ def losses_of_bus(bus: BusStats) -> dict[str, str]:
 
 
 def losses_of_stream(stream: StreamStats) -> dict[str, str]:
-    """Return a dict from the name of each nonzero loss counter of a patch to a phrase with its value."""
+    """Return a phrase for each nonzero loss counter of a patch; the keys are counter names."""
     assembler = stream.assembler
     counts = (
         ("scans_torn", "scan torn", "scans torn"),
@@ -73,9 +70,7 @@ def losses_of_stream(stream: StreamStats) -> dict[str, str]:
 
 
 def frames_counted(assembler: AssemblerStats) -> int:
-    """Return the number of chunks and summaries that a scan assembler has received, including rejected
-    frames.
-    """
+    """Return the number of frames that a scan assembler has accepted or rejected."""
     return (
         assembler.chunks_accepted
         + assembler.summaries_accepted

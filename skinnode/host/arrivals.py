@@ -36,8 +36,8 @@ class ArrivalPredictor:
         Args:
             t_ns: Monotonic time at which the scan ended, ns.
 
-        Returns:             Possible end times of the next scan (monotonic, ns, ascending); empty if no
-            prediction is possible.
+        Returns:
+            Possible end times of the next scan (monotonic, ns, ascending); empty if unpredictable.
         """
         period_ns, ends = self._period_ns, self._ends
         ends.appendleft(t_ns)

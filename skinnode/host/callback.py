@@ -1,6 +1,4 @@
-"""Call a user's function with each field on a separate thread, so that a slow function does not delay the
-host.
-"""
+"""Call a user's function with each field, on a separate thread so that the host is never delayed."""
 
 from __future__ import annotations
 
@@ -53,16 +51,15 @@ class FieldCallback:
         return self._failed
 
     def close(self) -> None:
-        """Stop calling the user's function, and wait up to a second for a running call. The user's function
-        may call ``close``.
+        """Stop calling the user's function, and wait up to a second for a running call.
+
+        The function itself may call ``close``.
         """
         self._fields.end()
         self.join()
 
     def join(self) -> None:
-        """Wait up to a second for the last call of the user's function to return, and log a warning if it
-        does not.
-        """
+        """Wait up to a second for the function's last call to return; log a warning if it does not."""
         if self._thread is threading.current_thread():
             return
         self._thread.join(LAST_CALL_S)
@@ -78,9 +75,7 @@ class FieldCallback:
         keep_on(self._turn, self._defects, "waiting for a field")
 
     def _turn(self) -> bool:
-        """Wait for the next field and pass it to the user's function. Return False if there are no more
-        fields.
-        """
+        """Pass the next field to the user's function. Return False if there are no more fields."""
         try:
             field = self._fields.take(None)
         except SkinError as error:  # every subscriber receives the error that stopped the host

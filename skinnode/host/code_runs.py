@@ -155,8 +155,10 @@ def _counts(state: _Int, u: int, k: int, steps: int) -> bool:
 
 @njit_part
 def _any_crossing(state: _Int, limits: _Int) -> bool:
-    """Return whether a crossing's code stays constant while its neighbours' codes change, or for longer than
-    most other crossings' codes.
+    """Return whether a crossing's code is suspiciously constant.
+
+    The code is suspicious if the neighbours' codes change in the meantime, or if most other crossings have
+    shorter runs.
     """
     known = still = longest = 0
     lead = limits[CROSSING_LEAD]
@@ -175,8 +177,10 @@ def _any_crossing(state: _Int, limits: _Int) -> bool:
 
 @njit_part
 def _any_wire(state: _Int, limits: _Int) -> bool:
-    """Return whether a wire's codes stay constant while its neighbours' codes change, or for longer than the
-    codes of most crossings.
+    """Return whether a wire's codes are suspiciously constant.
+
+    The codes are suspicious if the neighbours' codes change in the meantime, or if most crossings have
+    shorter runs.
     """
     for side in range(2):
         wires, others = state.shape[1 + side], state.shape[2 - side]
@@ -202,9 +206,7 @@ def _any_wire(state: _Int, limits: _Int) -> bool:
 
 
 def compile_kernels() -> None:
-    """Compile the kernel for read-only code arrays, or load the compiled kernel from the cache, before the
-    first scan arrives.
-    """
+    """Compile the kernel, or load it from the cache, before the first scan arrives."""
     codes = np.zeros((1, 1), np.uint32)
     codes.setflags(write=False)
     follow(codes, new_runs((1, 1)), np.zeros(7, np.int64), np.zeros(8, np.int64))

@@ -50,8 +50,9 @@ class Verdict:
         return replace(scan, codes=codes, valid=scan.valid & ~self.left_out)
 
     def applied(self, field: FieldFrame) -> FieldFrame:
-        """Return the scan's field with the detected faults added; the field is marked as not trusted if the
-        patch may be frozen.
+        """Return the scan's field with the detected faults added.
+
+        If the patch may be frozen, the returned field is marked as not trusted.
         """
         if not (self.faults or self.distrust):
             return field

@@ -1,11 +1,10 @@
-"""Configure a node: wait for its response, check its identity and layout, write its parameters, read its
-baseline.
+"""Configure a node: check its identity and layout, write its parameters, and read its baseline.
 
 The host writes to a node only after checking its identity and layout against the hand file, because the node
 could be a different device, such as a motor drive. The host reads back every parameter that it writes. On a
 bus that another master runs, the host sends no NMT commands, does not change the SYNC parameters, and writes
-patch-specific parameters only if they differ. If the host is not allowed to send any frame (``guest_sends =
-"nothing"``), all information about the node comes from files.
+patch-specific parameters only if they differ from the hand file. If the host is not allowed to send any frame
+(``guest_sends = "nothing"``), all information about the node comes from files.
 """
 
 from __future__ import annotations
@@ -73,10 +72,12 @@ class Configurator:
             profile: Wire format of the patch.
             remote: Object dictionary of the patch's node.
 
-        Raises:             NodeTimeout: if the node does not respond before the timeout. NodeError: if the
-            node is not the patch in the hand file, or does not keep its configuration. SdoAbort: if the node
-            refuses a transfer. ConfigError: if the baseline file does not match the patch. Abandoned: if
-            ``abandoned`` returned True.
+        Raises:
+            NodeTimeout: if the node does not respond before the timeout.
+            NodeError: if the node is not the patch in the hand file, or does not keep its configuration.
+            SdoAbort: if the node refuses a transfer.
+            ConfigError: if the baseline file does not match the patch.
+            Abandoned: if ``abandoned`` returned True.
         """
         if not (self.bus.role == "master" or self.bus.guest_sends == "sdo"):
             return self._from_files(patch, profile)
@@ -172,9 +173,7 @@ class Configurator:
             raise _mismatch(patch, "electrode coordinates", counted(len(data), "byte"), str(error)) from None
 
     def _configure_communication(self, remote: RemoteOd) -> None:
-        """Write the parameters that only a master may set: the SYNC parameters and the node's heartbeat
-        consumer entry.
-        """
+        """Write the node's SYNC and heartbeat consumer parameters, which only a master may set."""
         self._go_on()
         sync = self.hand.sync
         remote.write_checked(od.COB_ID_SYNC, 0, "u32", od.SYNC_COB_ID)
@@ -202,9 +201,7 @@ class Configurator:
     def _configure_patch(
         self, patch: PatchConfig, profile: PatchProfile, remote: RemoteOd, *, master: bool
     ) -> None:
-        """Write the patch-specific parameters, which define when the patch scans and how it sends the
-        scans.
-        """
+        """Write the parameters that define when the patch scans and how it sends its scans."""
         sync = self.hand.sync
         if not master:
             overflow = remote.read(od.SYNC_COUNTER_OVERFLOW, 0, "u8")
@@ -234,9 +231,7 @@ class Configurator:
                 remote.write_checked(index, sub, size, value)
 
     def _check_mapping(self, patch: PatchConfig, profile: PatchProfile, remote: RemoteOd) -> None:
-        """Check that the node's PDO mapping matches the mapping that the decoder expects for the node's
-        revision.
-        """
+        """Check that the node's PDO mapping is as the decoder expects for the node's revision."""
         expected = {item.index: item for item in profile.objects()}
         for index in (od.TPDO1_MAPPING, od.TPDO2_MAPPING):
             count = int(expected[index][0].default or 0)
@@ -250,8 +245,7 @@ class Configurator:
                     raise _mismatch(patch, what, f"0x{mapped:08X}", f"0x{entry:08X}")
 
     def settle_baseline(self, patch: PatchConfig, profile: PatchProfile, remote: RemoteOd) -> Float:
-        """Return the node's baseline; if the hand file names a baseline file with other values, write those
-        values first.
+        """Return the node's baseline, after writing the values of the hand's baseline file if they differ.
 
         A node returns zeros while it tares itself; the tare must finish before the boot deadline.
 
@@ -334,8 +328,7 @@ def is_configured(patch: PatchConfig, hand: HandConfig, remote: RemoteOd) -> boo
 
 
 def _open_window(remote: RemoteOd) -> None:
-    """Disable the synchronous window (0x1007): a node sends the summary after the whole scan, which may be
-    after the end of the window.
+    """Disable the synchronous window (0x1007), which might end before the summary is sent.
 
     A node without object 0x1007 has no synchronous window.
     """

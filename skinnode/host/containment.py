@@ -96,9 +96,9 @@ class Defects:
 
 
 def keep_on(turn: Callable[[], bool], defects: Defects, doing: str) -> None:
-    """Call ``turn`` until it returns False.
+    """Call ``turn`` repeatedly until it returns False.
 
-    An exception ends only the current call and is followed by a pause of 1 to 20 ms.
+    If a call raises an exception, the next call follows after a pause of 1 to 20 ms.
     """
     pause = Pause(_BRIEF_S, _LONGEST_BRIEF_S)
     while True:

@@ -2,25 +2,26 @@
 
 **Phase.** Some patches count their conversions and send the conversion phase
 (:attr:`~skinnode.protocol.summary.SummaryFlag.CONVERSIONS`). If two successive scans of a patch have the same
-phase and the same codes, they contain the same conversion. After missed scans or a lost summary, an equal
-phase proves nothing, because any phase may follow. A different phase always proves that a conversion took
-place.
+phase and the same codes, both scans contain the same conversion. If scans were missed or a summary was lost,
+an equal phase proves nothing. A changed phase always proves that a conversion took place.
 
-**Repeats.** Without a phase, the decision must be based on the codes. A run is a sequence of scans in which
-no code changes. A run counts as frozen if a live converter would produce the run with a probability below
-``FALSE_ALARM`` at the noise stated in the hand file. The probability must also be below ``FALSE_ALARM_QUIET``
-at a noise that is ``QUIETER`` times smaller, or at the noise found by :mod:`skinnode.host.wire_windows` if
-that noise is larger. In addition, the stream must have shown noise before: ``FLICKERS`` scans in which a code
-returned to its previous value. Finally, the run must be ``LONGER`` times as long as any earlier run that
-ended with a live converter. Runs at rest and runs under a press are compared separately, because the same
-converter repeats its codes for minutes at rest, but only for two or three scans under a press.
+**Repeats.** If a patch sends no phase, only its codes show whether the converter is running. A run is a
+sequence of scans in which no code changes. A run is considered frozen if, at the noise stated in the hand
+file, a live converter would produce the run with a probability below ``FALSE_ALARM``. The test is repeated
+with the limit ``FALSE_ALARM_QUIET`` and ``QUIETER`` times less noise, or half of the noise measured by
+:mod:`skinnode.host.wire_windows` if that is more. In addition, a code must have returned to its previous
+value in at least ``FLICKERS`` earlier scans, which proves that the codes are noisy. Finally, the run must be
+at least ``LONGER`` times as long as the longest run of the live converter so far. Runs at rest and runs under
+a press are compared separately, because the same converter repeats its codes for minutes at rest, but only
+for two or three scans under a press.
 
-**Doubt.** Repeated codes cannot prove within a few scans that a patch is frozen, but a press may change in
-that time. If the codes of a patch suddenly stop changing in mid-movement, the first ``DOUBT_RUN`` fields are
-therefore not trusted. This rule applies to patches that send no phase, have shown noise and have never
-repeated their codes.
+**Doubt.** A few repeated scans cannot prove that a patch is frozen, although a press may already have
+changed. If the codes of a patch suddenly stop changing in mid-movement, the next ``DOUBT_RUN`` fields are
+therefore not trusted. This rule applies only to patches that send no phase, have noisy codes and have never
+repeated all their codes before.
 
-If neither the phase nor the codes decide, and no code has changed for a second, the result is *cannot tell*.
+If the phase and the codes are inconclusive and no code has changed for a second, the converter's state is
+*cannot tell*.
 """
 
 from __future__ import annotations
@@ -42,50 +43,62 @@ from skinnode.text.words import counted
 _SOURCE_FAILED: Final = int(SummaryFlag.SOURCE_FAILED)
 
 FALSE_ALARM: Final = 1e-12
-"""Maximum probability that a live part (crossing, wire or patch) repeats its codes as often as observed, at
-the assumed noise. A patch of 10 × 30 wires has 341 parts. At 100 scans/s, all parts together are tested 1.2e9
-times in ten hours, so 0.001 false alarms are expected; the requirement is at most one false alarm."""
+"""Significance level of the test for frozen parts: maximum probability that a live crossing, wire or patch
+repeats its codes as often as observed. A patch of 10 × 30 wires has 341 parts. At 100 scans/s, these parts
+undergo 1.2e9 tests in ten hours, so 0.001 false alarms are expected; at most one false alarm is permitted.
+"""
 FALSE_ALARM_QUIET: Final = 1e-8
-"""Maximum probability that a live patch repeats its codes as often as observed, at a noise ``QUIETER`` times
-smaller than stated. For the 3.6e6 scans of ten hours, this limit corresponds to 0.04 false alarms, and few
-converters have so little noise."""
+"""Maximum probability that a live patch repeats its codes as often as observed if its noise is ``QUIETER``
+times less than stated. In ten hours (3.6e6 scans), a patch with so little noise would cause 0.04 false
+alarms; few converters are so quiet.
+"""
 QUIETER: Final = 10.0
 """Maximum ratio of the noise stated in the hand file to a converter's actual noise."""
 ABRUPT: Final = 16
-"""Minimum change of a code in the last scan of a movement that ended abruptly, codes. This value is not
-tuned."""
+"""Minimum change (codes) of the most changed code in the last scan before a movement stops, for the stop to
+be classified as abrupt. The value has not been tuned.
+"""
 DOUBT_RUN: Final = 64
-"""Number of scans after an abruptly ended movement whose fields are not trusted; after these scans, only the
-probability of the repeats decides. For most simulated patches that froze in mid-press, the decision took up
-to 11 scans, for some more than 16."""
+"""Number of scans after an abrupt stop whose fields are not trusted; later fields are distrusted only if the
+repeats are improbable. Most simulated patches that froze in mid-press were detected within 11 scans; some
+took more than 16 scans.
+"""
 FLICKERS: Final = 5
-"""Minimum number of scans in which a code returns to its previous value, as proof that the codes contain
-noise."""
+"""Minimum number of scans in which a code must have returned to its previous value before a patch's codes are
+considered noisy.
+"""
 LONGER: Final = 4
-"""Minimum ratio of the length of a frozen run to the length of the longest run of the live converter."""
+"""Minimum length of a frozen run, as a multiple of the live converter's longest run."""
 PROOF_NS: Final = 1_000_000_000
-"""Time for which the converter counts as running after a change of a code or of the phase, ns."""
+"""Time (ns) for which a converter is considered running after a code or the phase has changed."""
 PHASES_REPEATED: Final = 3
-"""Number of scans without a new conversion after which a patch counts as frozen; a patch counts as stale
-after the same number of missed scans. Fields are not trusted from the first scan without a new conversion."""
+"""Number of scans without a new conversion after which a patch is reported as frozen. Fields are not trusted
+from the first such scan. A patch is reported as stale after the same number of missed scans.
+"""
 _MOVED: Final = 16
-"""Minimum distance from the code at rest at which the quantization error of a code is random, codes."""
+"""Minimum distance (codes) of a code from its rest value for its quantization error to be considered
+random.
+"""
 _SPREAD: Final = 30
-"""Minimum number of different codes at least ``_MOVED`` away from the code at rest in a pressed patch."""
+"""Minimum number of distinct codes at least ``_MOVED`` from the rest code for a patch to be considered
+pressed.
+"""
 
 
 class Alive(enum.StrEnum):
-    """Whether the converter of a patch is running."""
+    """State of a patch's converter: running, stopped or unknown."""
 
     YES = "yes"
     NO = "no"
     CANNOT_TELL = "cannot tell"
-    """No code has changed for a second, but the patch does not count its conversions, and its converter has
-    so little noise that repeated codes prove nothing; or no scan has been received yet."""
+    """No scan has been received yet, or no code has changed for a second and the codes cannot show why.
+    Repeated codes prove nothing if the patch does not count its conversions and its converter has very little
+    noise.
+    """
 
 
 class ConverterLiveness:
-    """Tracker of the state of one patch's converter. Owned by the mainline.
+    """Tracker of the state of one patch's converter. Used only by the mainline.
 
     Args:
         scale: Scale of the codes.
@@ -96,15 +109,15 @@ class ConverterLiveness:
         self._scale, self._stated = scale, relative_noise / scale.step
         self._rest = round((1.0 - scale.lo) / scale.step)
         self.measured_noise = 0.0
-        """Noise measured over recent windows of scans, codes; 0 if none was measurable."""
-        self._log_p = 0.0  # log probability of the current run, if the run counts as frozen
-        self._abrupt = False  # whether a movement ended abruptly at the start of the current run
-        self._improbable = False  # whether the current run counts as frozen
-        self._largest = 0  # largest change of a code in the last scan with changes, codes
+        """Noise (codes) measured over recent windows of scans; 0 if no noise could be measured."""
+        self._log_p = 0.0  # log probability of a frozen current run, else 0
+        self._abrupt = False  # whether the current run began with an abrupt stop
+        self._improbable = False  # whether the current run is too improbable
+        self._largest = 0  # largest change (codes) in the last scan that changed
         self._run = self._codes = self._flickers = self._check_at = 0
         self._pressed = False
         self._longest = {False: 0, True: 0}
-        # noise measured before the current run, because constant codes have no noise
+        # noise measured before the current run; during the run, the constant codes show no noise
         self._noise_before = 0.0
         self._phase = self._phase_scan = self._same_phase = self._missing = 0
         self._t_ns = 0
@@ -112,7 +125,7 @@ class ConverterLiveness:
 
     @property
     def stopped(self) -> bool:
-        """Whether the newest scan repeats a conversion, or codes that a live converter would have changed."""
+        """Whether the converter had stopped at the newest scan, according to its phase or codes."""
         return self._same_phase > 0 or self._improbable
 
     @property
@@ -122,12 +135,12 @@ class ConverterLiveness:
 
     @property
     def deviations(self) -> float:
-        """Improbability of the current run for a live converter, in standard deviations."""
+        """Significance of the current run as evidence of a stopped converter, in standard deviations."""
         return math.inf if self._same_phase else deviations_of(self._log_p)
 
     @property
     def alive(self) -> Alive:
-        """Whether the converter was running at the newest scan."""
+        """State of the converter at the newest scan."""
         if self._same_phase >= PHASES_REPEATED or self._repeats_frozen():
             return Alive.NO
         if self._t_proof_ns is None or self._t_ns - self._t_proof_ns > PROOF_NS:
@@ -136,7 +149,7 @@ class ConverterLiveness:
 
     @property
     def words(self) -> str:
-        """Reason why the converter may not be running, in words; empty if it is running."""
+        """Human-readable reason why the converter may not be running; empty if it is running."""
         if self._same_phase:
             return f"its converter has completed no conversion for {counted(self._same_phase, 'scan')}"
         if self.stopped:
@@ -160,8 +173,8 @@ class ConverterLiveness:
 
         Args:
             scan: Scan to evaluate.
-            counts: Numbers of crossings measured, changed, and returned to their previous code; largest
-                change, codes; smallest code.
+            counts: Number of crossings measured, changed, and returned to the previous code; largest change
+                of a code; smallest code.
             last: (U, K) last code of each crossing.
             run: (U, K) number of scans since each crossing's code last changed.
         """
@@ -169,7 +182,7 @@ class ConverterLiveness:
         self._t_ns = scan.t_last_ns
         if changed:
             self._end_run(returned, largest)
-        # up to `_missing` codes may have changed because the previous scan lacked them
+        # up to `_missing` codes may differ only because the previous scan did not contain them
         self._compare_phase(scan, unchanged=measured > 0 and changed <= self._missing)
         self._missing = 0 if scan.flags & SummaryFlag.CHANGED_ONLY else scan.codes.size - measured
         if changed or not measured or scan.flags & SummaryFlag.CHANGED_ONLY:
@@ -180,7 +193,7 @@ class ConverterLiveness:
             unheard = not self._phase and not any(self._longest.values())
             self._abrupt = unheard and self._largest >= ABRUPT and self._flickers >= FLICKERS
         if self._run >= self._check_at and not self._improbable:
-            # the probability falls slowly, so evaluate at increasing intervals
+            # the probability of a run decreases slowly, so evaluate at increasing intervals
             self._check_at = self._run + 1 + self._run // 4
             self._evaluate_run(last, run, least)
 
@@ -190,7 +203,7 @@ class ConverterLiveness:
     def _compare_phase(self, scan: Scan, *, unchanged: bool) -> None:
         phase = scan.phase
         if not phase:
-            # the patch does not count its conversions, because the summary arrived without a phase
+            # a summary without a phase shows that the patch does not count its conversions
             if scan.device_time_us is not None:
                 self._phase = self._same_phase = 0
             return
@@ -203,7 +216,7 @@ class ConverterLiveness:
     def _end_run(self, returned: int, largest: int) -> None:
         self._t_proof_ns = self._t_ns
         self._flickers += returned > 0
-        if self._run and (not self._repeats_frozen() or largest <= 1):  # otherwise a frozen run has ended
+        if self._run and (not self._repeats_frozen() or largest <= 1):  # the converter was live in this run
             self._longest[self._pressed] = max(self._longest[self._pressed], self._run)
         self._run = self._codes = self._check_at = self._same_phase = 0
         self._pressed = self._abrupt = self._improbable = False

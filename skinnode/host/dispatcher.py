@@ -23,16 +23,17 @@ from skinnode.transport.bus_state import BusState, bus_state
 _log = logging.getLogger(__name__)
 
 Handler = Callable[[bytes, int], None]
-"""Function called with a frame's data and monotonic arrival time, ns."""
+"""Function called with a frame's data and its monotonic arrival time in ns."""
 
 _MARK_NS: Final = 100_000_000
-"""Interval at which the bits of the frames are summed for the bus load, ns."""
+"""Interval (ns) over which the frame bits are summed to compute the bus load."""
 _MARKS: Final = 10
-"""Number of summing intervals over which the bus load is averaged."""
+"""Number of summing intervals in the moving average of the bus load."""
 
 _POLL_NS: Final = 2_000_000
-"""Minimum interval between calls to the pollers, ns. A finer resolution is not needed, because the pollers'
-timeouts are at least 5 ms. Batches of frames arrive about a millisecond apart."""
+"""Minimum interval (ns) between calls to the pollers. Although a batch of frames arrives about every
+millisecond, the pollers' timeouts are at least 5 ms and need no finer resolution.
+"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,19 +46,19 @@ class BusStats:
     foreign: int
     """Number of data frames with a COB-ID that the host does not expect on this bus."""
     ignored: int
-    """Number of remote and extended frames; on a bus without ``fd``, also of CAN FD frames."""
+    """Number of remote and extended frames; on a bus without ``fd``, CAN FD frames are included."""
     error_frames: int
-    """Number of error frames, with which the interface reports bus errors and controller states."""
+    """Number of error frames, i.e. the interface's reports of bus errors and controller states."""
     bus_offs: int
-    """Number of times the interface reported that its controller had gone bus-off."""
+    """Number of times the CAN interface has reported that its controller went bus-off."""
     controller: BusState | None
-    """Most recently reported state of the controller; None if no state has been reported."""
+    """Most recently reported state of the CAN controller; None if no state has been reported."""
     foreign_ids: Mapping[int, int]
     """Number of frames for each foreign COB-ID."""
     read: int
     """Number of frames of all types read from the interface."""
     waiting: int
-    """Number of frames read but not yet dispatched."""
+    """Number of frames that have been read from the interface but not yet dispatched."""
     kernel_dropped: int
     """Number of frames dropped because the kernel's buffer was full; 0 if the interface does not report
     drops."""
@@ -66,10 +67,11 @@ class BusStats:
     malformed: int
     """Number of frames with an expected COB-ID but a wrong length or format."""
     outages: int
-    """Number of times the interface failed and was reopened."""
+    """Number of times the CAN interface has failed and been reopened."""
     bits: int
-    """Exact total length of all data frames received and sent, bits. The value is up to a tenth of a second
-    old."""
+    """Total length (bits, including stuff bits) of all data frames received and sent, as of at most 0.1 s
+    ago.
+    """
     load: float
     """Bus load over the last second, as a fraction of the capacity."""
 
@@ -82,7 +84,7 @@ class PortCounters:
     dropped: int = 0
     outages: int = 0
     read: int | None = None
-    """Number of frames read; None if all frames read have been dispatched."""
+    """Number of frames read; None if every frame is dispatched as soon as it is read."""
     waiting: int = 0
     kernel_dropped: int = 0
 
@@ -90,7 +92,8 @@ class PortCounters:
 class Dispatcher:
     """Dispatcher that counts the frames on one bus of the hand and passes them to handlers.
 
-    Threads: owned by the mainline; :meth:`count` and :meth:`count_sent` may be called from any thread.
+    Threads: only the mainline may use a dispatcher, but :meth:`count` and :meth:`count_sent` may be called
+    from any thread.
     """
 
     def __init__(self, config: BusConfig, handlers: Mapping[int, Handler], now_ns: int) -> None:
@@ -134,7 +137,7 @@ class Dispatcher:
         self._listeners = tuple(each for each in self._listeners if each is not listener)
 
     def poll_with(self, poller: Callable[[int], None], defects: Defects | None = None) -> None:
-        """Call ``poller`` with the monotonic time, ns, after batches of frames and while no frames arrive.
+        """Call ``poller`` with the monotonic time (ns) after each batch of frames and while the bus is idle.
 
         Args:
             poller: Function to call, at most every 2 ms.
@@ -146,19 +149,22 @@ class Dispatcher:
         """Handle ``error``, which was raised by the operation ``doing``.
 
         Raises:
-            Exception: always ``error`` itself, because a replay has no live bus to keep running.
+            Exception: always ``error``; unlike a live bus, a replay may stop at an exception.
         """
         raise error
 
     def expect(self, what: str, times_ns: tuple[int, ...]) -> None:
-        """Ignore the predicted arrival times, which matter only on a live bus."""
+        """Ignore the predicted arrival times of scans, which are used only on a live bus."""
 
     def count_sent(self, can_id: int, data: bytes) -> None:
         """Count a sent frame towards the bus load. Any thread."""
         self._outgoing.append((can_id, data))
 
     def dispatch(self, batch: Sequence[Frame]) -> None:
-        """Pass frames to their handlers, in order. An exception in a handler affects only its frame."""
+        """Pass frames to their handlers, in order of arrival.
+
+        If a handler raises an exception, only the frame in question is lost.
+        """
         for listener in self._listeners:
             try:
                 listener(batch)
@@ -182,7 +188,7 @@ class Dispatcher:
                         continue
                     handler(data, t_ns)
                 going_on = False
-            except Exception as defect:  # the iterator ``frames`` continues after the lost frame
+            except Exception as defect:  # the iterator ``frames`` resumes after the failed frame
                 self.contain(self._owners.get(can_id), f"frame 0x{can_id:03X}", defect)
         try:
             self._tally(batch, others)
@@ -190,7 +196,7 @@ class Dispatcher:
             self.contain(None, "counting frames", defect)
 
     def _tally(self, batch: Sequence[Frame], others: Sequence[Frame]) -> None:
-        """Count the frames in a batch, including ``others``, the frames of types that no handler accepts."""
+        """Count the frames in a batch, including ``others``: frames of types that no handler accepts."""
         takes_fd = self.config.fd
         if others:
             set_aside = {id(frame) for frame in others}
@@ -207,7 +213,7 @@ class Dispatcher:
         self._meter.add_all(batch)
 
     def poll(self, now_ns: int) -> None:
-        """Call the pollers with the monotonic time, ns, unless they were called within the last 2 ms."""
+        """Call the pollers with the monotonic time (ns) unless the last call was less than 2 ms ago."""
         if not 0 <= now_ns - self._polled_ns < _POLL_NS:
             self._polled_ns = now_ns
             for poll, owner in self._pollers:
@@ -219,8 +225,8 @@ class Dispatcher:
     def measure(self, now_ns: int) -> None:
         """Compute the bus load if a summing interval has passed.
 
-        The computation takes as long as handling forty frames. A mainline with several buses therefore calls
-        this method for only one bus per iteration.
+        Computing the bus load takes as long as handling forty frames. A mainline that serves several buses
+        therefore calls this method for only one bus per iteration.
         """
         if now_ns >= self._marks[-1][0] + _MARK_NS:
             self._mark(now_ns)
@@ -268,7 +274,10 @@ class Dispatcher:
                 self._bus_offs += state is BusState.OFF and before is not BusState.OFF
 
     def _mark(self, now_ns: int) -> None:
-        """Sum the bits of all frames so far. Mainline only, because the meter is not thread-safe."""
+        """Sum the bits of all frames counted so far.
+
+        Call only from the mainline; the load meter is not thread-safe.
+        """
         while self._outgoing:
             self._meter.add(*self._outgoing.popleft())
         bits = self._meter.bits

@@ -1,4 +1,4 @@
-"""Provide a bounded queue for a subscriber: a slow reader loses its oldest items and never delays the host.
+"""Provide a bounded queue whose slow reader loses the oldest items instead of delaying the writer.
 
 The standard library has no such queue: a full ``queue.Queue`` blocks or rejects a new item;
 ``collections.deque(maxlen=…)`` drops items without counting them, and its reader cannot wait for an item.
@@ -18,15 +18,18 @@ T = TypeVar("T")
 
 @dataclass(frozen=True, slots=True)
 class End:
-    """End marker of a queue, appended when the host has closed or been stopped by ``error``."""
+    """End marker, appended to a queue when the host closes or is stopped by ``error``."""
 
     error: SkinError | None = None
 
 
 class DropOldestQueue(Generic[T]):
-    """Queue of up to ``capacity`` items, ended by an :class:`End`. Thread-safe; writing never blocks.
+    """Queue of up to ``capacity`` items; the end of the stream is marked by an :class:`End`.
 
-    The end marker is never dropped, and every reader receives it, because :meth:`get` puts it back.
+    Thread-safe; writing never blocks.
+
+    The end marker is never dropped, and every reader receives the marker because :meth:`get` does not remove
+    it.
     """
 
     def __init__(self, capacity: int) -> None:
@@ -34,7 +37,7 @@ class DropOldestQueue(Generic[T]):
         self._capacity = capacity
 
     def put(self, item: T | End) -> int:
-        """Append an item, and drop the oldest items if the capacity is exceeded.
+        """Append an item to the queue, and drop the oldest items if the capacity is exceeded.
 
         Returns:
             Number of items dropped.
@@ -44,24 +47,24 @@ class DropOldestQueue(Generic[T]):
         while self._items.qsize() > self._capacity:
             try:
                 oldest = self._items.get_nowait()
-            except queue.Empty:  # a reader took the item first
+            except queue.Empty:  # another thread has already removed the oldest item
                 break
             if isinstance(oldest, End):
                 end = oldest
             else:
                 dropped += 1
-        if end is not None:  # the queue may then exceed its capacity by one
+        if end is not None:  # the queue may temporarily exceed its capacity by one item
             self._items.put(end)
         return dropped
 
     def get(self, timeout_s: float | None = None) -> T | End:
-        """Remove and return the oldest item; an end marker stays in the queue.
+        """Remove and return the oldest item; an end marker is returned but not removed.
 
         Args:
-            timeout_s: Maximum wait for an item, s; None for no limit, 0 for no wait.
+            timeout_s: Maximum time (s) to wait for an item; None for no limit, 0 to return immediately.
 
         Raises:
-            queue.Empty: if no item arrived in time.
+            queue.Empty: if no item arrived before the timeout.
         """
         item = self._items.get(timeout=timeout_s)
         if isinstance(item, End):

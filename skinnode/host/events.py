@@ -1,4 +1,4 @@
-"""Publish changes in the health of a hand as events, to subscribers and to the log."""
+"""Publish changes in a hand's health as events to subscribers and in the log."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from skinnode.process import clock
 _log = logging.getLogger(__name__)
 
 CAPACITY_EVENTS: Final = 1024
-"""Default maximum number of events waiting for a subscriber, beyond which the oldest event is dropped."""
+"""Default capacity of a subscriber's event queue; when the queue is full, the oldest event is dropped."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,13 +27,13 @@ class HealthEvent:
     t_ns: int
     """Monotonic time of the change, ns."""
     subject: str
-    """Name of the patch or bus, or ``host``."""
+    """Subject of the event: name of a patch or bus, or ``host``."""
     what: str
-    """New condition, name of the increased counter of :class:`PatchHealth` or :class:`BusHealth`, or
-    ``defects``.
+    """Type of the event: a new condition, the name of the counter of :class:`PatchHealth` or
+    :class:`BusHealth` that has increased, or ``defects``.
     """
     text: str
-    """Human-readable description of the change, without the subject."""
+    """Human-readable description of the change; does not include the subject's name."""
 
     def __str__(self) -> str:
         return f"{self.subject}: {self.text}"
@@ -51,13 +51,13 @@ class EventSubscription:
         self.dropped = 0
 
     def get(self, timeout_s: float | None = None) -> HealthEvent | None:
-        """Return the next event, or None if no event occurs.
+        """Wait for the next event and return it; return None on timeout or if the host closes.
 
         Args:
-            timeout_s: Maximum wait for an event, s; None for no limit.
+            timeout_s: Maximum time (s) to wait for an event; None for no limit.
 
         Returns:
-            The event; None if no event occurred in time or the host has closed.
+            Next event; None if no event occurred before the timeout or the host has closed.
         """
         try:
             event = self._queue.get(timeout_s)
@@ -80,7 +80,7 @@ class Events:
     def __init__(self, defects: Defects | None = None) -> None:
         self._defects = Defects("host") if defects is None else defects
         self._subscriptions: weakref.WeakSet[EventSubscription] = weakref.WeakSet()
-        self._lock = clock.lock()  # the set must not change while it is copied
+        self._lock = clock.lock()  # guards the set of subscriptions against changes while it is copied
         self._ended = False
 
     def subscribe(self, capacity: int) -> EventSubscription:
@@ -106,7 +106,7 @@ class Events:
         self._offer(event)
 
     def end(self) -> None:
-        """End all subscriptions, because the host has closed."""
+        """End all subscriptions when the host closes."""
         self._ended = True
         self._offer(End())
 

@@ -1,24 +1,25 @@
-"""Detect the frozen wires and crossings of a live patch, so that its fields are solved without them.
+"""Detect frozen wires and crossings of a live patch, so that they can be left out of the solve.
 
 **Movement.** A crossing is frozen if its code repeats exactly while the codes of all four neighbours change
 in the same direction by at least ``CROSSING_LEAD`` codes. A wire is frozen if all its codes repeat while, for
 at least ``LEADS`` of its crossings, the codes of the neighbours on the adjacent wires change by at least
-``WIRE_LEAD`` codes. These criteria do not depend on the converter's noise.
+``WIRE_LEAD`` codes. The movement criteria do not depend on the converter's noise.
 
 The limits were verified with simulated presses on live patches; :mod:`skinnode.host.code_runs` defines a
 lead. In 696 presses (two layouts, layers of 0.3 to 1 pitch, depths of 2 to 50 %, friction of 0 to 0.8, noise
 of 0 to 3e-6, 16-bit codes), the maximum lead of a crossing whose code stayed constant for five scans was 75
 codes. In 1,800 presses without noise (depths from 0.2 %), the maximum lead of a wire whose codes stayed
-constant for at least one scan was 25 codes. An indentation of 10 % changes codes by thousands.
+constant for at least one scan was 25 codes. For comparison, an indentation of 10 % changes codes by thousands
+of codes.
 
 **Noise.** A wire or crossing is also frozen if the probability that a live converter would repeat its codes
-as often as observed is :data:`~skinnode.host.converter_liveness.FALSE_ALARM` or less. This probability is
-computed for a tenth of the stated noise, or for half of the recently measured noise if that is larger. In
-addition, at least three quarters of the other crossings must have repeated their codes for less than a
-quarter as long. This condition prevents false alarms for converters with less noise than assumed, whose
-crossings all repeat.
+as often as observed is :data:`~skinnode.host.converter_liveness.FALSE_ALARM` or less. The probability of the
+repeats is computed for a tenth of the stated noise, or for half of the recently measured noise if that is
+larger. In addition, at least three quarters of the other crossings must have runs less than a quarter as long
+as that of the suspected part. This condition prevents false alarms if the converter has less noise than
+assumed: in that case, all crossings repeat their codes.
 
-A wire or crossing is used again as soon as one of its codes changes.
+A frozen wire or crossing is used in the solve again as soon as one of its codes changes.
 """
 
 from __future__ import annotations
@@ -51,14 +52,18 @@ from skinnode.model.data_fault import DataFault, FaultKind, FaultyPart
 from skinnode.protocol.codes import CodeScale
 
 CROSSING_LEAD: Final = 512
-"""Minimum lead of a frozen crossing, codes: seven times the maximum of live crossings in 696 simulated
-presses."""
+"""Minimum lead (codes) at which a crossing is considered frozen: seven times the maximum lead of the live
+crossings in 696 simulated presses.
+"""
 WIRE_LEAD: Final = 64
-"""Minimum lead of ``LEADS`` crossings of a frozen wire, codes: 2.5 times the maximum of live wires in 1,800
-simulated presses."""
+"""Minimum lead (codes) that ``LEADS`` crossings of a wire must have before the wire is considered frozen: 2.5
+times the maximum lead of live wires in 1,800 simulated presses.
+"""
 _NEVER: Final = 2**62
 _OTHERS: Final = 0.75
-"""Minimum fraction of the other crossings whose runs are shorter than a quarter of the frozen part's run."""
+"""Minimum fraction of the other crossings that must have runs shorter than a quarter of the frozen part's
+run.
+"""
 
 
 class FrozenParts:
@@ -67,8 +72,8 @@ class FrozenParts:
     Args:
         scale: Scale of the codes.
         relative_noise: Converter noise stated in the hand file, as a fraction of the resistance.
-        state: State of the runs (:mod:`skinnode.host.code_runs`). The detector writes the plane that marks
-            crossings as frozen.
+        state: State of the runs (:mod:`skinnode.host.code_runs`). The detector sets and clears the flags of
+            frozen crossings in this array.
     """
 
     def __init__(self, scale: CodeScale, relative_noise: float, state: NDArray[np.int64]) -> None:
@@ -76,7 +81,9 @@ class FrozenParts:
         self._log_stay = 0.0
         self.faults: tuple[DataFault, ...] = ()
         self.left_out: NDArray[np.bool_] | None = None
-        """(U, K) bool: crossings to leave out of the solve; None if no crossing is frozen."""
+        """(U, K) bool: True for each frozen crossing, to be left out of the solve; None if no crossing is
+        frozen.
+        """
         self.limits = np.zeros(7, np.int64)
         self.limits[STEPS] = scale.steps
         self.limits[_WIRE_LEAD], self.limits[_CROSSING_LEAD] = WIRE_LEAD, CROSSING_LEAD
@@ -86,7 +93,7 @@ class FrozenParts:
         """Set the minimum runs of frozen wires and crossings from the assumed noise.
 
         Args:
-            measured: Noise measured over recent windows, codes; 0 if no noise was measurable.
+            measured: Noise (codes) measured over recent windows of scans; 0 if no noise could be measured.
             least: Smallest code of a scan. The smallest code has the lowest noise, because noise is
                 proportional to the resistance.
         """
@@ -99,7 +106,7 @@ class FrozenParts:
             self.limits[limit] = max(LEAST_RUN, math.ceil(needed)) if needed < _NEVER else _NEVER
 
     def release(self) -> None:
-        """Remove the faults of wires and crossings with a changed code."""
+        """Remove the faults of all wires and crossings whose codes have changed."""
         alive = (self._state[NAMED] != 0) & (self._state[RUN] == 0)
         self._set([fault for fault in self.faults if not alive[_place(fault)].any()])
 
@@ -107,7 +114,7 @@ class FrozenParts:
         """Add faults for wires and crossings that are now frozen.
 
         Args:
-            scan: Number of the newest scan, at which the new faults begin.
+            scan: Number of the newest scan, recorded as the first scan of the new faults.
         """
         last, run, named = self._state[LAST], self._state[RUN], self._state[NAMED] != 0
         known = (last >= 0) & (last <= self._scale.steps) & ~named
@@ -128,7 +135,7 @@ class FrozenParts:
     def _wire(
         self, known: NDArray[np.bool_], run: NDArray[np.int64], lead: NDArray[np.int64], at: Any, limit: int
     ) -> float | None:
-        """Return the log probability that a live wire repeats its codes so long; None if it is not frozen."""
+        """Return the log probability of a wire's run if the wire were live; None if it is not frozen."""
         here = known[at]
         if not here.any() or (least := int(run[at][here].min())) < 1:
             return None
@@ -169,7 +176,7 @@ class FrozenParts:
 
 
 def _place(fault: DataFault) -> Any:
-    """Return the index of a fault's crossings in a (U, K) array."""
+    """Return an index that selects a fault's crossings in a (U, K) array."""
     return (
         slice(None) if fault.upper is None else fault.upper,
         slice(None) if fault.lower is None else fault.lower,

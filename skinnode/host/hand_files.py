@@ -38,7 +38,7 @@ def load_baseline(path: Path, profile: PatchProfile) -> Float:
     """Read a patch's baseline from a text file.
 
     Returns:
-        (U, K) resistances at rest, ohm, rounded to REAL32.
+        (U, K) ohm: resistances at rest, rounded to REAL32.
 
     Raises:
         ConfigError: if the file is not a table of U × K positive numbers.
@@ -68,11 +68,12 @@ def _ohm(word: str, key: str, allowed: str, where: str) -> float:
 
 
 def check_eds(path: Path, profile: PatchProfile) -> None:
-    """Check that an EDS file describes the hand file's wire format, with or without the scan check.
+    """Check that an EDS file describes a patch's wire format; the scan check is optional.
 
     Raises:
         ConfigError: if the file cannot be read.
-        ProfileError: if the file is not an EDS, or an object differs or is missing.
+        ProfileError: if the file is not an EDS file, an object is missing, or an object differs from the wire
+        format.
     """
     from canopen.objectdictionary.eds import import_eds  # accepts any file name
 
@@ -85,7 +86,7 @@ def check_eds(path: Path, profile: PatchProfile) -> None:
     check_form(text, str(path))
     try:
         described = import_eds(io.StringIO(text), None)  # type: ignore[no-untyped-call]
-    except Exception as error:  # canopen's parser may raise any exception
+    except Exception as error:  # the EDS parser in canopen may raise any exception
         raise no_eds(error, str(path), text) from None
     checked = described.get_variable(od.SUMMARY, od.SUMMARY_CHECK) is not None
     for item in replace(profile, checked=checked).objects():

@@ -1,6 +1,6 @@
 """Assemble hand frames, which contain the fields and contacts of all patches for one SYNC.
 
-Hand frames are assembled on the reading thread; no other thread is started.
+Hand frames are assembled on the thread that reads them; no other thread is started.
 """
 
 from __future__ import annotations
@@ -22,24 +22,27 @@ from skinnode.model.pose import Pose
 from skinnode.process import clock
 
 LATE: Final = "late"
-"""Reason for a missing field if the patch is operational but its field did not arrive in time."""
+"""Reason for a missing field: the patch is operational, but its field did not arrive before the deadline."""
 OVERTAKEN: Final = "overtaken"
-"""Reason for a missing field if the field of a newer scan of the patch arrived first."""
+"""Reason for a missing field: the field of a newer scan of the patch arrived first."""
 
 
 @dataclass(frozen=True, eq=False)
 class HandFrame:
-    """Fields of all patches for one SYNC, with their contacts in the coordinate frames of links and hand.
+    """Fields and contacts of all patches for one SYNC, in the coordinate frames of the links and hand.
 
     Contacts and wrenches are computed on first use.
     """
 
     scan: int
-    """Number of the SYNC, counted from the start of the host without wrapping; also the scan number of every
-    field."""
+    """Number of the SYNC since the host started, which is also the scan number of every field. The number
+    does not wrap.
+    """
     t_sync_ns: int
-    """Monotonic time at which SYNC was sent or received on the last bus, ns; 0 if unknown. Because SYNC may
-    be staggered (``sync.stagger_ms``), each field has the time of its own bus."""
+    """Monotonic time (ns) at which SYNC was sent or received on the last of the buses; 0 if unknown. SYNC may
+    be staggered between buses (``sync.stagger_ms``); a field therefore records the SYNC time of its own
+    bus.
+    """
     fields: Mapping[str, FieldFrame]
     """Fields by patch name."""
     missing: Mapping[str, str]
@@ -55,17 +58,17 @@ class HandFrame:
 
     @property
     def trusted(self) -> bool:
-        """Whether no field is missing and all fields are trusted."""
+        """Whether all fields are present and trusted."""
         return not self.missing and all(each.trusted for each in self.fields.values())
 
     @property
     def precise(self) -> bool:
-        """Whether no field is missing and all standard deviations are within the user's limits."""
+        """Whether all fields are present and all their standard deviations are within the user's limits."""
         return not self.missing and all(each.precise for each in self.fields.values())
 
     @property
     def distrust(self) -> Mapping[str, str]:
-        """Reasons why patches are not trusted, in words, by patch name; empty if all are trusted."""
+        """Human-readable reasons by patch name; contains only the patches that are not trusted."""
         reasons = {patch: f"no field: {reason}" for patch, reason in self.missing.items()}
         return reasons | {name: why_not(each) for name, each in self.fields.items() if not each.trusted}
 
@@ -75,7 +78,7 @@ class HandFrame:
         return tuple(each.moved(self.skeleton.link_pose(each.link)) for each in self._link_contacts)
 
     def contacts_on(self, link: str) -> tuple[HandContact, ...]:
-        """Return the contacts on a link's patches in the link's frame, in descending order of normal force.
+        """Return the contacts on a link's patches, in descending order of normal force.
 
         Args:
             link: Name of the link; ``hand`` for patches without a link.
@@ -91,8 +94,8 @@ class HandFrame:
     def wrenches(self) -> Mapping[str, Wrench]:
         """Force and torque on each link's skin about the origin of the link's frame, by link name.
 
-        Each link that carries a patch has an entry, even without a contact. The entry ``hand`` is for patches
-        without a link.
+        Each link that carries a patch has an entry, even if nothing touches the patch. The entry ``hand``
+        combines all patches without a link.
         """
         patches: dict[str, list[str]] = {}
         for patch in (*self.fields, *self.missing):
@@ -110,18 +113,18 @@ class HandFrame:
 
     @functools.cached_property
     def wrench(self) -> Wrench:
-        """Force and torque on the whole hand, about the origin of the hand's frame."""
+        """Force on the skin of the whole hand, and torque about the origin of the hand's coordinate frame."""
         return wrench_of(self.contacts, HAND, trusted=self.trusted)
 
     def at(self, link_poses: Mapping[str, Pose]) -> HandFrame:
-        """Return the hand frame with new link poses, for example from the robot's joint angles.
+        """Return a copy of the hand frame with new link poses, computed for example from joint angles.
 
         Args:
             link_poses: Poses in the coordinate frame of the hand, by link name. Links that are not listed
                 keep their poses; links without patches are ignored.
 
         Raises:
-            ValueError: if ``hand`` is listed, because its frame is the reference.
+            ValueError: if ``hand`` is listed; the hand's frame is the reference frame and has no pose.
         """
         if HAND in link_poses:
             raise ValueError(f"link_poses: got {HAND!r}, must be links that move in the hand")
@@ -130,7 +133,7 @@ class HandFrame:
 
     @functools.cached_property
     def _link_contacts(self) -> tuple[HandContact, ...]:
-        """Contacts on all patches, each in its link's frame, in descending order of normal force."""
+        """Contacts on all patches, each in its own link's frame, in descending order of normal force."""
         found = [
             HandContact.on_link(contact, patch, self.skeleton.mount(patch), trusted=each.trusted)
             for patch, each in self.fields.items()
@@ -140,18 +143,18 @@ class HandFrame:
 
 
 class HandGatherer:
-    """Assembler of hand frames from fields, in order of scan number.
+    """Assembler that combines fields into hand frames, in order of scan number.
 
     The assembler uses no clock and is not thread-safe.
 
-    A hand frame is ready when every awaited patch has delivered its field for the frame, or a newer field. A
-    patch whose fields were missing in :data:`~skinnode.host.health.SCANS_MISSED` consecutive hand frames is
-    not awaited until its next field. No patch is awaited for longer than ``patience_ns`` after the first
-    field.
+    A hand frame is ready as soon as every awaited patch has delivered its field for the frame or a newer
+    field. A patch whose fields were missing in :data:`~skinnode.host.health.SCANS_MISSED` consecutive hand
+    frames is not awaited again until its next field arrives. At the latest, a hand frame is ready
+    ``patience_ns`` after its first field.
 
     Args:
         patches: Names of the patches.
-        patience_ns: Maximum wait after the first field of a hand frame, ns.
+        patience_ns: Maximum time (ns) to wait for further fields after the first field of a hand frame.
         condition: Function that returns the condition of a patch.
         skeleton: Poses of the patches and links on the robot.
     """
@@ -186,7 +189,7 @@ class HandGatherer:
         self._until_ns.setdefault(stamp.scan, now_ns + self._patience_ns)
 
     def next(self, now_ns: int) -> HandFrame | None:
-        """Return the oldest hand frame if the frame is ready at ``now_ns``, otherwise None."""
+        """Return the oldest hand frame if that frame is ready at ``now_ns``, otherwise None."""
         if not self._open:
             return None
         scan = min(self._open)
@@ -204,7 +207,7 @@ class HandGatherer:
         return HandFrame(scan, t_sync_ns, fields, missing, self._skeleton)
 
     def next_deadline_ns(self) -> int | None:
-        """Return the deadline for the oldest frame's missing fields, ns; None if no frame is waiting."""
+        """Return the oldest hand frame's deadline (ns); None if no hand frame is pending."""
         return self._until_ns[min(self._open)] if self._open else None
 
     def _awaited(self, patch: str, scan: int) -> bool:
@@ -239,13 +242,13 @@ class HandSubscription:
         return self._gatherer.late
 
     def get(self, timeout_s: float | None = None) -> HandFrame | None:
-        """Return the next hand frame, or None if no frame arrives.
+        """Wait for the next hand frame and return it.
 
         Args:
-            timeout_s: Maximum wait for a hand frame, s; None for no limit.
+            timeout_s: Maximum time (s) to wait for a hand frame; None for no limit.
 
         Returns:
-            The hand frame; None if no frame arrived in time, or if the host has closed.
+            Next hand frame; None if no hand frame arrived before the timeout or the host has closed.
 
         Raises:
             SkinError: the error that stopped the host, if any.
@@ -316,7 +319,7 @@ class HandSubscription:
         return frame
 
     def _wait_s(self, end_ns: int | None) -> float | None:
-        """Return the time until the next deadline, s; None if there is no deadline."""
+        """Return the time (s) until the next deadline; None if there is no deadline."""
         times = [t_ns for t_ns in (end_ns, self._gatherer.next_deadline_ns()) if t_ns is not None]
         return max(0, min(times) - clock.monotonic_ns()) * 1e-9 if times else None
 

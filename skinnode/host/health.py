@@ -1,6 +1,6 @@
-"""Define the health of patches and buses, and derive a patch's condition from facts.
+"""Define the health of patches and buses, and derive a patch's condition from evidence.
 
-The facts are collected on the mainline by :class:`~skinnode.host.node_monitor.NodeMonitor`.
+Evidence about a node is collected on the mainline by :class:`~skinnode.host.node_monitor.NodeMonitor`.
 """
 
 from __future__ import annotations
@@ -21,30 +21,33 @@ from skinnode.transport.bus_state import BusState
 _log = logging.getLogger(__name__)
 
 HEARTBEATS_MISSED: Final = 3
-"""Number of heartbeat periods without a heartbeat after which a node counts as lost. CiA 301 does not specify
-this number. A burst of frames may delay one heartbeat, and a bus error may destroy another."""
+"""Number of heartbeat periods without a heartbeat after which a node is declared lost. CiA 301 does not
+specify this number. The value tolerates two missing heartbeats: one delayed by a burst of frames and one
+destroyed by a bus error.
+"""
 
 SCANS_MISSED: Final = 3
-"""Number of SYNC periods without a scan after which a patch counts as stale."""
+"""Number of SYNC periods without a scan after which a patch is declared stale."""
 
 SYNCS_MISSED: Final = 5
-"""Number of SYNC periods without SYNC after which a bus that another master runs is reported as lacking SYNC.
-The bus's patches are already stale by then."""
+"""Number of SYNC periods without a SYNC message after which missing SYNC is reported on a bus that another
+master runs. The patches on the bus become stale earlier.
+"""
 
 
 class Condition(enum.StrEnum):
-    """Condition of a patch, the most serious of its states."""
+    """Condition of a patch: the most serious of the states that apply."""
 
     NEVER_SEEN = "never seen"
     BOOTING = "booting"
-    """The node sends frames, but is not operational yet."""
+    """The node is sending frames but is not operational yet."""
     OPERATIONAL = "operational"
     STALE = "stale"
     """The node is operational according to its heartbeat, but no scans arrive, or all scans are withheld."""
     RESTARTING = "restarting"
     """The node restarts repeatedly without a command: see :data:`~skinnode.host.node_monitor.LOOP_RESTARTS`.
-    This condition does not apply to a node that has restarted only once, or that is operational again and has
-    not restarted for 0.5 s."""
+    The condition ends when the node is operational again and has not restarted for 0.5 s.
+    """
     FROZEN = "frozen"
     """Scans arrive, but the patch's converter has stopped: see :mod:`skinnode.host.converter_liveness`."""
     FAULTY = "faulty"
@@ -58,7 +61,10 @@ class Condition(enum.StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class PatchHealth:
-    """Health of a patch at one instant. The age of a heartbeat or scan is None if none has been received."""
+    """Snapshot of a patch's health.
+
+    The age of the newest heartbeat or scan is None before the first is received.
+    """
 
     patch: str
     node_id: int
@@ -71,48 +77,56 @@ class PatchHealth:
     emergencies: int
     """Number of EMCY messages that have reported an error since the host started."""
     last_emergency: int | None
-    """Error code of the newest EMCY message that reported an error; None before the first."""
+    """Error code of the newest EMCY message that reported an error; None before the first such message."""
     emergency_text: str
-    """Description of the newest EMCY message that reported an error; empty before the first."""
+    """Description of the newest EMCY message that reported an error; empty before the first such message."""
     error_register: int
     rejoins: int = 0
-    """Number of times the node has come back and been brought up again since the host started."""
+    """Number of times the node has reappeared and been brought up again since the host started."""
     refusal: str | None = None
-    """Reason why a responding node is not used: wrong identity or layout, or configuration not kept."""
+    """Reason why the host does not use a node that responds: wrong identity or layout, or configuration not
+    kept.
+    """
     restarts_in_a_loop: bool = False
-    """Whether the node restarted without a command three times within ten seconds, most recently within the
-    past 5 s."""
+    """Whether the node has restarted three times within ten seconds without a command, and the last restart
+    was less than 5 s ago.
+    """
     duplicate_id: bool = False
-    """Whether heartbeats arrive more often than a single node would send them, so that two nodes share the
-    node-ID."""
+    """Whether two nodes appear to share the node-ID, because heartbeats arrive more often than a single node
+    would send them.
+    """
     conflicts: int = 0
-    """Number of frames that contradict other frames of the same scan, because the node's counter is wrong or
-    two nodes share a node-ID."""
+    """Number of frames that contradict other frames of the same scan. Possible causes are a wrong counter in
+    the node and two nodes with the same node-ID.
+    """
     wires: tuple[WireFault, ...] = ()
-    """Faults of open, shorted, noisy and drifting wires."""
+    """Wire faults: open, shorted, noisy and drifting wires."""
     alive: Alive = Alive.CANNOT_TELL
     """Whether the patch's converter is running. If the value is ``no``, the condition is ``frozen``."""
     life: str = ""
-    """Reason why the converter may not be running, in words; empty if it is running."""
+    """Human-readable reason why the converter may not be running; empty if the converter is running."""
     faults: tuple[DataFault, ...] = ()
-    """Faults in the data of the newest field, with the affected parts, first scans and certainty."""
+    """Faults found in the newest field's data; each fault states the affected part, the first scan and the
+    certainty.
+    """
     defect: str | None = None
-    """Most recent failed operation of the host for this patch, with its exception; None after the next
-    bring-up."""
+    """Host operation that failed most recently for this patch, with its exception; reset to None by the next
+    bring-up.
+    """
     slow_overruns: int = 0
-    """Number of EMCY messages 0x8110, which report that the computer or bus is too slow for the node's
-    scans."""
+    """Number of EMCY messages with code 0x8110; the node sends the message if the computer or bus is too slow
+    for its scans.
+    """
     baselines: int = 0
-    """Number of times that a changed baseline has been read, for example after a tare."""
+    """Number of times the host has read a changed baseline, for example after a tare."""
     complaint: str | None = None
-    """Reason why the last bring-up failed; None if it succeeded."""
+    """Reason why the last bring-up failed; None if that bring-up succeeded."""
     withheld: bool = False
-    """Whether arriving scans are not yet decoded, because the node is being brought up or its baseline is
-    being read."""
+    """Whether scans are withheld because the node is being brought up or its baseline is being read."""
 
     @property
     def reason(self) -> str:
-        """Reason why the patch is not operational, or may not be converting; empty if there is none."""
+        """Reason why the patch is not operational or may not be converting; empty if there is none."""
         match self.condition:
             case Condition.OPERATIONAL:
                 return self.life
@@ -154,13 +168,13 @@ class PatchHealth:
 
 
 def faults_of(field: FieldFrame | None) -> tuple[DataFault, ...]:
-    """Return the faults in the data of a field; an empty tuple if there is no field."""
+    """Return the faults in a field's data; an empty tuple if there is no field."""
     return () if field is None else field.faults
 
 
 @dataclass(frozen=True, slots=True)
 class BusHealth:
-    """Health of a bus at one instant. All counters start at 0 when the host starts."""
+    """Snapshot of a bus's health. All counters start at 0 when the host starts."""
 
     bus: str
     away: str | None
@@ -180,17 +194,23 @@ class BusHealth:
     other_syncs: int
     """Number of SYNC messages from another producer on a bus whose master is the host."""
     other_masters: int
-    """Number of NMT commands, SDO requests to the hand's nodes, and heartbeats with the host's node-ID, from
-    other senders."""
+    """Number of frames from other senders that only the host should send: NMT commands, SDO requests to the
+    hand's nodes, and heartbeats with the host's node-ID.
+    """
     controller: BusState | None = None
     """Most recently reported state of the CAN controller; None if no state has been reported."""
     no_sync: bool = False
-    """Whether another master runs the bus, and no SYNC has arrived for :data:`SYNCS_MISSED` periods."""
+    """Whether another master runs the bus and no SYNC message has arrived for :data:`SYNCS_MISSED`
+    periods.
+    """
 
 
 @dataclass(frozen=True, slots=True)
 class Evidence:
-    """Facts that determine a patch's condition. Ages are in periods, and None before the first frame."""
+    """Evidence that determines a patch's condition.
+
+    Ages are counted in periods, and are None before the first frame.
+    """
 
     nmt_state: int | None
     late_heartbeats: float | None
@@ -203,7 +223,7 @@ class Evidence:
 
 
 def condition_of(facts: Evidence) -> Condition:
-    """Return the most serious condition that the facts indicate."""
+    """Return the most serious condition that applies."""
     late = facts.late_heartbeats
     stale = facts.late_scans is None or facts.late_scans > SCANS_MISSED
     rules = (

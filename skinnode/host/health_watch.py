@@ -14,10 +14,12 @@ from skinnode.process import clock
 from skinnode.text.words import counted
 
 _CHECK_S: Final = 0.05
-"""Interval between health checks, s. A shorter change may be visible only in the counters."""
+"""Interval (s) between health checks. A change that lasts for less than this interval may show only in the
+counters.
+"""
 
 _QUIET_NS: Final = 1_000_000_000
-"""Minimum interval between events for the same counter, ns."""
+"""Minimum interval (ns) between events for the same counter."""
 
 
 _PATCH_COUNTERS: Final = {
@@ -27,8 +29,7 @@ _PATCH_COUNTERS: Final = {
     "baselines": ("new baseline in use", "new baselines in use"),
     "conflicts": ("conflict", ""),
 }
-"""Counters of :class:`PatchHealth`, each with the singular of the counted noun, and the plural if it is
-irregular."""
+"""Counters of :class:`PatchHealth`, and the noun that each counts: singular, and plural if irregular."""
 _BUS_COUNTERS: Final = {
     "bus_offs": ("bus-off", ""),
     "error_frames": ("error frame", ""),
@@ -40,8 +41,7 @@ _BUS_COUNTERS: Final = {
     "other_syncs": ("SYNC of another producer", "SYNCs of another producer"),
     "other_masters": ("command of another master", "commands of another master"),
 }
-"""Counters of :class:`BusHealth`, each with the singular of the counted noun, and the plural if it is
-irregular."""
+"""Counters of :class:`BusHealth`, and the noun that each counts: singular, and plural if irregular."""
 
 
 def _is_frozen_part(fault: DataFault) -> bool:
@@ -49,7 +49,7 @@ def _is_frozen_part(fault: DataFault) -> bool:
 
 
 class HealthWatch:
-    """Monitor that publishes changes in the health of all patches and buses between two checks.
+    """Monitor that checks the health of all patches and buses, and publishes changes as events.
 
     Threads: a dedicated thread runs the health checks, from construction until :meth:`close`.
     """
@@ -67,7 +67,7 @@ class HealthWatch:
         self._all_defects = all_defects
         self._ended = False
         self._patch_before, self._bus_before = dict(patches()), dict(buses())
-        # time and count of the last event, by subject and counter
+        # (subject, counter) -> time of the last event and the counter's value at that time
         self._reported: dict[tuple[str, str], tuple[int, int]] = {}
         self._stop = clock.event()
         self._thread = clock.thread(target=self._run, name="health")
@@ -90,9 +90,10 @@ class HealthWatch:
         keep_on(self._turn, self._defects, "watching the health")
 
     def _turn(self) -> bool:
-        """Wait, then check the health. Returns False after the last check.
+        """Wait for the check interval, then check the health. Return False after the last check.
 
-        A check that raised an exception is repeated, so an event may be published twice but is never missed.
+        If a check raises an exception, the check is repeated. An event may therefore be published twice but
+        is never missed.
         """
         if self._ended:
             return False
@@ -145,7 +146,7 @@ class HealthWatch:
         self._compare_counters(name, before, now, _PATCH_COUNTERS)
 
     def _compare_frozen_parts(self, name: str, before: PatchHealth, now: PatchHealth) -> None:
-        """Publish when frozen wires and crossings are left out of the fields, and when they return."""
+        """Publish an event when a frozen wire or crossing is left out of the fields or used again."""
         was, are = (
             {each.place: each for each in health.faults if _is_frozen_part(each)} for health in (before, now)
         )

@@ -1,4 +1,4 @@
-"""Run the host of a hand: deliver fields, health, events and statistics, and tare patches."""
+"""Provide the public interface of a hand's host: fields, health, events, statistics and taring."""
 
 from __future__ import annotations
 
@@ -47,12 +47,13 @@ class HostStats:
     malformed: tuple[CodecError, ...]
     """First malformed frame received on each bus; buses without malformed frames are omitted."""
     defects: Mapping[str, DefectStats]
-    """Statistics of contained exceptions by patch or bus name; ``host`` for exceptions that concern
-    neither."""
+    """Statistics of contained exceptions by patch or bus name; the key ``host`` covers exceptions that
+    concern neither.
+    """
 
     @property
     def rivals(self) -> Mapping[str, OtherMasterStats]:
-        """Old name of :attr:`other_masters`, which will be removed in version 0.2."""
+        """Deprecated alias of :attr:`other_masters`; will be removed in version 0.2."""
         warnings.warn(
             "HostStats.rivals is now HostStats.other_masters; the old name will be removed in version 0.2",
             DeprecationWarning,
@@ -70,10 +71,10 @@ class Host:
             for field in host.fields():
                 ...
 
-    Inside the ``with`` block, all nodes are operational, SYNC is sent, and a node that restarts or comes back
-    is brought up again. After the block, and also if bring-up fails, the nodes are pre-operational, every
-    thread has ended and every interface is closed. On a bus that another master runs (``role = "guest"``),
-    the host sends neither NMT commands nor SYNC.
+    Inside the ``with`` block, all nodes are operational and the host sends SYNC. A node that restarts or
+    reappears is brought up again. When the block exits or bring-up fails, the host sets the nodes to
+    pre-operational, ends its threads and closes its interfaces. On a bus that another master runs (``role =
+    "guest"``), the host sends neither NMT commands nor SYNC.
 
     Threads: any thread may call any method.
     """
@@ -97,7 +98,7 @@ class Host:
         cancelled: Callable[[], bool] = never,
         tap: HostTap | None = None,
     ) -> Iterator[Host]:
-        """Bring up the hand described in a hand file, and shut it down at the end of the ``with`` block.
+        """Bring up the hand described in a hand file, and shut down the hand when the ``with`` block exits.
 
         Args:
             path: Path of the hand file.
@@ -109,7 +110,7 @@ class Host:
 
         Raises:
             ConfigError: if the hand file is missing or invalid.
-            SkinError: if :meth:`from_config` raises it.
+            SkinError: for the reasons listed under :meth:`from_config`.
         """
         hand = load_hand(path)
         running = cls.from_config(
@@ -136,16 +137,18 @@ class Host:
         tap: HostTap | None = None,
         open_port: Callable[[BusConfig], CanPort] = CanPort,
     ) -> Iterator[Host]:
-        """Bring up a hand, and shut it down at the end of the ``with`` block.
+        """Bring up a hand, and shut it down when the ``with`` block exits.
 
-        After a successful bring-up, no error ends the host: see :meth:`health` and :meth:`stats`.
+        After a successful bring-up, errors do not stop the host; they are reported by :meth:`health` and
+        :meth:`stats`.
 
         Args:
             hand: Configuration of the hand.
-            interface: python-can interface that replaces the hand's interfaces.
-            channel: Channel that replaces the hand's channel; only for a hand with one bus.
-            boot_deadline_s: Maximum time until the first response from a node, s.
-            cancelled: Called repeatedly during bring-up, which raises BringUpCancelled if the result is True.
+            interface: python-can interface to use instead of the interfaces in the hand file.
+            channel: Channel to use instead of the channel in the hand file; only for a hand with one bus.
+            boot_deadline_s: Maximum time (s) to wait for a node's first response.
+            cancelled: Function called repeatedly during bring-up; if it returns True, bring-up stops and
+                raises BringUpCancelled.
             tap: Recorder of the traffic, including bring-up; see :class:`skinnode.record.Recorder`.
             open_port: Function that opens a bus, for interfaces that python-can does not provide.
 

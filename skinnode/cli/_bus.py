@@ -10,14 +10,14 @@ if TYPE_CHECKING:
 
 
 class Place(NamedTuple):
-    """A bus and the hand to which it belongs; None if no hand file is given."""
+    """A bus and its hand; the hand is None if no hand file is given."""
 
     bus: BusConfig
     hand: HandConfig | None
 
     @property
     def patches(self) -> tuple[PatchConfig, ...]:
-        """Patches of the hand on this bus."""
+        """The hand's patches on this bus; empty without a hand."""
         return () if self.hand is None else self.hand.patches_on(self.bus.name)
 
     def patch_name(self, node_id: int) -> str:
@@ -126,7 +126,7 @@ def find_node(
     hand: Path | None,
     bus: str | None,
 ) -> tuple[Place, int]:
-    """Return the bus and node-ID for NODE: a node-ID, or the name of a patch on any bus of the hand.
+    """Return the bus and node-ID of NODE, which is a node-ID or the name of a patch on any bus of the hand.
 
     The other arguments are those of :func:`find_buses`.
 

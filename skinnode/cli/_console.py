@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from rich.table import Table
 
 UNBOUNDED: Final = 10_000
-"""Console width for output to a pipe, in columns, which exceeds the length of every printed line."""
+"""Console width for piped output, in columns; no printed line is longer."""
 
 
 def print_json(value: Any) -> None:
@@ -59,7 +59,7 @@ def _width(stream: TextIO) -> int | None:
 
 @functools.cache
 def _console_type() -> type[Console]:
-    """Define the console class. Imports rich late, so that ``--help`` responds without delay."""
+    """Define the console class. Rich is imported on the first call, which keeps ``--help`` fast."""
     from rich.console import Console, ConsoleOptions, RenderableType
     from rich.segment import Segment
     from rich.text import Text
@@ -99,7 +99,7 @@ def indented(text: str, columns: int = 10) -> Padding:
 
 @contextmanager
 def progress(quiet: bool = False) -> Iterator[Callable[[str], None]]:
-    """Yield a function that shows the current step on one line of stderr, which is erased at the end.
+    """Yield a function that shows the current step on one line of stderr; the line is erased at the end.
 
     Nothing is shown if ``quiet`` is set or stderr is not a terminal.
     """

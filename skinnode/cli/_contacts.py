@@ -11,7 +11,7 @@ if TYPE_CHECKING:
 
 
 def contact_tables(field: FieldFrame | None) -> list[dict[str, Any]] | None:
-    """Return the contacts of a field, strongest first, with the standard deviation of each value.
+    """Return a field's contacts, strongest first, including the standard deviation of each quantity.
 
     Returns:
         The contacts, with lengths in m, areas in m² and forces in N; None if there is no field yet.

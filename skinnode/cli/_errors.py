@@ -61,7 +61,7 @@ def _refused(line: str) -> int:
 
 
 def _wants_help(error: Any) -> bool:
-    """Return whether a command group was called without a command, which prints the help of the group."""
+    """Return True if a command group was called without a command, after printing the group's help."""
     if type(error).__name__ != "NoArgsIsHelpError":
         return False
     text = error.ctx.get_help()  # rich prints the help and returns no text

@@ -11,9 +11,9 @@ status  meaning
         reader of its output closed the pipe (SIGPIPE)
 ======  ==============================================================================================
 
-A signal causes no output, because it was sent on purpose; open resources are closed before the process exits.
-SIGHUP remains ignored if it was ignored at the start, as under nohup. This module imports no slow modules, so
-that its handlers are installed before any other module is loaded.
+A command that is stopped by a signal prints nothing, because the signal was sent on purpose. Open resources
+are closed before the process exits. SIGHUP remains ignored if it was ignored at the start, as under nohup.
+This module imports no slow modules, so that its handlers are installed before any other module is loaded.
 """
 
 from __future__ import annotations
@@ -44,9 +44,9 @@ class Stopped(SystemExit):
 def main_of(module: str, argv: Sequence[str] | None = None) -> NoReturn:
     """Run a typer application and exit with its status. From this call on, signals end the process.
 
-    BLAS libraries are limited to one thread unless the environment specifies a number. BLAS threads wait by
-    spinning, and under a real-time policy (``chrt -f``), threads that spin on every processor block a host
-    permanently.
+    BLAS libraries are limited to one thread unless the environment sets their number of threads. BLAS threads
+    wait by spinning, and under a real-time policy (``chrt -f``), threads that spin on every processor block a
+    host permanently.
 
     Args:
         module: Name of the module that defines the application as ``app``.
@@ -70,7 +70,7 @@ def main_of(module: str, argv: Sequence[str] | None = None) -> NoReturn:
 
 
 def _handle(handler: Callable[[int, FrameType | None], object] | signal.Handlers) -> None:
-    """Install ``handler`` for the signals if this is the main thread, as Python requires."""
+    """Install ``handler`` for the signals if this is the main thread; in other threads, Python forbids it."""
     import threading
 
     if threading.current_thread() is threading.main_thread():
@@ -91,8 +91,8 @@ def _exit_at_once(number: int, _frame: FrameType | None) -> None:
 def _stop(number: int, frame: FrameType | None) -> None:
     """Unwind the stack, or exit immediately if an import is in progress and there is no other thread.
 
-    During an import, some of Python's callbacks would swallow the exception or print it. No resource is open
-    while there is only one thread.
+    During an import, some of Python's callbacks would swallow the exception or print it. An immediate exit is
+    safe while there is only one thread, because no resource is open yet.
     """
     import threading
 
@@ -110,7 +110,7 @@ def _imports(frame: FrameType | None) -> bool:
 
 
 def _flush(status: int) -> int:
-    """Flush the output. Returns ``status``, or the SIGPIPE status if the reader has closed the pipe."""
+    """Flush the output, and return ``status``, or the SIGPIPE status if the reader has closed the pipe."""
     try:
         for stream in (sys.stdout, sys.stderr):
             if stream is not None:

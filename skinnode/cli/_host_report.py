@@ -18,12 +18,12 @@ if TYPE_CHECKING:
     from skinnode.model.frames import FieldFrame
 
 _OVERRUN_S, _OVERRUN_SYNCS = 1.0, 3
-"""Maximum wait at the end for overruns to clear, s and SYNC periods; the longer of the two applies."""
+"""Limits, in s and in SYNC periods, on the wait for overruns to clear at the end; the longer one applies."""
 
 _POLL_S = 0.01
 
 _FIRST_SCANS = 3
-"""Number of SYNCs after which a missing first scan counts as a fault."""
+"""Number of SYNCs after which a patch that has not sent a scan is reported as faulty."""
 
 _EXPLAINED_BY_SLOWNESS: Final = (
     "scans_torn",
@@ -36,7 +36,7 @@ _EXPLAINED_BY_SLOWNESS: Final = (
 
 
 def operational_text(running: Host) -> str:
-    """Return text with the number of operational patches and the condition of every other patch."""
+    """Return, as text, the number of operational patches and the condition of every other patch."""
     from skinnode.canopen.nmt import NmtState
 
     patches, name = running.hand.patches, running.hand.name
@@ -51,7 +51,7 @@ def operational_text(running: Host) -> str:
 
 
 def final_state_text(plan: HandConfig) -> str:
-    """Return text with the NMT state in which the host leaves the nodes on each bus."""
+    """Return, as text, the NMT state of the nodes on each bus after the host has stopped."""
     ends = {"master": "pre-operational", "guest": "left to their master"}
     used = [bus for bus in plan.buses if plan.patches_on(bus.name)]
     if len({bus.role for bus in used}) == 1:
@@ -62,9 +62,9 @@ def final_state_text(plan: HandConfig) -> str:
 def faults_and_notes(running: Host) -> tuple[list[str], list[str]]:
     """Return the faults and the notes of the run, one line each.
 
-    A node that skips scans because the computer running it is too slow sends EMCY 0x8110. The node's
-    missing and late frames are then reported as notes, as is the emergency if it is still active at the end.
-    Wrong frames remain faults.
+    A node that skips scans because the computer running it is too slow sends EMCY 0x8110. If a node has sent
+    EMCY 0x8110, its missing and late frames are reported as notes, and so is an emergency that is still
+    active at the end. Wrong frames remain faults.
     """
     _let_overruns_end(running)
     stats = running.stats()
@@ -127,7 +127,7 @@ def _patch_faults_and_notes(
 
 
 def _noise(running: Host, name: str) -> str:
-    """Return text that compares the measured noise with the hand file; empty if the noise is as stated."""
+    """Return a comparison of the measured noise with the hand file as text; empty if the two agree."""
     field = running.latest(name)
     if field is None or field.noise_factor == 1.0:
         return ""
@@ -136,7 +136,7 @@ def _noise(running: Host, name: str) -> str:
 
 
 def reason(health: PatchHealth, before: str = "") -> str:
-    """Return ``before`` and why a patch is faulty or refused; empty if it is neither."""
+    """Return ``before`` followed by the reason why a patch is faulty or refused; otherwise an empty text."""
     if health.condition == "refused" and health.refusal:
         return f"{before}{health.refusal}"
     if health.condition == "faulty" and health.defect is not None:
@@ -162,7 +162,7 @@ def _let_overruns_end(running: Host) -> None:
 
 
 class Second:
-    """Values reported for one second. The attribute names are the keys of the JSON object."""
+    """Values that the host reports for one second. The attribute names are the keys of the JSON object."""
 
     def __init__(
         self,
@@ -219,7 +219,7 @@ def _patch(running: Host, name: str, before: HostStats, now: HostStats) -> dict[
 
 
 def _deepest(field: FieldFrame | None) -> dict[str, float | None]:
-    """Return the depth (positive towards −z) of the deepest electrode and its standard deviation, m."""
+    """Return the deepest electrode's depth (positive towards −z) and the depth's standard deviation, m."""
     if field is None:
         return {"deepest_m": None, "deepest_std_m": None}
     z = field.displacement_m[..., 2]
@@ -228,12 +228,12 @@ def _deepest(field: FieldFrame | None) -> dict[str, float | None]:
 
 
 def _percentile(ordered: Sequence[float], share: float) -> float | None:
-    """Return a percentile of sorted values in seconds as milliseconds; None if there are no values."""
+    """Return a percentile, in ms, of sorted times in s; None if there are no times."""
     return round(ordered[min(len(ordered) - 1, int(share * len(ordered)))] * 1e3, 3) if ordered else None
 
 
 class Report(Protocol):
-    """Interface of the host's reports, which are formatted for a person or for a program."""
+    """Protocol implemented by the text and JSON reports of the host."""
 
     def note(self, text: str) -> None:
         """Report an event or a fault."""
@@ -281,10 +281,10 @@ def _patch_text(name: str, facts: Mapping[str, object]) -> str:
 
 
 def _doubts(facts: Mapping[str, object]) -> str:
-    """Return text about limits of a trusted field: low precision, and readings that were left out."""
+    """Return, as text, the limitations of a trusted field: low precision and excluded readings."""
     doubts, faults = "  imprecise" if facts["precise"] is False else "", facts["data_faults"]
     if isinstance(faults, list) and faults:
-        doubts += f"  {counted(len(faults), 'fault')} in the readings, left out"
+        doubts += f"  {counted(len(faults), 'fault')} in the readings, excluded"
     return doubts
 
 

@@ -25,7 +25,7 @@ Rounds = Annotated[int, typer.Option(min=1, help="Number of measurements per imp
 
 @app.command()
 def kernel(json: JsonFile = None, plot: PlotFile = None, rounds: Rounds = 31) -> None:
-    """Compare the speed of F + J and of each operator with NumPy, and of the dense kernels with LAPACK."""
+    """Compare the speed of F + J and the operators with NumPy's, and the dense kernels' with LAPACK's."""
     from skinnode.bench import kernel as bench
 
     _prepare(json, plot)
@@ -109,7 +109,7 @@ def trust(
     json: JsonFile = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of all streams and of the pairs of faults.")] = 1,
     short: Annotated[
-        bool, typer.Option("--short", help="Run one layout at two noises, and 20 pairs of faults.")
+        bool, typer.Option("--short", help="Run one layout at two noise levels, and 20 pairs of faults.")
     ] = False,
     table: Annotated[
         bool,
@@ -130,7 +130,7 @@ def trust(
         bool, typer.Option("--resume", help="Continue an interrupted run with the same --json and --seed.")
     ] = False,
 ) -> None:
-    """Solve presses with and without faults; check that trusted fields are right and sound patches trusted.
+    """Solve presses with and without faults; check that trusted fields are correct and sound patches trusted.
 
     The exit status is 1 if a target is missed. Sections: healthy, single (faults), pair, hours, table, speed,
     road.
@@ -158,7 +158,7 @@ def trust(
     _print_machine(figures)
     _write(json, figures)
     if kept is not None:
-        kept.unlink(missing_ok=True)  # only now, because any part may be interrupted
+        kept.unlink(missing_ok=True)  # deleted last, so that an interrupted run can be continued
     if not all(row["reached"] for row in figures["must"]):
         raise typer.Exit(1)
 
@@ -174,7 +174,8 @@ def accuracy(
 ) -> None:
     """Measure the error versus time, noise and code width, the coverage of intervals, and the time per frame.
 
-    The exit status is 1 if a requirement is not met. Requirements exclude times, which depend on the machine.
+    The exit status is 1 if a requirement is not met. No requirement limits a time, because times depend on
+    the machine.
     """
     from skinnode.bench import accuracy as bench
 
@@ -310,9 +311,10 @@ def soak(
 ) -> None:
     """Run a simulated hand under random faults for minutes or hours.
 
-    Frames of every kind are dropped, other processes occupy the processors, and the kernel cache is damaged
-    at the start. The host must survive, every patch must recover, all frame counts must add up, and memory,
-    threads and file descriptors must not grow. The exit status is 1 if any of these requirements is not met.
+    CAN frames of every kind are dropped, other processes occupy the processors, and the kernel cache is
+    damaged at the start. The host must survive, every patch must recover, all frame counts must add up, and
+    memory, threads and file descriptors must not grow. The exit status is 1 if any of these requirements is
+    not met.
     """
     from skinnode.bench import soak as bench
 
@@ -357,7 +359,7 @@ def _print_must(must: list[dict[str, Any]]) -> None:
 
 
 def _prepare(json: Path | None, plot: Path | None = None) -> None:
-    """Check that the files can be written, and report whether the kernels must be compiled first."""
+    """Check that the output files can be written, and report whether the kernels must be compiled first."""
     from skinnode.compiled.jit import is_cold
     from skinnode.files.output_file import require_writable
     from skinnode.files.plot_file import require_matplotlib

@@ -37,8 +37,8 @@ def demo(
 
     Each patch is a CANopen node on an embedded virtual bus. A spherical indenter presses and slides; the host
     collects the PDOs and solves the scans. The exit status is 1 if a scan was torn, a frame was lost, or
-    errors exceed the reported uncertainty. The limits are 1.15 times the reported RMS for the RMS error over
-    the run, and 6 standard deviations for the error of any coordinate.
+    errors exceed the reported uncertainty. The RMS error over the run may reach 1.15 times the reported RMS,
+    and the error of any coordinate 6 standard deviations.
     """
     import json
 

@@ -36,8 +36,8 @@ def doctor(
 ) -> None:
     """Examine buses, nodes, configuration, wires, noise, baseline, timing and losses.
 
-    The doctor only listens and reads, so a running hand is not disturbed. The skin is judged by its scans;
-    with --active, the doctor starts a hand that is not running, so that it sends scans. Do not touch the skin
+    The doctor only listens and reads, so a running hand is not disturbed. The doctor judges the skin by the
+    scans that the nodes send; with --active, it starts a hand that is not running. Do not touch the skin
     while the command runs. The exit status is 0 if no fault was found, 1 if any was found, 2 if the
     examination could not run.
     """

@@ -54,8 +54,8 @@ def eds(
 ) -> None:
     """Print the EDS or the DCF of a patch (CiA 306).
 
-    An EDS depends only on the sizes, the code width and --fd. The EDS files of the reference patches are
-    in eds/.
+    The EDS of a patch depends only on the wire and electrode counts, the code width and --fd. The EDS files
+    of the reference patches are in eds/.
     """
     from skinnode.errors import ConfigError
     from skinnode.files.output_file import require_writable, write_text

@@ -32,10 +32,10 @@ def check(
     """Validate a hand file and the files it names, compute the load of its buses, and list its limitations.
 
     For each bus, the command prints the planned load with every frame at its maximum length and with random
-    data. It prints the worst-case time from SYNC to the end of each patch's summary, also as a fraction of
-    the SYNC period, and the longest wait of each frame in `others`. Notes list what the hand cannot deliver,
-    such as shear or positions in the frame of the hand. No bus is opened. The exit status is 1 if the load of
-    a bus exceeds its max_load, 2 if the file cannot be used.
+    data. The command also prints the worst-case time from SYNC to the end of each patch's summary (absolute
+    and as a fraction of the SYNC period), and the longest wait of each frame in `others`. Notes list what the
+    hand cannot deliver, such as shear, or positions in the hand's coordinate frame. No bus is opened. The
+    exit status is 1 if the load of a bus exceeds its max_load, 2 if the file cannot be used.
     """
     from skinnode.bus_load.plan import plan_of, require_room
     from skinnode.config import load_hand

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from skinnode.host import Host
 
 _LONGEST_WAIT_S = 0.1
-"""Maximum delay of the reaction to Ctrl-C, s."""
+"""Maximum delay before the command reacts to Ctrl-C, s."""
 
 
 def host(
@@ -32,9 +32,9 @@ def host(
     With --json, each patch has `contacts` (null before the first field): centroid, area, normal and
     shear force with standard deviations, in m, m² and N. Ctrl-C ends the command and leaves the nodes
     pre-operational. The exit status is 1 if a patch was not operational at the end, an interface failed or
-    reported errors, or a guest received no SYNC. It is also 1 if a scan was torn or a frame was lost, unless
-    the node reported that its computer was too slow. The exit status is 2 if the hand could not be run, or if
-    a node sent frames whose content does not match their identifier.
+    reported errors, or a guest received no SYNC. The exit status is also 1 if a scan was torn or a frame was
+    lost, unless the node reported that its computer was too slow. The exit status is 2 if the hand could not
+    be run, or if a node sent frames whose content does not match their identifier.
     """
     from skinnode.cli._host_report import JsonReport, TextReport
     from skinnode.compiled.jit import is_cold

@@ -100,7 +100,7 @@ def set_node(
     """Set and store the node-ID, the bit rate or both in one node.
 
     A node that already has a node-ID is reset, so that the new node-ID takes effect. The exit status is 0 on
-    success, 1 if the node did not store its settings or did not boot, 2 if nothing could be done.
+    success, 1 if the node did not store its settings or did not boot, 2 if the command could not run.
     """
     from skinnode.canopen import indices as od
     from skinnode.canopen.lss import BIT_RATES_BPS, LssAddress

@@ -143,9 +143,9 @@ def _plan(hand: Path | None, interface: str | None, channel: str | None, simulat
 def _running(
     stack: ExitStack, plan: HandConfig, stop: threading.Event, simulate: bool, quiet: bool
 ) -> Source:
-    """Return a source that runs a host; ``stack`` closes the source.
+    """Return a monitor source that runs a host; ``stack`` closes the source.
 
-    Raises the errors of :meth:`Host.from_config`.
+    Raises the same errors as :meth:`Host.from_config`.
     """
     from skinnode.cli._console import progress
     from skinnode.compiled.jit import is_cold
@@ -168,13 +168,13 @@ def _running(
             stack.enter_context(simulated(plan))
         tell(f"bringing up {counted(len(plan.patches), 'patch', 'patches')}")
         stack.enter_context(responsive_threads())
-        stack.enter_context(without_long_collections())  # runs garbage collection before the first SYNC
+        stack.enter_context(without_long_collections())  # collects garbage on entry: before the first SYNC
         host = stack.enter_context(Host.from_config(plan, cancelled=stop.is_set))
     return stack.enter_context(HostSource(host))
 
 
 def _recording(stack: ExitStack, path: Path, speed: float) -> Source:
-    """Return a source that plays a recording; ``stack`` closes the source."""
+    """Return a monitor source that plays a recording; ``stack`` closes the source."""
     from skinnode.monitor.source import ReplaySource
     from skinnode.record import replay
 

@@ -184,7 +184,7 @@ def _sheet_if_any(remote: RemoteOd, eds: Path | None) -> DataSheet:
 def _read(remote: RemoteOd, entries: list[EdsEntry]) -> list[Reading]:
     """Read the objects.
 
-    A refused read raises SdoAbort if there is only one object; otherwise it is listed.
+    A refused read raises SdoAbort if there is only one object; with several objects, the refusal is listed.
     """
     from skinnode.diagnose.object_dictionary import read_entry
 

@@ -21,7 +21,7 @@ def replay(
         ),
     ],
     speed: Annotated[float, typer.Option(help="1: as recorded; 2: twice as fast.", metavar="X")] = 1.0,
-    fast: Annotated[bool, typer.Option("--fast", help="Play as fast as scans can be solved.")] = False,
+    fast: Annotated[bool, typer.Option("--fast", help="Play as fast as the scans can be solved.")] = False,
     as_json: Annotated[
         bool,
         typer.Option(
@@ -35,8 +35,8 @@ def replay(
     in m, m² and N.
 
     The exit status is 1 if the recording is damaged, was not ended properly, lacks frames or contains error
-    frames, or if a scan was torn or missed, or a chunk or summary was lost. The exit status is 2 if the
-    recording cannot be read.
+    frames. It is also 1 if a scan was torn or missed, or if a chunk or summary was lost. The exit status is 2
+    if the recording cannot be read.
     """
     from skinnode.process.signals import stop_on_signal
     from skinnode.record import replay as play

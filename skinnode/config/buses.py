@@ -99,9 +99,9 @@ class SyncConfig(Table):
     ] = 240
     """Maximum value of the SYNC counter (0x1019), which starts at 1 and numbers the scans. 0: the SYNC of
     another master has no counter, and each patch numbers its own scans."""
-    stagger_ms: Annotated[
-        float, Field(ge=0, allow_inf_nan=False), Allowed("a number of milliseconds, at least 0")
-    ] = 0.0
+    stagger_ms: Annotated[float, Field(ge=0, allow_inf_nan=False), Allowed("a number of at least 0 (ms)")] = (
+        0.0
+    )
     """Delay from the SYNC on one bus to the SYNC on the next when the host is the master, milliseconds. At 0,
     all patches scan at the same instant and their scans end together, so the last field has to
     wait until all others have been solved."""

@@ -34,7 +34,7 @@ Preset = Literal["aligned", "symmetric", "staggered"]
 Coordinates = Literal["preset", "node"]
 
 _Resistivity = Annotated[
-    float, Field(ge=1e-3, le=1e15, allow_inf_nan=False), Allowed("a number of ohm/m from 1e-3 to 1e15")
+    float, Field(ge=1e-3, le=1e15, allow_inf_nan=False), Allowed("a number from 1e-3 to 1e15 (ohm/m)")
 ]
 _RUBBER = Rubber()
 _Gain = Annotated[float, Field(ge=0.1, le=10, allow_inf_nan=False), Allowed("a number from 0.1 to 10")]
@@ -124,7 +124,7 @@ class CalibrationConfig(Table):
     stiffness_n_per_m: Stiffness | None = None
     """Stiffness of the rubber under one electrode, N/m; overrides ``solver.stiffness_n_per_m``."""
     young_pa: Annotated[
-        float, Field(ge=1e3, le=1e10, allow_inf_nan=False), Allowed("a number of Pa from 1e3 to 1e10")
+        float, Field(ge=1e3, le=1e10, allow_inf_nan=False), Allowed("a number from 1e3 to 1e10 (Pa)")
     ] = _RUBBER.young_pa
     """Young's modulus of the rubber, Pa, from which the forces of contacts are computed."""
     poisson: Annotated[float, Field(ge=0, le=0.5, allow_inf_nan=False), Allowed("a number from 0 to 0.5")] = (

@@ -37,12 +37,12 @@ class SolverConfig(Table):
     normal_only: bool = False
     """Solve only for the height of the electrodes, without shear."""
     max_std_m: Annotated[
-        float | None, Field(gt=0, le=1, allow_inf_nan=False), Allowed("a number of metres above 0, up to 1")
+        float | None, Field(gt=0, le=1, allow_inf_nan=False), Allowed("a number above 0 and up to 1 (m)")
     ] = None
     """Maximum standard deviation of a displacement in a precise field, metres; None: a limit derived from
     layout and noise."""
     max_force_std_n: Annotated[
-        float | None, Field(gt=0, le=1e6, allow_inf_nan=False), Allowed("a number of N above 0, up to 1e6")
+        float | None, Field(gt=0, le=1e6, allow_inf_nan=False), Allowed("a number above 0 and up to 1e6 (N)")
     ] = None
     """Maximum standard deviation of a contact's normal force in a precise field, newtons; None: a limit
     derived from layout and rubber, for calibrated forces only."""

@@ -9,10 +9,10 @@ from pydantic import Field
 from skinnode.config.table import Allowed, Length, Ratio, Table
 
 _Speed = Annotated[
-    float, Field(ge=1e-6, le=10.0, allow_inf_nan=False), Allowed("a number of m/s from 1e-6 to 10")
+    float, Field(ge=1e-6, le=10.0, allow_inf_nan=False), Allowed("a number from 1e-6 to 10 (m/s)")
 ]
 _Cycle = Annotated[
-    float, Field(ge=0.1, le=3600.0, allow_inf_nan=False), Allowed("a number of seconds from 0.1 to 3600")
+    float, Field(ge=0.1, le=3600.0, allow_inf_nan=False), Allowed("a number from 0.1 to 3600 (s)")
 ]
 
 

@@ -81,7 +81,10 @@ def skinnode_version() -> str:
             "node",
             "skinnode node: --source: got nothing, allowed: source of the resistances: MODULE:NAME, or a",
         ),
-        ("host hand.toml --seconds -1", "skinnode host: --seconds: got '-1', allowed: a number of seconds"),
+        (
+            "host hand.toml --seconds -1",
+            "skinnode host: --seconds: got '-1', allowed: a number of at least 0 (s)",
+        ),
         ("node --source simulated --seconds inf", "skinnode node: --seconds: got 'inf', allowed: a number"),
         ("record hand.toml x --seconds nan", "skinnode record: --seconds: got 'nan', allowed: a number"),
         ("record x.toml -o . --format asc", "skinnode record: --format: got 'asc', allowed: log or blf"),

@@ -171,12 +171,12 @@ NAME = "a string of 1 to 64 printable characters, not all blank"
         (
             ["patches", 0, "layout", "height_m"],
             0,
-            "patches[0].layout.height_m: got 0, allowed: a number of metres from 1e-6 to 1",
+            "patches[0].layout.height_m: got 0, allowed: a number from 1e-6 to 1 (m)",
         ),
         (
             ["patches", 0, "layout", "height_m"],
             float("nan"),
-            "patches[0].layout.height_m: got nan, allowed: a number of metres from 1e-6 to 1",
+            "patches[0].layout.height_m: got nan, allowed: a number from 1e-6 to 1 (m)",
         ),
         (
             ["patches", 0, "layout", "lower_wires"],
@@ -215,7 +215,7 @@ NAME = "a string of 1 to 64 printable characters, not all blank"
         (
             ["sync", "stagger_ms"],
             -1,
-            "sync.stagger_ms: got -1, allowed: a number of milliseconds, at least 0",
+            "sync.stagger_ms: got -1, allowed: a number of at least 0 (ms)",
         ),
         (
             ["sync", "counter_overflow"],

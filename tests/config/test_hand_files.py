@@ -176,7 +176,11 @@ def test_keys_of_a_preset_in_a_file(tmp_path: Path) -> None:
             "pitch_m: got an unknown key, allowed: one of upper_m, lower_m, resistivity_ohm_per_m",
         ),
         ("bad.toml", b'file = "bad.toml"', "file: got 'bad.toml', allowed: only in a hand file"),
-        ("bad.toml", b"height_m = -1", "bad.toml:1:1: height_m: got -1, allowed: a number of metres"),
+        (
+            "bad.toml",
+            b"height_m = -1",
+            "bad.toml:1:1: height_m: got -1, allowed: a number from 1e-6 to 1 (m)",
+        ),
     ],
 )
 def test_layout_file_that_is_none(name: str, content: bytes | None, says: str, tmp_path: Path) -> None:

@@ -57,27 +57,25 @@ _Place = Annotated[
     tuple[_Coordinate, _Coordinate], Field(strict=False), Allowed("two numbers [x, y], metres, from -1 to 1")
 ]
 _Radii = Annotated[
-    tuple[Length, Length, Length], Field(strict=False), Allowed("three numbers of metres from 1e-6 to 1")
+    tuple[Length, Length, Length], Field(strict=False), Allowed("three numbers from 1e-6 to 1 (m)")
 ]
 _Angle = Annotated[
     float, Field(ge=-6.2832, le=6.2832, allow_inf_nan=False), Allowed("a number from -6.2832 to 6.2832")
 ]
 _Slope = Annotated[float, Field(ge=0.01, le=1.5, allow_inf_nan=False), Allowed("a number from 0.01 to 1.5")]
 _Friction = Annotated[float, Field(ge=0, le=2, allow_inf_nan=False), Allowed("a number from 0 to 2")]
-_Time = Annotated[
-    float, Field(ge=0, le=86400, allow_inf_nan=False), Allowed("a number of seconds from 0 to 86400")
-]
+_Time = Annotated[float, Field(ge=0, le=86400, allow_inf_nan=False), Allowed("a number from 0 to 86400 (s)")]
 _Duration = Annotated[
-    float, Field(ge=1e-3, le=86400, allow_inf_nan=False), Allowed("a number of seconds from 1e-3 to 86400")
+    float, Field(ge=1e-3, le=86400, allow_inf_nan=False), Allowed("a number from 1e-3 to 86400 (s)")
 ]
 _Step = Annotated[
-    float, Field(ge=1e-3, le=0.1, allow_inf_nan=False), Allowed("a number of seconds from 1e-3 to 0.1")
+    float, Field(ge=1e-3, le=0.1, allow_inf_nan=False), Allowed("a number from 1e-3 to 0.1 (s)")
 ]
 _Force = Annotated[
-    float, Field(ge=1e-4, le=1e4, allow_inf_nan=False), Allowed("a number of N from 1e-4 to 1e4")
+    float, Field(ge=1e-4, le=1e4, allow_inf_nan=False), Allowed("a number from 1e-4 to 1e4 (N)")
 ]
 _Modulus = Annotated[
-    float, Field(ge=1e3, le=1e10, allow_inf_nan=False), Allowed("a number of Pa from 1e3 to 1e10")
+    float, Field(ge=1e3, le=1e10, allow_inf_nan=False), Allowed("a number from 1e3 to 1e10 (Pa)")
 ]
 _Poisson = Annotated[float, Field(ge=0, le=0.5, allow_inf_nan=False), Allowed("a number from 0 to 0.5")]
 
@@ -233,7 +231,9 @@ class TouchConfig(Table):
             most = 0.5 * (self.to_s - self.from_s)
             raise ConfigError("ramp_s", self.ramp_s, f"at most half the touch, {most:g} s")
         if self.times > 1 and self.every_s is None:
-            raise ConfigError("every_s", NOTHING, "a number of seconds, because times is more than 1")
+            raise ConfigError(
+                "every_s", NOTHING, "a number from 1e-3 to 86400 (s), because times is more than 1"
+            )
         if self.times > 1 and (self.every_s or 0.0) < self.to_s - self.from_s:
             least = self.to_s - self.from_s
             raise ConfigError("every_s", self.every_s, f"at least the duration of the touch, {least:g} s")

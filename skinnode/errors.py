@@ -25,7 +25,7 @@ from skinnode.text.words import counted
 
 
 class SkinError(Exception):
-    """Base class of all errors of this project; ``str(error)`` is a one-line message for a technician."""
+    """Base class of all skinnode exceptions; ``str(error)`` is a one-line message for a technician."""
 
 
 class Shown(str):
@@ -57,7 +57,7 @@ class ConfigError(SkinError, ValueError):
         self.key, self.got, self.allowed, self.where = key, got, allowed, where
         prefix = f"{where}: " if where else ""
         shown = repr(NOTHING if got is None else got)
-        if len(shown) > _MOST_SHOWN:  # the value may be a very long path, or an array
+        if len(shown) > _MOST_SHOWN:  # shortened: the value may be an array or a long path
             shown = f"{shown[: _MOST_SHOWN - 40]}…{shown[-40:]}"
         super().__init__(f"{prefix}{key}: got {shown}, allowed: {allowed}")
 
@@ -101,7 +101,7 @@ class SdoAbort(NodeError):
 
 
 class CodecError(SkinError, ValueError):
-    """Payload that cannot be decoded; ``cob_id`` and ``data`` are those of the frame."""
+    """Payload that cannot be decoded; ``cob_id`` and ``data`` are the frame's COB-ID and payload."""
 
     def __init__(self, cob_id: int, data: bytes, allowed: str) -> None:
         self.cob_id, self.data, self.allowed = cob_id, bytes(data), allowed

@@ -34,14 +34,20 @@ class NotARegularFile(OSError):
 
 @dataclass(frozen=True, slots=True)
 class FileLock:
-    """Acquired lock. The kernel releases the lock when its process ends, even if the process is killed."""
+    """Acquired lock.
+
+    The kernel releases the lock when the owning process exits, even if that process is killed.
+    """
 
     path: Path
     descriptor: int
     process: int
 
     def release(self) -> None:
-        """Release the lock; call once. A forked child that inherited the lock still keeps the file locked."""
+        """Release the lock; must be called only once.
+
+        A forked child that inherited the lock still keeps the file locked.
+        """
         if self.process == os.getpid():
             with contextlib.suppress(OSError):
                 self.path.unlink()
@@ -84,7 +90,7 @@ def lock_file(path: Path) -> FileLock:
         except BaseException:
             os.close(descriptor)
             raise
-        os.close(descriptor)  # the previous owner removed the file between open and lock
+        os.close(descriptor)  # try again: the previous owner removed the file after it was opened here
     raise FileInUse(path, None)
 
 

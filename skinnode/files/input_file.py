@@ -1,4 +1,4 @@
-"""Reads files that the user specifies, up to a size limit and without blocking indefinitely."""
+"""Reads user-specified files up to a size limit, without blocking indefinitely."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from typing import Final
 from skinnode.errors import ConfigError
 
 MOST_BYTES: Final = 1 << 20
-"""Maximum size of a text file, bytes: ten times the size of the largest known hand file, layout or baseline.
-The limit is needed because parsers use about a hundred times as much memory as the text."""
+"""Maximum size of a text file in bytes, ten times the size of the largest known hand, layout or baseline
+file. The limit is needed because parsers use about a hundred times as much memory as the text."""
 
 
 def read_input(key: str, path: Path, most_bytes: int = MOST_BYTES) -> bytes:
@@ -30,13 +30,11 @@ def read_input(key: str, path: Path, most_bytes: int = MOST_BYTES) -> bytes:
         with open(descriptor, "rb") as file:
             if stat.S_ISDIR(os.fstat(descriptor).st_mode):
                 raise ConfigError(key, str(path), "a file that can be read (Is a directory)")
-            os.set_blocking(
-                descriptor, True
-            )  # non-blocking mode is needed only for open(): a pipe may have no writer
+            os.set_blocking(descriptor, True)  # only open() must not block: a pipe may have no writer
             data = file.read(most_bytes + 1)
     except OSError as error:
         raise ConfigError(key, str(path), f"a file that can be read ({error.strerror})") from None
-    except ValueError as error:  # the path contains a NUL character
+    except ValueError as error:  # open() raises ValueError if the path contains a NUL character
         raise ConfigError(key, str(path), f"a file that can be read ({error})") from None
     if len(data) > most_bytes:
         raise ConfigError(key, str(path), f"a file of at most {most_bytes >> 20} MiB")

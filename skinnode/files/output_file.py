@@ -27,7 +27,7 @@ def require_writable(option: str, file: Path) -> None:
     except OSError as error:
         raise ConfigError(option, str(file), f"a file that can be written ({error.strerror})") from error
     if not os.access(target, os.W_OK):
-        raise ConfigError(option, str(file), "a file in an existing folder that can be written")
+        raise ConfigError(option, str(file), "a file in an existing, writable folder")
 
 
 def write_text(option: str, file: Path, text: str) -> None:

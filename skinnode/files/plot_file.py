@@ -18,7 +18,7 @@ def require_matplotlib(file: Path) -> None:
         ConfigError: matplotlib is missing, or cannot write this format.
     """
     if find_spec("matplotlib") is None:
-        raise ConfigError("--plot", str(file), "only with matplotlib: sh install.sh plot")
+        raise ConfigError("--plot", str(file), "plots require matplotlib (install: sh install.sh plot)")
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
     kinds = sorted(FigureCanvasAgg.get_supported_filetypes())

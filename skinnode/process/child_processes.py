@@ -1,9 +1,9 @@
 """Starts child processes that are protected from the terminal's signals.
 
-A terminal sends SIGINT (Ctrl-C) and SIGHUP to a command and also to its child processes. On SIGINT, a child
-that is still importing modules would print a traceback. SIGHUP would terminate the resource tracker of
-``multiprocessing`` before the tracker has cleaned up. Child processes therefore run with both signals
-blocked, and the command itself ends its child processes.
+A terminal sends SIGINT (Ctrl-C) and SIGHUP both to a command and to the command's child processes. A child
+that receives SIGINT while importing modules would print a traceback. SIGHUP would terminate the resource
+tracker of ``multiprocessing`` before the tracker has cleaned up. Child processes therefore run with both
+signals blocked, and the command itself terminates them.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ def starting_children() -> Iterator[None]:
     with _signals_deferred():
         before = signal.pthread_sigmask(signal.SIG_BLOCK, _TERMINAL_SIGNALS)
         try:
-            resource_tracker.ensure_running()  # starting the tracker unblocks SIGINT in this thread
+            resource_tracker.ensure_running()  # unblocks SIGINT: block it again below
             signal.pthread_sigmask(signal.SIG_BLOCK, _TERMINAL_SIGNALS)
             yield
         finally:
@@ -41,8 +41,8 @@ def _signals_deferred() -> Iterator[None]:
     """Defer the handling of signals to the end of the ``with`` block.
 
     Blocking the signals in the main thread is not sufficient: another thread can receive a signal, and Python
-    then calls the handler on the main thread. Python never interrupts other threads to handle a signal, so on
-    another thread this function does nothing.
+    then calls the handler on the main thread. Python handles signals only on the main thread, so this
+    function does nothing on any other thread.
     """
     if threading.current_thread() is not threading.main_thread():
         yield

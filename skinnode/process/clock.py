@@ -1,8 +1,8 @@
-"""Functions that read the time, wait and start threads, with the system clock or with a virtual clock.
+"""Functions that read the time, wait, and start threads, based on either the system clock or a virtual clock.
 
 Code that reads the time, waits or starts threads must call these functions. A new thread uses the clock of
 the thread that created it, and :func:`use` sets the clock of the current thread. Without a virtual clock,
-these functions call those of the standard library.
+these functions call their counterparts in the standard library.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from typing import Any, Protocol
 
 
 class Clock(Protocol):
-    """Source of time, and factory for threads and for the objects on which threads wait."""
+    """Time source, and factory for threads and for the synchronisation objects that threads wait on."""
 
     def monotonic_ns(self) -> int:
         """Return the monotonic time, ns."""
@@ -106,7 +106,7 @@ def monotonic() -> float:
 
 
 def perf_counter() -> float:
-    """Return a time for measuring durations, s; in virtual time, computation takes no time."""
+    """Return the time for measuring durations, s; a virtual clock does not advance during computation."""
     clock = _here.clock
     return system_time.perf_counter() if clock is _SYSTEM else clock.monotonic_ns() * 1e-9
 
@@ -154,8 +154,8 @@ def thread(target: Callable[..., object], name: str, args: tuple[Any, ...] = ())
 def pool(threads: int, name: str) -> Executor:
     """Create a :class:`concurrent.futures.ThreadPoolExecutor`.
 
-    To wait for a job, use :meth:`concurrent.futures.Future.add_done_callback`. Other waiting methods ignore
-    virtual time.
+    To wait for a job, use :meth:`concurrent.futures.Future.add_done_callback`. Other ways of waiting ignore
+    the virtual clock.
     """
     return _here.clock.pool(threads, name)
 

@@ -1,4 +1,4 @@
-"""Prevents garbage collection and busy threads from delaying programs with deadlines."""
+"""Prevents garbage collection and busy threads from delaying time-critical code."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from contextlib import contextmanager
 
 @contextmanager
 def without_long_collections() -> Iterator[None]:
-    """Exclude objects that exist on entry from garbage collection for the duration of the block.
+    """Exclude all objects that exist on entry to the ``with`` block from garbage collection during the block.
 
-    If numba and canopen are loaded, a full collection on a small computer stops every thread for 30 ms. A
-    node could then miss a scan, or a host could delay a SYNC. Enter the block after all setup has been
-    completed. Objects that exist on entry and become cyclic garbage are freed only after the block.
+    With numba and canopen loaded, a full garbage collection on a small computer stops all threads for 30 ms.
+    Such a pause can make a node miss a scan, or delay the host's SYNC. Enter the block after setup is
+    complete. Objects that exist on entry and become cyclic garbage are freed only after the block.
     """
     gc.collect()
     gc.freeze()
@@ -28,8 +28,8 @@ def without_long_collections() -> Iterator[None]:
 def responsive_threads() -> Iterator[None]:
     """Set Python's thread switch interval to 0.5 ms for the duration of the block; the default is 5 ms.
 
-    With the default, a thread that receives frames or updates the screen could delay a scan for longer than
-    its solution takes.
+    At 5 ms, a thread that receives frames or updates the screen could delay a scan for longer than the scan
+    takes to solve.
     """
     kept = sys.getswitchinterval()
     sys.setswitchinterval(5e-4)

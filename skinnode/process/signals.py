@@ -1,4 +1,4 @@
-"""Terminates programs that run until Ctrl-C in an orderly way."""
+"""Orderly shutdown of programs that run until Ctrl-C."""
 
 from __future__ import annotations
 
@@ -13,8 +13,9 @@ from types import FrameType
 class SignalEvent(threading.Event):
     """Event that a signal handler can safely set.
 
-    ``threading.Event.set`` acquires a lock. If the interrupted thread already holds this lock in ``wait``, a
-    handler that calls ``set`` blocks forever. ``SimpleQueue.put``, in contrast, is reentrant.
+    ``threading.Event.set`` acquires a lock. If a signal interrupts a thread that holds this lock in ``wait``,
+    a handler that calls ``set`` blocks forever. ``SimpleQueue.put``, which this class uses instead, is
+    reentrant.
     """
 
     def __init__(self) -> None:
@@ -36,19 +37,20 @@ class SignalEvent(threading.Event):
         if not self._is_set:
             with suppress(Empty):
                 self._wake.get(timeout=None if timeout is None else max(0.0, timeout))
-                self._wake.put(None)  # wakes the next waiting thread
+                self._wake.put(None)  # so that other waiting threads also wake up
         return self._is_set
 
 
 @contextmanager
 def stop_on_signal() -> Iterator[threading.Event]:
-    """Yield an event that stop signals set, and restore the previous signal handlers after the block.
+    """Yield an event that stop signals set; afterwards restore the previous signal handlers.
 
-    The stop signals are SIGINT (Ctrl-C), SIGTERM and SIGHUP (terminal closed). If SIGHUP was already ignored,
-    as under nohup, it remains ignored.
+    The stop signals are SIGINT (Ctrl-C), SIGTERM and SIGHUP (terminal closed). SIGHUP remains ignored if it
+    was already ignored on entry, as under nohup.
 
     Raises:
-        ValueError: if called from a thread other than the main thread, which cannot set signal handlers.
+        ValueError: Called from a thread other than the main thread; only the main thread can set signal
+            handlers.
     """
     stop = SignalEvent()
 

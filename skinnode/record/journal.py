@@ -1,9 +1,9 @@
-"""Reads and writes the journal of a recording, which contains everything except the frames.
+"""Reads and writes a recording's journal, the file that contains everything except the frames.
 
 The journal is a JSON Lines file next to the log. The first line contains the hand and the offset of the
 host's clock (:class:`Header`). Each further line describes an event that affected how the host decoded the
-frames. In an event, ``at`` is the number of frames received on ``bus`` before the event, and ``t_ns`` is the
-time of the event on the host's monotonic clock.
+frames. In an event, ``at`` is the number of frames previously received on ``bus``, and ``t_ns`` is the time
+of the event on the host's monotonic clock.
 
 =============  ==============================================================================
 ``event``      meaning
@@ -14,8 +14,8 @@ time of the event on the host's monotonic clock.
 ``withheld``   scans of ``patch`` are no longer decoded
 ``polled``     a timeout ended a scan that lacked frames
 ``overtaken``  ``scan`` of ``patch``, complete at ``received_ns``, was skipped for a newer one
-``dropped``    ``frames`` were not written, because the disk was too slow
-``ended``      the recording was closed with ``frames`` in the log; if this event is missing, the process was
+``dropped``    ``frames`` were not written because the disk was too slow ``ended``      the recording was
+closed with ``frames`` in the log; if this event is missing, the process was
                killed or the disk was full
 =============  ==============================================================================
 """
@@ -45,8 +45,8 @@ COMPLAINTS_KEPT: Final = 100
 
 _MOST: Final = 2**63 - 1
 _LONGEST_LINE: Final = 2 << 20
-"""Maximum length of a line, bytes; the facts about the largest patch fit. A longer line is read as several
-lines."""
+"""Maximum length of a line in bytes, sufficient for the facts about the largest patch. A longer line is
+read as several lines."""
 _OF_PATCHES: Final = ("resumed", "withheld", "polled", "overtaken")
 
 
@@ -58,7 +58,7 @@ class Header:
     started: str
     """Local date and time at which the recording began, ISO 8601."""
     wall_minus_mono_ns: int
-    """Log time minus time on the host's monotonic clock, ns."""
+    """Difference between the log's timestamps and the host's monotonic clock, ns."""
 
     def line(self) -> str:
         """Return the header as a line of JSON."""
@@ -68,7 +68,7 @@ class Header:
 
 
 def _without_paths(value: Any) -> Any:
-    """Remove file names, because the journal already contains what the host read from the files."""
+    """Remove file names, because the journal contains the data that was read from those files."""
     if isinstance(value, Mapping):
         kept = {key: item for key, item in value.items() if not isinstance(item, Path)}
         return {key: _without_paths(item) for key, item in kept.items()}
@@ -125,7 +125,7 @@ def facts_of(table: Mapping[str, Any], patch: PatchConfig, bus: BusConfig) -> No
             own["name"],
         )
     scale = CodeScale(patch.code_bits, table["lo"], table["hi"])
-    checked = table.get("checked", False)  # missing in journals of early versions, whose nodes sent no checks
+    checked = table.get("checked", False)  # missing in old journals; nodes sent no checks at that time
     if not isinstance(checked, bool):
         raise TypeError(f"checked: got {checked!r}, must be true or false")
     return NodeFacts(
@@ -140,7 +140,7 @@ def read_journal(path: Path) -> tuple[Header, list[dict[str, Any]], list[str]]:
         path: The journal.
 
     Returns:
-        The header, the events, and a line of text for each unreadable line.
+        The header, the events, and a one-line message for each unreadable line.
 
     Raises:
         ConfigError: The journal cannot be read, or its first line is not a header.
@@ -198,7 +198,8 @@ def _event(line: bytes, hand: HandConfig) -> dict[str, Any]:
         case "dropped":
             _whole(event["frames"])
         case "ended":
-            _whole(event.get("frames", 0))  # missing in journals of early versions
+            _whole(event.get("frames", 0))  # missing in old journals
+
         case kind if kind in _OF_PATCHES and hand.patch(event["patch"]).bus == event["bus"]:
             if kind == "overtaken":
                 _whole(event["scan"])
@@ -209,7 +210,7 @@ def _event(line: bytes, hand: HandConfig) -> dict[str, Any]:
 
 
 def _whole(value: object, least: int = 0) -> int:
-    """Return ``value``. Raises ValueError unless it is a 64-bit integer not less than ``least``."""
+    """Return ``value``. Raises ValueError if it is not a 64-bit integer, or is less than ``least``."""
     if not isinstance(value, int) or isinstance(value, bool) or not least <= value <= _MOST:
         raise ValueError
     return value

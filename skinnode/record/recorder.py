@@ -29,15 +29,17 @@ from skinnode.transport.frame_log import SUFFIXES, FrameLog, LogFormat, LoggedFr
 _log = logging.getLogger(__name__)
 
 FLUSH_S: Final = 0.25
-"""Interval between flushes to the kernel, s; entries older than one interval survive a crash of this
-process."""
+"""Interval between flushes to the kernel, s.
+
+If this process crashes, at most the entries of one interval are lost.
+"""
 
 SYNC_S: Final = 1.0
-"""Interval between fsync calls, s; entries older than one interval are on the disk. Each call blocks the
-writer thread for about 10 ms."""
+"""Interval between fsync calls, s. If power fails, at most the entries of about one interval are lost.
+Each call blocks the writer thread for about 10 ms."""
 
 CAPACITY: Final = 50_000
-"""Maximum number of queued batches, equal to several seconds of traffic on four fully loaded buses."""
+"""Maximum number of queued batches of frames: several seconds of traffic on four fully loaded buses."""
 
 _ALLOWED: Final = "a folder (created if needed), or a file ending in .log or .blf"
 
@@ -57,7 +59,7 @@ class RecorderStats:
 
 
 def name_in(folder: Path, hand: HandConfig, kind: LogFormat, now: datetime.datetime) -> Path:
-    """Return the path for a recording in ``folder``, named after the hand, the date and the time."""
+    """Return a path in ``folder`` for a recording: the hand's name with the date and time."""
     name = "".join(c if c.isalnum() or c in "-_" else "-" for c in hand.name)
     return folder / f"{name}-{now:%Y%m%d-%H%M%S}.{kind}"
 
@@ -65,8 +67,8 @@ def name_in(folder: Path, hand: HandConfig, kind: LogFormat, now: datetime.datet
 def make_folder(path: Path) -> Path | None:
     """Create the folder ``path`` and any missing parents, and return it; return None if it already existed.
 
-    Raises ConfigError if the folder cannot be created, or if the name has a suffix, because it is then
-    probably the misspelt name of a recording file.
+    Raises ConfigError if the folder cannot be created. A name with a suffix also raises ConfigError, because
+    it is probably a misspelt file name.
     """
     if path.is_dir():
         return None
@@ -90,7 +92,7 @@ def _is_folder(path: Path) -> bool:
 
 
 class Recorder:
-    """Records a host, to which it is passed as ``tap``, from construction until :meth:`close`.
+    """Records the traffic of the host to which it is passed as ``tap``, until :meth:`close` is called.
 
     Example::
 
@@ -98,19 +100,19 @@ class Recorder:
             ...
 
     If recording begins before the host starts, a replay reproduces the fields bit for bit. A recording that
-    begins while the host runs (:meth:`Host.tap`) lacks the previous state of the solvers. If a ``with`` block
-    fails before the first frame, no file remains. If the disk fails, recording ends, a log message reports
-    the failure, and the host continues. An entry that causes any other exception is lost and counted in
-    ``dropped``.
+    begins while the host is running (:meth:`Host.tap`) lacks the solvers' initial state. If an exception ends
+    the ``with`` block before the first frame, the empty recording is deleted. If the disk fails, recording
+    ends, a log message reports the failure, and the host continues. An entry that causes any other exception
+    is lost and counted in ``dropped``.
 
     Args:
         hand: The hand.
-        path: A file ending in .log or .blf, or a folder, created if needed, in which the file is named after
-            the hand, the date and the time. The journal is written next to it.
-        kind: Format of the file if ``path`` is a folder.
+        path: A file name ending in .log or .blf, or a folder, which is created if needed. In a folder, the
+            file is named after the hand, the date and the time. The journal is written next to the file.
+        kind: File format, used if ``path`` is a folder.
 
     Raises:
-        ConfigError: A file already exists, or a file or the folder cannot be created.
+        ConfigError: The log or journal already exists, or a file or folder cannot be created.
     """
 
     def __init__(self, hand: HandConfig, path: Path | str, kind: LogFormat = "log") -> None:
@@ -150,7 +152,7 @@ class Recorder:
         """Return the number of frames recorded and lost so far."""
         return RecorderStats(self._log.frames, self._lost, self._failure)
 
-    # --- methods called on the host's threads
+    # --- methods that the host's threads call
 
     def received(self, bus: str, frames: Sequence[Frame]) -> None:
         """Record a batch of received frames."""
@@ -172,7 +174,7 @@ class Recorder:
         self._event(patch, "withheld")
 
     def polled(self, patch: str, t_ns: int) -> None:
-        """Record that a timeout ended an incomplete scan."""
+        """Record that an incomplete scan timed out."""
         self._event(patch, "polled", t_ns=t_ns)
 
     def overtaken(self, patch: str, scan: int, t_receive_ns: int) -> None:
@@ -192,7 +194,7 @@ class Recorder:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
-        if error is not None and not self._log.frames:  # existing files would make a retry fail
+        if error is not None and not self._log.frames:  # otherwise a retry would fail because the files exist
             self.path.unlink(missing_ok=True)
             self.path.with_suffix(SUFFIX).unlink(missing_ok=True)
             if self._made is not None:
@@ -209,7 +211,7 @@ class Recorder:
         bus, t_ns = self._bus_of[patch], clock.monotonic_ns() if t_ns is None else t_ns
         self._put(lambda: self._write_event(bus, t_ns, event, patch=patch, **more), 0)
 
-    # --- methods called on the recorder's thread
+    # --- methods that the recorder's thread calls
 
     def _run(self) -> None:
         keep_on(self._turn, self._defects, "recording")
@@ -247,7 +249,7 @@ class Recorder:
             self._defects.report("recording", error)
 
     def _flush(self, *, to_disk: bool) -> None:
-        """Flush the journal and then the log, so that the journal on disk is never older than the log."""
+        """Flush the journal before the log, so that the journal on disk is never older than the log."""
         if self._lost != self._lost_reported:
             lost, self._lost_reported = self._lost - self._lost_reported, self._lost
             self._write_event("", clock.monotonic_ns(), "dropped", frames=lost)
@@ -275,7 +277,7 @@ class Recorder:
 
 
 def channels(hand: HandConfig) -> dict[str, str]:
-    """Return the log channel of each bus: the bus's name if candump accepts it, otherwise a numbered name."""
+    """Return each bus's channel name in the log: its name if candump accepts it, otherwise a number."""
     names = {}
     for number, bus in enumerate(hand.buses):
         plain = bus.name.isascii() and bus.name.isalnum() and not bus.name.isdigit() and len(bus.name) < 16

@@ -3,11 +3,11 @@
 The replay uses the host's dispatcher, assembler, decoder, stream, solver and publisher, but no threads: each
 scan is solved when its last frame is dispatched.
 
-The fields of a replay are identical to the live fields, bit for bit, if three conditions are met. The
-recording began before the host started and is complete; software and processor are the same; and no deadline
-ended a live solve early. Times refer to the clock of the recording host and have the resolution of log files,
-1 µs. If frames are missing or damaged, events of the journal are ordered by time and not by frame count, and
-the times of later frames determine when incomplete scans end.
+Replayed fields are identical to the live fields, bit for bit, if the recording is complete and began before
+the host started, software and processor are the same, and no live solve was cut short by its deadline. Times
+refer to the recording host's clock and have a resolution of 1 µs, as in log files. If frames are missing or
+damaged, the replay orders journal events by time instead of frame count, and uses the times of later frames
+to time out incomplete scans.
 """
 
 from __future__ import annotations
@@ -39,14 +39,16 @@ from skinnode.text.words import counted
 from skinnode.transport.frame_log_reader import FrameLogReader
 
 LONGEST_SILENCE_S: Final = 60.0
-"""Maximum pause between replayed frames, s; longer pauses, perhaps due to damaged timestamps, are
-shortened."""
+"""Maximum pause between replayed frames, s.
+
+Longer pauses are shortened; they may be due to damaged timestamps.
+"""
 
 _ROUNDING_NS: Final = 2_000
 """Maximum rounding error of a log's timestamps, ns."""
 
 _SLICE_S: Final = 0.1
-"""Maximum time until :meth:`Replay.stop` takes effect, s."""
+"""Maximum delay until :meth:`Replay.stop` takes effect, s."""
 
 
 def _never() -> bool:
@@ -61,12 +63,12 @@ def replay(path: Path | str, *, speed: float | None = None, cancelled: Callable[
         for field in skinnode.record.replay("runs/hand-20260102-030405.log"):
             ...
 
-    At any speed, the replay solves every scan that was solved live.
+    The replay solves every scan that was solved live, regardless of ``speed``.
 
     Args:
         path: File ending in .log or .blf.
-        speed: 1 for the speed of the recording, 2 for twice as fast; None for as fast as possible.
-        cancelled: Function called before each frame; if it returns True, the iteration ends as after
+        speed: Replay speed relative to the recording (2 is twice as fast); None replays as fast as possible.
+        cancelled: Function called before each frame; a return value of True has the same effect as
             :meth:`Replay.stop`.
 
     Raises:
@@ -84,11 +86,11 @@ class Replay:
         if not path.name:
             raise ConfigError("recording", str(path), "a file ending in .log or .blf")
         header, events, self.complaints = read_journal(path.with_suffix(SUFFIX))
-        """One line of text for each unreadable part of the journal."""
+        """One-line message for each unreadable part of the journal."""
         self.hand, self.started = header.hand, header.started
         self._speed, self._offset_ns = speed, header.wall_minus_mono_ns
         self.log = FrameLogReader(path)
-        """Reader of the log; its attributes ``damaged`` and ``damages`` report unreadable parts."""
+        """Log reader, whose attributes ``damaged`` and ``damages`` report unreadable parts."""
         ends = [event for event in events if event["event"] == "ended"]
         self.ended = bool(ends)
         """Whether the recording was closed properly; False if the recording process was killed."""
@@ -97,8 +99,7 @@ class Replay:
         self._first_ns: int | None = None
         self._journal = path.with_suffix(SUFFIX).name
         self.incomplete: str | None = None
-        """Description of what is missing from the log, set after a full iteration; None if nothing is
-        missing."""
+        """Description of the frames missing from the log; None if none are missing or before a full iteration."""
         self.dropped = sum(e["frames"] for e in events if e["event"] == "dropped")
         """Number of frames that the recorder could not write."""
         self._now_ns = 0
@@ -156,7 +157,7 @@ class Replay:
 
     @property
     def flaws(self) -> list[str]:
-        """Lines of text about missing or unreadable parts; complete only after the iteration has ended."""
+        """Messages about missing or unreadable parts; complete only after a full iteration."""
         found = [f"{self.log.path.name} {damage}" for damage in self.log.damages]
         if self.log.damaged > len(found):
             found.append(f"{self.log.damaged - len(found)} more damaged places")
@@ -171,12 +172,12 @@ class Replay:
         return found
 
     def stop(self) -> None:
-        """End the iteration within :data:`_SLICE_S`; any thread may call this method."""
+        """End the iteration within :data:`_SLICE_S`; can be called from any thread."""
         self._stopped = True
 
     @property
     def stopped(self) -> bool:
-        """Whether the iteration was or must be stopped before the end of the recording."""
+        """Whether the iteration has been stopped, or must stop, before the end of the recording."""
         return self._stopped or self._cancelled()
 
     def health(self, patch: str) -> PatchHealth:
@@ -202,7 +203,7 @@ class Replay:
             clock.sleep(min(left_s, _SLICE_S))
 
     def complain(self, event: dict[str, Any], what: str) -> None:
-        """Add a line about a malformed journal event to ``complaints``."""
+        """Add a message about a malformed journal event to ``complaints``."""
         self.complaints.append(f"{self._journal} line {event['line']}: {what}")
 
     def clock(self) -> int:
@@ -211,7 +212,7 @@ class Replay:
 
     @property
     def publisher(self) -> Publisher:
-        """Publisher that distributes the replayed fields."""
+        """Publisher that passes replayed fields to subscribers."""
         return self._publisher
 
 
@@ -242,7 +243,7 @@ class _PollerlessDispatcher(Dispatcher):
 
 
 class _Bus:
-    """Reception on one bus of the recording, with the streams of its patches."""
+    """Receiver for one bus of a recording, which contains the streams of the patches on the bus."""
 
     def __init__(self, config: BusConfig, replay: Replay, events: list[dict[str, Any]]) -> None:
         self._config, self._replay = config, replay
@@ -266,10 +267,10 @@ class _Bus:
             od.heartbeat_cob_id(patch.node_id): self.patches[patch.name].monitor
             for patch in hand.patches_on(config.name)
         }
-        self._stood_by: set[int] = set()  # heartbeat COB-IDs of nodes that the host has shut down
+        self._stood_by: set[int] = set()  # heartbeat COB-IDs of nodes that the host has set pre-operational
 
     def take(self, frame: Any, *, sent: bool, whole: bool) -> None:
-        """Process the next frame of the log; ``whole``: whether the log is undamaged so far."""
+        """Process the next frame of the log; ``whole`` is True if the log has been undamaged so far."""
         if sent:
             self._sent += 1
             self._dispatcher.count_sent(frame.can_id, frame.data)
@@ -284,7 +285,7 @@ class _Bus:
         self._dispatcher.dispatch((frame,))
         if frame.can_id in self._stood_by:
             monitor = self._of_heartbeat[frame.can_id]
-            if monitor.nmt_state == NmtState.PRE_OPERATIONAL:  # commanded, so not a fault
+            if monitor.nmt_state == NmtState.PRE_OPERATIONAL:  # not a fault, but the host's command
                 monitor.nmt_state = NmtState.OPERATIONAL
         if not whole:
             for heard in self.patches.values():
@@ -292,7 +293,7 @@ class _Bus:
         self._dispatcher.measure(frame.t_ns)
 
     def _on_command(self, data: bytes) -> None:
-        """Process an NMT command from the host, which sets operational nodes pre-operational when it ends."""
+        """Process an NMT command of the host, which sets nodes pre-operational on exit."""
         if len(data) != 2:
             return
         cob_id = od.heartbeat_cob_id(data[1])
@@ -330,7 +331,7 @@ class _Bus:
                     stream.resume(solver, stream.withholdings, anew=bool(event.get("anew")))
 
     def _solver(self, event: dict[str, Any]) -> ScanSolver | None:
-        """Return the solver for a journal event; None if the node's facts are unknown or unusable."""
+        """Return the solver for a journal event; None if the facts about the node are unknown or unusable."""
         name, replay = event["patch"], self._replay
         if "facts" in event:
             self._solvers[name] = None

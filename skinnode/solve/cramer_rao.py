@@ -1,4 +1,4 @@
-"""Cramér-Rao bound J⁺ diag(σ²) J⁺ᵀ for a wire: how precisely its resistances determine its rest position.
+"""Cramér-Rao bound J⁺ diag(σ²) J⁺ᵀ on the precision of a wire's rest position.
 
 J is the Jacobian of the relative residual a F − 1 at rest, and σ is the relative noise in each resistance.
 Standard deviations are in clearances; the clearance is the smallest distance at rest between an upper and a
@@ -24,22 +24,23 @@ def patch_std(layout: PatchLayout, relative_noise: ArrayLike, normal_only: bool 
 
 
 def wire_std(layout: PatchLayout, relative_noise: ArrayLike, normal_only: bool = False) -> Float:
-    """Return the standard deviation of the exact inverse of each wire at rest.
+    """Return each wire's standard deviation at rest, as computed by the exact inverse.
 
     Args:
         layout: The patch.
         relative_noise: Relative standard deviation of R, a number or (U, K).
-        normal_only: Whether only z is unknown.
+        normal_only: True if only the z coordinates are unknowns.
 
     Returns:
-        (U,) RMS standard deviation of a wire's coordinates, in clearances; inf if its Jacobian is singular.
+        (U,) RMS standard deviation of each wire's coordinates, in clearances; inf if the wire's Jacobian is
+        singular.
     """
     if np.ndim(relative_noise) == 0:
         return np.asarray(relative_noise) * _unit_std(layout, normal_only)
     return _std(layout, np.broadcast_to(relative_noise, layout.shape), normal_only)
 
 
-@functools.lru_cache(maxsize=64)  # cached, because this takes 3 ms per layout
+@functools.lru_cache(maxsize=64)  # cached, because the Jacobians of a layout take 3 ms
 def _unit_std(layout: PatchLayout, normal_only: bool) -> Float:
     return _std(layout, np.ones(layout.shape), normal_only)
 

@@ -14,8 +14,8 @@ of the event on the host's monotonic clock.
 ``withheld``   scans of ``patch`` are no longer decoded
 ``polled``     a timeout ended a scan that lacked frames
 ``overtaken``  ``scan`` of ``patch``, complete at ``received_ns``, was skipped for a newer one
-``dropped``    ``frames`` were not written because the disk was too slow ``ended``      the recording was
-closed with ``frames`` in the log; if this event is missing, the process was
+``dropped``    ``frames`` were not written, because the disk was too slow
+``ended``      the recording was closed with ``frames`` in the log; if this event is missing, the process was
                killed or the disk was full
 =============  ==============================================================================
 """

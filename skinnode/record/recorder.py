@@ -277,7 +277,7 @@ class Recorder:
 
 
 def channels(hand: HandConfig) -> dict[str, str]:
-    """Return each bus's channel name in the log: its name if candump accepts it, otherwise a number."""
+    """Return each bus's channel in the log: the bus's name if candump accepts it, otherwise bus0, bus1, …."""
     names = {}
     for number, bus in enumerate(hand.buses):
         plain = bus.name.isascii() and bus.name.isalnum() and not bus.name.isdigit() and len(bus.name) < 16

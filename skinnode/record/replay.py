@@ -99,7 +99,7 @@ class Replay:
         self._first_ns: int | None = None
         self._journal = path.with_suffix(SUFFIX).name
         self.incomplete: str | None = None
-        """Description of the frames missing from the log; None if none are missing or before a full iteration."""
+        """Description of the frames missing from the log; None if none are missing, or not known yet."""
         self.dropped = sum(e["frames"] for e in events if e["event"] == "dropped")
         """Number of frames that the recorder could not write."""
         self._now_ns = 0

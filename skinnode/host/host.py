@@ -175,12 +175,15 @@ class Host:
     def fields(
         self, *, timeout_s: float | None = None, capacity: int | None = None, patch: str | None = None
     ) -> Subscription:
-        """Subscribe to all further fields. Iterate over the subscription with ``for`` or ``async for``.
+        """Subscribe to the fields of all future scans.
+
+        Iterate over the subscription with ``for`` or ``async for``.
 
         Args:
-            timeout_s: Time without a field after which the loop raises TimeoutError, s; None for no limit.
-            capacity: Maximum number of waiting fields, beyond which the oldest field is dropped; the hand
-                file's capacity by default.
+            timeout_s: Maximum time (s) to wait for a field before the iteration raises TimeoutError; None for
+                no limit.
+            capacity: Capacity of the subscriber's queue; when the queue is full, the oldest field is dropped.
+                The hand file's capacity by default.
             patch: Patch whose fields are delivered; all patches by default.
 
         Raises:
@@ -190,18 +193,19 @@ class Host:
         return self._publisher.subscribe(kept, timeout_s, patch)
 
     def hands(self, *, timeout_s: float | None = None, capacity: int | None = None) -> HandSubscription:
-        """Subscribe to hand frames, each with all patches' fields for one SYNC.
+        """Subscribe to hand frames, each of which contains all patches' fields for one SYNC.
 
-        Iterate over the subscription with ``for`` or ``async for``. A hand frame waits at most two SYNC
-        periods for a patch's field, and does not wait for an absent patch.
+        Iterate over the subscription with ``for`` or ``async for``. A hand frame is delivered at most two
+        SYNC periods after its first field, and earlier if only absent patches are missing.
 
         Args:
-            timeout_s: Time without a hand frame after which the loop raises TimeoutError, s; None for no
-                limit.
-            capacity: Maximum number of waiting hand frames; the hand file's capacity by default.
+            timeout_s: Maximum time (s) to wait for a hand frame before the iteration raises TimeoutError;
+                None for no limit.
+            capacity: Capacity of the subscriber's queue, in hand frames; the hand file's capacity by default.
 
         Raises:
-            ValueError: if the patches of the hand do not all follow the same SYNC with a counter.
+            ValueError: if the hand's patches do not all follow the same SYNC producer, or its SYNC has no
+                counter.
         """
         self._require_one_sync()
         patches = [patch.name for patch in self.hand.patches]
@@ -219,15 +223,15 @@ class Host:
         patch: str | None = None,
         capacity: int | None = None,
     ) -> FieldCallback:
-        """Call ``function`` with each further field, on a separate thread.
+        """Call ``function`` with each new field, on a separate thread.
 
         The calls end when the host closes or the callback's ``close()`` is called. If the function blocks or
-        raises an exception, only its own fields are lost, and the callback counts them.
+        raises an exception, other subscribers are not affected; the callback counts the lost fields.
 
         Args:
             function: Function to call with each field.
             patch: Patch whose fields are delivered; all patches by default.
-            capacity: Maximum number of waiting fields; the hand file's capacity by default.
+            capacity: Capacity of the callback's queue, in fields; the hand file's capacity by default.
 
         Raises:
             TypeError: if ``function`` is not callable, or is async.
@@ -236,7 +240,7 @@ class Host:
         return self._callbacks.add(function, self.fields(capacity=capacity, patch=patch))
 
     def latest(self, patch: str) -> FieldFrame | None:
-        """Return the newest field of a patch, or None before the patch's first field. Never waits.
+        """Return a patch's newest field, or None if no field has been published yet. Never waits.
 
         Raises:
             ValueError: if there is no such patch.
@@ -269,17 +273,18 @@ class Host:
         return served.health(no_sync=self._lacks_sync(served))
 
     def _lacks_sync(self, bus: ServedBus) -> bool:
-        """Return whether a bus lacks SYNC, unless its patches scan on their own clocks and need no SYNC."""
+        """Return whether SYNC is missing on a bus whose patches need SYNC."""
         if not bus.sync_is_late(self._t_up_ns, self.hand.sync.period_ms * 1_000_000):
             return False
         streams = [node.stream for node in self._nodes.values() if node.link is bus.link]
         return bool(self.hand.sync.counter_overflow) or not any(each.stats().offered for each in streams)
 
     def events(self, *, capacity: int = CAPACITY_EVENTS) -> EventSubscription:
-        """Subscribe to all further changes in the health of patches, wires and buses.
+        """Subscribe to all future changes in the health of patches, wires and buses.
 
         Args:
-            capacity: Maximum number of waiting events, beyond which the oldest event is dropped.
+            capacity: Capacity of the subscriber's queue, in events; when the queue is full, the oldest event
+                is dropped.
 
         Raises:
             ValueError: if ``capacity`` is below 1.
@@ -306,10 +311,10 @@ class Host:
         return {each.subject: each.stats() for each in (self._defects, *of_buses, *of_patches)}
 
     def tap(self, tap: HostTap) -> Callable[[], None]:
-        """Record all further traffic with ``tap``. Only one tap may be active at a time.
+        """Record all future traffic with ``tap``. Only one tap may be active at a time.
 
         Returns:
-            A function that ends the recording.
+            Function that ends the recording.
         """
         ends, tap = [], ContainedTap(tap, self._defects)
         for bus in self._buses.values():
@@ -325,19 +330,19 @@ class Host:
     def tare(self, patch: str, *, deadline_s: float | None = None) -> None:
         """Tare a patch: its current resistances become the baseline.
 
-        The call returns when the host has read the new baseline and solves scans with it. The event
-        ``baselines`` announces the new baseline to all subscribers. The tare is commanded by RPDO1. The node
-        loses the new baseline at power-off unless the baseline is stored (0x1010).
+        The call returns when the host has read the new baseline and uses it to solve scans. The event
+        ``baselines`` announces the new baseline to all subscribers. The host commands the tare with RPDO1.
+        The node loses the new baseline at power-off unless the baseline is stored (0x1010).
 
         Args:
             patch: Name of the patch.
-            deadline_s: Maximum wait for the new baseline, s; 5 s plus three SYNC periods by default.
+            deadline_s: Maximum time (s) to wait for the new baseline; 5 s plus three SYNC periods by default.
 
         Raises:
             KeyError: if there is no such patch.
             NodeError: if another master runs the bus, the baseline is kept in a file, or the node is not
                 operational.
-            NodeTimeout: if no new baseline arrived in time.
+            NodeTimeout: if no new baseline arrived before the deadline.
             BusError: if the command cannot be sent.
         """
         node = self._nodes[patch]

@@ -1,4 +1,4 @@
-"""Start a host's parts in order, and end them in reverse order."""
+"""Start a host's components in order, and shut them down in reverse order."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ from skinnode.transport import CanPort
 _log = logging.getLogger(__name__)
 
 LAST_SCAN_S: Final = 0.5
-"""Maximum wait for the last scans while a host closes, s."""
+"""Maximum time (s) to wait for the last scans when a host closes."""
 
 _POLL_S: Final = 0.005
 
@@ -54,9 +54,11 @@ class StartOptions:
     """Start options of a host. Raises ValueError if the deadline is negative, infinite or not a number."""
 
     boot_deadline_s: float = BOOT_DEADLINE_S
-    """Maximum time until the first response from a node, s."""
+    """Maximum time (s) to wait for a node's first response."""
     cancelled: Callable[[], bool] = never
-    """Function called repeatedly during bring-up, which raises BringUpCancelled if the result is True."""
+    """Function called repeatedly during bring-up; if it returns True, bring-up stops and raises
+    BringUpCancelled.
+    """
     tap: HostTap | None = None
     """Recorder of the traffic, including bring-up; None for no recording."""
     open_port: Callable[[BusConfig], CanPort] = CanPort
@@ -71,7 +73,7 @@ class StartOptions:
 
 @dataclass(frozen=True, slots=True)
 class HostParts:
-    """Parts of a running host, created and ended by :func:`running_parts`."""
+    """Components of a running host, created and shut down by :func:`running_parts`."""
 
     hand: HandConfig
     buses: Mapping[str, ServedBus]
@@ -88,18 +90,18 @@ class HostParts:
 
 @contextlib.contextmanager
 def running_parts(hand: HandConfig, options: StartOptions) -> Iterator[HostParts]:
-    """Start the parts of a host, and end them at the end of the ``with`` block.
+    """Start a host's components, and shut them down when the ``with`` block exits.
 
-    The shutdown has this order: SYNC stops, scans in progress end, configuration stops, nodes become
-    pre-operational, the mainline ends, waiting scans are discarded, workers end, interfaces close, and
-    subscribers' loops end.
+    The shutdown follows this order: stop SYNC, wait for scans in progress, stop configuring nodes, make the
+    nodes pre-operational, end the mainline, discard queued scans, end the workers, close the interfaces, and
+    end subscribers' loops.
 
     Raises:
         SkinError: see :meth:`skinnode.host.Host.from_config`.
     """
     check_plan(hand)
     check_files(hand)
-    load_kernels()  # compiling the bus load's kernels later would delay the mainline
+    load_kernels()  # compile the bus load kernels now; compiling later would delay the mainline
     defects = Defects("host")
     publisher = Publisher(tuple(patch.name for patch in hand.patches), defects)
     callbacks = Callbacks(defects)
@@ -119,7 +121,7 @@ def running_parts(hand: HandConfig, options: StartOptions) -> Iterator[HostParts
             _tap_all(ContainedTap(options.tap, defects), buses.values(), nodes)
         for node in nodes:
             stack.callback(node.stream.close)
-        # Frames may be dispatched from here on, because all handlers are set.
+        # All handlers are set, so frames may now be dispatched.
         stack.enter_context(Mainline([bus.link for bus in buses.values()], defects))
         ready = _brought_up(hand, nodes, options, stack)
         supervisor = Supervisor(nodes, list(ready), hand.bring_up.heartbeat_s, defects)
@@ -158,7 +160,7 @@ def _tap_all(tap: ContainedTap, buses: Iterable[ServedBus], nodes: Iterable[Remo
 def _brought_up(
     hand: HandConfig, nodes: Sequence[RemoteNode], options: StartOptions, stack: contextlib.ExitStack
 ) -> dict[RemoteNode, ScanSolver]:
-    """Configure and start the nodes, which become pre-operational again when ``stack`` is closed."""
+    """Configure and start the nodes; closing ``stack`` makes the nodes pre-operational again."""
     for patch in hand.patches:
         go_on_unless(options.cancelled)
         check_solvable(patch, hand.solver)
@@ -169,7 +171,7 @@ def _brought_up(
         start_all(ready)
     except BusError:
         for node in nodes:
-            if node.link.failure is not None:  # the nodes are silent because the bus failed
+            if node.link.failure is not None:  # the nodes do not respond because the bus has failed
                 raise node.link.failure from node.link.failure.__cause__
         raise
     return ready
@@ -181,7 +183,7 @@ def _sync(
     nodes: Sequence[RemoteNode],
     stack: contextlib.ExitStack,
 ) -> SyncProducer | None:
-    """Send SYNC on the buses whose master is the host, until ``stack`` is closed."""
+    """Send SYNC on all buses whose master is the host; closing ``stack`` stops SYNC."""
     own = [bus for bus in buses.values() if bus.link.config.role == "master"]
     if not own:
         return None
@@ -195,11 +197,11 @@ def _sync(
 
 
 def _logged_already(error: Exception) -> None:
-    """Ignore a bus defect, because the health watch publishes it."""
+    """Ignore an exception on a bus; the health watch publishes the exception as an event."""
 
 
 def _let_scans_end(streams: Sequence[tuple[PatchStream, Ticks]], period_s: float) -> None:
-    """Wait for the scans started by the last SYNC, so that the shutdown does not interrupt these scans."""
+    """Wait for the scans started by the last SYNC, so that shutdown does not cut them off."""
     end_s = clock.monotonic() + min(1.5 * period_s, LAST_SCAN_S)
     while not all(stream.settled(ticks.newest) for stream, ticks in streams):
         if clock.monotonic() > end_s:

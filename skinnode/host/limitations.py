@@ -1,4 +1,4 @@
-"""Determine the limitations of a hand: results that its hand file, layouts and noise make impossible.
+"""Determine a hand's limitations: results that its hand file, layouts and noise make impossible.
 
 A limitation is not an error. ``skinnode hand check`` lists the limitations, so that users do not expect
 results that the hand cannot deliver.
@@ -23,8 +23,10 @@ from skinnode.solve.tracker import choose_method
 from skinnode.solve.wires.problem import PatchProblem
 
 BY_PRIOR: Final = 0.3
-"""Standard deviation of the exact inverse at rest, as a fraction of the clearance, above which neighbours and
-elasticity mostly determine the displacement. Few presses indent the layer by a larger fraction."""
+"""Maximum useful standard deviation of the exact inverse at rest, as a fraction of the clearance. Above this
+value, the displacement is mostly determined by neighbours and elasticity. Few presses indent the layer by a
+larger fraction.
+"""
 
 
 _BY_PRIOR: Final = "neighbours and elasticity determine the rest (see data_share)"
@@ -32,20 +34,21 @@ _BY_PRIOR: Final = "neighbours and elasticity determine the rest (see data_share
 
 @dataclass(frozen=True, slots=True)
 class Limitation:
-    """Result that some patches of a hand cannot deliver."""
+    """Limitation: a result that some patches of a hand cannot provide."""
 
     patches: tuple[str, ...]
     """Names of the patches."""
     key: str
-    """Key in the hand file that could remove the limitation."""
+    """Key in the hand file whose value could be changed to remove the limitation."""
     text: str
-    """Description of the missing result, and the reason."""
+    """Description of the missing result and of the reason for its absence."""
 
 
 def limitations(hand: HandConfig) -> list[Limitation]:
-    """Return the limitations of a hand, with one entry for all patches that share a limitation.
+    """Return a hand's limitations; patches with the same limitation share an entry.
 
-    No kernels are compiled, so the solver's deadline is checked only if the kernels are already compiled.
+    The function compiles no kernels; the solver's deadline is checked only if the kernels have been compiled
+    before.
     """
     patches: dict[tuple[str, str], list[str]] = {}
     for patch in hand.patches:
@@ -55,7 +58,7 @@ def limitations(hand: HandConfig) -> list[Limitation]:
 
 
 def _of_results(patch: PatchConfig, solver: SolverConfig) -> Iterator[tuple[str, str]]:
-    """Yield the keys and texts of results that the solver cannot compute for a patch."""
+    """Yield the key and description of each result that the solver cannot compute for a patch."""
     layout = patch.layout.build()
     noise = math.hypot(patch.relative_noise, CodeScale(patch.code_bits).relative_std)
     options = tracker_options(patch, solver, relative_noise=noise)
@@ -111,7 +114,7 @@ def _of_deadline(layout: PatchLayout, options: TrackerOptions, deadline_us: int)
 
 
 def _of_place(patch: PatchConfig, hand: HandConfig) -> Iterator[tuple[str, str]]:
-    """Yield the keys and texts of coordinate frames that are unavailable for a patch's contacts."""
+    """Yield the key and description of each coordinate frame unavailable for a patch's contacts."""
     if "pose" not in patch.model_fields_set:
         yield "patches.pose", "no pose: contacts are in the patch's own coordinate frame"
     if patch.link is not None and patch.link not in [link.name for link in hand.links]:

@@ -22,15 +22,15 @@ from skinnode.transport import CanPort, Frame, Intake
 _log = logging.getLogger(__name__)
 
 _REOPEN_S: Final = 0.1
-"""Pause before a failed interface is reopened, s."""
+"""Pause (s) before each attempt to reopen a failed interface."""
 
 
 class BusLink(Dispatcher):
-    """Connection to a bus, open from construction until :meth:`close` or the end of a ``with`` block.
+    """Connection to a bus; open from construction until :meth:`close` or the end of a ``with`` block.
 
-    If a handler, a poller, a listener or a job raises an exception, only the current frame or call is lost.
-    If the dispatching itself raises an exception, dispatching pauses for this bus while received frames wait
-    in the queue. If the interface fails after it has been opened, a thread repeatedly tries to reopen it.
+    If a handler, poller, listener or job raises an exception, only the current frame or call is lost.
+    If the dispatcher itself raises an exception, the bus is paused, and received frames wait in the queue. If
+    the interface fails after it has been opened, a thread repeatedly tries to reopen it.
 
     Threads: :meth:`send`, :meth:`ask_remote`, :meth:`call` and :meth:`stats` may be called from any thread.
     The other methods may be called only by a :class:`~skinnode.host.mainline.Mainline`. A separate thread
@@ -38,8 +38,10 @@ class BusLink(Dispatcher):
 
     Args:
         config: Configuration of the bus.
-        handlers: Handlers by COB-ID, called on the mainline with the data frames that have this COB-ID.
-        on_defect: Called with the first occurrence of each distinct defect, on the thread that raised it.
+        handlers: Handlers by COB-ID; each is called on the mainline with the data frames that have its
+            COB-ID.
+        on_defect: Function called when a distinct exception first occurs, on the thread that raised the
+            exception.
         open_port: Function that opens the interface.
 
     Raises:
@@ -59,12 +61,12 @@ class BusLink(Dispatcher):
         self._sent_listeners: tuple[Callable[[Frame], None], ...] = ()
         self._jobs: deque[tuple[Callable[[], object], Defects]] = deque()
         self.failure: BusError | None = None
-        """Error that makes the bus unavailable; None while the bus works."""
-        self._due_s = 0.0  # time from which a reopened interface counts as working
+        """Error because of which the bus is unavailable; None while the bus is available."""
+        self._due_s = 0.0  # time after which a reopened interface is considered to be working
         self._outages = 0
         self.t_dispatched_ns = 0
-        """Monotonic time up to which all received frames have been dispatched, ns."""
-        self._rests = False  # whether dispatching is paused: the bus is unavailable, or a defect occurred
+        """Monotonic time (ns) up to which all received frames have been dispatched."""
+        self._rests = False  # whether dispatching is paused (bus unavailable or exception)
         self._rest_end_s = 0.0
         self._opening = False
         self._pause = Pause()
@@ -86,7 +88,7 @@ class BusLink(Dispatcher):
         """
         t_ns = clock.monotonic_ns()
         self._port.send(can_id, data)
-        try:  # the frame has been sent, so the caller must not see a listener's exception
+        try:  # the frame has already been sent: hide listeners' exceptions from the caller
             if can_id != SYNC_COB_ID:
                 self.intake.asked(t_ns)
             self.count_sent(can_id, data)
@@ -105,9 +107,9 @@ class BusLink(Dispatcher):
 
         Args:
             node_id: Node-ID of the node.
-            on_answer: Called with the monotonic time of each SDO response, ns, on the mainline.
+            on_answer: Function called on the mainline with the monotonic time (ns) of each SDO response.
             defects: Collector of the response handler's exceptions, as in :meth:`handle`. If given,
-                exceptions after which a transfer is retried are reported to the bus's collector.
+                exceptions that only cause a transfer to be retried are still reported to the bus's collector.
         """
 
         def on_response(data: bytes, t_ns: int) -> None:
@@ -124,7 +126,7 @@ class BusLink(Dispatcher):
         return RemoteOd(self.network, node_id, lambda error: self.defects.report(doing, error))
 
     def ask_remote(self, can_id: int) -> None:
-        """Send a remote frame, as used for node guarding. Any thread.
+        """Send a remote frame, for example for node guarding. Any thread.
 
         Raises:
             BusError: if the interface does not accept the frame.
@@ -136,7 +138,7 @@ class BusLink(Dispatcher):
             listener(Frame(can_id, b"", t_ns, remote=True))
 
     def listen_to_sent(self, listener: Callable[[Frame], None]) -> None:
-        """Pass every sent frame, with the time of sending, to ``listener`` on the sending thread."""
+        """Pass every sent frame and its send time to ``listener``, on the sending thread."""
         self._sent_listeners = (*self._sent_listeners, listener)
 
     def unlisten_to_sent(self, listener: Callable[[Frame], None]) -> None:
@@ -170,7 +172,7 @@ class BusLink(Dispatcher):
         )
 
     def close(self) -> None:
-        """Close the interface. The mainline must have ended before the call."""
+        """Close the interface. The mainline must be ended before this method is called."""
         self._port.close()
 
     def __enter__(self) -> Self:
@@ -218,14 +220,14 @@ class BusLink(Dispatcher):
             self.defects.report("measuring the load", error)
 
     def end(self) -> None:
-        """Stop trying to reopen the interface. Called after the last :meth:`turn`."""
+        """Stop trying to reopen the interface. Call after the last :meth:`turn`."""
         self._stop.set()
         if self._reopening is not None:
             self._reopening.join()
 
     def _dispatch_received(self) -> bool:
-        """Dispatch one batch of frames. Returns whether any frame was received."""
-        seen_ns = self.intake.seen_ns  # read before the batch, which thus contains all frames up to this time
+        """Dispatch one batch of frames. Return whether any frame was received."""
+        seen_ns = self.intake.seen_ns  # read first: the batch contains all frames up to this time
         batch = self.intake.take()
         while self._jobs:
             job, owner = self._jobs.popleft()
@@ -246,12 +248,12 @@ class BusLink(Dispatcher):
         return bool(batch)
 
     def _rest(self) -> None:
-        """End a pause that is over, or start the reopening thread again if it did not start."""
+        """End the bus's pause if it has elapsed; restart the reopening thread if it failed to start."""
         if not self._opening:
             self._rests = clock.monotonic() < self._rest_end_s
         elif (
             self._reopening is None or not self._reopening.is_alive()
-        ) and self._opening:  # the reopening thread did not start
+        ) and self._opening:  # the reopening thread failed to start
             self._begin_reopening()
 
     def _go_away(self, error: Exception) -> None:
@@ -267,7 +269,7 @@ class BusLink(Dispatcher):
         self._begin_reopening()
 
     def _begin_reopening(self) -> None:
-        """Start a thread that reopens the interface, because reopening may block."""
+        """Start a separate thread to reopen the interface, because reopening may block."""
         if self._stop.is_set():
             return
         name = f"reopen {self.config.name}"
@@ -276,11 +278,14 @@ class BusLink(Dispatcher):
         self._reopening = thread  # set after start(): a thread that was not started cannot be joined
 
     def _reopen(self) -> None:
-        """Try to reopen the interface until successful, with pauses that are longer after a defect."""
+        """Try repeatedly to reopen the interface.
+
+        After an unexpected exception, the pause before the next attempt is longer.
+        """
         keep_on(self._reopens_not, self.defects, "reopening the interface")
 
     def _reopens_not(self) -> bool:
-        """Make one attempt to reopen the interface. Returns whether another attempt is needed."""
+        """Try once to reopen the interface. Return whether another attempt is needed."""
         if self._stop.wait(self._reopen_s):
             return False
         try:

@@ -2,9 +2,8 @@
 
 A slave that does not match a request stays silent, so every negative result takes a full timeout. LSS
 responses are not numbered, so a late response to an earlier request looks like a response to the current
-request. A node therefore counts as found or selected only if it has sent its own address, which differs from
-any other response. After a service without a response, the master waits until a late response can no longer
-arrive.
+request. The master therefore considers a node found or selected only after receiving the node's own LSS
+address. After a timeout, the master waits until a late response can no longer arrive.
 """
 
 from __future__ import annotations
@@ -30,31 +29,39 @@ from skinnode.errors import BusError
 from skinnode.process import clock
 
 ANSWER_S: Final = 0.1
-"""Maximum wait for an LSS response, s. LSS frames have a low priority on the bus."""
+"""Maximum time (s) to wait for an LSS response. The limit allows for the low priority of LSS frames on the
+bus.
+"""
 
 STORE_ANSWER_S: Final = 2.0
-"""Maximum wait for the response to the store command, s. The node writes to flash memory or to a file that it
-synchronises to disk. For comparison, CANopenNode's LSS master waits 1 s for every response."""
+"""Maximum time (s) to wait for the response to the store command. Before responding, the node writes to flash
+memory or syncs a file to disk. For comparison, CANopenNode's LSS master waits 1 s for every response.
+"""
 
 _SCAN_ANSWERS_S: Final = (0.03, 0.15)
-"""Timeouts for the requests of a fastscan, s. Every negative result takes one timeout, so the longer timeout
-is used only if the first attempt found no node."""
+"""Timeouts (s) for the requests of a first and a second fastscan. Every negative result takes a full timeout,
+so the longer timeout is used only if the first fastscan found no node.
+"""
 
 _TRIES: Final = 2
-"""Number of requests without a response after which a node is assumed not to exist. A single request is not
-enough, because a busy computer may miss a response."""
+"""Number of unanswered requests after which a node is assumed to be absent. A busy computer may miss the
+response to a single request.
+"""
 
 _SETTLE: Final = 0.2
-"""Maximum time between several slaves' responses to one request, as a fraction of the timeout."""
+"""Maximum time between the first and last slave's response to the same request, as a fraction of the
+timeout.
+"""
 
 _UNDER_WAY_S: Final = 0.4
-"""Time after a timeout at which a late response can no longer arrive, s."""
+"""Time (s) to wait after a timeout, until a late response can no longer arrive."""
 
 _PARTS: Final = 4
 _REVISIONS: Final = od.REVISION_NUMBER, od.UNCHECKED_REVISION_NUMBER
 _LIKELY: Final = (od.VENDOR_ID,), (od.PRODUCT_CODE,), _REVISIONS
-"""Values of the first address parts of skinnode patches: vendor-ID, product code and revision. A fastscan
-tries these values first and then needs three or four requests for these parts instead of 96."""
+"""First parts of the LSS address of a skinnode patch: vendor-ID, product code and revision number. A fastscan
+tries these values first; if they match, three or four requests are enough for these parts instead of 96.
+"""
 
 
 class LssFailed(BusError):
@@ -64,10 +71,11 @@ class LssFailed(BusError):
 class LssMaster:
     """LSS master on one bus.
 
-    Requests are sent with ``send``; responses (COB-ID 0x7E4) must be passed to :meth:`on_response`.
+    The master sends requests with ``send``; the caller must pass all responses (COB-ID 0x7E4) to
+    :meth:`on_response`.
 
-    Threads: only one thread at a time may use the master, except that concurrent calls to
-    :meth:`give_node_id` are serialised. The mainline calls :meth:`on_response`.
+    Threads: only :meth:`give_node_id` may be called from several threads at the same time. The mainline calls
+        :meth:`on_response`.
     """
 
     def __init__(self, send: Callable[[int, bytes], None]) -> None:
@@ -76,15 +84,15 @@ class LssMaster:
         self._dialogue = clock.lock()
 
     def on_response(self, data: bytes, t_ns: int) -> None:
-        """Process a slave's response. As CiA 305 requires, ignore responses that are not 8 bytes long."""
+        """Process a slave's response. Ignore responses that are not 8 bytes long, as CiA 305 requires."""
         if len(data) == 8:
             self._answers.put(data)
 
     def give_node_id(self, serial: int, node_id: int) -> bool:
         """Make the patch with this serial number boot with ``node_id``, without storing the node-ID.
 
-        The decision to store a node-ID is left to technicians. A patch that already has the node-ID stays
-        unchanged.
+        Storing a node-ID permanently is left to a technician. A patch that already has the node-ID is not
+        changed.
 
         Returns:
             Whether the patch was found and accepted the node-ID.
@@ -101,7 +109,7 @@ class LssMaster:
                     self.set_node_id(node_id)
             except LssFailed:
                 return False
-            finally:  # on release, a slave that has received its first node-ID boots
+            finally:  # release makes a slave boot if it has just received its first node-ID
                 self.release()
             if active not in (None, node_id):
                 self._send(od.NMT_COB_ID, nmt.encode(nmt.NmtCommand.RESET_COMMUNICATION, active))
@@ -112,8 +120,8 @@ class LssMaster:
     def any_unconfigured(self) -> bool:
         """Return whether any node on the bus lacks a node-ID.
 
-        The master sends the service *identify non-configured remote slave* and the first request of a
-        fastscan, because some stacks (CANopenNode) support only fastscan.
+        The master sends both the service *identify non-configured remote slave* and the first request of a
+        fastscan, because some stacks, such as CANopenNode, support only fastscan.
         """
         expected = bytes((LssCommand.IDENTIFIED_NOT_CONFIGURED,))
         if any(self._ask(LssCommand.IDENTIFY_NOT_CONFIGURED, expected=expected) for _ in range(_TRIES)):
@@ -123,7 +131,7 @@ class LssMaster:
     def find_unconfigured(self) -> LssAddress | None:
         """Find a node without a node-ID by fastscan.
 
-        The node found stays in configuration state until :meth:`release`.
+        A node that is found stays in configuration state until :meth:`release` is called.
 
         Returns:
             LSS address of the node, or None if no node was found.
@@ -144,7 +152,7 @@ class LssMaster:
         return None
 
     def _scan_part(self, part: int, answer_s: float) -> int | None:
-        """Return one part of an LSS address found by fastscan; None if no node responds any more."""
+        """Find one part of an LSS address by fastscan; return None if no node responds any more."""
         following = (part + 1) % _PARTS
         for likely in _LIKELY[part] if part < len(_LIKELY) else ():
             if self._scan(likely, 0, part, following, answer_s) is not None:
@@ -158,7 +166,7 @@ class LssMaster:
     def _scan(self, value: int, bit: int, part: int, following: int, answer_s: float) -> bytes | None:
         data = value.to_bytes(4, "little") + bytes((bit, part, following))
         answer = self._ask(LssCommand.FASTSCAN, data, bytes((LssCommand.IDENTIFIED,)), answer_s)
-        # wait before the next request, because other slaves may respond a little later
+        # other slaves may respond slightly later: wait for them before the next request
         if answer is not None:
             clock.sleep(answer_s * _SETTLE)
         return answer
@@ -166,7 +174,7 @@ class LssMaster:
     # --- one node
 
     def select(self, address: LssAddress) -> bool:
-        """Switch the node with this address to configuration state. Returns whether the node was found."""
+        """Switch the node with this address to configuration state. Return whether the node was found."""
         self.release()
         for command, value in enumerate(address[:3], LssCommand.SELECT_VENDOR):
             self._request(command, value.to_bytes(4, "little"))
@@ -179,7 +187,7 @@ class LssMaster:
         return False
 
     def select_patch(self, serial: int) -> LssAddress | None:
-        """Switch the patch with this serial number and any revision to configuration state.
+        """Switch the patch with this serial number to configuration state, whatever its revision number.
 
         Returns:
             LSS address of the patch, or None if the patch was not found.
@@ -216,11 +224,11 @@ class LssMaster:
         _require_done(answer, f"node-ID {node_id}")
 
     def set_bit_rate(self, bitrate_bps: int) -> None:
-        """Set the bit rate that the node uses after its next power-on, provided that the bit rate is stored.
+        """Set the bit rate that the node will use after its next power-on; takes effect only if stored.
 
         Raises:
             LssFailed: if the node refuses the bit rate or does not respond.
-            ValueError: if the bit rate is not one of those defined by CiA 301.
+            ValueError: if CiA 301 does not define the bit rate.
         """
         codes = {rate: code for code, rate in BIT_RATES_BPS.items()}
         if bitrate_bps not in codes:
@@ -239,7 +247,10 @@ class LssMaster:
         _require_done(answer, "the store command")
 
     def release(self) -> None:
-        """Switch all nodes to waiting state. A node that has just received its first node-ID then boots."""
+        """Switch all nodes to waiting state.
+
+        A node that has just received its first node-ID boots on this command.
+        """
         self._request(LssCommand.SWITCH_GLOBAL, bytes((LssState.WAITING,)))
 
     # --- frames
@@ -256,8 +267,8 @@ class LssMaster:
     ) -> bytes | None:
         """Send a request and return the first response that starts with ``expected``.
 
-        The default for ``expected`` is the command itself. Other responses belong to earlier requests and are
-        discarded. Returns None if no expected response arrives in time.
+        The default for ``expected`` is the command itself. All other responses are discarded, because they
+        belong to earlier requests. Return None if no such response arrives before the timeout.
         """
         expected = bytes((command,)) if expected is None else expected
         while not self._answers.empty():

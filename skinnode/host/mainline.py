@@ -14,7 +14,7 @@ from skinnode.process import clock
 from skinnode.transport import Receiver
 
 _WAIT_S: Final = 0.02
-"""Maximum wait for a frame before the pollers run, s."""
+"""Maximum time (s) to wait for a frame before calling the pollers."""
 
 
 class Mainline:
@@ -22,8 +22,8 @@ class Mainline:
 
     A failure on one bus does not affect the others.
 
-    Threads: a single thread serves all buses, because their frames arrive at the same time, and waking a
-    thread takes as long as handling twenty frames.
+    Threads: a single thread serves all buses, because frames arrive on all buses at about the same time and
+        waking another thread would take as long as handling twenty frames.
 
     Args:
         links: Connections to the buses.
@@ -45,7 +45,10 @@ class Mainline:
         self._thread.start()
 
     def stop(self) -> None:
-        """End and join all threads of the mainline. Frames can still be sent after the call."""
+        """End and join all threads of the mainline.
+
+        Frames can still be sent after the mainline has stopped.
+        """
         self._stop.set()
         self._thread.join()
         for link in self._links:

@@ -9,10 +9,13 @@ from skinnode.canopen.nmt import NmtCommand, encode
 
 
 def start(send: Callable[[int, bytes], None], node_id: int) -> None:
-    """Command a node to enter the NMT state operational."""
+    """Command a node to enter the NMT state *operational*."""
     send(NMT_COB_ID, encode(NmtCommand.START, node_id))
 
 
 def stand_by(send: Callable[[int, bytes], None], node_id: int) -> None:
-    """Command a node to become pre-operational, and so to send only heartbeats, EMCY and SDO responses."""
+    """Command a node to become pre-operational.
+
+    In this state, a node sends only heartbeats, EMCY messages and SDO responses.
+    """
     send(NMT_COB_ID, encode(NmtCommand.ENTER_PRE_OPERATIONAL, node_id))

@@ -1,4 +1,4 @@
-"""Parameters of a patch that are available after its node has been configured."""
+"""Define the parameters of a patch that are known after its node has been configured."""
 
 from __future__ import annotations
 
@@ -19,13 +19,15 @@ class NodeFacts:
     profile: PatchProfile
     scale: CodeScale
     baseline_ohm: Float
-    """(U, K) ohm: resistances at rest with which the node encodes its scans."""
+    """(U, K) ohm: resistances at rest, to which the codes in the node's scans are relative."""
     serial: int | None
     """Serial number of the node; None if the host is not allowed to read the serial number."""
     heartbeat_s: float
     """Heartbeat period of the node, s."""
     checked: bool = False
-    """Whether the node is known to send a check with every scan; False if its revision could not be read."""
+    """Whether the node sends a check with every scan; False if the node's revision number could not be
+    read.
+    """
 
     def with_baseline(self, baseline_ohm: Float) -> NodeFacts:
         """Return a copy with a different baseline, for example after a tare."""

@@ -25,30 +25,37 @@ from skinnode.host.health import (
 _log = logging.getLogger(__name__)
 
 RESTART_MEMORY_NS: Final = 5_000_000_000
-"""Time after the last restart of a loop during which the loop is still reported, ns."""
+"""Time (ns) after the last restart for which a restart loop is still reported."""
 
 SETTLED_NS: Final = 500_000_000
-"""Time after the last restart of a loop during which a node counts as restarting even if it is operational
-again, ns."""
+"""Time (ns) after the last restart in a loop for which a node's condition remains *restarting*, even if the
+node is operational again.
+"""
 
 LOOP_RESTARTS: Final = 3
 LOOP_NS: Final = 10_000_000_000
-"""Minimum number of spontaneous restarts in a loop, and the maximum duration of these restarts, ns."""
+"""Minimum number of spontaneous restarts that are reported as a loop, and the time (ns) within which they
+must occur.
+"""
 
 BEATS: Final = 12
 BEATS_TOO_OFTEN: Final = 0.7
-"""Number of heartbeats examined, and the maximum ratio of their actual to their expected duration that proves
-a second node. Two nodes with the same node-ID together send two heartbeats per period. A single node that
-catches up after a delay stays well above this ratio."""
+"""Test for two nodes with the same node-ID: number of heartbeats examined, and the ratio of actual to
+expected duration below which a second node must be sending. Two nodes with the same node-ID send two
+heartbeats per period, a ratio of 0.5. A single node that catches up after a delay stays well above the
+limit.
+"""
 
 
 class NodeMonitor:
-    """Collector of facts about one node. Mainline only, except :meth:`health` (any thread).
+    """Collector of evidence about one node.
+
+    Only :meth:`health` may be called from any thread; all other methods belong to the mainline.
 
     Args:
         patch: Name of the patch.
         node_id: Node-ID of the patch's node.
-        on_reject: Called with each malformed heartbeat or EMCY message.
+        on_reject: Function called with each malformed heartbeat or EMCY message.
         watch: Fault detector for the codes of the patch.
     """
 
@@ -72,12 +79,16 @@ class NodeMonitor:
         self._registers_said = 0
         self._last_emergency: tuple[int, bytes] | None = None  # error code and manufacturer-specific bytes
         self.running = False
-        """Whether the node has been started, so that further boot-ups count as spontaneous restarts."""
+        """Whether the node has been started; from then on, boot-up messages are counted as spontaneous
+        restarts.
+        """
         self.rejoins = self.baselines = 0
         self.refusal: str | None = None
         self.defect: str | None = None
         self.complaint: str | None = None
-        """Reason why the last bring-up failed; set by the supervisor, like ``refusal`` and ``defect``."""
+        """Reason why the last bring-up failed. The supervisor sets this attribute, ``refusal`` and
+        ``defect``.
+        """
 
     @property
     def boot_ups(self) -> int:
@@ -86,12 +97,12 @@ class NodeMonitor:
 
     @property
     def t_heartbeat_ns(self) -> int | None:
-        """Monotonic time of the newest heartbeat or boot-up message, ns; None before the first."""
+        """Monotonic time (ns) of the newest heartbeat or boot-up message; None before the first."""
         return self._t_heartbeat_ns
 
     @property
     def t_scan_ns(self) -> int | None:
-        """Monotonic time of the newest scan's last frame, ns; None before the first scan."""
+        """Monotonic time (ns) of the newest scan's last frame; None before the first scan."""
         return self._t_scan_ns
 
     def on_heartbeat(self, data: bytes, t_ns: int) -> None:
@@ -102,7 +113,7 @@ class NodeMonitor:
         state = data[0] & STATE_MASK  # bit 7 is the toggle bit of node guarding
         if state == NmtState.INITIALISING:
             self._boot_ups += 1
-            self._on_register(0)  # a reset clears the register, and persistent errors are reported again
+            self._on_register(0)  # a reset clears the register; persistent errors are reported again
             if self.running:
                 self._restarts.append(t_ns)
                 _log.warning("node %d (%s) restarted by itself", self.node_id, self.patch)
@@ -115,7 +126,7 @@ class NodeMonitor:
         """Process an EMCY message.
 
         The message contains an error code (u16), the error register (u8) and five manufacturer-specific
-        bytes. Error code 0 means that the error has been cleared.
+        bytes. Error code 0 reports that all errors have been cleared.
         """
         if len(data) != 8:
             self.on_reject(CodecError(emcy_cob_id(self.node_id), data, "8 bytes (EMCY)"))
@@ -134,11 +145,11 @@ class NodeMonitor:
 
     @property
     def registers_said(self) -> int:
-        """Number of times that the node's error register has been reported."""
+        """Number of messages received that report the node's error register."""
         return self._registers_said
 
     def on_register_read(self, register: int, said: int) -> None:
-        """Store an error register read by SDO, unless a report has arrived since the request.
+        """Store an error register read by SDO, unless an EMCY message has reported a newer value.
 
         Args:
             register: Value of the error register.
@@ -152,7 +163,7 @@ class NodeMonitor:
         self._registers_said += 1
 
     def said_since(self, state: int, t_ns: int) -> bool:
-        """Return whether the newest heartbeat arrived after ``t_ns`` and reported ``state``."""
+        """Return whether the newest heartbeat arrived after ``t_ns`` and reported the NMT state ``state``."""
         heard_ns = self._t_heartbeat_ns
         return heard_ns is not None and heard_ns > t_ns and self.nmt_state == state
 
@@ -175,8 +186,8 @@ class NodeMonitor:
             heartbeat_s: Heartbeat period of the node, s.
             scan_s: Scan period, s.
             conflicts: Number of frames that contradict other frames of the same scan.
-            t_passed_ns: Monotonic arrival time of the newest scan that was not withheld, ns; 0 before the
-                first such scan, None if scans are never withheld.
+            t_passed_ns: Monotonic arrival time (ns) of the newest scan that was not withheld. 0 before the
+                first such scan; None if scans are never withheld.
         """
 
         def age_s(t_ns: int | None) -> float | None:
@@ -234,7 +245,7 @@ class NodeMonitor:
         )
 
     def _emergency_text(self, code: int, detail: bytes) -> str:
-        """Return the text of an emergency message.
+        """Return a description of an emergency message.
 
         skinnode's error texts are not used for a refused node, which may be a different type of device.
         """
@@ -247,7 +258,7 @@ class NodeMonitor:
         return restarts[-1] - restarts[0] < LOOP_NS
 
     def _beats_too_often(self, now_ns: int, heartbeat_s: float) -> bool:
-        """Return whether heartbeats arrive so often that two nodes must be sending them under one node-ID."""
+        """Return whether heartbeats arrive so often that two nodes must have the same node-ID."""
         beats, period_ns = list(self._beats), heartbeat_s * 1e9
         if len(beats) < BEATS or now_ns - beats[-1] > HEARTBEATS_MISSED * period_ns:
             return False

@@ -1,4 +1,4 @@
-"""Run the state machine of supervised nodes: the actions in each phase, and the phase transitions."""
+"""Run the state machine of the supervised nodes: actions in each phase, and phase transitions."""
 
 from __future__ import annotations
 
@@ -20,26 +20,28 @@ from skinnode.text.words import known
 _log = logging.getLogger(__name__)
 
 START_DEADLINE_S: Final = 1.0
-"""Maximum time from the start command to a heartbeat that reports the NMT state operational, s: four
-heartbeat periods."""
+"""Maximum time (s) from the start command to the first heartbeat with the NMT state operational: four
+heartbeat periods.
+"""
 
 _PROBE_NS: Final = 250_000_000
-"""Interval between requests to an absent node, ns. The node's boot-up message may have been lost, and without
-requests, a node that sends no heartbeats would never be noticed. The requests to four nodes require 0.1 % of
-the capacity of a bus."""
+"""Interval (ns) between requests to an absent node. Without these requests, a node that sends no heartbeats
+would never be detected if its boot-up message was lost. The requests to four nodes take 0.1 % of a bus's
+capacity.
+"""
 
 _SEARCH_NS: Final = 1_000_000_000
-"""Interval between LSS searches for an absent node, ns."""
+"""Interval (ns) between LSS searches for an absent node."""
 
 _FORGET_NS: Final = 2_000_000_000
-"""Duration of silence after which a node is no longer reported as refused or faulty, ns."""
+"""Time (ns) without a frame from a node after which the node is no longer reported as refused or faulty."""
 
 _MUTE_NS: Final = 1_000_000_000
-"""Minimum interval between two readings of the configuration of a node that sends no scans, ns."""
+"""Minimum interval (ns) between two reads of a node's configuration while the node sends no scans."""
 
 
 class NodeSupervision:
-    """State machine for all supervised nodes. Owned by the supervisor's thread.
+    """State machine for all supervised nodes. Used only by the supervisor's thread.
 
     Jobs that wait for a node run on ``pool``, with at most one job per node at a time.
     """
@@ -54,7 +56,7 @@ class NodeSupervision:
         if node.upset or (count != node.defects and node.phase in (Phase.STARTING, Phase.RUNNING)):
             self._make_faulty(node, now_ns)
             return
-        # bring-up is already due, and exceptions in frame handlers must not delay it
+        # bring-up is already due, and must not be delayed by exceptions in frame handlers
         if count != node.defects:
             node.defects = count
             node.complaint = node.remote.monitor.defect = node.remote.defects.newest
@@ -78,12 +80,14 @@ class NodeSupervision:
                 self._begin(node, now_ns)
             return
         if now_ns - max(heard_ns, node.since_ns) > _FORGET_NS:
-            monitor.refusal = monitor.defect = None  # the node has gone, so its error no longer applies
+            monitor.refusal = monitor.defect = (
+                None  # the node has disappeared, so its error no longer applies
+            )
         if remote.listen_only or remote.link.failure is not None:
             return
         if now_ns >= node.probe_ns:
             node.probe_ns = now_ns + _PROBE_NS
-            # if the bus is unavailable or full, the request is repeated later
+            # the request is repeated later if the bus is unavailable or full
             with contextlib.suppress(BusError):
                 remote.probe()
         search_is_over = node.searching is None or node.searching.done()
@@ -92,9 +96,9 @@ class NodeSupervision:
             node.searching = self._pool.submit(_search, remote)
 
     def _begin(self, node: Supervised, now_ns: int) -> None:
-        """Start configuring a node, or abort the job that is still using the node.
+        """Start configuring a node; if another job is using the node, abort that job first.
 
-        After an aborted job, the configuration is started in a later iteration.
+        After a job has been aborted, configuration starts in a later iteration.
         """
         if node.job is not None and not node.job.done():
             node.abandon.set()
@@ -111,9 +115,9 @@ class NodeSupervision:
 
     def _join(self, node: Supervised, now_ns: int) -> None:
         remote, job = node.remote, node.job
-        assert job is not None  # in phase JOINING, there is always a job
+        assert job is not None  # a node in phase JOINING always has a job
         if remote.monitor.boot_ups != remote.boot_ups:
-            node.abandon.set()  # the node booted again and lost the configuration written so far
+            node.abandon.set()  # the node has booted again and lost its new configuration
         if not job.done():
             return
         if node.abandon.is_set():
@@ -123,7 +127,7 @@ class NodeSupervision:
         node.job = None
         try:
             joined = job.result()
-            assert joined is not None  # a bring-up always has a result
+            assert joined is not None  # a bring-up job never returns None
             assert joined.solver is not None
             remote.start(joined.solver, joined.withholdings)
             note_baseline(node)
@@ -146,10 +150,10 @@ class NodeSupervision:
         elif remote.monitor.said_since(NmtState.OPERATIONAL, node.since_ns):
             self._running(node, now_ns)
         elif remote.link.t_dispatched_ns > node.since_ns + START_DEADLINE_S * 1e9:
-            # the state was reported before the command
+            # the heartbeat was sent before the start command
             silent = remote.monitor.nmt_state == NmtState.OPERATIONAL
             self._fail(node, _not_started(remote, silent=silent), now_ns, refused=not silent)
-        elif now_ns >= node.probe_ns:  # the start command may be lost, because NMT commands are unconfirmed
+        elif now_ns >= node.probe_ns:  # NMT commands are unconfirmed, so the start command may have been lost
             node.probe_ns = now_ns + _PROBE_NS
             with contextlib.suppress(BusError):
                 nmt_master.start(remote.link.send, remote.patch.node_id)
@@ -177,9 +181,9 @@ class NodeSupervision:
         self._await_again(node, now_ns, was_silent=True)  # another node may replace a refused node
 
     def _make_faulty(self, node: Supervised, now_ns: int) -> None:
-        """Make a patch faulty after a defect.
+        """Mark a patch as faulty after an unexpected exception.
 
-        If this method raises an exception, it is called again in the next iteration.
+        If the method itself raises an exception, the method is called again in the next iteration.
         """
         remote = node.remote
         count = remote.defects.count
@@ -213,7 +217,7 @@ class NodeSupervision:
             ):
                 node.probe_ns = (
                     now_ns + _PROBE_NS
-                )  # a job waits for a response that a stopped node does not send
+                )  # the running job waits for a response, which a stopped node does not send
                 with contextlib.suppress(BusError):
                     nmt_master.stand_by(remote.link.send, remote.patch.node_id)
             if node.phase is Phase.JOINING:
@@ -245,14 +249,14 @@ class NodeSupervision:
 
 
 def _read_back(node: Supervised) -> None:
-    """Determine whether a node that sends no scans has lost its configuration."""
-    # if reading fails, the configuration is read again later
+    """Return whether a node that sends no scans has lost its configuration."""
+    # after a failed read, the configuration is read again later
     with contextlib.suppress(BusError, ConfigError):
         node.unconfigured = not node.remote.is_configured()
 
 
 def _search(remote: RemoteNode) -> bool:
-    """Search for a node by LSS. Returns whether the node was found."""
+    """Search for a node by LSS. Return whether the node was found."""
     try:
         return remote.search()
     except Exception as error:
@@ -261,7 +265,7 @@ def _search(remote: RemoteNode) -> bool:
 
 
 def _not_started(remote: RemoteNode, *, silent: bool) -> str:
-    """Return a message that explains why a node does not count as started."""
+    """Return a message that explains why a node is considered not to have started."""
     node = f"node {remote.patch.node_id}"
     if silent:
         return f"{node}: got no heartbeat within {START_DEADLINE_S:g} s of the start command"

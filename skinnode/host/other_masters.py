@@ -1,6 +1,6 @@
-"""Detect other masters on a bus by the frames that only masters send.
+"""Detect other masters on a bus from frames that only a master sends.
 
-The host does not receive its own frames, so any such frame comes from another master.
+The host does not receive its own frames, so every received master's frame comes from another master.
 """
 
 from __future__ import annotations
@@ -16,14 +16,16 @@ from skinnode.config import BusConfig
 _log = logging.getLogger(__name__)
 
 QUIET_NS: Final = 10_000_000_000
-"""Minimum silence after which frames of the same type from another master are logged again, ns."""
+"""Minimum pause (ns) in another master's frames of one type after which the next such frame is logged
+again.
+"""
 
 SYNC, NMT, SDO, HEARTBEAT = "SYNC", "NMT commands", "SDO requests to our nodes", "our own heartbeat"
 
 
 @dataclass(frozen=True, slots=True)
 class OtherMasterStats:
-    """Counters of frames that only masters send, from senders other than this host.
+    """Counters of frames from other senders that only a master may send.
 
     On a bus that another master runs, SYNC and NMT commands are not counted, so ``syncs`` and
     ``nmt_commands`` stay 0.
@@ -32,15 +34,17 @@ class OtherMasterStats:
     syncs: int
     nmt_commands: int
     sdo_requests: int
-    """Number of SDO requests to the hand's nodes, from a second host or a technician's tool."""
+    """Number of SDO requests to the hand's nodes from other senders, such as a second host or a service
+    tool.
+    """
     heartbeats: int
     """Number of heartbeats with the host's node-ID."""
     last_ns: int | None
-    """Monotonic time of the newest frame from another master, ns; None before the first such frame."""
+    """Monotonic time (ns) of the newest frame from another master; None before the first such frame."""
 
 
 class OtherMasters:
-    """Counter of other masters' frames on one bus. Logs the first frame of each type. Mainline only."""
+    """Counter of other masters' frames on one bus. The first frame of each type is logged. Mainline only."""
 
     def __init__(self, bus: BusConfig) -> None:
         self._bus = bus
@@ -48,9 +52,9 @@ class OtherMasters:
         self._last_ns: dict[str, int] = {}
 
     def handlers(self, node_ids: list[int]) -> dict[int, Callable[[bytes, int], None]]:
-        """Return the handlers, by COB-ID, that count frames only a master sends.
+        """Return handlers, by COB-ID, that count the frames sent only by masters.
 
-        If another master runs the bus, there are no handlers for SYNC or NMT commands.
+        If another master runs the bus, SYNC and NMT commands are legitimate and have no handler.
 
         Args:
             node_ids: Node-IDs of the hand's nodes on this bus.

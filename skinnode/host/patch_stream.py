@@ -1,8 +1,8 @@
 """Turn a patch's chunks into fields: assemble scans on the mainline, decode and solve them on workers.
 
-The mainline assembles scans and puts the newest scan into a box that holds a single scan. A worker thread
-takes the scan from the box and solves it. If a newer scan replaces the scan in the box, the older scan is
-skipped and counted. A token ensures that at most one worker processes the stream at a time.
+The mainline assembles scans and stores the newest complete scan in a one-element buffer (the *box*). A worker
+thread takes the scan from the box and solves it. If a newer scan replaces an unsolved scan in the box, the
+older scan is counted as skipped. A token ensures that at most one worker processes the stream at a time.
 """
 
 from __future__ import annotations
@@ -35,16 +35,17 @@ _BASELINE_CHANGED: Final = int(SummaryFlag.BASELINE_CHANGED)
 
 _EVER_NS: Final = 2**63
 WATCH_AFTER_NS: Final = 5_000_000
-"""Delay from the last frame of a scan to the search for noisy and drifting wires, ns. Solving has priority,
-because programs wait for the fields, and all patches' fields for one SYNC are due at the same time."""
+"""Delay (ns) from a scan's last frame to the search for noisy and drifting wires. The delay gives priority to
+solving: all patches' fields for one SYNC are due at the same time, and applications are waiting for them.
+"""
 
 
 @dataclass(frozen=True, slots=True)
 class StreamStats:
     """Counters of a patch's scans.
 
-    ``offered`` + ``withheld`` + ``partial`` is the number of assembled scans; ``offered`` is ``solved`` +
-    ``failed`` + ``skipped`` + at most two scans in progress.
+    The number of assembled scans is ``offered`` + ``withheld`` + ``partial``. The value of ``offered`` is
+    ``solved`` + ``failed`` + ``skipped``, plus up to two scans in progress.
     """
 
     frames: int
@@ -57,18 +58,21 @@ class StreamStats:
     """Number of incomplete scans withheld because of ``stream.partial`` in the hand file."""
     solved: int
     skipped: int
-    """Number of scans replaced by newer scans before a worker was free."""
+    """Number of scans that were replaced by newer scans before a worker was available."""
     untrusted: int
     """Number of fields that are not trusted."""
     invalid_codes: int
-    """Number of codes in all solved scans that are over range, short, open or missing."""
+    """Number of codes that are over range, short, open or missing, summed over all solved scans."""
     assembler: AssemblerStats
     failed: int = 0
     """Number of scans whose decoding or solving raised an exception."""
 
 
 class StreamTap(Protocol):
-    """Recorder of the events, other than frames, that determine which scans are solved. Mainline only."""
+    """Recorder of the events, apart from received frames, that determine which scans are solved.
+
+    Mainline only.
+    """
 
     def resumed(self, patch: str, solver: ScanSolver, *, anew: bool) -> None:
         """Record that :meth:`PatchStream.resume` started passing scans to a solver."""
@@ -99,8 +103,9 @@ class StreamOutput:
     workers: Workers | Inline
     publisher: Publisher
     defects: Defects | None = None
-    """Collector of exceptions raised by decoding and solving; if None, the first exception ends the
-    publisher."""
+    """Collector of exceptions raised by decoding and solving; if None, the first exception stops the
+    publisher.
+    """
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,23 +118,26 @@ class StreamOptions:
     """Function called immediately with each assembled scan."""
     judge: Callable[[Scan, int], Verdict] = _find_nothing
     """Function called with each assembled scan and its number before the scan is solved. All earlier scans
-    have been passed to ``watch`` by then, so a replay produces the same verdicts as the host."""
+    are passed to ``watch`` first, so that a replay produces the same verdicts as the host.
+    """
     watch: Callable[[Scan], None] = _ignore
     """Function called with each assembled scan after a delay of :data:`WATCH_AFTER_NS`."""
     partial: Partial = "pass"
     """Handling of incomplete scans: ``pass`` or ``withhold``."""
     under_way: bool = False
-    """Whether another master starts the node, so that the node may already be sending when the stream starts
-    passing scans to a solver."""
+    """Whether another master starts the node. If so, the node may already be sending scans when the stream is
+    resumed.
+    """
 
 
 class PatchStream:
     """Stream of one patch's scans, from received frames to published fields.
 
-    Scans are withheld until :meth:`resume` is called with a solver. A scan whose decoding or solving raises
-    an exception is lost.
+    Scans are withheld until :meth:`resume` is called with a solver. If decoding or solving a scan raises an
+    exception, that scan is lost.
 
-    Threads: only the mainline may call the methods, except :meth:`settled` and :meth:`stats` (any thread).
+    Threads: :meth:`settled` and :meth:`stats` may be called from any thread, all other methods only from the
+        mainline.
     """
 
     def __init__(
@@ -141,7 +149,7 @@ class PatchStream:
         self._workers, self._publisher, self._defects = output.workers, output.publisher, output.defects
         assembler.on_discarded = self._doubt
         self._unwatched: deque[tuple[int, Scan]] = deque()
-        # contains at most one scan; thread-safe
+        # one-element buffer; thread-safe
         self._box: deque[tuple[Scan, ScanStamp, ScanSolver, Verdict]] = deque()
         self._token: deque[None] = deque([None])
         self.tap: StreamTap | None = None
@@ -150,15 +158,16 @@ class PatchStream:
         self.withholdings = 0
         """Number of times that :meth:`withhold` has been called."""
         self.doubtful = False
-        """Whether a summary that may have announced a new baseline was lost or discarded with its scan."""
+        """Whether a summary was lost or discarded that may have announced a new baseline."""
         self._frames = self._withheld = self._partial = 0
         self._offered = self._taken = self._solved = self._failed = self._untrusted = self._invalid = 0
         self._newest = 0
         self._solving = 0
         """Number of the scan that a worker is currently solving."""
         self.t_passed_ns = 0
-        """Monotonic arrival time of the newest scan that was not withheld, ns; 0 before the first such
-        scan."""
+        """Monotonic arrival time (ns) of the newest scan that was not withheld; 0 before the first such
+        scan.
+        """
 
     # --- mainline
 
@@ -177,7 +186,7 @@ class PatchStream:
             self._offer(scan)
 
     def poll(self, t_ns: int) -> None:
-        """End an incomplete scan after its deadline, and check earlier scans for faulty wires."""
+        """End the current scan if its deadline has passed, and check earlier scans for faulty wires."""
         self._watch_until(t_ns)
         deadline_ns = self._assembler.next_deadline_ns()
         if deadline_ns is None or t_ns < deadline_ns:
@@ -194,7 +203,7 @@ class PatchStream:
             self._options.watch(self._unwatched.popleft()[1])
 
     def withhold(self) -> int:
-        """Withhold all further scans, including the scan being assembled. Returns ``withholdings``."""
+        """Withhold all scans from now on, including the scan being assembled. Returns ``withholdings``."""
         self._solver = None
         self.withholdings += 1
         if self.tap is not None:
@@ -211,10 +220,9 @@ class PatchStream:
 
         Args:
             solver: Solver for the scans.
-            withholdings: Value of ``withholdings`` known to the caller. If scans have been withheld again
-                since then, the call has no effect.
-            anew: Whether the node has been restarted, so that frames received earlier belong to a previous
-                stream.
+            withholdings: Value of ``withholdings`` known to the caller. If the value has changed since, the
+                call has no effect.
+            anew: Whether the node has been restarted, so that all earlier frames must be ignored.
         """
         if withholdings != self.withholdings:
             return
@@ -229,16 +237,16 @@ class PatchStream:
             self.tap.resumed(self._patch, solver, anew=anew)
 
     def inform_tap(self) -> None:
-        """Inform a new tap about the solver if scans are not being withheld."""
+        """Record the current solver with a new tap, unless scans are being withheld."""
         if self.tap is not None and self._solver is not None:
             self.tap.resumed(self._patch, self._solver, anew=False)
 
     def close(self) -> None:
-        """Discard the scan that waits for a worker. Called after the mainline has ended."""
+        """Discard the scan that is waiting for a worker. Call only after the mainline has ended."""
         self._box.clear()
         while self._unwatched:
             scan = self._unwatched.popleft()[1]
-            with contextlib.suppress(Exception):  # no caller remains that could handle the exception
+            with contextlib.suppress(Exception):  # no caller is left that could handle the exception
                 self._options.watch(scan)
 
     def _doubt(self) -> None:
@@ -284,14 +292,14 @@ class PatchStream:
         self._call_worker()
 
     def leave_out(self, times_ns: Sequence[int], within_ns: int) -> None:
-        """Skip the scans that newer scans overtook when the recording was made.
+        """Skip the scans that were replaced by newer scans when the recording was made.
 
-        Scan numbers cannot identify the overtaken scans: after a pause, the two halves of one scan may count
-        as two scans with the same number.
+        The replaced scans are identified by arrival time. Their scan numbers are not unique: if reception
+        pauses in the middle of a scan, both parts may be assembled as scans with the same number.
 
         Args:
-            times_ns: Monotonic arrival times of the last frames of the overtaken scans, ns.
-            within_ns: Tolerance for the arrival times, ns.
+            times_ns: Monotonic arrival times (ns) of the replaced scans' last frames.
+            within_ns: Tolerance (ns) for the arrival times.
         """
         self._left_out, self._left_out_within_ns = sorted(times_ns), within_ns
 
@@ -302,7 +310,10 @@ class PatchStream:
         return i < len(self._left_out) and self._left_out[i] <= t_ns + self._left_out_within_ns
 
     def settled(self, scan: int) -> bool:
-        """Return whether no scan remains to be solved, and ``scan`` has arrived or scans are withheld."""
+        """Return whether ``scan`` has arrived and no scan is queued or being solved.
+
+        While scans are being withheld, ``scan`` need not have arrived.
+        """
         return (self._newest >= scan or self._solver is None) and not self._box and bool(self._token)
 
     # --- worker
@@ -311,7 +322,7 @@ class PatchStream:
         try:
             self._token.pop()
         except IndexError:
-            return  # the busy worker checks the box when it has finished
+            return  # the busy worker checks the box after its current scan
         try:
             self._workers.submit(self._work, self._work_failed)
         except Exception:
@@ -326,7 +337,7 @@ class PatchStream:
         self._leave()
 
     def _solve_next(self) -> None:
-        self._taken += 1  # counted before the scan leaves the box, so that the counters always include it
+        self._taken += 1  # count the scan before it leaves the box, so that the counters always include it
         try:
             scan, stamp, solver, verdict = self._box.popleft()
         except IndexError:  # the stream was closed
@@ -345,14 +356,14 @@ class PatchStream:
         self._publisher.publish(field, stamp.patch)
 
     def _work_failed(self, error: Exception) -> None:
-        """Handle an exception that a worker raised outside the solving itself."""
+        """Handle an exception that a worker raised while not solving a scan."""
         self._report(error)
         self._leave()
 
     def _leave(self) -> None:
-        """Return the token, and call another worker immediately if a scan is waiting.
+        """Return the worker's token, and schedule another worker immediately if a scan is waiting.
 
-        Never raises an exception, because the token must be returned exactly once.
+        The method never raises an exception, because the token must be returned exactly once.
         """
         self._token.append(None)
         try:
@@ -373,8 +384,7 @@ class PatchStream:
     def stats(self) -> StreamStats:
         """Return all counters of the stream.
 
-        The order in which the counters are read ensures that a scan that may still be solved is never counted
-        as skipped.
+        The counters are read in an order that prevents a scan in progress from being counted as skipped.
         """
         offered, waiting = self._offered, len(self._box)
         return StreamStats(

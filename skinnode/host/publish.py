@@ -1,4 +1,4 @@
-"""Pass fields from the worker threads to subscribers, each of which has a bounded queue."""
+"""Pass fields from the worker threads to the subscribers' bounded queues."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def check_timeout(timeout_s: float | None) -> None:
     """Check a timeout.
 
     Raises:
-        ValueError: if the timeout is negative, not a number, or longer than the operating system supports.
+        ValueError: if the timeout is negative, is not a number, or exceeds the operating system's limit.
     """
     if timeout_s is not None and not 0 <= timeout_s <= threading.TIMEOUT_MAX:
         raise ValueError(f"timeout_s: got {timeout_s!r}, must be from 0 to {threading.TIMEOUT_MAX:.0f}")
@@ -39,18 +39,20 @@ def check_capacity(capacity: int) -> None:
 
 
 class Subscription:
-    """Subscription to fields, read in order of publication with ``for``, ``async for`` or :meth:`get`.
+    """Subscription to fields.
+
+    Read the fields in order of publication with ``for``, ``async for`` or :meth:`get`.
 
     If the subscription's queue is full, its oldest field is dropped and counted in ``dropped``. The
-    subscription ends with :meth:`close`, at the end of a ``with`` block, or when the last reference to it is
-    deleted. Any thread or event loop may read the subscription.
+    subscription ends when :meth:`close` is called, a ``with`` block exits, or the last reference to the
+    subscription is deleted. Any thread or event loop may read the subscription.
     """
 
     def __init__(self, capacity: int, timeout_s: float | None, patches: frozenset[str]) -> None:
         self._queue: DropOldestQueue[FieldFrame] = DropOldestQueue(capacity)
         self._timeout_s = timeout_s
         self._subscribed = patches
-        # Each patch has its own counter, which only one worker writes at a time.
+        # Each patch has its own counter, so no two workers write the same counter at the same time.
         self._dropped = dict.fromkeys([*patches, ""], 0)
         self._wakers: dict[object, Callable[[], object]] = {}  # one wake-up function per waiting event loop
 
@@ -60,13 +62,13 @@ class Subscription:
         return sum(self._dropped.values())
 
     def get(self, timeout_s: float | None = None) -> FieldFrame | None:
-        """Return the next field, or None if no field arrives.
+        """Wait for the next field and return it.
 
         Args:
-            timeout_s: Maximum wait for a field, s; None for no limit.
+            timeout_s: Maximum time (s) to wait for a field; None for no limit.
 
         Returns:
-            The field; None if no field arrived in time or the host has closed.
+            Next field; None if no field arrived before the timeout or the host has closed.
 
         Raises:
             SkinError: the error that stopped the host, if any.
@@ -100,25 +102,25 @@ class Subscription:
         try:
             async with limit:
                 while True:
-                    await asyncio.sleep(0)  # let other tasks run even if fields arrive continuously
+                    await asyncio.sleep(0)  # yield to other tasks even if fields arrive continuously
                     arrived.clear()
                     try:
                         return self._open(self._queue.get(0.0))
                     except queue.Empty:
                         await arrived.wait()
         except TimeoutError:
-            if not limit.expired():  # this TimeoutError is the error that stopped the host
+            if not limit.expired():  # not a timeout of this wait: the TimeoutError stopped the host
                 raise
             raise queue.Empty from None
         finally:
             del self._wakers[key]
 
     def close(self) -> None:
-        """Stop accepting fields. Fields that are still queued are lost."""
+        """Stop accepting fields. Queued fields are discarded."""
         self._subscribed = frozenset()
 
     def end(self) -> None:
-        """Stop accepting fields, and end the reader's loop after the queued fields. Any thread."""
+        """Stop accepting fields; the reader's loop ends after the fields already queued. Any thread."""
         self.close()
         self.offer(End(), "")
 
@@ -170,7 +172,7 @@ class Subscription:
     def _open(self, item: FieldFrame | End) -> FieldFrame | None:
         if isinstance(item, FieldFrame):
             return item
-        self._wake()  # wake the other readers, each of which must receive the end marker
+        self._wake()  # wake the other readers: every reader must receive the end marker
         if item.error is not None:
             raise item.error
         return None
@@ -183,11 +185,11 @@ class Subscription:
 class Publisher:
     """All subscriptions of a host, and the newest field of each patch.
 
-    If passing a field to a subscriber raises an exception, the exception is reported to ``defects``, and that
-    subscriber loses the field.
+    Exceptions raised while passing a field to a subscriber are reported to ``defects``; only that subscriber
+    loses the field.
 
-    Threads: only worker threads publish, one worker per patch at a time. Any thread may call the other
-    methods.
+    Threads: only worker threads may publish fields, and only one worker per patch at a time. All other
+        methods may be called from any thread.
     """
 
     def __init__(self, patches: tuple[str, ...], defects: Defects | None = None) -> None:
@@ -219,7 +221,7 @@ class Publisher:
         return subscription
 
     def latest(self, patch: str) -> FieldFrame | None:
-        """Return the newest field of a patch, or None before the patch's first field.
+        """Return a patch's newest field, or None if no field has been published yet.
 
         Raises:
             ValueError: if there is no such patch.
@@ -229,22 +231,25 @@ class Publisher:
         return self._latest.get(patch)
 
     def publish(self, field: FieldFrame, patch: str) -> None:
-        """Pass a field to its subscribers. Called by the worker that owns the patch. Never blocks."""
+        """Pass a field to its subscribers.
+
+        Only the worker that is processing the patch may call this method. Never blocks.
+        """
         self._latest[patch] = field
         self._offer(field, patch)
 
     @property
     def failure(self) -> SkinError | None:
-        """Error that stopped the host; None if no error did."""
+        """Error that stopped the host; None if the host is running or was closed normally."""
         return None if self._last is None else self._last.error
 
     def fail(self, error: SkinError) -> None:
-        """End every subscription with ``error`` after its queued fields, because the host cannot continue."""
+        """Raise ``error`` in every subscription after its queued fields, because the host has failed."""
         self._last = self._last or End(error)
         self._offer(self._last, "")
 
     def end(self) -> None:
-        """End every subscription after its queued fields, because the host has closed."""
+        """End every subscription after its queued fields. Call when the host closes."""
         self._last = self._last or End()
         self._offer(self._last, "")
 

@@ -1,6 +1,7 @@
 """Register a host's handlers for the frames on a bus, by COB-ID.
 
-The functions neither send nor wait nor start threads, so a replay can use them with recorded frames.
+The functions in this module do not send frames, block or start threads, so a replay can also use them for
+recorded frames.
 """
 
 from __future__ import annotations
@@ -24,13 +25,15 @@ from skinnode.protocol.profile import PatchProfile
 from skinnode.protocol.scan import Scan
 
 LEAST_GRACE_NS: Final = 5_000_000
-"""Minimum time to wait for a scan's summary after its last chunk, ns; half a SYNC period if that is longer.
-On a fully loaded bus, the summary loses arbitration to the chunks of all other patches."""
+"""Minimum time (ns) to wait for a scan's summary after its last chunk. The host waits for half a SYNC period
+if that is longer, because on a fully loaded bus the summary loses arbitration to all other patches'
+chunks.
+"""
 
 
 @dataclass(frozen=True, slots=True)
 class PatchReception:
-    """Stream and monitor that receive a patch's frames."""
+    """Receivers of a patch's frames: the patch's stream and node monitor."""
 
     stream: PatchStream
     monitor: NodeMonitor
@@ -38,7 +41,7 @@ class PatchReception:
 
 @dataclass(frozen=True, slots=True)
 class BusReception:
-    """Detector of other masters on a bus, and follower of their SYNC."""
+    """Receivers of other masters' frames on a bus: the detector of other masters and the SYNC follower."""
 
     other_masters: OtherMasters
     follower: SyncFollower
@@ -67,23 +70,23 @@ def receive_patch(
 ) -> PatchReception:
     """Register the handlers that pass a patch's frames to its monitor and its stream.
 
-    The stream withholds scans until a solver is available, because a node that an earlier host left
-    operational may already be sending.
+    The stream withholds scans until a solver is available. A node may already be sending scans if an earlier
+    host left the node operational.
 
     Args:
         patch: Configuration of the patch.
         hand: Configuration of the hand to which the patch belongs.
         dispatcher: Dispatcher of the frames on the patch's bus.
         ticks: SYNC times of the patch's bus.
-        output: Workers and publisher for the patch's scans. Exceptions are reported to ``output.defects``; if
-            that is None, exceptions are raised, and the publisher fails.
+        output: Workers and publisher for the patch's scans. Exceptions are reported to ``output.defects``. If
+            ``output.defects`` is None, exceptions are raised, and the publisher fails.
     """
     period_ns = hand.sync.period_ms * 1_000_000
     watch = CodeWatch(CodeScale(patch.code_bits), patch.relative_noise)
     monitor = NodeMonitor(patch.name, patch.node_id, dispatcher.reject, watch)
 
     arrivals = ArrivalPredictor(period_ns)
-    dispatcher.expect(patch.name, ())  # no prediction before the patch's first scan
+    dispatcher.expect(patch.name, ())  # no prediction is possible before the patch's first scan
 
     def on_scan(scan: Scan) -> None:
         if not scan.empty:

@@ -1,4 +1,4 @@
-"""Remote node: the host's view of a patch over the bus, with its SDO client, parameters and stream."""
+"""Represent a patch's node on the host, including its SDO client, parameters and scan stream."""
 
 from __future__ import annotations
 
@@ -22,24 +22,27 @@ from skinnode.protocol.command import pack_command
 from skinnode.protocol.profile import PatchProfile
 
 _MAINLINE_S: Final = 1.0
-"""Maximum wait for a short job on the mainline, s. Unless the node's bus is unavailable, the mainline runs
-waiting jobs at least fifty times a second."""
+"""Maximum time (s) to wait for a short job on the mainline. The mainline runs pending jobs at least fifty
+times a second unless the node's bus is unavailable.
+"""
 
 _ANSWER_S: Final = 0.05
-"""Time to wait for the responses to a single SDO request, s. The check for a second node with the same
-node-ID prolongs a failed bring-up by at least two such waits."""
+"""Time (s) to wait for all responses to one SDO request when checking for a second node with the same
+node-ID. The check makes a failed bring-up at least twice this time longer.
+"""
 
 _MUTE_S: Final = 0.4
 _MUTE_SCANS: Final = 5
 """Time without a scan after which a node's configuration is read back: ``_MUTE_S`` seconds or ``_MUTE_SCANS``
-SYNC periods, whichever is longer. The time is short, because the stream must recover within a second."""
+SYNC periods, whichever is longer. The time is short so that the stream recovers within a second.
+"""
 
 
 class RemoteNode:
-    """One patch of the hand, and its CANopen node.
+    """Patch of the hand and its CANopen node, as seen by the host.
 
-    Threads: one thread at a time, which must not be the mainline, may bring the node up. Only that thread may
-    call the methods, except those marked "Any thread".
+    Threads: only one thread at a time may bring up the node, and this thread must not be the mainline.
+        Methods not marked "Any thread" may be called only by the thread that brings up the node.
     """
 
     def __init__(
@@ -58,12 +61,13 @@ class RemoteNode:
         """Whether the hand file forbids sending any frame to the node."""
         self.facts: NodeFacts | None = None
         self.boot_ups = 0
-        """Number of the node's boot-up messages at the start of bring-up. If another boot-up message arrives,
-        bring-up must be repeated."""
+        """Number of the node's boot-up messages at the start of bring-up. If the number increases, bring-up
+        must be repeated.
+        """
         self.t_answer_ns = 0
-        """Monotonic time of the node's newest SDO response, ns."""
+        """Monotonic time (ns) of the node's newest SDO response."""
         self._answers = 0
-        """Number of SDO responses received with the node's node-ID."""
+        """Number of SDO responses received under the node's node-ID."""
         self._hand, self._lss = hand, bus.lss
         self._profile = PatchProfile.from_config(patch, self.bus)
         self._remote = self.link.remote_od(patch.node_id, self._on_answer, defects)
@@ -83,7 +87,7 @@ class RemoteNode:
 
     @property
     def heartbeat_s(self) -> float:
-        """Heartbeat period of the node, s."""
+        """Node's heartbeat period, s."""
         return self._hand.bring_up.heartbeat_s if self.facts is None else self.facts.heartbeat_s
 
     def configure(
@@ -95,16 +99,17 @@ class RemoteNode:
         """Configure the node while its scans are withheld.
 
         Args:
-            deadline_s: Maximum time until the node's first response, s.
-            abandoned: Called repeatedly during configuration, which raises Abandoned if the result is True.
-            on_answer: Called when the node has responded.
+            deadline_s: Maximum time (s) to wait for the node's first response.
+            abandoned: Function called repeatedly during configuration; if it returns True, the configuration
+                stops and raises Abandoned.
+            on_answer: Function called once the node has responded.
 
         Returns:
             The solver for the node's scans.
 
         Raises:
             NodeError: if the node's electrode layout cannot be solved, or two nodes have the same node-ID.
-            SkinError: if :meth:`Configurator.configure` raises it.
+            SkinError: for the reasons listed under :meth:`Configurator.configure`.
         """
         self.boot_ups = self.monitor.boot_ups
         if self.monitor.running and self.monitor.nmt_state == NmtState.STOPPED and not self.has_other_master:
@@ -152,16 +157,17 @@ class RemoteNode:
         self.monitor.running = True
 
     def renew_baseline(self, deadline_s: float, abandoned: Callable[[], bool]) -> ScanSolver | None:
-        """Read the node's current baseline, and create a solver if the baseline has changed.
+        """Read the node's current baseline, and create a new solver if needed.
 
         Returns:
-            A solver with the new baseline; None if the baseline is unchanged and no scans are withheld.
+            Solver with the baseline that was read; None if the baseline is unchanged and no scans are
+            withheld.
 
         Raises:
-            SkinError: if :meth:`Configurator.settle_baseline` raises it.
+            SkinError: for the reasons listed under :meth:`Configurator.settle_baseline`.
         """
         facts = self.facts
-        assert facts is not None  # called only for running nodes
+        assert facts is not None  # this method is called only for running nodes
         configurator = self._configurator(deadline_s, abandoned, lambda patch: None)
         with self._remote.abort_if(abandoned):
             baseline_ohm = configurator.settle_baseline(self.patch, self._profile, self._remote)
@@ -169,11 +175,11 @@ class RemoteNode:
             return None
         facts = facts.with_baseline(baseline_ohm)
         solver = ScanSolver(facts, self._hand.solver)
-        self.facts = facts  # set last: if no solver can be created, the old baseline stays in use
+        self.facts = facts  # update only now: if creating the solver fails, the old baseline stays in use
         return solver
 
     def renew_register(self) -> None:
-        """Read the node's error register, in case the emergency that clears an error was lost.
+        """Read the node's error register, in case the emergency message that clears an error was lost.
 
         Raises:
             NodeError: if reading fails; see :class:`RemoteOd`.
@@ -189,7 +195,7 @@ class RemoteNode:
         configuration.
 
         Args:
-            since_ns: Monotonic time since which the node has been operational, ns.
+            since_ns: Monotonic time (ns) at which the node became operational.
         """
         scan_ns = max(self.monitor.t_scan_ns or 0, since_ns)
         patience_ns = max(_MUTE_S, _MUTE_SCANS * self._hand.sync.period_s) * 1e9
@@ -217,13 +223,14 @@ class RemoteNode:
         self.link.send(od.command_cob_id(node_id), pack_command(tare=True))
 
     def withhold(self) -> int:
-        """Make the mainline withhold the node's scans.
+        """Withhold the node's scans; the mainline executes the request.
 
         Returns:
             Number to pass to :meth:`start` as ``withholdings``.
 
         Raises:
-            NodeTimeout: if the mainline does not respond in time, for example because the bus is unavailable.
+            NodeTimeout: if the mainline does not respond before the timeout, for example because the bus is
+                unavailable.
         """
         answer: queue.SimpleQueue[int] = clock.simple_queue()
         self.link.call(lambda: answer.put(self.stream.withhold()), self.defects)
@@ -244,10 +251,10 @@ class RemoteNode:
         self.link.send(od.sdo_request_cob_id(self.patch.node_id), request)
 
     def _answers_to_one_question(self) -> int:
-        """Return the number of responses to a single SDO request: two if two nodes share the node-ID.
+        """Return the number of responses to one SDO request; two responses reveal a shared node-ID.
 
-        Two requests are sent, and the smaller count is returned, because a late response to an earlier
-        request would be counted too.
+        A late response to an earlier request would also be counted. The method therefore sends two requests
+        and returns the smaller number of responses.
         """
         clock.sleep(_ANSWER_S)
         counts = []
@@ -262,13 +269,13 @@ class RemoteNode:
 
     @property
     def searchable(self) -> bool:
-        """Whether the host can search for the node by LSS, as a bus master that has the serial number."""
+        """Whether the host can find the node by LSS: it is the bus master and has the serial number."""
         return not self.has_other_master and self.patch.serial is not None
 
     def search(self) -> bool:
-        """Search for the node by LSS, using its serial number. Returns whether the node was found.
+        """Search for the node by LSS, using its serial number. Return whether the node was found.
 
-        After a successful search, the node boots with the node-ID from the hand file.
+        If the node is found, the node boots with the node-ID from the hand file.
         """
         if self.has_other_master or self.patch.serial is None:
             return False

@@ -1,4 +1,4 @@
-"""Determine the pauses between attempts at a failing operation, such as bringing up a node."""
+"""Determine the pauses between attempts to repeat a failed operation, such as bringing up a node."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from skinnode.process import clock
 
 FIRST_PAUSE_S: Final = 0.1
 LONGEST_PAUSE_S: Final = 1.0
-"""First and longest pause before a failed operation is retried, s. Each pause is twice as long as the
+"""First and longest pause (s) before a failed operation is retried. Each pause is twice as long as the
 previous pause."""
 
 
 class Pause:
-    """Sequence of increasing pauses between attempts at an operation.
+    """Sequence of increasing pauses between attempts to repeat a failed operation.
 
-    If the operation has worked for longer than the longest pause, the sequence starts again.
+    If no failure occurs for longer than the longest pause, the sequence starts again.
     """
 
     def __init__(self, first_s: float = FIRST_PAUSE_S, longest_s: float = LONGEST_PAUSE_S) -> None:
@@ -25,7 +25,7 @@ class Pause:
         self._end_s = -math.inf
 
     def next_s(self) -> float:
-        """Return the duration of the pause before the next attempt, s."""
+        """Return the pause (s) before the next attempt."""
         now_s = clock.monotonic()
         again = now_s <= self._end_s + self._longest_s
         self._pause_s = min(2 * self._pause_s, self._longest_s) if again else self._first_s

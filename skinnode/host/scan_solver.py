@@ -1,4 +1,4 @@
-"""Decode a patch's scans to resistances, and solve the resistances for fields."""
+"""Decode a patch's scans into resistances, and compute fields from the resistances."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ from skinnode.solve.tracker import Tracker
 
 
 class ScanSolver:
-    """Decoder and solver for one patch's scans. Owned by one thread at a time.
+    """Decoder and solver for one patch's scans. Not thread-safe.
 
     Args:
         facts: Layout, code scale and baseline of the patch.
         config: Settings of the solver.
-        now: Function that returns the current monotonic time, ns.
+        now: Function that returns the current monotonic time in ns.
     """
 
     def __init__(
@@ -54,18 +54,17 @@ class ScanSolver:
         self._decoder = Decoder(facts.baseline_ohm, scale)
 
     def decode(self, scan: Scan, stamp: ScanStamp) -> ResistanceFrame:
-        """Return the resistances of a scan, with NaN where a code is not a measurement."""
+        """Return the resistances of a scan; NaN for each code that is not a measurement."""
         resistance_ohm, valid = self._decoder.decode(scan.codes)
         if self._codes.gain is not None:
             resistance_ohm *= self._codes.gain
         return ResistanceFrame(resistance_ohm, valid, stamp)
 
     def solve(self, scan: Scan, stamp: ScanStamp) -> tuple[FieldFrame, int]:
-        """Solve a scan, with the converter's noise and the rounding of the codes combined.
+        """Solve a scan; the assumed noise combines converter noise and code rounding.
 
         Returns:
-            The field with its time stamp and read-only arrays, and the number of codes that are not
-            measurements.
+            Field (time-stamped, with read-only arrays), and the number of codes that are not measurements.
         """
         self._tracker.scan = stamp.scan
         field, invalid = self._tracker.update_codes(scan.codes)
@@ -82,7 +81,7 @@ def tracker_options(
         patch: Configuration of the patch.
         config: Settings of the solver.
         relative_noise: Standard deviation of a resistance, as a fraction of the resistance.
-        baseline_ohm: (U, K) ohm: resistances at rest; None if they are not known yet.
+        baseline_ohm: (U, K) ohm: resistances at rest; None if the baseline is not known yet.
     """
     calibration = patch.calibration
     return TrackerOptions(
@@ -93,7 +92,7 @@ def tracker_options(
         stiffness_n_per_m=calibration.stiffness_n_per_m or config.stiffness_n_per_m,
         rubber=calibration.rubber,
         force_calibrated=calibration.force_calibrated,
-        # the exact inverse does not support tolerances
+        # the exact inverse cannot include tolerances
         tolerances=None if config.method == "exact" else patch.tolerances.build(),
         deadline_us=config.deadline_us,
         estimate_noise=config.estimate_noise,
@@ -107,7 +106,7 @@ def tracker_options(
 def check_solvable(patch: PatchConfig, config: SolverConfig) -> None:
     """Check that a patch's layout can be solved, and prepare the solver's kernels and tables.
 
-    Preparation takes time, so call this function before a node waits for the host.
+    Preparation is slow; call this function before starting any node.
 
     Raises:
         ConfigError: if the layout cannot be solved.

@@ -1,8 +1,8 @@
 """Read and write the object dictionary of a remote node as an SDO client.
 
-canopen's SDO client blocks the requesting thread, while the mainline passes the responses to the client
-through :meth:`SkinNetwork.notify`. This module limits the length and the duration of a transfer. canopen's
-client has no such limits, so a faulty node could fill the memory or block a thread forever.
+While canopen's SDO client blocks the requesting thread, the mainline passes responses to the client through
+:meth:`SkinNetwork.notify`. This module limits the length and the duration of a transfer. canopen's client has
+no such limits, so a faulty node could fill the memory or block a thread forever.
 
 Threads: only one thread at a time may access a node. Different nodes may be accessed in parallel.
 """
@@ -29,11 +29,12 @@ from skinnode.process import clock
 from skinnode.text.words import counted
 
 ATTEMPTS: Final = 3
-"""Maximum number of attempts at a transfer that gets no response, or gets the response to an earlier
-transfer."""
+"""Maximum number of attempts if a transfer gets no response or a response to an earlier transfer."""
 
 _SILENCES: Final = ("No SDO response", "could not be retransmitted")
-"""canopen's error messages for a missing response; the second message follows retransmission requests."""
+"""canopen's error messages for a missing response. canopen raises the second message after its own
+retransmission requests.
+"""
 
 _OUT_OF_STEP: Final = (
     AbortCode.TOGGLE_BIT,
@@ -43,21 +44,23 @@ _OUT_OF_STEP: Final = (
     AbortCode.INVALID_SEQUENCE,
     AbortCode.CRC,
 )
-"""SDO abort codes with which a node reports that it missed a frame of the transfer: toggle bit, timeout,
-command specifier, block size, sequence number, CRC. The transfer is then retried."""
+"""SDO abort codes after which a transfer is retried, because they indicate that the node missed a frame:
+toggle bit, timeout, command specifier, block size, sequence number, CRC.
+"""
 
 MAX_UPLOAD_BYTES: Final = 4 * 254 * 254
-"""Maximum length of a value, bytes: the baseline of the largest patch."""
+"""Maximum length (bytes) of any value: the length of the largest patch's baseline."""
 
 MAX_TEXT_BYTES: Final = 4096
-"""Maximum length of a value if a number or a text is expected, bytes."""
+"""Maximum length (bytes) of a number or text."""
 
 _MAX_NUMBER_BYTES: Final = 8
 
 _TRANSFER_S: Final = 5.0
 _SEGMENT_S: Final = 0.02
-"""Maximum duration of a transfer, s: ``_TRANSFER_S``, plus ``_SEGMENT_S`` for each segment of the longest
-value allowed."""
+"""Terms of the maximum duration (s) of a transfer: ``_TRANSFER_S``, plus ``_SEGMENT_S`` for each segment of
+the longest permitted value.
+"""
 
 _PLAIN: Final = {"u8": "<B", "u16": "<H", "u32": "<I", "f32": "<f"}
 
@@ -67,15 +70,15 @@ logging.getLogger("canopen").addHandler(logging.NullHandler())
 
 
 class Abandoned(Exception):
-    """Abort of a transfer whose result the caller no longer needs."""
+    """Exception for a transfer that was aborted because the caller no longer needs the result."""
 
 
 class _UploadTooLong(Exception):
-    """Upload that exceeds the maximum length or the maximum duration."""
+    """Exception for an upload that exceeds the maximum length or duration."""
 
 
 class SkinNetwork(canopen.Network):
-    """canopen network that sends its frames with the function ``send``."""
+    """canopen network that sends frames by calling ``send``."""
 
     def __init__(self, send: Callable[[int, bytes], None]) -> None:
         super().__init__()
@@ -95,16 +98,17 @@ class SkinNetwork(canopen.Network):
 class RemoteOd:
     """Object dictionary of a remote node, read and written by SDO.
 
-    Values have one of the types ``u8 u16 u32 f32``. ``abandoned`` is called after each segment; if the result
-    is True, the transfer is aborted and Abandoned is raised. A transfer is also retried after an exception
-    that was not caused by a response from the node.
+    Values have one of the types ``u8 u16 u32 f32``. The function ``abandoned`` is called after each segment;
+    if it returns True, the transfer is aborted and Abandoned is raised. A transfer is retried if there is no
+    response or if an unexpected exception is raised.
 
     Threads: only one thread at a time may use an instance.
 
     Args:
         network: Network that sends the requests.
         node_id: Node-ID of the SDO server.
-        on_defect: Called with each exception that was not caused by a response from the node.
+        on_defect: Function called with each unexpected exception, i.e. an exception not caused by the node's
+            response.
 
     Raises:
         NodeTimeout: if the node does not respond; raised by all methods.
@@ -153,11 +157,11 @@ class RemoteOd:
         return True
 
     def read_bytes(self, index: int, subindex: int, most: int = MAX_TEXT_BYTES) -> bytes:
-        """Return an object's value of at most ``most`` bytes, without decoding."""
+        """Return an object's undecoded value; the maximum length is ``most`` bytes."""
         return bytes(self._transfer(index, subindex, "read", lambda: self._upload(index, subindex, most)))
 
     def read_block(self, index: int, most: int = MAX_UPLOAD_BYTES) -> bytes:
-        """Read a long value of at most ``most`` bytes by block transfer with CRC."""
+        """Read a long value (at most ``most`` bytes) by block transfer with CRC."""
 
         def ask() -> bytes:
             with BlockUpload(self._client, index) as stream:  # type: ignore[no-untyped-call]
@@ -166,7 +170,7 @@ class RemoteOd:
         return bytes(self._transfer(index, 0, "block read", ask))
 
     def read_large(self, index: int, most: int = MAX_UPLOAD_BYTES) -> bytes:
-        """Read a long value by block transfer, or by segmented transfer if the node refuses that."""
+        """Read a long value by block transfer; fall back to segmented transfer if the node refuses."""
         try:
             return self.read_block(index, most)
         except SdoAbort:
@@ -258,8 +262,9 @@ class RemoteOd:
     def _whole(self, stream: Any, most: int) -> bytes:
         """Read a stream to its end.
 
-        Raises SdoCommunicationError if the data do not have the announced length, _UploadTooLong if they are
-        longer than ``most`` or take too long, and Abandoned if ``abandoned`` returns True.
+        Raises SdoCommunicationError if the length of the data differs from the announced length,
+        _UploadTooLong if the data exceed ``most`` bytes or the transfer takes too long, and Abandoned if
+        ``abandoned`` returns True.
         """
         if stream.size is not None and stream.size > most:
             raise _UploadTooLong(f"a value of {counted(stream.size, 'byte')}, expected at most {most}")
@@ -289,9 +294,7 @@ class RemoteOd:
         if any(silence in str(failure) for silence in _SILENCES):
             waited_s = ATTEMPTS * self._client.RESPONSE_TIMEOUT
             return NodeTimeout(self.node_id, f"{where}: no response within {waited_s:.1f} s")
-        if "returned a value for" in str(
-            failure
-        ):  # the response to another client's request, or from another node
+        if "returned a value for" in str(failure):  # response to another client or from another node
             got = f"{where}: got the response for another object"
             why = f"two nodes answer with node-ID {self.node_id}, or another SDO client is using it"
             return NodeError(self.node_id, f"{got}; {why}")
@@ -304,7 +307,7 @@ class RemoteOd:
 
 
 def _send(stream: Any, data: bytes) -> None:
-    """Write all of ``data`` to a stream. If ``data`` is empty, one empty segment is sent."""
+    """Write ``data`` to a stream. If ``data`` is empty, send one empty segment."""
     at = stream.write(data[:SEGMENT_BYTES])
     while at < len(data):
         at += stream.write(data[at : at + SEGMENT_BYTES])

@@ -35,21 +35,26 @@ from skinnode.canopen.sdo import ABORT
 from skinnode.process import clock
 
 _QUIET_S: Final = 0.02
-"""Duration of silence after an abort that rules out further responses to the aborted transfer, s."""
+"""Time (s) without a response after an abort, after which the node is assumed to send no more responses to
+the aborted transfer.
+"""
 
 _SETTLE_S: Final = 0.1
-"""Maximum wait for the silence after an abort, s. Another SDO client may keep the node busy for longer."""
+"""Maximum time (s) to wait for responses to cease after an abort. The wait is limited because another SDO
+client may keep the node busy.
+"""
 
 _RETRANSMISSIONS: Final = 20
-"""Maximum number of retransmitted blocks in one transfer. A node that requires more retransmissions is
-assumed to reject every block."""
+"""Maximum number of retransmitted blocks in one transfer. If a node requests more retransmissions, the
+transfer fails, because the node probably rejects every block.
+"""
 
 
 class Client(SdoClient):
-    """canopen's SDO client for the SDO server of node ``node_id``, without an object dictionary."""
+    """canopen SDO client for node ``node_id``, without an object dictionary."""
 
     def __init__(self, network: canopen.Network, node_id: int) -> None:
-        empty: Any = ObjectDictionary  # the class's constructor is not typed
+        empty: Any = ObjectDictionary  # canopen's constructor has no type annotations
         cob_ids = sdo_request_cob_id(node_id), sdo_response_cob_id(node_id)
         super().__init__(*cob_ids, empty())  # type: ignore[no-untyped-call]  # canopen is not typed
         self.network = network
@@ -57,17 +62,17 @@ class Client(SdoClient):
         self._abort_code: int = AbortCode.TIMED_OUT
 
     def abort(self, abort_code: int = AbortCode.TIMED_OUT) -> None:
-        """Store the abort code for :meth:`give_up`, which sends the abort."""
+        """Store the abort code; :meth:`give_up` sends the abort message."""
         self._abort_code = abort_code
 
     def request_response(self, sdo_request: bytes) -> bytes:
         """Send an SDO request and return the response.
 
-        If the request begins a transfer, responses for other objects are skipped, because a slow node may
-        still be sending frames from the previous transfer.
+        If the request starts a transfer, responses for other objects are skipped: a slow node may still be
+        responding to the previous transfer.
 
         Raises:
-            SdoError: if no response arrives in time, or the response is an abort.
+            SdoError: if no response arrives before the timeout, or the response is an abort.
         """
         begins = sdo_request[0] >> 5 in (1, 2) or (sdo_request[0] >> 5, sdo_request[0] & 1) in (
             (5, 0),
@@ -93,7 +98,7 @@ class Client(SdoClient):
             late = response
 
     def give_up(self, index: int, subindex: int) -> None:
-        """Abort the transfer of an object on the node, and discard late responses.
+        """Abort the current transfer of an object, and discard late responses.
 
         Raises:
             BusError: if the abort message cannot be sent.
@@ -109,23 +114,23 @@ class Client(SdoClient):
 class BlockUpload(BlockUploadStream):
     """Block upload that tolerates late segments.
 
-    canopen 2.4 requests a late segment twice and drops the first response, so every pause longer than
-    canopen's timeout results in a wrong CRC. An out-of-order segment is requested only once. This class
-    therefore presents a late segment to canopen as an out-of-order segment.
+    If a segment is late, canopen 2.4 requests the segment twice and drops the first response, so the CRC is
+    wrong after any pause longer than canopen's timeout. canopen requests an out-of-order segment only once.
+    This class therefore presents a late segment to canopen as an out-of-order segment.
     """
 
     def read(self, size: int = -1) -> bytes:
-        """Read one segment of the upload, with the interface of canopen's method."""
+        """Read one segment of the upload; overrides canopen's method."""
         if size >= 0 and not self._done:
             try:
                 response = self.sdo_client.read_response()
             except SdoCommunicationError:
-                response = bytes(8)  # no segment has number 0
+                response = bytes(8)  # sequence number 0 is never valid
             self.sdo_client.responses.queue.appendleft(response)
         return bytes(super().read(size))  # type: ignore[no-untyped-call]  # canopen is not typed
 
     def abort(self, abort_code: int) -> None:
-        """Store the abort code. canopen calls this method if the end of the transfer does not arrive."""
+        """Store the abort code. canopen calls this method if the node does not end the transfer."""
         self._error = True
         self.sdo_client.abort(abort_code)
 
@@ -144,7 +149,7 @@ class BlockDownload(BlockDownloadStream):
     def __init__(self, client: Client, index: int, data: bytes) -> None:
         super().__init__(client, index, 0, len(data))  # type: ignore[no-untyped-call]
         self._crc.process(data)
-        self._retransmitting = True  # stops canopen from updating the CRC
+        self._retransmitting = True  # prevents canopen from updating the CRC
         self._left = _RETRANSMISSIONS
 
     def close(self) -> None:

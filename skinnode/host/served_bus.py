@@ -16,7 +16,7 @@ from skinnode.host.sync import SyncFollower, Ticks
 
 @dataclass(frozen=True, slots=True)
 class ServedBus:
-    """Bus with its SYNC times, SYNC follower, LSS master and detector of other masters."""
+    """Bus of the hand, including its SYNC times, SYNC follower, LSS master and detector of other masters."""
 
     link: BusLink
     ticks: Ticks
@@ -25,7 +25,7 @@ class ServedBus:
     lss: LssMaster
 
     def health(self, *, no_sync: bool) -> BusHealth:
-        """Return the health of the bus; ``no_sync`` is copied to the result."""
+        """Return the bus's health. The argument ``no_sync`` is copied to the result."""
         masters, stats, failure = self.other_masters.stats(), self.link.stats(), self.link.failure
         return BusHealth(
             bus=self.link.config.name,
@@ -48,11 +48,11 @@ class ServedBus:
     def sync_is_late(self, t_up_ns: int, period_ns: int) -> bool:
         """Return whether another master's SYNC has been absent for :data:`SYNCS_MISSED` periods.
 
-        Times are compared with the time of the newest dispatched frame instead of the current time, so that a
-        delay in the host does not count as missing SYNC.
+        The SYNC time is compared with the time of the newest dispatched frame instead of the current time, so
+        that a delay in the host is not reported as missing SYNC.
 
         Args:
-            t_up_ns: Monotonic time at which bring-up was complete, ns.
+            t_up_ns: Monotonic time (ns) at which bring-up was completed.
             period_ns: SYNC period, ns.
         """
         if self.link.config.role == "master" or self.link.failure is not None:

@@ -1,4 +1,4 @@
-"""Store where patches are: each patch's pose on its link, and each link's pose in the hand's frame."""
+"""Define the pose of each patch on its link, and of each link in the hand's coordinate frame."""
 
 from __future__ import annotations
 
@@ -15,9 +15,13 @@ class Skeleton:
     """Poses of a hand's patches on their links, and of the links in the hand's coordinate frame."""
 
     mounts: Mapping[str, Mount] = field(default_factory=dict)
-    """Link and pose by patch name; a patch that is not listed is at the origin of the hand's frame."""
+    """Link and pose of each patch, by patch name. A patch without an entry has the same coordinate frame as
+    the hand.
+    """
     link_poses: Mapping[str, Pose] = field(default_factory=dict)
-    """Pose in the hand's frame by link name; the frame of a link that is not listed is the hand's frame."""
+    """Pose of each link in the hand's coordinate frame, by link name. A link without an entry has the same
+    coordinate frame as the hand.
+    """
 
     @classmethod
     def of(cls, hand: HandConfig) -> Skeleton:
@@ -26,7 +30,7 @@ class Skeleton:
         return cls(mounts, {link.name: link.pose.build() for link in hand.links})
 
     def mount(self, patch: str) -> Mount:
-        """Return the link and the pose of a patch."""
+        """Return a patch's link, and the patch's pose on that link."""
         return self.mounts.get(patch, Mount())
 
     def link_pose(self, link: str) -> Pose:

@@ -19,25 +19,27 @@ from skinnode.process import clock
 from skinnode.text.words import known
 
 BRING_UP_THREADS: Final = 16
-"""Maximum number of nodes configured in parallel; additional nodes would only wait for the bus."""
+"""Maximum number of nodes configured in parallel; with more nodes, the bus would be the bottleneck."""
 
 _BRING_UPS: Final = 3
-"""Maximum number of attempts to configure a node. Another attempt is made if the node boots during an
-attempt, as nodes just found by LSS do, or if an unexpected exception is raised."""
+"""Maximum number of attempts to configure a node. The configuration is repeated after an unexpected
+exception, or if the node boots in the meantime, as a node just found by LSS does.
+"""
 
 _START_AGAIN_NAPS: Final = 50
-"""Number of polling pauses after which an unconfirmed start command is repeated, because the command may have
-been lost. The pauses last a quarter of a second in total."""
+"""Number of polling intervals (a quarter of a second in total) after which an unconfirmed start command is
+repeated, because the command may have been lost.
+"""
 
 _POLL_S: Final = 0.005
 
 
 class BringUpCancelled(SkinError):
-    """Cancellation of bring-up by the caller."""
+    """Exception raised when the caller cancels bring-up."""
 
 
 class _Defective(NodeError):
-    """Unexpected exception during the last attempt to configure a node."""
+    """Error: the last attempt to configure a node raised an unexpected exception."""
 
 
 def go_on_unless(cancelled: Callable[[], bool]) -> None:
@@ -55,17 +57,16 @@ def configure_all(
 
     Args:
         nodes: Nodes to configure.
-        missing: ``wait`` if silent nodes may join later, ``refuse`` if all nodes must be present.
-        deadline_s: Maximum time until the first response from a node, s.
-        cancelled: Called repeatedly during configuration, which ends if the result is True.
+        missing: ``wait`` if nodes that do not respond may join later; ``refuse`` if all nodes must respond.
+        deadline_s: Maximum time (s) to wait for a node's first response.
+        cancelled: Function called repeatedly during configuration; if it returns True, configuration stops.
 
     Returns:
-        Nodes that are present, each with the solver for its scans.
+        Nodes that responded, each with the solver for its scans.
 
     Raises:
-        NodeTimeout: if a node is silent and ``missing`` is ``refuse``.
-        BusError: if all nodes on a bus are silent and ``missing`` is ``refuse``, or if
-            :meth:`RemoteNode.configure` raises it.
+        NodeTimeout: if a node does not respond and ``missing`` is ``refuse``.
+        BusError: if no node on a bus responds and ``missing`` is ``refuse``, or a frame cannot be sent.
         BringUpCancelled: if ``cancelled`` returned True.
     """
     return _Start(nodes, missing, deadline_s, cancelled).run()
@@ -83,7 +84,7 @@ class _Start:
         self._answered: list[PatchConfig] = []
 
     def run(self) -> dict[RemoteNode, ScanSolver]:
-        """Configure the nodes and return those that are present, with their solvers."""
+        """Configure the nodes, and return each node that responded with its solver."""
         threads = min(len(self._nodes), BRING_UP_THREADS)
         with clock.pool(threads, "bring-up") as pool:
             try:
@@ -127,7 +128,7 @@ class _Start:
         return self._waits and (silent or isinstance(failure, _Defective))
 
     def _wait_for(self, jobs: dict[RemoteNode, Future[ScanSolver]]) -> None:
-        """Wait until all jobs have ended, or until a job fails in a way that prevents the start."""
+        """Wait until all jobs have ended or one job has failed with an error that prevents the start."""
         ended: SimpleQueue[RemoteNode] = clock.simple_queue()
 
         def put_when_done(node: RemoteNode) -> Callable[[Future[ScanSolver]], None]:
@@ -142,7 +143,10 @@ class _Start:
                 break
 
     def _result(self, node: RemoteNode, job: Future[ScanSolver]) -> ScanSolver | None:
-        """Return a node's solver, or None if it may join later. Raises a failure that prevents the start."""
+        """Return a node's solver, or None if the node may join later.
+
+        Raise any error that prevents the start.
+        """
         failure = None if job.cancelled() else job.exception()
         if job.cancelled() or isinstance(failure, Abandoned):
             return None
@@ -156,13 +160,13 @@ class _Start:
 
 
 def start_all(ready: dict[RemoteNode, ScanSolver]) -> None:
-    """Start the nodes without another master, and wait until their heartbeats report operational.
+    """Start the nodes on the host's own buses, and wait until their heartbeats report operational.
 
-    The deadline is measured in polling pauses, so that time during which the computer is suspended does not
-    count.
+    The deadline is measured in polling intervals, so that time during which the computer is suspended is not
+    included.
 
     Raises:
-        NodeTimeout: if a node does not become operational in time.
+        NodeTimeout: if a node does not become operational before the deadline.
     """
     t_start_ns = clock.monotonic_ns()
     for node, solver in ready.items():
@@ -185,7 +189,7 @@ def start_all(ready: dict[RemoteNode, ScanSolver]) -> None:
 
 
 def _listen(node: RemoteNode, deadline_s: float, abandoned: Callable[[], bool]) -> None:
-    """Wait for a frame from a node to which the host may not send; raise NodeTimeout after the deadline."""
+    """Wait for a frame from a node to which the host must not send; raise NodeTimeout after the deadline."""
     end_s = clock.monotonic() + deadline_s
     while not node.heard:
         if abandoned():
@@ -202,10 +206,10 @@ def _listen(node: RemoteNode, deadline_s: float, abandoned: Callable[[], bool]) 
 def _silence(
     node: RemoteNode, nodes: Sequence[RemoteNode], answered: list[PatchConfig], deadline_s: float
 ) -> BusError:
-    """Return the error for a silent node.
+    """Return the error for a node that does not respond.
 
-    If all nodes on a bus are silent, the error names the bus instead, because its cable, supply or bit rate
-    is probably at fault.
+    If no node on the bus responds, the error names the bus instead, because the cause is probably its cable,
+    supply or bit rate.
     """
     bus, patch = node.bus, node.patch
     on_bus = [other.patch for other in nodes if other.bus is bus]

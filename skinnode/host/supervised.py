@@ -15,10 +15,10 @@ from skinnode.model.layout import Float
 from skinnode.process import clock
 
 JOIN_DEADLINE_S: Final = 1.0
-"""Maximum time for a node that has sent any frame to respond by SDO, or to tare itself, s."""
+"""Maximum time (s) that a node may take to respond by SDO or to tare itself, after it has sent any frame."""
 
 LEAST_NS: Final = 300_000_000
-"""Minimum time between two bring-ups of a node that restarts in a loop, ns."""
+"""Minimum time (ns) between two bring-ups of a node that restarts in a loop."""
 
 
 class Phase(enum.StrEnum):
@@ -36,13 +36,13 @@ class NodeStats:
 
     phase: Phase
     rejoins: int
-    """Number of bring-ups after the host's start that ended with the node running."""
+    """Number of successful bring-ups since the host finished starting."""
     failures: int
-    """Number of bring-ups after the host's start that failed."""
+    """Number of failed bring-ups since the host finished starting."""
     baselines: int
-    """Number of new baselines with which scans have been solved."""
+    """Number of times the solver has switched to a new baseline."""
     complaint: str | None
-    """Reason why the last bring-up failed; None if it succeeded."""
+    """Reason why the last bring-up failed; None if that bring-up succeeded."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,24 +61,25 @@ class Supervised:
     phase: Phase
     since_ns: int
     read_ns: int
-    """Earliest monotonic time for the next reading of the node's baseline, ns."""
+    """Earliest monotonic time (ns) at which to read the node's baseline again."""
     job: Future[Joined | None] | None = None
-    """Running job that communicates with the node; the result is None if the job only reads the error
-    register."""
+    """Running job that communicates with the node. The job's result is None if the job reads only the error
+    register.
+    """
     searching: Future[bool] | None = None
     abandon: threading.Event = field(default_factory=clock.event)
     """Event that aborts the running job."""
     pause: Pause = field(default_factory=Pause)
     not_before_ns: int = 0
-    """Monotonic time at which the pause after a failed bring-up or a defect ends, ns."""
+    """Monotonic time (ns) at which the pause after a failed bring-up or an unexpected exception ends."""
     was_silent: bool = True
-    """Whether any frame from the node ends the pause, because the node was silent or refused."""
+    """Whether the pause ends at the node's next frame, because the node did not respond or was refused."""
     begun_ns: int = 0
-    """Monotonic start time of the most recent bring-up, ns."""
+    """Monotonic time (ns) at which the most recent bring-up started."""
     defects: int = 0
-    """Number of the node's reported defects that have been handled."""
+    """Number of the node's unexpected exceptions that the supervisor has already handled."""
     upset: bool = False
-    """Whether supervising the node raised an exception, so that its state is unknown."""
+    """Whether the node's state is unknown because supervising the node raised an exception."""
     probe_ns: int = 0
     search_ns: int = 0
     register_ns: int = 0
@@ -88,8 +89,8 @@ class Supervised:
     rejoins: int = 0
     failures: int = 0
     baseline_ohm: Float | None = None
-    """(U, K) ohm: baseline with which the node's scans are solved; None before the first bring-up."""
+    """(U, K) ohm: baseline used to solve the node's scans; None before the first bring-up."""
     announced: bool = False
-    """Whether the node has announced a new baseline with which scans are not yet solved."""
+    """Whether the node has announced a new baseline that the solver does not use yet."""
     baselines: int = 0
     complaint: str | None = None

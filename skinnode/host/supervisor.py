@@ -1,10 +1,10 @@
 """Keep the nodes of a running hand operational.
 
-A node that comes back or appears late is configured and started, and a changed baseline is read again. The
-state of one node does not affect the others. A single thread decides fifty times a second what to do, based
-on the data collected by the mainline. Operations that wait for a node (configuration, reading a baseline) run
-on a thread pool, with one job per node at a time. The deciding thread fetches the result of a finished job,
-so all state is owned by this thread.
+A node that reappears or appears late is configured and started; a changed baseline is read again. Nodes are
+supervised independently of each other. Fifty times a second, the supervisor's thread evaluates the data
+collected by the mainline and decides what to do. Operations that wait for a node (configuration, reading a
+baseline) run as jobs on a thread pool, with one job per node at a time. The supervisor's thread fetches the
+results of finished jobs, so no other thread accesses its state.
 
 =========  ========================================  =========================================
 phase      meaning                                   next phase
@@ -17,9 +17,10 @@ RUNNING    the node's scans are solved               JOINING if it boots or leav
 =========  ========================================  =========================================
 
 A defect is an exception raised while serving a patch in phase STARTING or RUNNING, or while configuring its
-node. A defect makes the patch faulty: its scans are withheld, and its node is in phase AWAITED for a pause of
-0.1 s to 1 s that doubles with each defect. The same pause follows a failed configuration. A boot-up message
-from the node ends the pause. After silence or a refusal, any frame from the node ends the pause.
+node. After a defect, the patch is marked faulty: its scans are withheld, and its node stays in phase AWAITED
+for a pause. The pause starts at 0.1 s and doubles with each defect, up to 1 s. The same pause follows a
+failed configuration. A boot-up message from the node ends the pause. If the node did not respond or was
+refused, any frame from the node ends the pause.
 """
 
 from __future__ import annotations
@@ -41,15 +42,16 @@ from skinnode.process import clock
 _log = logging.getLogger(__name__)
 
 THREADS: Final = 8
-"""Maximum number of nodes configured in parallel after the start; additional nodes would only wait for the
-bus."""
+"""Maximum number of nodes configured in parallel after the start; with more nodes, the bus would be the
+bottleneck.
+"""
 
 _TURN_S: Final = 0.02
-"""Interval between two checks of all nodes, s."""
+"""Interval (s) between checks of all nodes."""
 
 
 class Supervisor:
-    """Supervisor of all nodes, from construction until :meth:`close`.
+    """Supervisor of all nodes; runs from construction until :meth:`close`.
 
     The supervisor also sends the host's heartbeats. Threads: one thread makes all decisions; a pool runs the
     jobs that wait for nodes; any thread may call :meth:`stats`.
@@ -129,23 +131,23 @@ class Supervisor:
         for node in self._nodes:
             try:
                 self._supervision.look(node, clock.monotonic_ns())
-            except Exception as error:  # the next iteration makes the patch faulty
+            except Exception as error:  # the next iteration marks the patch as faulty
                 node.upset = True
                 node.remote.defects.report("supervision", error)
         self._beat(clock.monotonic_ns())
         return True
 
     def _beat(self, now_ns: int) -> None:
-        """Send the host's heartbeat on the buses where it has a node-ID."""
+        """Send the host's heartbeat on each bus where the host has a node-ID."""
         if now_ns < self._beat_ns:
             return
         self._beat_ns = max(self._beat_ns + self._heartbeat_ns, now_ns)
         for link in self._links.values():
             node_id = link.config.heartbeat_node_id
-            assert node_id is not None  # only buses with a node-ID for the host are kept
+            assert node_id is not None  # the dictionary contains only buses on which the host has a node-ID
             try:
                 link.send(od.heartbeat_cob_id(node_id), bytes([NmtState.OPERATIONAL]))
-            except BusError:  # nodes that miss the heartbeat report the error themselves
+            except BusError:  # nodes report a missing heartbeat themselves
                 continue
             except Exception as error:
                 link.defects.report("sending a heartbeat", error)

@@ -1,4 +1,4 @@
-"""Produce SYNC with a counter at a drift-free rate, or follow the SYNC of another producer."""
+"""Produce SYNC messages with a counter at a drift-free rate, or follow another producer's SYNC."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from skinnode.process import clock
 
 
 class Tick(NamedTuple):
-    """Number and monotonic time of one SYNC."""
+    """Number and monotonic time of one SYNC message."""
 
     number: int
     t_ns: int
@@ -26,39 +26,40 @@ class SyncStats:
 
     sent: int
     missed: int
-    """Number of SYNC periods skipped because the sending thread woke too late."""
+    """Number of SYNC periods skipped because the sending thread was not scheduled in time."""
     failed: int
-    """Number of SYNC messages that a bus did not accept."""
+    """Number of SYNC messages that could not be sent on a bus."""
     latest_ns: int
-    """Maximum delay of a SYNC relative to its due time, ns."""
+    """Maximum delay (ns) of a SYNC message relative to its due time."""
     received: int = 0
     """Number of SYNC messages from other producers, on buses that another master runs."""
     irregular: int = 0
-    """Number of received SYNC messages whose counter is missing or does not follow the previous counter. Such
-    a message indicates a lost SYNC or a second producer."""
+    """Number of received SYNC messages whose counter is missing or does not follow the previous counter. A
+    missing or unexpected counter indicates a lost SYNC or a second producer.
+    """
 
 
 class Ticks:
-    """Table of the newest SYNC for each counter value.
+    """Table of SYNC times: the newest SYNC for each counter value.
 
-    The table is written by the thread that sends or follows SYNC, and read by the mainline.
+    Threads: the thread that sends or follows SYNC writes the table, and the mainline reads it.
     """
 
     def __init__(self, counter_overflow: int) -> None:
         self.counter_overflow = counter_overflow
         self._ticks: list[Tick | None] = [None] * (counter_overflow + 1)
         self.newest = 0
-        """Number of the newest SYNC; 0 before the first."""
+        """Number of the newest SYNC; 0 before the first SYNC."""
 
     def note(self, number: int, t_ns: int) -> int:
-        """Store the time of SYNC ``number``. Returns the SYNC's counter, 1 to ``counter_overflow``."""
+        """Store the time of SYNC ``number``. Return its counter value (1 to ``counter_overflow``)."""
         counter = (number - 1) % self.counter_overflow + 1
         self._ticks[counter] = Tick(number, t_ns)
         self.newest = number
         return counter
 
     def find(self, counter: int) -> Tick | None:
-        """Return the newest SYNC with this counter value, or None if there was no such SYNC."""
+        """Return the newest SYNC with this counter value, or None if no SYNC has had this value."""
         return self._ticks[counter] if 0 < counter <= self.counter_overflow else None
 
 
@@ -69,7 +70,7 @@ class SyncFollower:
         self._ticks = ticks
         self.received = self.irregular = 0
         self.t_newest_ns = 0
-        """Monotonic time of the newest SYNC, ns; 0 before the first."""
+        """Monotonic time (ns) of the newest SYNC; 0 before the first SYNC."""
 
     def on_sync(self, data: bytes, t_ns: int) -> None:
         """Process a received SYNC. A SYNC whose counter is missing or out of range is only counted."""
@@ -82,7 +83,7 @@ class SyncFollower:
         if not overflow:
             return
         newest = self._ticks.newest
-        ahead = (data[0] - newest - 1) % overflow + 1  # 1 if no SYNC was lost
+        ahead = (data[0] - newest - 1) % overflow + 1  # the step is 1 if no SYNC was lost
         if newest == 0:
             self._ticks.note(data[0], t_ns)
             return
@@ -97,16 +98,16 @@ class SyncProducer:
     """Producer that sends SYNC on all buses, at the same instant or staggered, until :meth:`close`.
 
     The counter runs from 1 to its overflow value (CiA 301, 0x1019). SYNC number n + 1 is due n periods after
-    the first SYNC. If the thread wakes a whole period late, that period is skipped, so that two SYNC messages
-    are never sent in quick succession. A SYNC that has been sent on one bus is always sent
-    on the other buses too.
+    the first SYNC. If the thread is a whole period late, that period is skipped, so that two SYNC messages
+    are never sent in quick succession. A SYNC that has been sent on one bus is always sent on the other buses
+    too.
 
     Threads: a dedicated thread sends the SYNC messages.
 
     Args:
-        buses: For each bus, the function that sends frames, and the table of SYNC times.
+        buses: For each bus, the function that sends frames and the table of SYNC times.
         period_s: SYNC period, s.
-        stagger_s: Delay between the SYNC messages of successive buses, s.
+        stagger_s: Delay (s) between the SYNC messages on successive buses.
         defects: For each bus, the collector of exceptions raised while sending on that bus.
     """
 
@@ -148,16 +149,16 @@ class SyncProducer:
         keep_on(self._turn, self._defects[0], "sending SYNC")
 
     def _turn(self) -> bool:
-        """Wait until the next SYNC is due, and send it. Returns False if the thread must end."""
+        """Send the next SYNC at its due time. Return False if the thread must end."""
         if self._wait(self._due_ns):
             return False
         self._number += 1
         due_ns, self._due_ns = self._due_ns, self._due_ns + self._period_ns
-        now_ns = clock.monotonic_ns()  # the same instant for all buses
+        now_ns = clock.monotonic_ns()  # all buses share one SYNC time
         for i in range(len(self._buses)):
             try:
                 self._send(i, due_ns + i * self._stagger_ns, now_ns)
-            except BusError:  # the bus may recover, and lost scans are counted by the assembler
+            except BusError:  # the bus may recover; the assembler counts lost scans
                 self._failed += 1
             except Exception as error:
                 self._failed += 1
@@ -174,10 +175,10 @@ class SyncProducer:
             self._wait(due_ns)
             now_ns = clock.monotonic_ns()
         self._latest_ns = max(self._latest_ns, now_ns - due_ns)
-        # store the SYNC before sending it, so that its scans find it
+        # store the SYNC time before sending: scans look it up as soon as they arrive
         payload = bytes([ticks.note(self._number, now_ns)])
         send(SYNC_COB_ID, payload)
 
     def _wait(self, until_ns: int) -> bool:
-        """Wait until ``until_ns`` or :meth:`close`. Returns whether the producer was closed."""
+        """Wait until ``until_ns`` or :meth:`close`. Return whether the producer was closed."""
         return self._stop.wait(max(0.0, (until_ns - clock.monotonic_ns()) * 1e-9))

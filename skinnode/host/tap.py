@@ -1,4 +1,4 @@
-"""Pass all frames to and from a host, and the events that affect their decoding, to a recorder."""
+"""Pass a host's sent and received frames, and the events that affect decoding, to a recorder."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ from skinnode.transport import Frame
 
 
 class HostTap(StreamTap, Protocol):
-    """Recorder of all frames, and of the events that affect how a host decodes the frames. Never waits."""
+    """Recorder of all frames and of the events that affect how a host decodes the frames. Never waits."""
 
     def received(self, bus: str, frames: Sequence[Frame]) -> None:
         """Record a batch of frames about to be dispatched. Called on the mainline."""
 
     def sent(self, bus: str, frame: Frame) -> None:
-        """Record a frame that the interface accepted. Called on the sending thread."""
+        """Record a frame that the interface accepted. The sending thread calls this method."""
 
 
 class ContainedTap:
-    """Wrapper that contains the exceptions of a tap.
+    """Wrapper that prevents a tap's exceptions from affecting the host.
 
-    If the tap raises an exception, the exception is reported to ``defects``, and the tap loses that entry.
+    Exceptions raised by the tap are reported to ``defects``; only the current entry of the recording is lost.
     """
 
     def __init__(self, tap: HostTap, defects: Defects) -> None:
@@ -64,10 +64,13 @@ class ContainedTap:
 
 
 def tap_link(tap: HostTap, link: BusLink) -> Callable[[], None]:
-    """Start passing every frame on a bus to ``tap``. Mainline only, except before the mainline starts.
+    """Start passing every frame on a bus to ``tap``.
+
+    After the mainline has started, only the mainline may call this function.
 
     Returns:
-        A function that ends the recording, subject to the same restriction.
+        Function that ends the recording; may be called only from the mainline, or while the mainline is not
+        running.
     """
     received = functools.partial(tap.received, link.config.name)
     sent = functools.partial(tap.sent, link.config.name)
@@ -82,10 +85,10 @@ def tap_link(tap: HostTap, link: BusLink) -> Callable[[], None]:
 
 
 def tap_bus(tap: HostTap, link: BusLink, streams: Sequence[PatchStream]) -> Callable[[], None]:
-    """Make the mainline pass to ``tap`` the state of all streams, then every frame and change of state.
+    """Start passing to ``tap`` the state of all streams, then every frame and change of state.
 
     Returns:
-        A function that ends the recording; any thread may call it.
+        Function that ends the recording; any thread may call this function.
     """
     ends: list[Callable[[], None]] = []
 

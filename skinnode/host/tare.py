@@ -11,13 +11,15 @@ from skinnode.host.remote_node import RemoteNode
 from skinnode.process import clock
 
 TARE_DEADLINE_S: Final = 5.0
-"""Default deadline for a tare, s, to which :data:`TARE_DEADLINE_SYNCS` periods are added. The node's 16
-readings take milliseconds, reading the baseline takes 0.1 to 0.3 s, and the supervisor may pause for 2 s
-after the previous reading."""
+"""Default time limit (s) for a tare, excluding the additional :data:`TARE_DEADLINE_SYNCS` periods. The node
+takes its 16 readings within milliseconds, and the host reads the baseline in 0.1 to 0.3 s. The supervisor may
+wait for 2 s after the previous read of the baseline.
+"""
 
 TARE_DEADLINE_SYNCS: Final = 3
-"""Number of SYNC periods added to the deadline for a tare, because the summary of the next scan announces the
-new baseline."""
+"""Number of SYNC periods added to a tare's time limit, because the next scan's summary announces the new
+baseline.
+"""
 
 _POLL_S: Final = 0.005
 
@@ -25,17 +27,17 @@ _POLL_S: Final = 0.005
 def tare(
     node: RemoteNode, baselines: Callable[[], int], health: Callable[[], PatchHealth], deadline_s: float
 ) -> None:
-    """Tare a patch, and return when its scans are solved with the new baseline.
+    """Tare a patch, and return as soon as the solver uses the new baseline.
 
     Args:
         node: Node of the patch.
         baselines: Function that returns the number of new baselines read so far.
         health: Function that returns the health of the patch.
-        deadline_s: Maximum wait for the new baseline, s.
+        deadline_s: Maximum time (s) to wait for the new baseline.
 
     Raises:
         NodeTimeout: if no new baseline is in use after ``deadline_s``.
-        SkinError: if :meth:`RemoteNode.tare` raises it.
+        SkinError: for the reasons listed under :meth:`RemoteNode.tare`.
     """
     before, emergencies = baselines(), health().emergencies
     node.tare()

@@ -15,8 +15,8 @@ from skinnode.text.json_values import plain
 def trust_table(field: FieldFrame | None) -> dict[str, Any]:
     """Return a field's trust, precision, data share and faults; every value is None if there is no field.
 
-    ``deepest_data_share`` is the data share of the deepest electrode's depth, which is 1 if the field does
-    not depend on a prior.
+    The entry ``deepest_data_share`` is the data share of the depth at the deepest electrode; 1 if no prior
+    was used.
     """
     if field is None:
         return dict.fromkeys(("trusted", "distrust", "precise", "deepest_data_share", "data_faults"))
@@ -33,14 +33,14 @@ def trust_table(field: FieldFrame | None) -> dict[str, Any]:
 
 
 def deepest_data_share(field: FieldFrame) -> float:
-    """Return the data share of the deepest electrode's depth; 1 if the depth comes from the data alone."""
+    """Return the data share of the depth at the deepest electrode; 1 if no prior was used."""
     if field.data_share is None:
         return 1.0
     return float(field.data_share[..., 2].flat[int(np.argmin(field.displacement_m[..., 2]))])
 
 
 def fault_table(fault: DataFault) -> dict[str, Any]:
-    """Return a fault as a table for JSON, with infinite deviations replaced by None."""
+    """Return a fault as a table for JSON; infinite deviations are replaced by None."""
     table: dict[str, Any] = plain(
         {
             "part": str(fault.part),

@@ -1,4 +1,4 @@
-"""Wire faults in a patch's health report, and detection of open and shorted wires from their codes."""
+"""Define the wire faults in a patch's health report, and detect open and shorted wires from codes."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from skinnode.protocol.codes import CodeScale
 
 
 class WireState(enum.StrEnum):
-    """Type of fault of a wire."""
+    """Type of wire fault."""
 
     OPEN = "open"
     SHORT = "short"
@@ -32,7 +32,7 @@ class WireFault:
 
 
 def broken_wires(codes: NDArray[Any], scale: CodeScale) -> tuple[WireFault, ...]:
-    """Return the wires whose crossings are all open, or all shorted.
+    """Return the faults of the wires whose crossings are all open or all shorted.
 
     Args:
         codes: (U, K) codes of one scan.

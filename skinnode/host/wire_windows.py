@@ -1,18 +1,19 @@
 """Detect noisy and drifting wires in windows of successive scans, and measure the noise of the codes.
 
-Noise and drift are evaluated over windows of ``WINDOW`` scans, and a wire is reported if its criterion is met
-in ``WINDOWS`` consecutive windows.
+Noise and drift are evaluated over windows of ``WINDOW`` scans. A wire is reported if the criterion for noise
+or drift is met in ``WINDOWS`` consecutive windows.
 
-A wire is noisy if the mean square of its codes' second differences over time exceeds ``NOISY`` times the
-value for the median wire on its side, and ``NOISY`` times the value for the expected noise. Second
-differences are used because they do not depend on steady movement.
+The noise power of a wire is the mean square of its codes' second differences over time, which are not
+affected by steady movement. A wire is noisy if its noise power exceeds both the median over the wires on its
+side and the expected noise power by a factor of ``NOISY``.
 
 A wire drifts if the resistances of all its crossings have changed by the same fraction of R0, while its
-neighbours have not changed in the same way. The change must exceed ``DRIFT`` relative to both the median wire
-and the rest state. A touch, in contrast, changes the crossings of a wire unevenly, and the rubber spreads the
-change to the adjacent wires. In simulated touches (spheres of 2 mm to 0.3 m with indentations of 10 to 60 %),
-a wire changed by more than ``DRIFT`` at 780,000 instants, and no change was mistaken for drift. The criterion
-has a cost: two neighbours that drift alike are not reported, and neither is a touched wire.
+neighbours have not changed in the same way. The change must exceed ``DRIFT``, both relative to the median
+wire and relative to rest. A touch, in contrast, changes the crossings of a wire unevenly, and the rubber
+spreads the change to the adjacent wires. In simulated touches (spheres of 2 mm to 0.3 m, indentations of 10
+to 60 %), a wire changed by more than ``DRIFT`` in 780,000 cases, none of which was mistaken for drift. The
+criterion for drift has a drawback: it misses adjacent wires that drift equally, and drift of a wire that is
+being touched.
 """
 
 from __future__ import annotations
@@ -33,17 +34,20 @@ WINDOW: Final = 16
 WINDOWS: Final = 3
 """Number of consecutive windows in which a wire must be noisy or drift before it is reported."""
 NOISY: Final = 25.0
-"""Minimum ratio of a noisy wire's noise power to the median wire's noise power; the amplitude ratio is 5."""
+"""Minimum ratio of a noisy wire's noise power to the median wire's; corresponds to an amplitude ratio of
+5.
+"""
 DRIFT: Final = 1e-3
 """Minimum drift of a drifting wire, as a fraction of R0: a tenth of the change that a light touch causes in
-the crossings below it."""
+the touched crossings.
+"""
 UNEVEN: Final = 0.05
-"""Maximum deviation of a crossing from the median of its drifting wire, as a fraction of the drift."""
+"""Maximum deviation of a drifting wire's crossings from their median, as a fraction of the drift."""
 APART: Final = 0.3
 """Minimum difference in R / R0 between a drifting wire and the more similar of its two neighbours, as a
 fraction of the drift."""
 _SHOWN: Final = 8
-"""Number of most recent windows that determine the measured noise."""
+"""Number of recent windows from which the noise is determined."""
 
 
 class WireWindows:
@@ -57,22 +61,22 @@ class WireWindows:
     def __init__(self, scale: CodeScale, relative_noise: float) -> None:
         self._scale, self._relative_noise = scale, relative_noise
         self.wires: tuple[WireFault, ...] = ()
-        """Faults of the noisy and the drifting wires."""
+        """Faults of all wires currently found noisy or drifting."""
         self.windows = 0
         """Number of windows evaluated so far."""
-        self._odd: dict[WireFault, int] = {}  # number of consecutive windows with each fault
+        self._odd: dict[WireFault, int] = {}  # fault -> number of consecutive windows
         self._window: list[Codes] = []
-        # crossings measured in all scans of the window; None if all
+        # crossings measured in every scan of the window; None: all crossings
         self._measured: NDArray[np.bool_] | None = None
         self._shown: deque[float] = deque(maxlen=_SHOWN)
 
     @property
     def shown_noise(self) -> float:
-        """Minimum noise over the most recent windows, codes; 0 if a window had no measurable noise."""
+        """Minimum noise (codes) over the recent windows; 0 if any window had no measurable noise."""
         return min(self._shown) if len(self._shown) == _SHOWN else 0.0
 
     def on_scan(self, scan: Scan) -> None:
-        """Evaluate the next scan, which must be complete and contain every code."""
+        """Add the next scan, which must be complete and contain every code."""
         if not scan.valid.all():
             self._measured = scan.valid if self._measured is None else self._measured & scan.valid
         self._window.append(scan.codes)
@@ -103,8 +107,8 @@ class WireWindows:
             off = np.abs(ratio - (gain[:, None] if axis else gain))
             spread = _of_wires(off, axis, whole, np.max, np.nanmax)
             quiet = max(expected, _median_of_known(level))
-            # The change from rest is also required: if a touch changed the median wire, the untouched wires
-            # deviate from the median.
+            # The wire must also have changed from rest: if a touch changes the median wire, the untouched
+            # wires deviate from the median without drifting.
             away = np.minimum(np.abs(gain - _median_of_known(gain)), np.abs(gain - 1.0))
             step = np.concatenate(([np.inf], np.abs(np.diff(gain)), [np.inf]))
             apart = np.fmin(step[:-1], step[1:])
@@ -118,10 +122,11 @@ class WireWindows:
 
 
 def _shown_noise(codes: NDArray[np.float64], power: NDArray[np.float64]) -> float:
-    """Return the noise that three quarters of the crossings exceed, codes; 0 if it is not measurable.
+    """Return the noise (codes) that three quarters of the crossings exceed; 0 if not measurable.
 
-    Only crossings whose codes span at least three values without a lasting change are considered. Even a
-    crossing without noise alternates between two codes if its value is at the edge of a quantization step.
+    The noise of a crossing is measured only if its codes span at least three values without a lasting change.
+    With almost no noise, a crossing may still alternate between two codes if its value is at the edge of a
+    quantization step.
 
     Args:
         codes: (WINDOW, U, K) codes of a window.
@@ -135,7 +140,7 @@ def _shown_noise(codes: NDArray[np.float64], power: NDArray[np.float64]) -> floa
 
 
 def _median(values: NDArray[np.float64], axis: int) -> NDArray[np.float64]:
-    """Return the median of values without NaN; three times as fast as ``np.median`` for a patch."""
+    """Return the median of values that contain no NaN; for a patch, three times as fast as ``np.median``."""
     ordered, count = np.sort(values, axis=axis), values.shape[axis]
     middle: NDArray[np.float64] = ordered.take([(count - 1) // 2, count // 2], axis=axis).sum(axis=axis)
     return 0.5 * middle
@@ -150,9 +155,9 @@ def _median_of_known(values: NDArray[np.float64]) -> float:
 def _of_wires(
     values: NDArray[np.float64], axis: int, whole: NDArray[np.bool_], plain: Any, without_nan: Any
 ) -> NDArray[np.float64]:
-    """Reduce each wire's crossings to one number, ignoring NaN; NaN if all crossings are NaN.
+    """Reduce the values of each wire's crossings to one number; ignore NaN unless all values are NaN.
 
-    NaN denotes a crossing that was not measured. Without NaN, the function is ten times as fast.
+    NaN denotes a crossing that was not measured. The function is ten times as fast if no value is NaN.
     """
     if not np.isnan(values).any():
         return np.asarray(plain(values, axis=axis))

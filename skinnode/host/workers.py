@@ -1,8 +1,8 @@
-"""Run submitted jobs in order on a pool of worker threads.
+"""Run submitted jobs on a pool of worker threads, in order of submission.
 
-Submitting a job takes the mainline only half a microsecond, because the pool needs neither result objects nor
-a lock in addition to the queue's, unlike ThreadPoolExecutor. If a job raises an exception, the exception is
-passed to the function submitted with the job, and the thread continues with the next job.
+Submitting a job takes only half a microsecond of the mainline's time. Unlike ThreadPoolExecutor, the pool
+creates no result objects and uses no lock except that of its queue. If a job raises an exception, the
+exception is passed to an error handler submitted with the job, and the thread continues with the next job.
 """
 
 from __future__ import annotations
@@ -17,13 +17,15 @@ from skinnode.process import clock
 
 Job = Callable[[], None]
 OnError = Callable[[Exception], object]
-"""Function called with the exception raised by a job, on the thread that ran the job; must not raise."""
+"""Function called with a job's exception, on the thread that ran the job. The function must not raise
+exceptions.
+"""
 
 
 class Workers:
-    """Pool of ``count`` worker threads, which run from construction until :meth:`close`.
+    """Pool of ``count`` worker threads that run from construction until :meth:`close`.
 
-    Threads: any thread may submit jobs. Exceptions raised outside jobs are reported to ``defects``.
+    Threads: any thread may submit jobs. Exceptions raised outside the jobs are reported to ``defects``.
     """
 
     def __init__(self, count: int, name: str, defects: Defects | None = None) -> None:
@@ -38,7 +40,7 @@ class Workers:
         self._jobs.put((job, on_error))
 
     def close(self) -> None:
-        """Wait until the submitted jobs have run, then end and join the threads."""
+        """Wait until all submitted jobs have run, then end and join the threads."""
         for _ in self._threads:
             self._jobs.put(None)
         for thread in self._threads:
@@ -56,7 +58,7 @@ class Workers:
         keep_on(self._turn, self._defects, "taking a job")
 
     def _turn(self) -> bool:
-        """Wait for the next job and run it. Returns False if the thread must end."""
+        """Wait for the next job and run it. Return False if the thread must end."""
         task = self._jobs.get()
         if task is None:
             return False

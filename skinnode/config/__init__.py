@@ -8,9 +8,10 @@
 
 :func:`load_hand` reads a file, :func:`parse_hand` validates a table in memory. Both raise
 :class:`~skinnode.errors.ConfigError` with a one-line message: file, line and column, dotted key, value found
-and values allowed. Types are strict because TOML is typed: ``node_id = "3"`` is an error, not a 3.
+and values allowed. Values must have exactly the required type, because TOML is typed: ``node_id = "3"`` is an
+error, not a 3.
 
-The suffix of a key names its unit; a key without a unit suffix is a count, a ratio or a name.
+The suffix of a key is its unit; a key without a unit suffix contains a count, a ratio or a name.
 """
 
 from skinnode.config.buses import (

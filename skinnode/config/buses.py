@@ -13,7 +13,7 @@ from skinnode.errors import ConfigError
 MAX_BUS_LOAD: Final = 0.70
 """Default load limit of a bus, as a fraction. Above this limit, the response times of low-priority frames
 grow steeply (Davis, Burns, Bril, Lukkien: Controller Area Network (CAN) schedulability analysis, Real-Time
-Systems 35, 2007), and no capacity is left to repeat frames after errors."""
+Systems 35, 2007), and too little capacity remains to repeat frames after errors."""
 
 Role = Literal["master", "guest"]
 GuestSends = Literal["nothing", "sdo"]
@@ -42,7 +42,7 @@ class BusConfig(Table):
     """CAN bus, identified by the names of its interface and channel in python-can."""
 
     name: Name = "can0"
-    """Name of the bus. Patches refer to this name in their key ``bus``."""
+    """Name of the bus, to which the key ``bus`` of each patch refers."""
     interface: Annotated[str, Field(min_length=1), Allowed("the name of a python-can interface")] = "virtual"
     """Name of the interface in python-can: socketcan, pcan, kvaser, udp_multicast, ..."""
     channel: Annotated[str, Field(min_length=1), Allowed("the name of a channel, as a string")] = "skin"
@@ -64,17 +64,17 @@ class BusConfig(Table):
     role: Annotated[Role, one_of(Role)] = "master"
     """``guest`` if the robot's own master sends NMT and SYNC on this bus; the host then sends neither."""
     guest_sends: Annotated[GuestSends, one_of(GuestSends)] = "nothing"
-    """Frames that a guest may send: ``nothing``, or ``sdo`` to identify and configure the patches and to
-    read their data."""
+    """Frames that the host may send as a guest: ``nothing``, or ``sdo`` requests that identify and configure
+    the patches and read their data."""
     heartbeat_node_id: Annotated[NodeId | None, Allowed("an integer from 1 to 127 that no node uses")] = None
-    """Node-ID under which the host, as master, sends a heartbeat. The patches monitor this heartbeat and go
-    pre-operational when it stops. None: the host sends no heartbeat."""
+    """Node-ID in the heartbeat that the host sends as master. The patches monitor this heartbeat and go
+    pre-operational when it stops. If the node-ID is None, the host sends no heartbeat."""
     max_load: Annotated[
         float, Field(gt=0, le=1, allow_inf_nan=False), Allowed("a number above 0 and up to 1")
     ] = MAX_BUS_LOAD
     """Maximum planned bus load, as a fraction, with every frame at its maximum length."""
     others: Annotated[tuple[OtherFrame, ...], Field(strict=False)] = ()
-    """Frames that other devices send on this bus; the plan takes them into account."""
+    """Frames that other devices send on this bus; the planned bus load includes these frames."""
 
     @field_validator("options", mode="before")
     @classmethod
@@ -88,7 +88,7 @@ class BusConfig(Table):
 
 
 class SyncConfig(Table):
-    """SYNC produced by the host or by the robot's own master; each SYNC starts one scan of every patch."""
+    """SYNC, sent by the host or by the robot's own master; each SYNC starts one scan of every patch."""
 
     period_ms: Annotated[int, Field(ge=1, le=60_000), Allowed("an integer from 1 to 60000")] = 80
     """SYNC period, milliseconds."""
@@ -102,13 +102,13 @@ class SyncConfig(Table):
     stagger_ms: Annotated[float, Field(ge=0, allow_inf_nan=False), Allowed("a number of at least 0 (ms)")] = (
         0.0
     )
-    """Delay from the SYNC on one bus to the SYNC on the next when the host is the master, milliseconds. At 0,
-    all patches scan at the same instant and their scans end together, so the last field has to
-    wait until all others have been solved."""
+    """Delay from the SYNC on one bus to the SYNC on the next bus, milliseconds, if the host is the master. If
+    the delay is 0, the scans of all patches end together, so the last field is delayed until all others have
+    been solved."""
 
     @property
     def stagger_s(self) -> float:
-        """Delay from the SYNC on one bus to the SYNC on the next, s."""
+        """Delay from the SYNC on one bus to the SYNC on the next bus, s."""
         return self.stagger_ms * 1e-3
 
     @property
@@ -121,12 +121,12 @@ class BringUpConfig(Table):
     """Settings for bringing up patches, at start-up and later."""
 
     missing: Annotated[Missing, one_of(Missing)] = "refuse"
-    """Action if a patch does not answer at start-up: ``refuse`` to start, or start with the other patches and
-    ``wait`` for the missing patch."""
+    """Action if a patch does not answer at start-up: ``refuse`` does not start the hand; ``wait`` starts the
+    other patches and waits for the missing patch."""
     heartbeat_ms: Annotated[int, Field(ge=20, le=10_000), Allowed("an integer from 20 to 10000")] = 250
-    """Heartbeat period of the nodes, milliseconds. The host sets this period in the nodes; a guest that sends
-    nothing merely assumes it. At 250 ms, a lost node is detected within a second, and the heartbeats
-    of four nodes take 0.1 % of the bandwidth."""
+    """Heartbeat period of the nodes, milliseconds. The host sets this period in the nodes. A guest that sends
+    nothing cannot set the period, and assumes that the nodes use it. At a period of 250 ms, a lost node is
+    detected within a second, and the heartbeats of four nodes use 0.1 % of the bandwidth."""
 
     @property
     def heartbeat_s(self) -> float:

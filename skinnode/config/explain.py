@@ -1,7 +1,7 @@
 """Explains pydantic validation errors in one line: key, value found, values allowed, position.
 
 Pydantic reports the key but not its line in the file, and its messages name Python types ("Input should be a
-valid integer") instead of the range allowed in TOML.
+valid integer") instead of the range of values allowed in the file.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ def first_error(
         where: Function that returns the position of a key in its file.
     """
     found = error.errors()
-    # A misspelt required key is also reported as missing; the misspelling is more informative.
+    # Pydantic also reports a misspelt required key as missing; the error about the misspelling is clearer.
     first = next((item for item in found if item["type"] == "extra_forbidden"), found[0])
     location, kind = first["loc"], first["type"]
     cause = first.get("ctx", {}).get("error")
@@ -55,7 +55,7 @@ def first_error(
 
 
 def short(value: object) -> object:
-    """Return ``value``, or the first 60 characters of its text if the text is longer, to fit on one line."""
+    """Return ``value``; if its text exceeds 60 characters, return only the first 60, to fit on one line."""
     text = repr(value)
     return value if len(text) <= _LONGEST_SHOWN else Shown(text[: _LONGEST_SHOWN - 1] + "…")
 
@@ -90,13 +90,13 @@ def _place(location: KeyPath, table: type[BaseModel]) -> tuple[list[str], str | 
 
 
 def allowed_in(field: FieldInfo) -> str | None:
-    """Return a description of the values allowed for a key; None if the type describes them sufficiently."""
+    """Return a description of the values allowed for a key; None if the key's type is description enough."""
     marks = [mark.text for mark in field.metadata if isinstance(mark, Allowed)]
     return next(iter([*marks, *_marks_in(field.annotation)]), None)
 
 
 def tables_in(annotation: Any) -> list[type[BaseModel]]:
-    """Return the models of the tables that a key may hold, directly or in a list."""
+    """Return the models of the tables that the value of a key may contain, directly or in a list."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return [annotation]
     return [table for part in get_args(annotation) for table in tables_in(part)]

@@ -1,4 +1,4 @@
-"""Model of the whole hand: ``hand.toml`` as frozen, validated options."""
+"""Defines the model of a hand: the contents of ``hand.toml`` as immutable, validated settings."""
 
 from __future__ import annotations
 
@@ -26,11 +26,12 @@ MOST_BUSES: Final = 64
 
 
 class HandConfig(Table):
-    """Hand with its buses and patches, and the settings of the host.
+    """Configuration of a hand: its buses and patches, and the settings of the host.
 
     A duplicate name, node-ID or serial number, an unknown bus, an impossible geometry or a conflict with the
-    role of a bus causes a ConfigError. Pydantic wraps this error in its ValidationError; :func:`parse_hand`
-    unwraps it. :func:`skinnode.bus_load.plan.check_plan` checks whether the plan fits its buses.
+    role of a bus causes a ConfigError. Pydantic wraps the ConfigError in a ValidationError;
+    :func:`parse_hand` unwraps the ConfigError. :func:`skinnode.bus_load.plan.check_plan` checks whether the
+    plan fits its buses.
     """
 
     name: Name = "hand"
@@ -44,7 +45,7 @@ class HandConfig(Table):
     ]
     """Skin patches of the hand."""
     links: Annotated[tuple[LinkConfig, ...], Field(strict=False)] = ()
-    """Robot links that carry patches, with their poses in the frame of the hand."""
+    """Robot links on which patches are mounted, and the poses of these links in the hand's frame."""
     sync: SyncConfig = SyncConfig()
     bring_up: BringUpConfig = BringUpConfig()
     solver: SolverConfig = SolverConfig()
@@ -81,7 +82,7 @@ class HandConfig(Table):
 
         Args:
             interface: python-can interface of all buses, which replaces the interfaces in the file.
-            channel: Channel, which replaces the channel in the file.
+            channel: Channel of the bus, which replaces the channel in the file.
 
         Raises:
             ConfigError: A channel is given for a hand with several buses, or a name is empty.
@@ -134,7 +135,7 @@ class HandConfig(Table):
         return self
 
     def _check_links(self) -> None:
-        """Check that each link has one entry and carries a patch."""
+        """Check that each link has only one entry in the file, and that a patch is mounted on it."""
         _require_unique("links", "name", [link.name for link in self.links])
         used = list(dict.fromkeys(patch.link for patch in self.patches if patch.link is not None))
         for i, link in enumerate(self.links):
@@ -190,8 +191,8 @@ def load_hand(path: Path | str) -> HandConfig:
 
     Raises:
         ConfigError: The file cannot be read, is not TOML, has an unknown or missing key, has a value of the
-            wrong type or out of range, or fails a check of :class:`HandConfig`. The message is one
-            line and gives the line and column in the file.
+            wrong type or out of range, or fails a check of :class:`HandConfig`. The error message is one line
+            and includes the line and column in the file.
     """
     path = Path(path)
     return _parse(read_toml(path, "hand file"), path.parent)
@@ -221,7 +222,7 @@ def _parse(document: Document, folder: Path) -> HandConfig:
 
 
 def _check_geometry(key: str, patch: PatchConfig) -> None:
-    """Raise ConfigError if the geometry is impossible or the numbers of gains and wires differ."""
+    """Raise ConfigError if the geometry is impossible, or if there is not one gain per upper wire."""
     try:
         layout = patch.layout.build()
     except ValueError as error:

@@ -1,4 +1,4 @@
-"""Poses in a hand file: ``[patches.pose]``, and ``[[links]]``, the links of the robot that carry patches."""
+"""Poses in a hand file: of patches (``[patches.pose]``) and of the robot's links (``[[links]]``)."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class PoseConfig(Table):
     position_m: Annotated[
         tuple[_Metres, _Metres, _Metres], Field(strict=False), Allowed("three numbers [x, y, z], metres")
     ] = (0.0, 0.0, 0.0)
-    """Origin of the frame, metres."""
+    """Origin of the frame in its parent frame, metres."""
     quaternion_xyzw: Annotated[
         tuple[_Part, _Part, _Part, _Part] | None,
         Field(strict=False),
@@ -53,19 +53,19 @@ class PoseConfig(Table):
         return self
 
     def build(self) -> Pose:
-        """Return the pose in the form that the model uses."""
+        """Return the pose as the model's type ``Pose``."""
         if self.rpy_rad is not None:
             return Pose.from_rpy(self.position_m, self.rpy_rad)
         return Pose(self.position_m, self.quaternion_xyzw or (0.0, 0.0, 0.0, 1.0))
 
 
 class LinkConfig(Table):
-    """Link of the robot that carries patches."""
+    """Link of the robot on which patches are mounted."""
 
     name: Name
-    """Name of the link. Patches refer to this name in their key ``link``."""
+    """Name of the link, to which the key ``link`` of each patch refers."""
     pose: PoseConfig = PoseConfig()
-    """Pose of the link's frame in the frame of the hand, used until the program sets another pose
+    """Pose of the link's frame in the hand's frame, used until the program sets another pose
     (``HandFrame.at``)."""
 
     @field_validator("name")

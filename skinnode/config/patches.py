@@ -50,7 +50,8 @@ class LayoutConfig(Table):
 
     file: Annotated[Path | None, Field(strict=False), Allowed("the path of a layout file")] = None
     """NPZ or TOML file with the electrodes (``upper_m``, ``lower_m``, metres), or TOML file with the other
-    keys of this table, which are then not allowed here. The path is relative to the hand file."""
+    keys of this table. With a file, ``coordinates`` is the only other key allowed here. The path is relative
+    to the hand file."""
     preset: Annotated[Preset, one_of(Preset)] = "staggered"
     """Named arrangement of the electrodes."""
     pitch_m: Length = 4e-3
@@ -58,19 +59,19 @@ class LayoutConfig(Table):
     height_m: Length = 2e-3
     """Height of the upper electrodes above the lower electrodes, metres."""
     upper_wires: Count = 10
-    """Number of upper wires, U, which are the rows of a frame."""
+    """Number of upper wires, U; each upper wire is one row of a frame."""
     upper_electrodes: Count = 10
     """Number of electrodes per upper wire, N."""
     lower_wires: Count | None = None
-    """Number of lower wires, K, which are the columns of a frame; None: 3 N."""
+    """Number of lower wires, K; each lower wire is one column of a frame. None: 3 N."""
     lower_electrodes: Count | None = None
     """Number of electrodes per lower wire, M; None: U."""
     resistivity_ohm_per_m: _Resistivity = 1e7
-    """Resistance of the rubber per metre of distance between two electrodes, ohm per metre."""
+    """Resistance of the rubber between two electrodes, divided by their distance, ohm per metre."""
     coordinates: Annotated[Coordinates, one_of(Coordinates)] = "preset"
     """Source of the electrode positions: ``preset`` for this table, or ``node`` if the host reads the
-    positions from the patch (0x2300). Plans and simulations still use the preset or file, whose numbers of
-    wires and electrodes must therefore be correct."""
+    positions from the patch (0x2300). Bus-load plans and simulations always use this table, so its numbers of
+    wires and electrodes must be correct."""
 
     @field_validator("file")
     @classmethod
@@ -109,49 +110,47 @@ class LayoutConfig(Table):
 def _preset(name: str, **sizes: float | int | None) -> PatchLayout:
     """Return a preset layout from a cache.
 
-    Most patches of a hand have the same layout, and every check of the hand needs it. Layouts are
-    immutable and can be shared.
+    Layouts are immutable and can be shared. Most patches of a hand have the same layout, and each check of a
+    hand file requires the layouts.
     """
     return PatchLayout.preset(name, **sizes)  # type: ignore[arg-type]
 
 
 class CalibrationConfig(Table):
-    """Measured properties of this patch.
-
-    The resistances at rest are in ``baseline``, and the resistivity is in the layout.
-    """
+    """Measured properties of a patch, except resistances at rest (``baseline``) and resistivity (layout)."""
 
     stiffness_n_per_m: Stiffness | None = None
     """Stiffness of the rubber under one electrode, N/m; overrides ``solver.stiffness_n_per_m``."""
     young_pa: Annotated[
         float, Field(ge=1e3, le=1e10, allow_inf_nan=False), Allowed("a number from 1e3 to 1e10 (Pa)")
     ] = _RUBBER.young_pa
-    """Young's modulus of the rubber, Pa, from which the forces of contacts are computed."""
+    """Young's modulus of the rubber, Pa, used to compute contact forces."""
     poisson: Annotated[float, Field(ge=0, le=0.5, allow_inf_nan=False), Allowed("a number from 0 to 0.5")] = (
         _RUBBER.poisson
     )
     """Poisson's ratio of the rubber."""
     force_calibrated: bool = False
-    """Whether ``young_pa`` reproduces known forces on this patch, for instance when objects similar to those
-    in use press on it and a load cell measures the force. If false, the standard deviations of normal forces
-    also cover a layer bonded to a rigid support, which can carry fifty times the force. A modulus from a data
-    sheet is not a calibration."""
+    """Whether ``young_pa`` has been calibrated on this patch, for instance by pressing it with typical
+    objects while a load cell measures the force. If false, the standard deviations of normal forces are large
+    enough to cover rubber bonded to a rigid support, where the force can be fifty times as high. A modulus
+    from a data sheet is not a calibration."""
     upper_gain: Annotated[tuple[_Gain, ...] | None, Field(strict=False), Allowed("a list of numbers")] = None
     """Correction factors, one per upper wire, that restore the wire's resistances to their values at the time
     of the baseline."""
 
     @property
     def rubber(self) -> Rubber:
-        """Rubber parameters from which forces are computed."""
+        """Rubber parameters used to compute forces."""
         return Rubber(self.young_pa, self.poisson)
 
 
 class TolerancesConfig(Table):
     """Manufacturing tolerances of a patch, which the reported standard deviations include.
 
-    The text `"ordinary"` stands for the defaults below, `"exact"` for a patch that equals its layout, such as
-    a simulated patch. Only the posterior can include tolerances. With tolerances, the method `auto` selects
-    the posterior, and the method `exact` reports the standard deviations of a patch that equals its layout.
+    The text `"ordinary"` selects the defaults below; `"exact"` selects a patch without deviations from its
+    layout, such as a simulated patch. Only the posterior can include tolerances. If a patch has tolerances,
+    the method `auto` selects the posterior; the method `exact` ignores the tolerances in its standard
+    deviations.
     """
 
     placement: _Tolerance = ORDINARY.placement
@@ -173,12 +172,12 @@ class TolerancesConfig(Table):
         return asdict(_NAMED_TOLERANCES[value])
 
     def build(self) -> Tolerances:
-        """Return the tolerances in the form that the solvers require."""
+        """Return the tolerances as the type that the solvers require."""
         return Tolerances(**self.model_dump())
 
 
 def _or_named(schema: dict[str, Any]) -> None:
-    """Extend the JSON Schema of the key ``tolerances`` by the named tolerances."""
+    """Add the named tolerances to the JSON Schema of the key ``tolerances``."""
     named = {"type": "string", "enum": list(_NAMED_TOLERANCES)}
     schema["anyOf"] = [named, {"$ref": schema.pop("$ref")}]
 
@@ -195,8 +194,8 @@ class PatchConfig(Table):
     link: Name | None = None
     """Name of the robot link that carries the patch; None: the patch is fixed to the hand itself."""
     pose: PoseConfig = PoseConfig()
-    """Pose of the patch's frame in the frame of its link or, without a link, of the hand. If ``[[links]]``
-    specifies no pose for the link, the frames of the link and the hand are the same."""
+    """Pose of the patch's frame in the frame of its link, or in the hand's frame if the patch has no link. A
+    link without a pose in ``[[links]]`` has the same frame as the hand."""
     eds: Annotated[Path | None, Field(strict=False), Allowed("the path of an EDS file")] = None
     """Electronic data sheet (EDS) to check against the wire format of this patch; the path is relative to the
     hand file."""
@@ -206,8 +205,8 @@ class PatchConfig(Table):
     serial: Annotated[int | None, Field(ge=0, le=0xFFFF_FFFF), Allowed("an integer from 0 to 2^32 - 1")] = (
         None
     )
-    """Required serial number of the node (0x1018:4); None accepts any. If no node answers at the node-ID, the
-    host finds the node by its serial number over LSS and assigns the node-ID."""
+    """Required serial number of the node (0x1018:4); None: any serial number is accepted. If no node answers
+    at the node-ID, the host finds the node by its serial number over LSS and assigns the node-ID."""
     relative_noise: Ratio = 3e-6
     """Relative standard deviation of the analogue noise in a resistance measurement, excluding
     quantisation."""
@@ -220,9 +219,9 @@ class PatchConfig(Table):
     tolerances: Annotated[TolerancesConfig, Field(json_schema_extra=_or_named), Allowed(_TOLERANCES)] = (
         TolerancesConfig()
     )
-    """Manufacturing tolerances: `"ordinary"`, the default, for a patch made in a good workshop,
-    `"exact"` for a simulated patch, or a table of numbers. Calibration values do not describe the
-    geometry, so they do not replace tolerances."""
+    """Manufacturing tolerances: `"ordinary"` (the default) for a patch made in a good workshop, `"exact"` for
+    a simulated patch, or a table of numbers. Calibration values do not describe the geometry, so they do not
+    replace tolerances."""
 
     @field_validator("eds", "baseline")
     @classmethod
@@ -239,7 +238,8 @@ def load_layout(path: Path | str) -> PatchLayout:
             ``[patches.layout]``.
 
     Raises:
-        ConfigError: The file cannot be read or does not contain a valid layout. The message is one line.
+        ConfigError: The file cannot be read or does not contain a valid layout. The error message is one
+            line.
     """
     path = Path(path)
     if path.suffix == ".npz":

@@ -18,19 +18,20 @@ class SolverConfig(Table):
     """Settings for computing displacements from resistances."""
 
     method: Annotated[Method, one_of(Method)] = "auto"
-    """Method: ``exact`` inverse for each wire, ``posterior`` for the patch, or ``auto`` to choose between
-    them according to layout and noise."""
+    """Method: the ``exact`` inverse of each wire, the ``posterior`` of the whole patch, or ``auto``, which
+    selects one of these two according to layout and noise."""
     operator: Annotated[Operator, one_of(Operator)] = "dogleg"
-    """Operator, that is the kind of solver step, of the exact inverse."""
+    """Operator (type of solver step) of the exact inverse."""
     stiffness_n_per_m: Stiffness | None = None
     """Stiffness of the rubber under one electrode, N/m, from which the exact inverse computes forces. The
-    calibration of a patch can override it."""
+    calibration of a patch can override this stiffness."""
     deadline_us: Annotated[
         int | None, Field(ge=100, le=10_000_000), Allowed("an integer from 100 to 10000000")
     ] = None
-    """Time limit per frame, microseconds, after which the current estimate is returned; None: no limit."""
+    """Time limit per frame, microseconds, after which the solver returns its current estimate; None: no
+    limit."""
     estimate_noise: bool = False
-    """Estimate the noise in the measured resistances from the stream; requires the posterior."""
+    """Estimate the noise in the resistances from the stream of scans; requires the posterior."""
     drift: Annotated[Drift, one_of(Drift)] = "none"
     """Estimate a gain common to all resistances of the ``patch``, or of each upper ``wire``, together with
     the displacement; requires the posterior."""
@@ -39,13 +40,13 @@ class SolverConfig(Table):
     max_std_m: Annotated[
         float | None, Field(gt=0, le=1, allow_inf_nan=False), Allowed("a number above 0 and up to 1 (m)")
     ] = None
-    """Maximum standard deviation of a displacement in a precise field, metres; None: a limit derived from
-    layout and noise."""
+    """A field is precise only if no displacement has a standard deviation above this limit, metres. None: the
+    limit is derived from layout and noise."""
     max_force_std_n: Annotated[
         float | None, Field(gt=0, le=1e6, allow_inf_nan=False), Allowed("a number above 0 and up to 1e6 (N)")
     ] = None
-    """Maximum standard deviation of a contact's normal force in a precise field, newtons; None: a limit
-    derived from layout and rubber, for calibrated forces only."""
+    """A field is precise only if no contact's normal force has a standard deviation above this limit,
+    newtons. None: the limit is derived from layout and rubber, and applies only to calibrated forces."""
     workers: Annotated[int | None, Field(ge=1, le=64), Allowed("an integer from 1 to 64")] = None
     """Number of threads that solve patches in parallel; None: one per core, at most one per patch."""
 
@@ -55,8 +56,8 @@ class StreamConfig(Table):
 
     partial: Annotated[Partial, one_of(Partial)] = "pass"
     """Handling of incomplete scans, which lack chunks or the summary with the scan check. ``pass`` delivers
-    these scans unchecked with a mask of the valid resistances; ``withhold`` does not deliver them. Both are
-    counted."""
+    these scans unchecked with a mask of the valid resistances; ``withhold`` does not deliver incomplete
+    scans. Incomplete scans are counted in either case."""
     capacity_fields: Annotated[int, Field(ge=1, le=1_000_000), Allowed("an integer from 1 to 1000000")] = 64
-    """Maximum number of fields by which a subscriber may lag before the oldest fields are lost. At the
-    default of 64, four patches at 12.5 scans per second fill more than a second."""
+    """Maximum number of fields in a subscriber's queue; if the queue is full, the oldest field is dropped.
+    The default, 64, holds more than one second of fields from four patches at 12.5 scans per second."""

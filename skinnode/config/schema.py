@@ -16,7 +16,7 @@ SCHEMA_FILE: Final = Path(__file__).with_name("hand.schema.json")
 
 
 def schema_text() -> str:
-    """Return the schema as JSON text, which is reproducible byte by byte."""
+    """Return the schema as JSON text; the same models always produce the same bytes."""
     schema = HandConfig.model_json_schema()
     schema["$schema"] = "https://json-schema.org/draft/2020-12/schema"
     return json.dumps(schema, indent=2, ensure_ascii=False) + "\n"

@@ -17,14 +17,17 @@ _Cycle = Annotated[
 
 
 class SimulationConfig(Table):
-    """Scene that ``vcan-sim`` simulates on each patch: press, slide, lift, repeat. The host ignores it."""
+    """Scene that ``vcan-sim`` simulates on each patch: an indenter repeatedly presses, slides and lifts off.
+
+    The host ignores it.
+    """
 
     seed: Annotated[int, Field(ge=0), Allowed("an integer of at least 0")] = 1
-    """Random seed for the converter noise and the positions of the indenters."""
+    """Seed of the random converter noise and indenter positions."""
     indenter_radius_m: Length = 0.04
     """Radius of the spherical indenter, metres."""
     depth: Ratio = 0.1
-    """Maximum indentation as a fraction of the height of the upper layer; 0: nothing touches the hand."""
+    """Maximum indentation, as a fraction of the upper layer's height; 0: nothing touches the hand."""
     shear_ratio: Annotated[float, Field(ge=0, le=2, allow_inf_nan=False), Allowed("a number from 0 to 2")] = (
         0.3
     )

@@ -1,4 +1,4 @@
-"""Defines the base class and value types for tables of a hand file, with descriptions of allowed values."""
+"""Defines the base class and the value types of the tables in a hand file."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from skinnode.canopen.indices import MAX_NODE_ID
 
 @dataclass(frozen=True, slots=True)
 class Allowed:
-    """Annotation that describes, for error messages, the values allowed for a field."""
+    """Annotation that describes the allowed values of a field, for use in error messages."""
 
     text: str
 
@@ -33,7 +33,7 @@ def one_of(names: Any) -> Allowed:
 
 
 def existing_file(value: Path | None, info: ValidationInfo, what: str) -> Path | None:
-    """Resolve ``value``, a path relative to the folder of the hand file.
+    """Resolve ``value``, a path relative to the hand file's folder.
 
     Raises:
         ValueError: There is no such file.
@@ -50,7 +50,7 @@ _NAME: Final = "a string of 1 to 64 printable characters, not all blank"
 
 
 def _printable(value: str) -> str:
-    """Check that a name, which is printed unescaped, contains no terminal control codes or line breaks."""
+    """Check that a name contains no control codes or line breaks, because names are printed unescaped."""
     if not value.isprintable() or not value.strip():
         raise ValueError(_NAME)
     return value

@@ -35,8 +35,8 @@ _DEEPEST: Final = 32
 """Maximum number of parts in a key; a hand file needs six."""
 _PART: Final = r"(?:[\w-]++|\"[^\"\n]*+\"|'[^'\n]*+')[ \t]*+"
 _LONG_KEY: Final = re.compile(rf"(?<![\w\-\"'])(?:{_PART}\.[ \t]*+){{{4 * _DEEPEST}}}")
-"""Pattern of a key with far more than ``_DEEPEST`` parts; also matches long runs of numbers joined by dots,
-which no hand file has."""
+"""Pattern that matches a key with far more than ``_DEEPEST`` parts. It also matches long runs of numbers
+joined by dots, but no hand file contains such runs."""
 _LEAST, _MOST = -(1 << 63), (1 << 63) - 1  # range of integers in TOML 1.0
 _INTEGERS: Final = "integers from -2^63 to 2^63 - 1"
 _TOO_LONG: Final = Shown("a longer integer")
@@ -70,7 +70,7 @@ def read_toml(path: Path, what: str) -> Document:
 
     Raises:
         ConfigError: The file cannot be read, is not TOML, is nested more deeply than any hand file, or
-            contains integers outside the range that TOML guarantees. The message is one line.
+            contains integers outside the range that TOML guarantees. The error message is one line.
     """
     try:
         text = read_input(what, path).decode()
@@ -86,7 +86,7 @@ def read_toml(path: Path, what: str) -> Document:
         raise _syntax_error(str(path), text, str(error)) from None
     except RecursionError:
         raise ConfigError(what, Shown("deeper nesting"), _TOO_DEEP, where=str(path)) from None
-    except ValueError:  # an integer with more decimal digits than Python accepts
+    except ValueError:  # an integer has more decimal digits than Python accepts
         raise ConfigError(what, _TOO_LONG, _INTEGERS, where=str(path)) from None
     leaves = list(_leaves(table))
     if any(len(key) > _DEEPEST for key, _ in leaves):
@@ -99,7 +99,7 @@ def read_toml(path: Path, what: str) -> Document:
 
 
 def _leaves(table: dict[str, Any]) -> Iterator[tuple[KeyPath, Any]]:
-    """Yield each scalar or empty value with its key; values nested too deeply are yielded whole."""
+    """Yield each scalar or empty value and its key; values nested too deeply are not split."""
     todo: list[tuple[KeyPath, Any]] = [((), table)]
     while todo:
         key, value = todo.pop()
@@ -115,9 +115,9 @@ def _leaves(table: dict[str, Any]) -> Iterator[tuple[KeyPath, Any]]:
 
 
 def _syntax_error(where: str, text: str, message: str) -> ConfigError:
-    """Convert a tomllib message to a ConfigError.
+    """Convert an error message of tomllib to a ConfigError.
 
-    The tomllib message ends with the position, ``(at line 3, column 5)`` or ``(at end of document)``.
+    A tomllib message ends with the position, ``(at line 3, column 5)`` or ``(at end of document)``.
     """
     match = re.fullmatch(r"(?P<what>.*) \(at (?P<place>.*)\)", message, flags=re.DOTALL)
     what, place = (match["what"], match["place"]) if match else (message, "somewhere")

@@ -53,7 +53,7 @@ HELP: Final = """\
  sends no data."""
 
 _SHOWN_AS_EVENTS: Final = ("skinnode.host.supervisor", "skinnode.host.health")
-"""Names of the loggers whose warnings already appear in the event log."""
+"""Names of loggers to ignore, because the event log already contains their warnings."""
 
 
 class MonitorApp(App[None]):
@@ -133,7 +133,7 @@ class MonitorApp(App[None]):
 
     @property
     def terminal_is_deaf(self) -> bool:
-        """Whether the terminal failed to accept the final output."""
+        """Whether the terminal did not accept the final output."""
         return isinstance(self._driver, PatientDriver) and self._driver.deaf
 
     @property
@@ -169,7 +169,7 @@ class MonitorApp(App[None]):
         self.faults.update(view, time.monotonic_ns(), ending=ending)
         for event in self._source.events():
             begins = event.what == "operational" and time.monotonic() - self._begun_s < _BEGIN_S
-            if not begins:  # at start-up, all patches become operational
+            if not begins:  # at start-up, all patches report that they are operational
                 self._lines.append(log_line(event, self._wall_minus_mono_ns))
         self._settle_tares()
         if not self._paused:
@@ -230,7 +230,7 @@ class MonitorApp(App[None]):
             self._draw()
 
     def action_zoom(self) -> None:
-        """Show the selected patch alone, or all patches."""
+        """Switch between the selected patch alone and all patches."""
         self._zoomed = not self._zoomed
         self._draw()
 
@@ -308,7 +308,7 @@ class MonitorApp(App[None]):
 
 
 class _Records(logging.Handler):
-    """Shows logged warnings in the event log, because output to the terminal would corrupt the picture."""
+    """Logging handler that adds warnings to the event log; printing them would corrupt the picture."""
 
     def __init__(self, lines: deque[LogLine]) -> None:
         super().__init__(logging.WARNING)

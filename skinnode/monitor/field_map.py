@@ -1,8 +1,8 @@
 """Renders a displacement field as characters: depth as brightness, shear as arrows.
 
-The x axis, along the upper wires, points right; the y axis, across them, points up. Each character shows two
-pixels, one above the other, so a pixel is roughly square. Without colours, each character represents the mean
-of its two pixels; denser characters mean a deeper press.
+On the map, the patch's x axis (along the upper wires) points right, and its y axis points up. Each character
+shows two pixels, one above the other, so a pixel is roughly square. Without colours, each character
+represents the mean of its two pixels; denser characters mean a deeper press.
 """
 
 from __future__ import annotations
@@ -30,39 +30,39 @@ Colours = Literal["rgb", "ansi", "none"]
 Line = list[Segment]
 """Styled text of a screen line or of a part of a line."""
 
-# Five points of matplotlib's "magma" (CC0), where equal steps of depth look like equal steps of brightness.
+# Five points of matplotlib's colour map "magma" (CC0), whose perceived brightness increases uniformly.
 _MAGMA: Final = np.array([(0, 0, 4), (81, 18, 124), (183, 55, 121), (252, 137, 97), (252, 253, 191)], float)
 LEVELS: Final = 24
 """Number of shades. More shades would be indistinguishable and take longer to draw and to transmit."""
 _UNKNOWN: Final = -1
 """Shade level of skin without a measurement."""
 _SIGNS: Final = "·:-=+*#%@"
-"""Characters that represent depth, from untouched to deep, in order of increasing density."""
+"""Characters that represent depth, from untouched to deepest; denser characters represent deeper skin."""
 _ANSI: Final = ("black", "blue", "magenta", "red", "yellow", "bright_white")
 ARROWS: Final = "→↗↑↖←↙↓↘"
 
 SURE: Final = 4.0
-"""Minimum shear that is drawn as an arrow, in standard deviations."""
+"""Minimum shear that is drawn as an arrow, as a multiple of its standard deviation."""
 _SHORT: Final = 0.15
-"""Minimum shear that is drawn as an arrow, as a fraction of full scale."""
+"""Minimum shear that is drawn as an arrow, as a fraction of the shear drawn at full brightness."""
 
 _STEPS_M: Final = tuple(
     step * 10.0**power for power in (-5, -4, -3, -2) for step in (1.0, 1.5, 2.0, 3.0, 5.0, 7.0)
 )
 _LEAST_M: Final = 5e-5
-"""Minimum full scale of the depth, m, so that noise does not look like a touch."""
+"""Minimum depth drawn at full brightness, m; the limit prevents noise from looking like a touch."""
 _MEMORY_NS: Final = 6_000_000_000
-"""Time for which the depth scale includes a past press, ns."""
+"""Time for which a past press still determines the brightness scale, ns."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Surface:
-    """Quantities of a field that a map shows. Arrays are (U, N), upper wire 0 first, in metres."""
+    """Quantities drawn on a map of a field: (U, N) arrays in metres, upper wire 0 first."""
 
     depth_m: Float
     """Depth, positive where the skin is pressed inwards."""
     shear_m: Float
-    """(2, U, N) shear, along the upper wires and across them."""
+    """(2, U, N) shear: components along and across the upper wires."""
     shear_std_m: Float
     unknown: NDArray[np.bool_]
     """Electrodes without a measurement."""
@@ -76,7 +76,7 @@ class Surface:
 
 
 def surface_of(field: FieldFrame, upper_m: Float) -> Surface:
-    """Return the quantities of a field that a map shows.
+    """Return the quantities drawn on a map of a field.
 
     Args:
         field: Newest field of the patch.
@@ -94,7 +94,7 @@ def surface_of(field: FieldFrame, upper_m: Float) -> Surface:
 
 
 def aspect_of(upper_m: Float) -> float:
-    """Return the ratio of a patch's width to its height, where each electrode occupies one cell."""
+    """Return a patch's width-to-height ratio; each electrode is the centre of one cell of the patch."""
     wires, electrodes = upper_m.shape[:2]
     width, height = np.ptp(upper_m[..., :2].reshape(-1, 2), axis=0)
     width, height = width / max(electrodes - 1, 1) * electrodes, height / max(wires - 1, 1) * wires
@@ -109,7 +109,7 @@ def fit(width: int, height: int, aspect: float) -> tuple[int, int]:
 
 @functools.lru_cache(maxsize=64)
 def _weights(size: int, n: int) -> Float:
-    """Return (size, n) bilinear weights of n electrodes in each pixel; electrodes are cell centres."""
+    """Return the (size, n) linear interpolation weights of n electrodes for ``size`` pixels."""
     at = np.clip((np.arange(size) + 0.5) / size * n - 0.5, 0.0, n - 1)
     low = np.minimum(at.astype(int), max(n - 2, 0))
     made = np.zeros((size, n))
@@ -119,7 +119,7 @@ def _weights(size: int, n: int) -> Float:
 
 
 def resample(grid: Float, width: int, height: int) -> Float:
-    """Return (height, width) pixels of a (U, N) grid; upper wire 0 is the last row."""
+    """Interpolate a (U, N) grid to a (height, width) picture, in which upper wire 0 is the last row."""
     rows, columns = _weights(height, grid.shape[0]), _weights(width, grid.shape[1])
     return np.asarray((rows @ grid @ columns.T)[::-1])
 
@@ -130,7 +130,7 @@ def arrow(x: float, y: float) -> str:
 
 
 def mean_shear_m(surface: Surface) -> tuple[float, float]:
-    """Return the mean shear (x, y) in m, weighted by depth; zero if nothing is pressed."""
+    """Return the depth-weighted mean shear (x, y), in m; zero if nothing presses on the patch."""
     weight = np.where(surface.unknown, 0.0, np.clip(surface.depth_m, 0.0, None))
     total = float(weight.sum())
     if total <= 0.0:
@@ -142,7 +142,7 @@ def mean_shear_m(surface: Surface) -> tuple[float, float]:
 class Scale:
     """Depth drawn at full brightness: the smallest round number above the depth of the deepest recent press.
 
-    All patches share this scale, so that their maps are comparable.
+    All patches share one brightness scale, so that their maps are comparable.
     """
 
     def __init__(self) -> None:
@@ -150,7 +150,7 @@ class Scale:
         self.full_m = _LEAST_M
 
     def update(self, t_ns: int, deepest_m: float) -> None:
-        """Update the scale with the depth in m of the deepest press at ``t_ns``."""
+        """Update the brightness scale with the depth of the deepest press at ``t_ns``, in m."""
         while self._peaks and (self._peaks[0][0] < t_ns - _MEMORY_NS or self._peaks[0][0] > t_ns):
             self._peaks.popleft()
         while self._peaks and self._peaks[-1][1] <= deepest_m:
@@ -170,7 +170,7 @@ class MapStyle:
 
     @property
     def full_shear_m(self) -> float:
-        """Shear drawn at full brightness, m; below ``full_m``, because shear is smaller than depth."""
+        """Shear drawn at full brightness, m: less than ``full_m``, because shear is smaller than depth."""
         return 0.25 * self.full_m
 
 
@@ -193,7 +193,7 @@ def paint_map(
 
 
 def _arrows_on(surface: Surface, style: MapStyle, width: int, height: int) -> dict[tuple[int, int], str]:
-    """Return arrows keyed by column and line, spaced so that several arrows fit into a press."""
+    """Return arrows keyed by column and line, spaced closely enough to show several arrows per press."""
     down = 1 if height < 7 else 2 if height < 18 else 3
     across = 2 * down
     rows, columns = (
@@ -242,7 +242,7 @@ def paint_shear(surface: Surface, style: MapStyle, width: int, height: int) -> l
 
 
 def legend(style: MapStyle, width: int, text: Style) -> Line:
-    """Draw the colour scale from untouched to brightest, labelled with the depth at full brightness."""
+    """Draw the colour scale, labelled with the depth at full brightness."""
     levels = np.rint(np.linspace(0, LEVELS - 1, width)).astype(int).tolist()
     return [*_depth_line(levels, levels, {}, style.colours), Segment(f" {1e6 * style.full_m:.0f} µm", text)]
 

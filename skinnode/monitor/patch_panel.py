@@ -1,4 +1,4 @@
-"""Renders a patch, either as a tile among other patches or alone with all its values."""
+"""Renders a patch: as one of several tiles, or alone with all its values."""
 
 from __future__ import annotations
 
@@ -21,19 +21,19 @@ GONE: Final = ("lost", "never seen", "stale", "refused", "restarting", "booting"
 _AROUND: Final = 3
 """Number of lines in a tile, excluding its map."""
 _LEAST_OUTLINED: Final = (8, 5)
-"""Minimum size, in characters and lines, of a box in which the map has an outline."""
+"""Minimum box size, in characters and lines, for drawing an outline around the map."""
 _LABEL: Final = 10
-"""Width of the column with the names of values, characters."""
+"""Width of the column of value names, in characters."""
 
 
 def tiles(patches: Sequence[PatchView], paint: Paint, width: int, height: int) -> list[Line]:
-    """Draw all patches in the number of columns that makes the maps largest, in at most ``height`` lines."""
+    """Draw all patches as tiles within ``height`` lines, in as many columns as give the largest maps."""
     theme = paint.theme
     count = len(patches)
     aspect = max((patch.surface.aspect for patch in patches if patch.surface is not None), default=1.0)
 
     def high_of(columns: int) -> int:
-        """Return the height of a map in lines if there are this many columns of tiles."""
+        """Return the height of a map, in lines, for a given number of columns of tiles."""
         box = width // columns - 1, height // -(-count // columns) - _AROUND
         across, down, frame = _fit(*box, aspect) if min(box) > 0 else (0, 0, 0)
         return down + frame if across else 0
@@ -64,9 +64,9 @@ def _tile(number: int, patch: PatchView, paint: Paint, width: int, height: int) 
 def _map(patch: PatchView, paint: Paint, width: int, height: int, *, arrows: bool) -> list[Line]:
     """Draw the depth map of a patch, centred in its box.
 
-    The map has an outline because untouched skin is as dark as the screen. If a patch stops sending data, its
-    last map is drawn without colours and with the condition written over it. Such a map cannot be mistaken
-    for live data.
+    An outline marks the edge of the map, because untouched skin is as dark as the screen. If a patch stops
+    sending data, its last map is drawn without colours, and the patch's condition is written over the map, so
+    that the map is not mistaken for live data.
     """
     theme = paint.theme
     if patch.surface is None:
@@ -127,7 +127,7 @@ def _figures(patch: PatchView, theme: Theme, width: int) -> Line:
 
 
 def _health(patch: PatchView, theme: Theme, width: int) -> Line:
-    """Draw the condition of a patch and its first fault; if it has no fault, its field rate."""
+    """Draw a patch's condition, and its first fault or, if the patch has no fault, its field rate."""
     style = theme.of(patch.level)
     if patch.words:
         return pad([Segment(f" {patch.condition}: {patch.words[0]}", style)], width, theme)
@@ -188,7 +188,7 @@ def _caption(text: str, theme: Theme) -> Line:
 
 
 def facts(patch: PatchView, theme: Theme, width: int) -> list[Line]:
-    """Return all values of a patch as lines that each contain a name and a value."""
+    """Return all values of a patch as lines; each line contains the name of a value and the value."""
     health, stream = patch.health, patch.stream
     counts = stream.assembler
     lines = [

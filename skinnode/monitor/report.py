@@ -15,7 +15,7 @@ from skinnode.monitor.touches import Touch
 from skinnode.monitor.view_model import History, PatchView, View
 
 SETTLE_NS: Final = 3_000_000_000
-"""Time after which a patch of a running hand that is not operational counts as a fault, ns."""
+"""Time after the start at which a live patch that is not yet operational is recorded as a fault, ns."""
 
 LOOK_S: Final = 0.1
 """Interval at which the source is checked for faults, s."""
@@ -28,8 +28,9 @@ class FaultBook:
     """Faults of a monitoring session, each listed once, in order of first occurrence.
 
     Args:
-        live: Whether the hand is running, so that its patches must soon be operational. A recording begins
-            before the bring-up, so patches that have never been operational count as faults only at its end.
+        live: Whether the source is a running hand, whose patches must be operational soon after the start. A
+            recording begins before the bring-up, so a patch that is never operational is recorded as a fault
+            only at the end of the recording.
     """
 
     def __init__(self, *, live: bool) -> None:
@@ -49,7 +50,8 @@ class FaultBook:
         Args:
             view: Current view of the hand.
             real_ns: Monotonic time of the monitor, ns.
-            ending: Whether the session is ending, so that patches not yet operational count as faults.
+            ending: Whether the session is ending; a patch that is not yet operational is then recorded as a
+                fault.
         """
         if self._begun_ns is None:
             self._begun_ns = real_ns
@@ -73,7 +75,7 @@ class FaultBook:
 
 
 def _lasting(health: PatchHealth) -> list[tuple[str, str]]:
-    """Return the faults of a patch other than its condition, each as an identifying key and a text."""
+    """Return a patch's faults, other than its condition, as pairs of an identifying key and a text."""
     wires = [f"{fault.side} wire {fault.number} {fault.state}" for fault in health.wires]
     found = [(text, text) for text in wires]
     if health.duplicate_id:
@@ -87,13 +89,13 @@ def _lasting(health: PatchHealth) -> list[tuple[str, str]]:
 def watch(
     source: Source, stop: threading.Event, seconds: float | None, faults: FaultBook
 ) -> Iterator[dict[str, Any]]:
-    """Yield the view as a JSON table every second, and once more at the end.
+    """Yield the current view as a JSON object every second, and once more at the end.
 
     Args:
         source: Host or recording.
         stop: Event that ends the iteration.
         seconds: Maximum duration; None for no limit.
-        faults: Fault book that receives the faults of the session.
+        faults: Fault book in which the session's faults are recorded.
 
     Raises:
         SkinError: The source failed.
@@ -116,7 +118,7 @@ def watch(
 
 
 def as_json(view: View) -> dict[str, Any]:
-    """Return the view as JSON-compatible data, without the fields."""
+    """Return the view as JSON-compatible data; the displacement fields are omitted."""
     return {
         "patches": {patch.name: _patch_json(patch) for patch in view.patches},
         "buses": {

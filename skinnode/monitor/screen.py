@@ -17,11 +17,11 @@ from skinnode.text.words import counted
 
 LEAST_WIDTH: Final = 50
 LEAST_HEIGHT: Final = 16
-"""Minimum size of the screen in characters; on a smaller screen, only the required size is shown."""
+"""Minimum size of the screen, in characters; a smaller screen shows only a note of the required size."""
 
 
 def screen(view: View, paint: Paint, log: Sequence[LogLine], width: int, height: int) -> list[Line]:
-    """Render the screen as ``height`` lines of ``width`` characters; ``log`` ends with the newest line."""
+    """Render the screen as ``height`` lines of ``width`` characters; the newest line of ``log`` is last."""
     theme, ui = paint.theme, paint.ui
     if width < LEAST_WIDTH or height < LEAST_HEIGHT:
         text = f"{width} × {height} is too small: at least {LEAST_WIDTH} × {LEAST_HEIGHT}"
@@ -77,7 +77,7 @@ def _header(view: View, ui: UiState, theme: Theme, width: int) -> Line:
 
 
 def _losses(view: View, bus: BusView) -> str:
-    """Return a text about the first kind of loss found on a bus; empty if nothing was lost."""
+    """Describe the first kind of frame loss found on a bus; return an empty text if no frame was lost."""
     counts = [patch.stream.assembler for patch in view.patches if patch.bus == bus.name]
     for name, one, several in (
         ("chunks_lost", "chunk lost", "chunks lost"),
@@ -197,10 +197,7 @@ def _touch_line(patch: PatchView, touch: Touch, theme: Theme, name: int) -> Line
 
 
 def _quiet(view: View) -> str:
-    """Return the text shown while the event log is empty.
-
-    The text names faults that are older than the log.
-    """
+    """Return the text for an empty event log: it lists any faults that occurred before the log began."""
     wrong = [f"{patch.name} {patch.condition}" for patch in view.patches if patch.level == "bad"]
     wrong += [bus.name for bus in view.buses if bus.level == "bad"]
     if wrong:

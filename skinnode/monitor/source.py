@@ -1,6 +1,6 @@
-"""Provides the data sources of the monitor: a running host, or a replayed recording.
+"""Provides the monitor's data sources: a running host or a replayed recording.
 
-Sources take only the newest data and never block the host.
+Data sources read only the newest data and never block the host.
 """
 
 from __future__ import annotations
@@ -32,10 +32,11 @@ _EVENTS: Final = 500
 
 @dataclass(frozen=True, slots=True)
 class Snapshot:
-    """State of a hand at one instant; mappings are keyed by patch name or bus name."""
+    """State of a hand at one instant, as mappings from patch names or bus names."""
 
     t_ns: int
-    """Monotonic time of the host or, for a recording, of the host that made the recording, ns."""
+    """Time on the host's monotonic clock, ns; for a recording, the clock of the host that made the
+    recording."""
     health: Mapping[str, PatchHealth]
     bus_health: Mapping[str, BusHealth]
     buses: Mapping[str, BusStats]
@@ -54,7 +55,7 @@ class Recording:
 
 
 class Source(Protocol):
-    """Interface of the monitor's data sources.
+    """Protocol implemented by the monitor's data sources.
 
     All methods return immediately, except record and stop_recording.
     """
@@ -76,7 +77,7 @@ class Source(Protocol):
 
     @property
     def flaws(self) -> list[str]:
-        """Descriptions of missing or unreadable data in the part of a recording replayed so far."""
+        """Descriptions of the missing or unreadable data found so far in a replayed recording."""
 
     def tare(self, patch: str) -> None:
         """Tare a patch, as :meth:`Host.tare` does."""
@@ -96,7 +97,7 @@ class Source(Protocol):
 
 
 class HostSource:
-    """Source for a running host; the caller closes the host."""
+    """Data source for a running host, which the caller closes."""
 
     live = True
 
@@ -104,13 +105,13 @@ class HostSource:
         self.hand, self.title = host.hand, host.hand.name
         self._host = host
         self._events = host.events(capacity=_EVENTS)
-        self._fields = host.fields(capacity=_CAPACITY)  # receives the error if the host fails
+        self._fields = host.fields(capacity=_CAPACITY)  # reports a failure of the host
         self._recorder: Recorder | None = None
         self._untap: Callable[[], None] | None = None
 
     def snapshot(self) -> Snapshot:
         """Return the current state of the hand."""
-        for _ in range(_CAPACITY + 1):  # the error of a failed host is queued last
+        for _ in range(_CAPACITY + 1):  # if the host has failed, the last queued item is the error
             self._fields.get(0.0)
         host, stats = self._host, self._host.stats()
         return Snapshot(
@@ -182,7 +183,7 @@ class HostSource:
 
 
 class ReplaySource:
-    """Source for a recording, replayed on its own thread from construction to :meth:`close`."""
+    """Data source that replays a recording on a separate thread, from construction to :meth:`close`."""
 
     live = False
 
@@ -261,7 +262,7 @@ class ReplaySource:
                 pass
             for flaw in self._run.flaws:
                 self._all_events.publish(HealthEvent(self._run.clock(), self.title, "recording", flaw))
-        except Exception as error:  # every failure must reach the user
+        except Exception as error:  # report every exception to the user, not only SkinError
             self._failure = error if isinstance(error, SkinError) else SkinError(f"replay: {error!r}")
 
     def _health(self) -> dict[str, PatchHealth]:
@@ -290,7 +291,7 @@ class ReplaySource:
 
 
 def drain(subscription: EventSubscription) -> list[HealthEvent]:
-    """Return all queued events; None in the queue marks its end."""
+    """Return all queued events; the entry None marks the end of the queue."""
     found: list[HealthEvent] = []
     while (event := subscription.get(0.0)) is not None:
         found.append(event)

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 _STDOUT: Final = 1
 
 _MAX_QUEUED: Final = 30
-"""Maximum number of writes queued for the terminal, enough for a few pictures."""
+"""Maximum number of writes queued for the terminal; a few pictures fit into the queue."""
 
 _END_S: Final = 1.0
 """Maximum time to wait at exit for the terminal to accept queued output, s."""
@@ -25,8 +25,8 @@ _END_S: Final = 1.0
 class _Writer(threading.Thread):
     """Writes text to a file descriptor on a daemon thread.
 
-    The thread does not use Python's own standard output, which holds a lock while the terminal stalls: the
-    interpreter would wait for that lock at exit.
+    The thread does not write through ``sys.stdout``, because a stalled write would hold a lock for which the
+    interpreter waits at exit.
     """
 
     def __init__(self, descriptor: int, gone: threading.Event) -> None:
@@ -45,9 +45,9 @@ class _Writer(threading.Thread):
                     self._gone.set()
 
     def end(self) -> None:
-        """End the thread after the queue is empty.
+        """End the thread when the queue is empty.
 
-        A thread blocked on a stalled terminal ends with the process.
+        If the thread is blocked by a stalled terminal, it ends with the process.
         """
         with suppress(queue.Full):
             self.queue.put_nowait(None)
@@ -62,7 +62,7 @@ class PatientDriver(LinuxDriver):
         self._gone = threading.Event()
         self._writer: _Writer | None = None
         self.torn = False
-        """Whether output was discarded because the queue was full; the screen must then be redrawn."""
+        """Whether output was discarded because the queue was full, so that the screen must be redrawn."""
 
     def start_application_mode(self) -> None:
         """Start the writer thread, then enter application mode."""
@@ -90,11 +90,11 @@ class PatientDriver(LinuxDriver):
 
     @property
     def deaf(self) -> bool:
-        """Whether a write would block on a stalled terminal, or the terminal is gone."""
+        """Whether the terminal has stalled, so that a write would block, or no longer exists."""
         return self.gone or (self._writer is not None and self._writer.is_alive())
 
     def run_input_thread(self) -> None:
-        """Read keys until the application ends; an input error means that the terminal is gone."""
+        """Read keys until the application ends; treat an input error as a closed terminal."""
         try:
             super().run_input_thread()
         except OSError:

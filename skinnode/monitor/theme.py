@@ -1,4 +1,4 @@
-"""Defines screen styles and user interface state, and lays out lines of styled text."""
+"""Defines the screen's styles and the state of the user interface; lays out lines of styled text."""
 
 from __future__ import annotations
 
@@ -99,7 +99,7 @@ class UiState:
 
 @dataclass(frozen=True, slots=True)
 class Paint:
-    """Drawing parameters for all parts of the screen."""
+    """Parameters used to draw every part of the screen."""
 
     theme: Theme
     ui: UiState
@@ -134,13 +134,13 @@ def width_of(line: Line) -> int:
 
 
 def spread(left: Line, right: Line, width: int, theme: Theme, style: Style | None = None) -> Line:
-    """Align ``right`` with the end of a line that starts with ``left``; cut ``left`` if both do not fit."""
+    """Join ``left`` and a right-aligned ``right`` into one line; cut ``left`` if the two do not fit."""
     room = max(0, width - width_of(right))
     return pad([*pad(left, room, theme, style), *right], width, theme, style)
 
 
 def beside(blocks: Sequence[tuple[list[Line], int]], height: int, theme: Theme) -> list[Line]:
-    """Join blocks of lines, each with its width, side by side."""
+    """Join blocks of lines of given widths side by side."""
     return [
         [
             segment

@@ -11,11 +11,11 @@ from skinnode.model.frames import FieldFrame
 from skinnode.model.layout import Float
 
 TOUCH: Final = 0.35
-"""Minimum depth of touched skin as a fraction of the maximum depth, if contacts are found by depth. Under
+"""Depth, as a fraction of the maximum depth, above which skin is assigned to a touch. Under
 Hertzian pressure, the rim of a contact is half as deep as its centre."""
 SURE: Final = 6.0
-"""Minimum depth of a touch, in standard deviations; noise on 100 electrodes exceeds this limit once in
-10 million fields."""
+"""Minimum depth of a touch, as a multiple of its standard deviation; noise on 100 electrodes exceeds this
+limit once in 10 million fields."""
 LEAST_TOUCH_M: Final = 1e-5
 
 
@@ -23,7 +23,7 @@ LEAST_TOUCH_M: Final = 1e-5
 class Touch:
     """One contact on a patch; unknown values are None.
 
-    If the field has no contacts, forces are known only if a stiffness was specified.
+    A touch found as a region of pressed skin has forces only if a stiffness was specified.
     """
 
     x_m: float
@@ -40,9 +40,9 @@ class Touch:
 def touches_of(field: FieldFrame, rest_m: Float) -> tuple[Touch, ...]:
     """Return the contacts on a patch, strongest first.
 
-    Returns the contacts in the field. If a field of the exact inverse has no contacts, for example because it
-    was recorded without them, returns connected regions of pressed skin. Regions have forces if a stiffness
-    was specified.
+    If the exact inverse computed the field and the field contains no contacts (for example, an old
+    recording), each connected region of pressed skin is returned as a contact. Forces of such regions are
+    known only if a stiffness was specified.
 
     Args:
         field: Newest field of the patch.

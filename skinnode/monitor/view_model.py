@@ -27,7 +27,7 @@ from skinnode.monitor.source import Snapshot
 from skinnode.monitor.touches import Touch, touches_of
 
 Level = Literal["good", "note", "bad"]
-"""Severity levels: good, worth checking, fault."""
+"""Severity: no fault, a condition to check, or a fault."""
 HISTORY_NS: Final = 2_000_000_000
 """Period over which rates and latencies are computed, ns."""
 
@@ -48,17 +48,17 @@ class PatchView:
     rate_hz: float
     """Fields per second."""
     latency_s: float | None
-    """Median time from a scan's last frame to its field, over the fields shown recently, s."""
+    """Median time from the arrival of a scan's last frame to the scan's field, over recent fields, s."""
     latency_max_s: float | None
     scan: int | None
     trusted: bool
     distrust: str
-    """Why the newest field is not trusted; empty if it is trusted or there is no field."""
+    """Reason why the newest field is not trusted; empty if the field is trusted or does not exist."""
     precise: bool
     data_share: float | None
-    """Data share of the depth of the deepest electrode; None if there is no field."""
+    """Data share of the deepest electrode's depth; None if there is no field."""
     data_faults: tuple[DataFault, ...]
-    """Faulty readings that were left out of the newest field."""
+    """Faulty readings that were excluded when the newest field was computed."""
     method: str
     surface: Surface | None
     depth_m: float | None
@@ -93,7 +93,7 @@ class View:
     patches: tuple[PatchView, ...]
     buses: tuple[BusView, ...]
     scans_hz: float
-    """Fields per second of the fastest patch; equals the SYNC rate when no scan is lost."""
+    """Fields per second from the patch with the highest rate; equals the SYNC rate if no scan is lost."""
     fields_hz: float
     """Fields per second, summed over all patches."""
     latency_s: float | None
@@ -111,7 +111,7 @@ class View:
 
 @dataclass(frozen=True, slots=True)
 class LogLine:
-    """One event and its time of day."""
+    """Entry of the event log: an event and its time of day."""
 
     time: str
     subject: str
@@ -130,7 +130,7 @@ class History:
         """Add the newest snapshot and return its view."""
         kept = self._kept
         if kept and kept[-1].t_ns > snapshot.t_ns:
-            kept.clear()  # the time of a recording may jump back
+            kept.clear()  # the clock of a recording may jump back
         elif kept and kept[-1].t_ns == snapshot.t_ns:
             kept.pop()
         kept.append(snapshot)
@@ -223,7 +223,7 @@ def _latencies_s(history: Sequence[Snapshot], name: str) -> list[float]:
 def upper_m(layout: LayoutConfig) -> Float:
     """Return the (U, N, 3) electrode positions at rest according to the hand file, m.
 
-    A layout stored in the patch may differ.
+    The positions stored in the patch may differ.
     """
     return layout.build().upper_m
 
@@ -240,7 +240,7 @@ def judge_patch(
     missed = stream.assembler.scans_missed - before.assembler.scans_missed
     lossy = [f"{count} {what} lost" for count, what in ((losses, "chunks"), (missed, "scans")) if count > 0]
     if condition is not Condition.OPERATIONAL:
-        lossy = []  # a missing patch loses every frame
+        lossy = []  # omit lost frames: a missing patch loses every frame
     level: Level = "good"
     if lossy or words:
         level = "note"
@@ -325,7 +325,7 @@ def log_line(event: HealthEvent, wall_minus_mono_ns: int) -> LogLine:
 
 
 def time_of_day(t_ns: int) -> str:
-    """Return the local time of day, to the second, of a wall-clock time in ns."""
+    """Convert a wall-clock time in ns to text: the local time of day, to the second."""
     import datetime
 
     return datetime.datetime.fromtimestamp(t_ns * 1e-9).strftime("%H:%M:%S")

@@ -21,7 +21,7 @@ Painter = Callable[[int, int], list[Line]]
 
 
 class Canvas(Widget):
-    """Shows the lines of a painter, sending only changed lines to the terminal.
+    """Canvas that draws the lines returned by a painter, and sends only changed lines to the terminal.
 
     Textual's own widgets do not compare lines and would redraw the whole picture on each update.
     """
@@ -34,7 +34,7 @@ class Canvas(Widget):
         self._strips: list[Strip] = []
 
     def show(self, painter: Painter) -> None:
-        """Show the pictures of ``painter`` from now on."""
+        """Replace the painter, and redraw the canvas."""
         self._painter = painter
         self._paint()
 

@@ -1,8 +1,8 @@
 """Access CAN interfaces: bus ports, their receiving threads, and frame log files.
 
-The module ``socketcan`` receives batches of frames through the system call wrapped by ``recvmmsg``, and reads
-the kernel's counter of dropped frames. ``port`` sends and counts frames and reopens failed interfaces;
-``receiver`` contains the receiving threads.
+The module ``socketcan`` receives batches of frames with the system call recvmmsg(2), and reads the kernel's
+counter of dropped frames. ``port`` sends and counts frames and reopens failed interfaces; ``receiver``
+contains the receiving threads.
 
 No other package in the project uses python-can at run time.
 """

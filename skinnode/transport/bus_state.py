@@ -20,15 +20,16 @@ class BusState(StrEnum):
 
     ACTIVE = "error active"
     WARNING = "error warning"
-    """An error counter has reached the warning limit; the controller is still error active."""
+    """At least one error counter has reached the warning limit; the controller is still error active."""
     PASSIVE = "error passive"
-    """An error counter has reached the error passive limit; the controller still sends and receives."""
+    """At least one error counter has reached the error passive limit; the controller still sends and
+    receives."""
     OFF = "bus-off"
     """The controller neither sends nor receives frames."""
 
 
 def bus_state(frame: Frame) -> BusState | None:
-    """Return the controller state that a SocketCAN error frame reports, or None if it reports no state."""
+    """Return the controller state reported by a SocketCAN error frame; None if the frame reports no state."""
     if frame.can_id & _BUS_OFF:
         return BusState.OFF
     if frame.can_id & _RESTARTED:

@@ -1,8 +1,8 @@
 """Provide a UDP bus for load tests; each packet contains one frame in SocketCAN's memory layout.
 
-Packets are received by the same reader as SocketCAN frames, with the same system calls, kernel timestamps,
-bounded buffer and drop counter. UDP over the loopback device only replaces the CAN driver and the CAN
-protocol layer of the kernel, at about the same cost to the receiver.
+The reader for SocketCAN frames also receives the UDP packets, so system calls, kernel timestamps, bounded
+buffer and drop counter are the same. Only the kernel's CAN driver and CAN protocol layer are replaced, by UDP
+over the loopback device; the cost to the receiver is about the same.
 """
 
 from __future__ import annotations

@@ -6,7 +6,10 @@ from typing import NamedTuple
 
 
 class Frame(NamedTuple):
-    """A received CAN frame. ``t_ns`` is a monotonic time; ``data`` is empty in a remote frame."""
+    """A received CAN frame.
+
+    ``t_ns`` is the frame's time on the monotonic clock; ``data`` is empty in a remote frame.
+    """
 
     can_id: int
     data: bytes

@@ -1,9 +1,9 @@
 """Write CAN frames to a candump text file (``.log``) or a Vector BLF file, with python-can's writers.
 
 In both formats, all frames written before the last :meth:`FrameLog.flush` survive if the process is killed
-later. In a ``.log`` file, each frame is simply appended. python-can's BLF writer buffers up to 128 kB
-of frames and completes the file header only when the writer stops. Each flush therefore stops the BLF writer,
-which leaves a complete file, and opens another writer that appends.
+later. Each frame is simply appended to a ``.log`` file. For BLF files, python-can's writer buffers up to 128
+kB of frames and completes the file header only when the writer stops. Each flush of a BLF file therefore
+stops the writer, which completes the file, and opens a new writer in append mode.
 """
 
 from __future__ import annotations
@@ -27,11 +27,12 @@ flushes, so that no frame is split between two containers."""
 
 
 class LoggedFrame(NamedTuple):
-    """A CAN frame in a log file; the frame's ``t_ns`` is wall-clock time with a resolution of 1 µs."""
+    """CAN frame in a log file, where ``t_ns`` is wall-clock time with a resolution of 1 µs."""
 
     frame: Frame
     channel: str
-    """Channel name; in a BLF file, which stores no names, the channel number, counted from 0."""
+    """Name of the channel. BLF files store no names; for these files, the channel's number, counted from
+    0."""
     sent: bool
     """Whether the recording program sent the frame."""
 
@@ -95,7 +96,10 @@ class FrameLog:
             os.fsync(self._file.fileno())
 
     def close(self) -> None:
-        """Close the file. No exception is raised, because earlier calls have already reported any error."""
+        """Close the file.
+
+        Closing raises no exception, because earlier calls have already reported any error.
+        """
         with contextlib.suppress(OSError):
             self.flush(to_disk=True)
         with contextlib.suppress(OSError):

@@ -1,9 +1,9 @@
 """Read frames from a candump log or a BLF file, even if the file is damaged.
 
-All complete frames of a truncated or partly overwritten file are read. Damaged places are counted and located
-by line or offset (:class:`Damage`). Invalid file content never causes an exception. If a corrupted byte
-leaves a frame well-formed, the error is detected in a BLF file, whose containers have checksums, but not in a
-candump log, which has no checksums.
+All complete frames of a truncated or partly overwritten file are read. Each damaged part of a file is
+counted, and its line or offset is recorded (:class:`Damage`). Invalid file content never causes an exception.
+A corrupted byte that leaves a frame well-formed is detected only in a BLF file, because candump logs have no
+checksums.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ from skinnode.transport.frame import Frame
 from skinnode.transport.frame_log import SUFFIXES, LoggedFrame
 
 DAMAGES_KEPT: Final = 100
-"""Maximum number of damaged places described; additional damaged places are only counted."""
+"""Maximum number of damaged parts of a file that are described; any others are only counted."""
 
 
 @dataclass(frozen=True, slots=True)
 class Damage:
-    """Damaged part of a log file, which could not be read."""
+    """Damaged, unreadable part of a log file."""
 
     line: int | None
     """Line number, counted from 1; None in a BLF file, which has no lines."""
@@ -56,7 +56,7 @@ class _Container(NamedTuple):
 
 
 class FrameLogReader:
-    """Log file that can be read once, by iterating over the reader. Owned by one thread.
+    """Reader of a log file; iterate over the reader, once only, to get the frames. Owned by one thread.
 
     Raises:
         ConfigError: if the file cannot be opened, or its name does not end in ``.log`` or ``.blf``.
@@ -71,9 +71,9 @@ class FrameLogReader:
             raise ConfigError("recording", str(path), f"a file that can be read ({error.strerror})") from None
         self.path = path
         self.damages: list[Damage] = []
-        """Descriptions of the first :data:`DAMAGES_KEPT` damaged places."""
+        """Descriptions of the first :data:`DAMAGES_KEPT` damaged parts of the file."""
         self.damaged = 0
-        """Number of damaged places found so far."""
+        """Number of damaged parts of the file found so far."""
 
     def __iter__(self) -> Iterator[LoggedFrame]:
         with self._file:
@@ -123,7 +123,7 @@ class FrameLogReader:
                 if objects is not None:
                     whole, tail = self._whole_objects(tail + objects, at)
                     yield from self._frames(header, whole, at)
-                if not intact:  # a partial frame's length may be wrong and extend over later frames
+                if not intact:  # a partial frame with a wrong length could swallow the frames that follow
                     tail = b""
                 following = _find_container(data, end)
                 if following > end + _PADDING_BYTES and intact:
@@ -134,7 +134,7 @@ class FrameLogReader:
                 self._complain(None, size, f"truncated: a frame that ends after {counted(len(tail), 'byte')}")
 
     def _container(self, data: mmap.mmap, at: int) -> _Container:
-        """Return the end and the content of the container at file offset ``at``.
+        """Return the end and the content of the BLF container at file offset ``at``.
 
         A damaged container is assumed to end directly after its header, because its length may be wrong.
         """
@@ -192,7 +192,7 @@ class FrameLogReader:
                 at = start + length
 
     def _frames(self, header: bytes, objects: bytes, container: int) -> Iterator[LoggedFrame]:
-        """Yield the CAN frames in ``objects``, which python-can reads from an in-memory BLF file."""
+        """Yield the CAN frames in ``objects``; python-can parses the objects as an in-memory BLF file."""
         head = _OBJECT.pack(b"LOBJ", _OBJECT.size, 1, _CONTAINER_HEAD_BYTES + len(objects), _LOG_CONTAINER)
         file = io.BytesIO(header + head + struct.pack("<H6xL4x", _STORED, len(objects)) + objects)
         try:

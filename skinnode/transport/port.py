@@ -1,9 +1,9 @@
 """Provide a CAN bus endpoint with the same behaviour on every type of interface.
 
-Each python-can error is raised as a one-line :class:`~skinnode.errors.BusError`. Frame times are times of the
-host's monotonic clock. If the interface timestamps frames with the wall clock (virtual, udp_multicast,
-socketcan), the timestamp's age is subtracted from the time of reading, so that the time that a frame spends
-in a queue does not change its arrival time.
+Every error of python-can is converted to a :class:`~skinnode.errors.BusError` with a one-line message. The
+arrival time of each frame is a time on the host's monotonic clock. Some interfaces (virtual, udp_multicast,
+socketcan) timestamp frames with the wall clock. The arrival time is then the time of reading minus the
+timestamp's age, so that time spent in a queue does not matter.
 """
 
 from __future__ import annotations
@@ -31,12 +31,13 @@ if TYPE_CHECKING:
     from skinnode.config import BusConfig
 
 VIRTUAL_QUEUE_FRAMES: Final = 32768
-"""Queue capacity of an endpoint on python-can's virtual bus, frames: about 4 s of traffic on a fully loaded
-bus at 1 Mbit/s. Without a limit, the queue of an endpoint that is never read would fill the memory."""
+"""Capacity, in frames, of the queue of an endpoint on python-can's virtual bus: about 4 s of traffic on a
+fully loaded bus at 1 Mbit/s. Without a limit, the queue of an endpoint that is never read would fill the
+memory."""
 
 RECEIVE_BUFFER_BYTES: Final = 1 << 22
-"""Size of the receive buffer requested from the kernel for interfaces that are sockets, bytes; a waiting
-frame occupies about 800 bytes."""
+"""Size (bytes) of the receive buffer that is requested from the kernel for a socket; each frame in the buffer
+occupies about 800 bytes."""
 
 # Python has no names for these constants from <asm-generic/socket.h>, <linux/in.h> and <linux/in6.h>.
 SO_RCVBUFFORCE: Final = 33
@@ -44,20 +45,20 @@ _IP_MULTICAST_ALL: Final = 49
 _IPV6_MULTICAST_ALL: Final = 29
 
 _OLDEST_STAMP_S: Final = 10.0
-"""Maximum age of a frame's timestamp, s. An older or future timestamp does not come from this machine's wall
-clock, so the time of reading is used instead."""
+"""Maximum age of a frame's timestamp, s. A timestamp that is older or in the future is not from this
+machine's wall clock; the time of reading replaces it."""
 
 _LINK_GONE: Final = (errno.ENETDOWN, errno.ENODEV, errno.ENXIO)
-"""Error codes with which the kernel reports that the interface went down. The kernel reports this error only
-once per socket, and possibly from a send call rather than a receive call."""
+"""Error codes by which the kernel reports that an interface went down: once per socket, from either a receive
+or a send call."""
 
 _SOCKETCAN: Final = "socketcan"
 _MULTICAST: Final = "udp_multicast"
 _VIRTUAL: Final = "virtual"
 
 _DELIVERY_S: Final = 0.05
-"""Time allowed for the kernel to finish delivering a frame, s. The value is an assumption that exceeds 28 ms,
-the delay once observed on a virtual machine."""
+"""Time allowed for the kernel to finish delivering a frame, s. This assumed value exceeds the longest delay
+observed, 28 ms on a virtual machine."""
 
 # In a program that does not configure logging, python-can's loggers would print warnings to stderr, even for
 # errors that are already reported by a BusError.
@@ -65,7 +66,7 @@ logging.getLogger("can").addHandler(logging.NullHandler())
 
 
 def is_interface(config: BusConfig) -> bool:
-    """Return whether python-can or one of its plugins provides the bus's type of interface."""
+    """Return whether python-can, or a plugin for python-can, provides the type of interface of the bus."""
     return config.interface in can.VALID_INTERFACES
 
 
@@ -77,7 +78,7 @@ def allowed_interfaces(config: BusConfig) -> str:
 
 
 class _Message(can.Message):
-    """CAN message that can be copied five times as fast as python-can's ``Message``.
+    """CAN message that is copied five times as fast as python-can's ``Message``.
 
     Copying speed matters because python-can's virtual bus copies each message once per receiver.
     """
@@ -156,9 +157,9 @@ class CanPort:
         self._longest = 64 if config.fd else 8
         self._closed = False
         self._link_gone: Exception | None = None
-        self._counting = clock.lock()  # protects the counters that several threads change in send()
+        self._counting = clock.lock()  # protects counters in send(), which several threads may call
         self._sent = self._received = self._errors = self._undelivered = self._malformed = 0
-        self._dropped_before = 0  # frames dropped by earlier readers
+        self._dropped_before = 0  # frames dropped while earlier readers were in use
         self._away = False
         self._bus = self._open()
         self._reader = self._open_reader()
@@ -172,7 +173,7 @@ class CanPort:
         return open_can_bus(self.config)
 
     def _open_reader(self) -> SocketReader | None:
-        """Return the reader that receives instead of python-can, or None if python-can receives."""
+        """Return the reader that receives frames in place of python-can; None if no such reader is used."""
         bus: Any = self._bus  # python-can's SocketcanBus
         return SocketReader(bus.socket) if self.config.interface == _SOCKETCAN else None
 
@@ -202,12 +203,12 @@ class CanPort:
 
     @property
     def undelivered(self) -> int:
-        """Number of sent frames lost because the queue of another endpoint on the virtual bus was full."""
+        """Number of sent frames that another endpoint on the virtual bus lost because its queue was full."""
         return self._undelivered
 
     @property
     def malformed(self) -> int:
-        """Number of packets received from the multicast group that were not CAN frames."""
+        """Number of received multicast packets that were not CAN frames."""
         return self._malformed
 
     @property
@@ -219,7 +220,8 @@ class CanPort:
         """Send a frame with an 11-bit identifier.
 
         On a bus with ``fd``, data of more than 8 bytes are sent as a CAN FD frame with bit-rate switching,
-        padded with zeros to a valid length. On a virtual bus, endpoints whose queues are full lose the frame.
+        padded with zeros to a valid length. An endpoint on a virtual bus loses the frame if the endpoint's
+        queue is full.
 
         Args:
             can_id: Identifier, 0 to 0x7FF.
@@ -271,7 +273,7 @@ class CanPort:
         return batch[0] if batch else None
 
     def recv_batch(self, timeout_s: float, most: int = BATCH_FRAMES) -> list[Frame]:
-        """Return the waiting frames, or wait for the first frame if none is waiting.
+        """Return the frames that have arrived; if there are none, wait for the first frame.
 
         Args:
             timeout_s: Maximum wait for the first frame, s.
@@ -308,7 +310,7 @@ class CanPort:
                     self._errors += 1
                     raise BusError(f"{self._where}: cannot receive ({_why(error)})") from error
                 self._malformed += 1
-            # After the endpoint's own frame or a malformed packet, wait for the remaining time.
+            # The frame was this endpoint's own or malformed: wait for another until the timeout.
             timeout_s = max(0.0, (end_ns - clock.monotonic_ns()) * 1e-9)
 
     def reopen(self) -> None:
@@ -375,8 +377,8 @@ def _tune_socket(fileno: int) -> None:
             duplicate.setsockopt(socket.SOL_SOCKET, SO_RCVBUFFORCE, RECEIVE_BUFFER_BYTES)
         except OSError:  # only root may exceed net.core.rmem_max
             duplicate.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER_BYTES)
-        # python-can binds the socket to any address. Such a socket receives the frames of every multicast
-        # group that any program on the machine has joined, which would merge the buses of different groups.
+        # python-can binds the socket to any address. Such a socket receives frames from every multicast group
+        # joined by any program on the machine, so the buses of different groups would be merged.
         if duplicate.family == socket.AF_INET:
             duplicate.setsockopt(socket.IPPROTO_IP, _IP_MULTICAST_ALL, 0)
             _discard_other_groups(duplicate)
@@ -390,7 +392,7 @@ def _tune_socket(fileno: int) -> None:
 def _discard_other_groups(sock: socket.socket) -> None:
     """Discard the frames received while the socket still accepted other multicast groups.
 
-    If any such frame was received, the kernel may still be delivering another.
+    If any frame is discarded, the kernel may still be delivering another, so wait and discard again.
     """
     if _discard_waiting(sock):
         clock.sleep(_DELIVERY_S)
@@ -424,17 +426,17 @@ def _frame(message: can.Message) -> Frame:
 
 
 def _is_garbage(error: Exception) -> bool:
-    """Return whether a multicast bus failed because of a packet's content rather than the network.
+    """Return whether a packet's content, rather than the network, caused an error on a multicast bus.
 
-    Errors caused by the content are raised by msgpack or by a check of the message, errors of the network by
-    the socket.
+    Invalid content causes an exception in msgpack or in a check of the message; a network error causes an
+    OSError in the socket.
     """
     cause = error.__cause__
     return isinstance(error, can.CanOperationError) and cause is not None and not isinstance(cause, OSError)
 
 
 def _why(error: BaseException) -> str:
-    """Return the message of the most informative exception in a chain of exceptions, as one line."""
+    """Return, as one line, the message of the most informative exception in an exception chain."""
     while error.__cause__ is not None:
         error = error.__cause__
     if error.__context__ is not None and isinstance(error.__context__, OSError):

@@ -1,6 +1,6 @@
-"""Receive CAN frames on threads that only copy frames into bounded queues and count those that do not fit.
+"""Receive CAN frames on threads that only copy the frames into bounded queues, and count dropped frames.
 
-A single reader thread takes whole batches of frames from the queues.
+A single reader thread takes all queued frames at a time.
 """
 
 from __future__ import annotations
@@ -21,32 +21,33 @@ from skinnode.transport.port import CanPort
 
 CAPACITY_FRAMES: Final = 16384
 """Capacity of an intake, frames: 2 s of traffic on a fully loaded bus at 1 Mbit/s (8,000 frames/s). If the
-reader pauses for longer, frames are lost."""
+reader thread pauses for longer than 2 s, frames are lost."""
 
 _POLL_S: Final = 0.02
-"""Maximum time for which a receiving thread waits for a frame before it checks whether to end, s."""
+"""Maximum time that a receiving thread waits for a frame before it checks whether to end, s."""
 
 
 GATHER_NS: Final = 1_500_000
-"""Pause after receiving a batch, ns, similar to the interrupt moderation of a network card. Waking 8,000
-times a second, once per frame, would cost more than handling the frames. The first frame after a period of
-silence is not delayed, and every frame keeps its original arrival time."""
+"""Pause after receiving a batch of frames, ns; comparable to a network card's interrupt moderation. Without
+the pause, the thread would wake for each frame, 8,000 times a second, at a higher cost than handling the
+frames. The first frame after a period of silence is not delayed, and every frame keeps its original arrival
+time."""
 
 LONG_NS: Final = 5_000_000
 """Pause after receiving a batch if the arrival time of every awaited frame is predicted, ns. An unpredicted
-frame may wait in the kernel for up to one and a half times this pause."""
+frame may remain in the kernel for up to 1.5 times this pause."""
 
 _BEFORE_NS: Final = 800_000
-"""Time before a predicted arrival at which the waiting frames are fetched, ns. Little work then remains when
-the predicted frame arrives."""
+"""Time before a predicted arrival at which frames that have already arrived are fetched, ns, so that little
+work remains when the predicted frame arrives."""
 _SHORT_NS: Final = 300_000
-"""Minimum pause between fetches, ns; used while a predicted frame is imminent or overdue."""
+"""Minimum pause between two fetches, ns; used while a predicted frame is imminent or slightly overdue."""
 _LATE_NS: Final = 600_000
-"""Time after a predicted arrival during which an overdue frame is awaited with minimum pauses, ns."""
+"""Time after a predicted arrival, ns, during which fetches are separated by the minimum pause."""
 _GIVEN_UP_NS: Final = 200_000_000
-"""Time after a predicted arrival at which an overdue frame is no longer awaited, ns."""
+"""Time after a predicted arrival, ns, after which the predicted frame is no longer expected."""
 _ANSWER_NS: Final = 20_000_000
-"""Time after sending a request during which the response may arrive at any instant, ns."""
+"""Time after a request is sent, ns, during which the arrival of the response cannot be predicted."""
 _LAG_NS: Final = 50_000
 """Delay from a frame's arrival until the frame can be read from the socket, ns."""
 
@@ -54,8 +55,8 @@ _LAG_NS: Final = 50_000
 class Intake:
     """Bounded queue between the receiving thread of a port and the reader.
 
-    If the queue is full, the newest frame is dropped, as by a kernel socket. The queued frames thus stay in
-    order without gaps, and only the receiving thread accesses the end of the queue. ``dropped`` counts the
+    If the queue is full, the newest frame is dropped, as by a kernel socket. The queued frames therefore stay
+    in order without gaps, and only the receiving thread modifies the end of the queue. ``dropped`` counts the
     lost frames.
 
     Threads: only the reader may call :meth:`take` and :meth:`expect`. Only the receiving thread may call the
@@ -88,7 +89,10 @@ class Intake:
 
     @property
     def dropped(self) -> int:
-        """Number of frames lost because the queue was full. Drops by the kernel are counted by the port."""
+        """Number of frames lost because the queue was full.
+
+        The port counts the frames dropped by the kernel.
+        """
         return self._dropped
 
     @property
@@ -104,7 +108,7 @@ class Intake:
             BusError: if the bus failed and all frames received before the failure have already been taken.
             Exception: any other exception raised by the receiving thread.
         """
-        # read the error first: all frames received before the error are then queued
+        # read the error before the queue: frames received before the error are then already queued
         error, batches = self._error, self._queue
         if not batches:
             if error is not None:
@@ -117,7 +121,7 @@ class Intake:
         return frames
 
     def expect(self, what: str, times_ns: tuple[int, ...]) -> None:
-        """Predict when the last frame of a group will arrive, so that this frame is fetched without delay.
+        """Set the predicted arrival time of a group's last frame, so that the frame is fetched without delay.
 
         Args:
             what: Name of the group of frames. A new prediction replaces the group's previous prediction.
@@ -128,15 +132,18 @@ class Intake:
         self._first_ns = min([times[0] if times else 0 for times in self._expected.values()])
 
     def asked(self, t_ns: int) -> None:
-        """Record that a request was sent at monotonic time ``t_ns`` and expects a response. Any thread."""
+        """Record that a request was sent at monotonic time ``t_ns``, so a response may arrive soon.
+
+        Any thread may call this method.
+        """
         self._asked_ns = t_ns
 
     # --- called by the receiver
 
     def gather(self, now_ns: int) -> None:
-        """Set :attr:`due_ns` after receiving a batch, so that frames accumulate until the next fetch."""
+        """Set the time of the next fetch, :attr:`due_ns`, so that frames accumulate until then."""
         known = now_ns > self._asked_ns + _ANSWER_NS
-        if now_ns < self._first_ns:  # fast path, because this method runs after every batch from every bus
+        if now_ns < self._first_ns:  # fast path: this method runs after every batch from every bus
             awaited_ns = _before(self._first_ns, now_ns)
         else:
             awaited_ns, all_known = self._next_awaited(now_ns)
@@ -144,7 +151,7 @@ class Intake:
         self.due_ns = min(awaited_ns, _together(now_ns, LONG_NS if known else GATHER_NS))
 
     def _next_awaited(self, now_ns: int) -> tuple[int, bool]:
-        """Return when to fetch the next predicted frame, ns, and whether all awaited frames are predicted."""
+        """Return the fetch time (ns) of the next predicted frame, and whether all frames are predicted."""
         awaited_ns, all_known = now_ns + LONG_NS, bool(self._expected)
         for times in tuple(self._expected.values()):
             for t_ns in times:
@@ -165,7 +172,7 @@ class Intake:
         self._error = None
 
     def fetch(self, timeout_s: float) -> bool:
-        """Queue the frames that have arrived at the port.
+        """Move the frames that have arrived at the port into the queue.
 
         Args:
             timeout_s: Maximum wait for the first frame, s.
@@ -176,7 +183,7 @@ class Intake:
         now_ns = clock.monotonic_ns()
         try:
             frames = self.port.recv_batch(timeout_s)
-        except Exception as error:  # every exception must reach the reader thread
+        except Exception as error:  # pass every exception to the reader thread
             self._error = error
             return True
         if not frames:
@@ -212,8 +219,8 @@ class Receiver:
 
     Args:
         intakes: Queues to fill.
-        on_defect: Called with any exception raised outside the ports, on the thread that raised the
-            exception; reception continues.
+        on_defect: Function called with any exception raised outside the ports, on the thread that raised the
+            exception. Reception continues.
     """
 
     def __init__(
@@ -221,7 +228,7 @@ class Receiver:
     ) -> None:
         self._on_defect = on_defect
         self._news: queue.SimpleQueue[None] = clock.simple_queue()
-        self._joining: deque[Intake] = deque()  # intakes that the shared thread has yet to add
+        self._joining: deque[Intake] = deque()  # new intakes, which the shared thread adds to its poll object
         self._stop = clock.event()
         self._shared: threading.Thread | None = None
         self._alone: dict[Intake, threading.Thread] = {}
@@ -249,7 +256,7 @@ class Receiver:
         name = f"receive {intake.port.config.name}"
         thread = clock.thread(target=self._receive_alone, args=(intake,), name=name)
         thread.start()
-        self._alone[intake] = thread  # set after start(): a thread that was not started cannot be joined
+        self._alone[intake] = thread  # only after start(): a thread must be started before it can be joined
 
     def close(self) -> None:
         """End and join the receiving threads. The ports stay open and are closed by their owner."""
@@ -320,19 +327,19 @@ class Receiver:
                 clock.sleep(_POLL_S)
 
     def _notify(self) -> None:
-        if self._news.empty():  # one notification is enough for all intakes
+        if self._news.empty():  # one notification covers all intakes
             self._news.put(None)
 
 
 def _fetch(intakes: Iterable[Intake]) -> bool:
-    """Fetch frames from every port. Returns whether any intake has new frames or an error."""
-    return sum(intake.fetch(0.0) for intake in intakes) > 0  # any() would stop at the first success
+    """Fetch frames from every port, and return whether any intake has new frames or an error."""
+    return sum(intake.fetch(0.0) for intake in intakes) > 0  # any() would skip intakes after a success
 
 
 def _together(now_ns: int, pause_ns: int) -> int:
     """Return the end of a pause that lasts 0.5 to 1.5 times ``pause_ns``.
 
-    The end of the pause is the same instant for all buses, so that one wake-up serves all of them.
+    Pauses end at multiples of ``pause_ns``, so that all buses are read in one wake-up.
     """
     return (now_ns + pause_ns // 2) // pause_ns * pause_ns + pause_ns
 
@@ -354,7 +361,7 @@ def _poll_of(intakes: Iterable[Intake]) -> select.poll:
 
 
 def drain(port: CanPort, within_s: float) -> list[Frame]:
-    """Return all frames that arrive within ``within_s``; for tools and tests without a receiving thread."""
+    """Return all frames that arrive within ``within_s``; only for use without a receiving thread."""
     frames: list[Frame] = []
     end_ns = clock.monotonic_ns() + int(within_s * 1e9)
     while (left_ns := end_ns - clock.monotonic_ns()) > 0:

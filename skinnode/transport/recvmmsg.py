@@ -1,8 +1,8 @@
 """Receive many socket messages with one call to recvmmsg(2), which Python's socket module does not provide.
 
-The call does not release Python's global interpreter lock, but it does not wait either and takes only about
-1 µs per message. Releasing the lock 8,000 times a second, once per message, would delay the other threads
-more.
+The global interpreter lock stays held during the call, which never waits and takes only about 1 µs per
+message. Releasing the lock for every message, 8,000 times a second, would delay other threads more than
+keeping it.
 """
 
 from __future__ import annotations
@@ -69,13 +69,14 @@ class MessageBatch:
         self._got = 0
 
     def receive(self, sock: socket.socket, most: int) -> int:
-        """Replace the batch with up to ``most`` new messages, at most ``count``, without waiting.
+        """Replace the batch with up to ``most`` new messages (at most ``count``), without waiting.
 
         Returns:
             Number of messages received.
 
         Raises:
-            OSError: if receiving fails; if messages arrived before the error, only the next call raises it.
+            OSError: if receiving fails. If messages arrived before the error, they are returned, and the next
+                call raises the error.
         """
         used = self._got * _USED.size
         # restore the buffer sizes, which the kernel overwrote with the used sizes
@@ -91,14 +92,13 @@ class MessageBatch:
         return self._got
 
     def used(self) -> Iterator[tuple[int, int]]:
-        """Yield the lengths of each received message's ancillary data and of the message, bytes."""
+        """Yield two lengths for each received message: of its ancillary data and of the message, bytes."""
         return _USED.iter_unpack(self._memory[: self._got * _USED.size])
 
     def taken(self) -> memoryview:
         """Return the memory that contains the received messages.
 
-        Each message occupies a record of fixed size: its data, then its ancillary data, each with unused
-        space.
+        Each message occupies a record of fixed size: the data, padded, then the ancillary data, padded.
         """
         return self._room[: self._got * self._record]
 

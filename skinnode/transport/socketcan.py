@@ -42,8 +42,8 @@ times."""
 _EXTENDED, _REMOTE, _ERROR = 1 << 31, 1 << 30, 1 << 29
 
 _OLDEST_NS: Final = 10_000_000_000
-"""Maximum age of a received frame, ns. An older timestamp was taken before the wall clock was set, and is
-replaced by the time of reading."""
+"""Maximum age of a received frame, ns. An older timestamp, taken before the wall clock was set, is replaced
+by the time of reading."""
 
 _NEWEST_NS: Final = 100_000_000
 """Maximum time from the start of reading a batch to the arrival of the batch's last frame, ns."""
@@ -56,9 +56,11 @@ BATCH_FRAMES: Final = 256
 
 
 class SocketReader:
-    """Reader that receives batches of frames from a bound SocketCAN socket. Owned by the receiving thread.
+    """Reader that receives batches of frames from a bound SocketCAN socket.
 
-    Hardware timestamps are used if the driver offers them: see :class:`HardwareDelay`.
+    Only the receiving thread may use the reader.
+
+    Arrival times are derived from hardware timestamps if the driver provides them (:class:`HardwareDelay`).
     """
 
     def __init__(self, sock: socket.socket) -> None:
@@ -84,7 +86,7 @@ class SocketReader:
         return self._sock.fileno()
 
     def read(self, timeout_s: float, most: int = BATCH_FRAMES) -> list[Frame]:
-        """Return the waiting frames, or wait for the first frame if none is waiting.
+        """Return the frames that have arrived; if there are none, wait for the first frame.
 
         Args:
             timeout_s: Maximum wait for the first frame, s.
@@ -128,7 +130,7 @@ class SocketReader:
         return frames
 
     def _arrival(self, control: bytes, now_ns: int, wall_to_mono_ns: int) -> int:
-        """Return a frame's monotonic arrival time, ns, from the frame's ancillary data."""
+        """Derive a frame's monotonic arrival time, ns, from the frame's ancillary data."""
         t_ns, at = now_ns, 0
         while at < len(control):
             length, _, kind = _CONTROL.unpack_from(control, at)
@@ -177,12 +179,12 @@ def _ip_link(config: BusConfig, *arguments: str) -> None:
 
 
 class HardwareDelay:
-    """Converter from hardware timestamps of a CAN controller to the monotonic clock.
+    """Converts a CAN controller's hardware timestamps to the monotonic clock.
 
     The converted arrival time is correct even if the kernel timestamped the frame late. A kernel timestamp is
-    never early, so each frame provides an upper bound on the difference between the two clocks. The tracked
-    difference is the lower envelope of these bounds; its rate of increase is limited to the maximum drift
-    between two crystals. Owned by one thread.
+    never early, so each frame provides an upper bound on the difference between the two clocks. The clock
+    difference is estimated as the lower envelope of the bounds from all frames; the estimate may increase no
+    faster than two crystals can drift apart. Owned by one thread.
     """
 
     DRIFT: Final = 200e-6  # maximum relative drift of two oscillators with a tolerance of 100 ppm each

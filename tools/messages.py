@@ -2,8 +2,8 @@
 
     python tools/messages.py [FOLDER...]
 
-A message is any string that contains a space and is not a docstring; help texts of options are included.
-Braces mark the values that an f-string inserts.
+A message is a string that contains a space and is not a docstring; help texts of options are messages, too.
+Placeholders in braces stand for the values inserted by an f-string.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ FOLDERS = ("skinnode", "vcan_sim")
 
 
 class Message(NamedTuple):
-    """A string literal that the user may see, and its location."""
+    """A string literal that may be shown to the user, and its location."""
 
     place: str
     """File and line number."""
@@ -42,14 +42,14 @@ def messages(folder: Path) -> Iterator[Message]:
 
 
 def _docstrings(tree: ast.AST) -> Iterator[ast.AST]:
-    """Yield string literals that are statements, such as docstrings of functions and variables."""
+    """Yield string literals that are statements, such as docstrings."""
     for node in ast.walk(tree):
         if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant):
             yield node.value
 
 
 def _text(node: ast.AST) -> str | None:
-    """Return the text of a string literal with placeholders, or None if the node is not a string."""
+    """Return a string literal's text with placeholders; None if the node is not a string."""
     if isinstance(node, ast.Constant) and isinstance(node.value, str):
         return node.value
     if isinstance(node, ast.JoinedStr):

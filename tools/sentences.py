@@ -1,7 +1,7 @@
 """Select random sentences for an editor to grade: ``python -m tools.sentences --seed 1``.
 
-The sentences are taken from docstrings, comments, messages (other strings of at least five words) and pages.
-Tests, the changelog, code blocks and tables are excluded.
+The sentences come from docstrings, comments, documentation pages, and messages (other strings of at least
+five words). Tests, the changelog, code blocks and tables are excluded.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ _LEAST_WORDS = 5
 
 
 class Sentence(NamedTuple):
-    """Sentence with its location and kind."""
+    """A sentence with its location and kind."""
 
     place: str
     kind: str
@@ -29,7 +29,7 @@ class Sentence(NamedTuple):
 
 
 def sentences() -> list[Sentence]:
-    """Return all sentences of the project, file by file."""
+    """Return all sentences in the project, in the order of files."""
     found: list[Sentence] = []
     for folder in ("skinnode", "vcan_sim", "tools"):
         for path in sorted((ROOT / folder).rglob("*.py")):

@@ -1,10 +1,11 @@
-"""Compare ``solve_system`` with SciPy on the Moré-Garbow-Hillstrom set: ``python -m tools.systems``.
+"""Compare ``solve_system`` with SciPy on the Moré-Garbow-Hillstrom problems: ``python -m tools.systems``.
 
-All solvers use the same functions, a tolerance of 1e-12, at most 2000 evaluations, and the standard starting
-points multiplied by 1, 10 and 100. A problem is solved if the resulting point is a root. If the system has no
-root or is tall, the point must be a minimum. This verdict is computed in 80-bit arithmetic, independently of
-the status that the solver reports. A claim is false if a solver reports success at a point that is neither
-root nor minimum, or reports a root of a square system at a minimum.
+All solvers use the same functions, a tolerance of 1e-12, and at most 2000 evaluations. They start from the
+standard starting points multiplied by 1, 10 and 100. A square system with a root is solved if the final point
+is a root. Any other system is solved if the final point is a minimum of the residual norm. Whether a point is
+a root or a minimum is determined in 80-bit arithmetic, independently of the solver's reported status. A
+solver's claim is false if it reports success at a point that is neither a root nor a minimum, or a root of a
+square system at a point that is only a minimum.
 """
 
 from __future__ import annotations
@@ -30,7 +31,8 @@ MOST = 2000
 
 Function = Callable[[Any], Any]
 Solve = Callable[[Function, Function, Any], tuple[Any, bool, bool]]
-"""Function that returns the point, whether a root or minimum is claimed, and whether a root is claimed."""
+"""Solver function; returns the final point, whether a root or minimum is claimed, and whether a root is
+claimed."""
 
 
 def ours(operator: str) -> Solve:
@@ -73,14 +75,14 @@ SOLVERS: dict[str, Solve] = {
 
 
 def solved(problem: Problem, truth: Verdict) -> bool:
-    """Return whether a point with the verdict ``truth`` solves the problem."""
+    """Return whether a point classified as ``truth`` solves the problem."""
     if truth.root or (problem.square and problem.least == 0):
         return truth.root
     return truth.minimum and (truth.isolated or truth.norm**2 <= problem.least * (1 + 5e-6))
 
 
 def outcomes(solve: Solve, square: bool) -> Iterator[dict[str, Any]]:
-    """Solve the square or the tall problems from every starting point, and yield each outcome."""
+    """Solve all square or all tall problems from every starting point; yield one outcome per attempt."""
     for problem in PROBLEMS:
         for factor in FACTORS if problem.square == square else ():
             calls = [0, 0]
@@ -105,7 +107,7 @@ def outcomes(solve: Solve, square: bool) -> Iterator[dict[str, Any]]:
 
 
 def measure(name: str) -> dict[str, Any]:
-    """Run one solver on all problems; the row contains None for tall problems if it cannot solve them."""
+    """Return one solver's row; the entry for tall problems is None if the solver does not support them."""
     kinds = {"square": True, "tall": False}
     found = {
         kind: None if "hybr" in name and not square else list(outcomes(SOLVERS[name], square))

@@ -1,9 +1,9 @@
-"""Scores decoded fields by comparison with the truth: error, reported uncertainty, and theoretical bound.
+"""Scores decoded fields: compares their errors with the reported uncertainty and the theoretical bound.
 
-The bound is the Cramér-Rao bound for one scan. Let S be the diagonal matrix of the standard deviations of the
-relative residuals F/b − 1, and J the Jacobian of the residuals at the true position. No unbiased estimator of
-a wire's electrode positions has a covariance below J⁻¹ S Sᵀ J⁻ᵀ. This module computes the bound from the
-NumPy reference model, independently of the solver.
+The theoretical bound is the Cramér-Rao bound for a single scan. S denotes the diagonal matrix of the standard
+deviations of the relative residuals F/b − 1; J is the residuals' Jacobian at the true position. The
+covariance of an unbiased estimator of a wire's electrode positions is at least J⁻¹ S Sᵀ J⁻ᵀ. To be
+independent of the solver, this module computes the bound with the NumPy reference model.
 """
 
 from __future__ import annotations
@@ -17,16 +17,16 @@ from skinnode.model.frames import FieldFrame
 from skinnode.model.layout import Float, PatchLayout
 
 OUTLIER_DEVIATIONS = 6.0
-"""Maximum error that does not count as a fault, in reported standard deviations. A run scores about 1e5
-coordinates. By chance alone, 2e-4 of these coordinates exceed six standard deviations, which causes one false
-alarm in 5,000 runs."""
+"""Maximum permissible error of a coordinate, in reported standard deviations. A run scores about 1e5
+coordinates, of which on average only 2e-4 exceed six standard deviations by chance. The false-alarm rate is
+therefore one per 5,000 runs."""
 
 EXCESS_LIMIT = 1.15
-"""Maximum ratio of a run's RMS error to its RMS reported standard deviation, as required by this project."""
+"""Maximum permissible ratio of a run's RMS error to its RMS reported standard deviation."""
 
 
 def bound_std_m(layout: PatchLayout, upper_m: Float, relative_std: Float) -> Float:
-    """Compute the Cramér-Rao bound of each coordinate as a standard deviation (U, N, 3), metres.
+    """Return the Cramér-Rao bound (U, N, 3) on each coordinate's standard deviation, metres.
 
     Args:
         layout: The patch.
@@ -34,7 +34,7 @@ def bound_std_m(layout: PatchLayout, upper_m: Float, relative_std: Float) -> Flo
         relative_std: Relative standard deviations (U, K) of the resistances.
 
     Returns:
-        The bound (U, N, 3), metres; inf for a wire whose Jacobian is singular.
+        The bound (U, N, 3), metres; inf for wires with a singular Jacobian.
     """
     potential = potential_per_m(layout, upper_m)
     slopes = jacobian(layout, upper_m).reshape(*layout.shape, layout.unknowns)
@@ -49,28 +49,28 @@ def bound_std_m(layout: PatchLayout, upper_m: Float, relative_std: Float) -> Flo
 
 @dataclass(frozen=True, slots=True)
 class Score:
-    """Results for one patch in a run; lengths are in metres, and NaN if no scan was scored."""
+    """Results for one patch in a run; lengths are in metres; a length is NaN if no scan was scored."""
 
     scans: int
     untrusted: int
-    """Number of scans whose field was not trusted; these scans are excluded from the other results."""
+    """Number of scans with an untrusted field; such scans are excluded from all other results."""
     deepest_m: float
-    """Largest component of a true electrode displacement."""
+    """Largest absolute component of any true electrode displacement."""
     error_rms_m: float
     reported_rms_m: float
     bound_rms_m: float
-    """RMS Cramér-Rao bound due to quantisation alone, without the converter's noise."""
+    """RMS Cramér-Rao bound for quantisation noise only, without converter noise."""
     error_max_m: float
     relative_error: float
     """Relative error ‖X − X*‖ / ‖X* − X(0)‖ of the scan with the largest true displacement."""
     coverage95: float
-    """Fraction of coordinates whose error is within the reported 95 % interval."""
+    """Fraction of coordinates with an error inside the reported 95 % interval."""
     worst_deviations: float
-    """Largest error of any coordinate, in reported standard deviations."""
+    """Largest error of a coordinate, in reported standard deviations."""
 
     @property
     def within_uncertainty(self) -> bool:
-        """Whether the RMS error and every individual error are consistent with the reported uncertainty."""
+        """Whether all scans were trusted and all errors agree with the reported uncertainty."""
         return (
             self.scans > 0
             and self.untrusted == 0
@@ -81,12 +81,12 @@ class Score:
 
 @dataclass
 class Scorer:
-    """Scores one patch during a run; ``code_std`` is the standard deviation of R / R0 due to quantisation."""
+    """Scores one patch during a run; ``code_std`` is the quantisation noise of R/R0 (standard deviation)."""
 
     layout: PatchLayout
     code_std: float
     bound_every: int = 10
-    """Number of scans per computation of the Cramér-Rao bound, which changes slowly."""
+    """Interval, in scans, at which the slowly changing Cramér-Rao bound is computed."""
     _scans: int = 0
     _untrusted: int = 0
     _squares: float = 0.0
@@ -98,7 +98,7 @@ class Scorer:
     _deepest: tuple[float, float] = (0.0, float("nan"))
 
     def add(self, frame: FieldFrame, true_upper_m: Float) -> float:
-        """Add a scan, given its true positions (U, N, 3), metres; return the RMS error in metres."""
+        """Score a scan, given its true positions (U, N, 3), metres; return the scan's RMS error in metres."""
         truth = true_upper_m - self.layout.upper_m
         error = frame.displacement_m - truth
         rms = float(np.sqrt(np.mean(error**2)))
@@ -121,7 +121,7 @@ class Scorer:
         return rms
 
     def score(self) -> Score:
-        """Compute the score of the scans added so far."""
+        """Return the score of all scans added so far."""
         count = self._scans or float("nan")
         at_rest = potential_per_m(self.layout, self.layout.upper_m)
         bounds = [

@@ -1,12 +1,13 @@
-"""Soak test under random faults: checks that host and patches recover, and that all frame counts agree.
+"""Soak test with random faults: checks that host and patches recover, and that all frame counters agree.
 
-The host and simulated nodes run in this process and communicate over two virtual buses. Each round injects
-one to three kinds of fault, such as dropped frames, into one patch or into all patches, while subscribers
-come and go. The round then clears the faults and waits until every patch is operational and streaming again.
-In some rounds, other processes occupy the processors. Memory use is measured twice while the host is
-undisturbed, after a warm-up and at the end. The measured quantities are resident memory and the number of
-blocks allocated by Python (:func:`sys.getallocatedblocks`), which would reveal a leak of one object per scan.
-This module may import the simulator, as the demo may, because the simulator provides the faults.
+The host and the simulated nodes run in the same process and communicate over two virtual buses. Each round
+injects one to three kinds of fault, such as dropped frames, into one patch or all patches. During the round,
+subscribers subscribe and unsubscribe. At the end of the round, the faults are removed, and the test waits
+until every patch is operational and publishes fields again. In some rounds, additional child processes keep
+all processors busy. Memory use is measured without faults, after a warm-up and at the end. The measurements
+are the resident memory and the number of blocks allocated by Python (:func:`sys.getallocatedblocks`). The
+number of blocks would reveal even a leak of one object per scan. This module may import the simulator, like
+the demo, because the simulator injects the faults.
 """
 
 from __future__ import annotations
@@ -43,26 +44,27 @@ from vcan_sim.fleet import Fleet
 from vcan_sim.sensor import REMEMBERED_READINGS
 
 WARM_UP: Final = 0.25
-"""Fraction of the test duration after which memory use is first measured."""
+"""Warm-up time before the first memory measurement, as a fraction of the test duration."""
 BLOCKS: Final = 2000
-"""Maximum growth in the number of memory blocks. The number normally varies by a few hundred blocks; a leak
-of one block per scan adds 10,000 blocks in three minutes."""
+"""Maximum permissible increase in the number of memory blocks. The number normally varies by a few hundred; a
+leak of one block per scan would add 10,000 blocks in three minutes."""
 RESIDENT_MB: Final = 8.0
-"""Maximum growth of resident memory, MB; the C allocator may return freed memory with a delay."""
+"""Maximum permissible increase of resident memory, MB; small increases are normal, because the C allocator
+does not return all freed memory at once."""
 BACK_S: Final = 15.0
-"""Time after which a stream that has not resumed counts as lost, s. Recovery should take one second, but may
-take longer on a loaded machine."""
+"""Time limit for the recovery of all patches after a round, s. Recovery normally takes less than a second,
+but may take longer on a loaded machine."""
 SLOW_S: Final = 1.0
 """Recovery time above which a round is reported as slow, s."""
 STARVED: Final = 0.1
-"""Fraction of the rounds in which other processes occupy the processors."""
+"""Fraction of the rounds in which child processes keep all processors busy."""
 STARVED_S: Final = 3.0
 TARED: Final = 0.2
 """Fraction of the rounds in which a patch is tared."""
 CALM_S: Final = 1.5
 _PATCHES: Final = 4
 _MANY: Final = 8
-"""Minimum number of simultaneous kinds of fault that are reported by number and not by name."""
+"""Number of simultaneous fault kinds from which a report states only the number instead of the names."""
 
 _KINDS: Final[tuple[dict[str, Any], ...]] = (
     {"lost": 0.05},
@@ -135,7 +137,7 @@ _KINDS: Final[tuple[dict[str, Any], ...]] = (
 
 @dataclass(frozen=True, slots=True)
 class _Size:
-    """Resource usage of this process, which must not grow during the test."""
+    """Resource usage of the test process, which must not increase during the test."""
 
     blocks: int
     resident_mb: float
@@ -144,7 +146,7 @@ class _Size:
 
 
 def warm_up() -> None:
-    """Compile the kernels that a soak test needs."""
+    """Compile all kernels used by a soak test."""
     hand = _hand()
     load_kernels()
     for patch in hand.patches:
@@ -156,19 +158,19 @@ def run(minutes: float, seed: int, report: Callable[[str], None]) -> dict[str, A
 
     Args:
         minutes: Duration of the test.
-        seed: Seed of the faults.
-        report: Function that receives each line of progress.
+        seed: Seed of the random faults.
+        report: Function that receives the progress messages.
     """
     chance = random.Random(seed)
     hand = _hand()
     counter = sums.FrameCounter([bus.name for bus in hand.buses])
     kept = logging.getLogger("skinnode")
     level = kept.level
-    kept.setLevel(logging.CRITICAL)  # injected faults would cause thousands of warnings
+    kept.setLevel(logging.CRITICAL)  # hide the thousands of warnings caused by injected faults
     try:
         fleet = Fleet(hand, faults=Faults(seed=seed))
         for source in fleet.patches.values():
-            for k in range(REMEMBERED_READINGS):  # fill the history before memory use is measured
+            for k in range(REMEMBERED_READINGS):  # a growing history would look like a leak
                 source.read(-1000 * TIME_STEP_US * (k + 1))
         with fleet:
             before = {bus.name: Counter(fleet.passed(bus.name).sent) for bus in hand.buses}
@@ -265,7 +267,7 @@ def _soak(
             if chance.random() < TARED:
                 what += f"; {_tare(host, chance.choice(names))}"
             if hungry:
-                what += f" with {round_.enter_context(starved_processor())} processes occupying the processor"
+                what += f" with {round_.enter_context(starved_processor())} busy child processes"
             with host.fields(capacity=2) as abandoned:
                 callback = host.on_field(_broken if rounds % 2 else _patient, capacity=4)
                 abandoned.get(0.1)
@@ -301,7 +303,7 @@ def _soak(
 
 
 def _all_at_once(host: Host, fleet: Fleet, names: list[str]) -> None:
-    """Bring up all patches at the same time, so that the number of threads reaches its maximum."""
+    """Make all patches restart simultaneously, so that the number of threads reaches its maximum."""
     fleet.inject(Faults(unplugged=True))
     time.sleep(CALM_S)
     _calm(fleet)
@@ -310,7 +312,7 @@ def _all_at_once(host: Host, fleet: Fleet, names: list[str]) -> None:
 
 
 def _inject(fleet: Fleet, chance: random.Random, names: list[str]) -> str:
-    """Inject the faults of a round, and return their description."""
+    """Inject random faults and return their description."""
     if chance.random() < 0.05:
         bus = chance.choice(fleet.hand.buses).name
         fleet.bus_off(bus, off=True)
@@ -325,10 +327,10 @@ def _inject(fleet: Fleet, chance: random.Random, names: list[str]) -> str:
 
 
 def _tare(host: Host, name: str) -> str:
-    """Tare a patch if the patch is running, and return the outcome as text."""
+    """Try to tare a patch, and return a description of the result."""
     try:
         host.tare(name)
-    except BusError:  # NodeError, raised if the patch is not operational, is a BusError
+    except BusError:  # includes NodeError, which is raised if the patch is not operational
         return f"{name} could not be tared"
     return f"{name} tared"
 
@@ -337,14 +339,15 @@ def _calm(fleet: Fleet) -> None:
     for bus in fleet.hand.buses:
         fleet.bus_off(bus.name, off=False)
     fleet.inject(NO_FAULTS)
-    fleet.faults.forget_log()  # its growth would appear as a leak
+    fleet.faults.forget_log()  # the growth of the log would look like a memory leak
 
 
 def _wait_for_patches(host: Host, names: list[str]) -> tuple[float, str]:
-    """Wait until every patch is operational and has published a field for a SYNC sent after the call.
+    """Wait until every patch is operational and has published a field whose SYNC was sent after the call.
 
     Returns:
-        The waiting time in s, and the last patch that was not ready, with the reason.
+        The waiting time in s, and a text that names the last patch to become ready and the reason for the
+        delay.
     """
     begin_ns, waited_for = time.monotonic_ns(), ""
 
@@ -364,7 +367,7 @@ def _wait_for_patches(host: Host, names: list[str]) -> tuple[float, str]:
 
 
 def _not_operational(host: Host) -> list[str]:
-    """Return one line of text for each patch that is not operational, with the reason."""
+    """Return a line of text for each patch that is not operational, stating the reason."""
     healths = (host.health(patch.name) for patch in host.hand.patches)
     return [f"{health.patch}, {health.condition}: {health.reason}" for health in healths if health.reason]
 

@@ -1,4 +1,4 @@
-"""Prepares a damaged copy of the kernel cache, with which a soak test starts."""
+"""Prepares a damaged copy of the kernel cache for a soak test."""
 
 from __future__ import annotations
 
@@ -12,13 +12,14 @@ from typing import Final
 
 CACHE_ENVIRONMENT: Final = "SKINNODE_CACHE_DIR"
 _DAMAGED: Final = 4
-"""Number of cache files to damage; recompiling a kernel takes up to a few seconds."""
+"""Number of cache files to damage; it is small because each damaged kernel takes up to a few seconds to
+recompile."""
 _COMPILE_S: Final = 600.0
-"""Time limit for compiling all kernels, s; sufficient for a slow machine."""
+"""Time limit for compiling all kernels on a slow machine, s."""
 
 
 def fill(folder: Path) -> None:
-    """Fill a kernel cache under ``folder`` with all kernels that a soak test needs.
+    """Fill a kernel cache in ``folder`` with all kernels used by a soak test.
 
     The kernels are copied from the user's cache or, if that cache is empty, compiled in a child process. The
     user's cache is never modified.
@@ -38,14 +39,15 @@ def fill(folder: Path) -> None:
 
 
 def environment(folder: Path) -> dict[str, str]:
-    """Return environment variables that make a process use the kernel cache under ``folder``."""
+    """Return a copy of the environment that selects the kernel cache in ``folder``."""
     return {**os.environ, CACHE_ENVIRONMENT: str(folder)}
 
 
 def damage(folder: Path, seed: int) -> list[str]:
-    """Damage cache files under ``folder``, alternately by truncation and by filling with random bytes.
+    """Damage random cache files in ``folder``, alternately by truncation and with random bytes.
 
-    The same seed always damages the same files. Returns one line of text per damaged file.
+    The choice of files depends only on the seed and the folder's contents. Returns one line of text per
+    damaged file.
     """
     chance = random.Random(seed)
     files = sorted(file for file in folder.rglob("*.nb[ci]") if file.stat().st_size > 1)

@@ -1,4 +1,4 @@
-"""Deprives a soak test of CPU time by means of child processes that run busy loops."""
+"""Deprives a soak test of CPU time with child processes that run busy loops."""
 
 from __future__ import annotations
 
@@ -10,10 +10,11 @@ from collections.abc import Iterator
 from typing import Final
 
 _NICE: Final = -5
-"""Nice value of the child processes; without the permission to set it, they inherit the parent's value."""
+"""Nice value of the child processes. If the user lacks the permission to set it, the parent's nice value is
+used."""
 _CHILDREN_PER_PROCESSOR: Final = 3
 _LONGEST_S: Final = 30.0
-"""Maximum lifetime of a child process, s; it also exits as soon as its parent has exited."""
+"""Maximum lifetime of a child process, s; a child also exits when its parent has exited."""
 
 _BUSY: Final = """
 import os, sys, time
@@ -34,7 +35,7 @@ def starved_processor() -> Iterator[int]:
             command = [sys.executable, "-S", "-c", _BUSY, str(_LONGEST_S)]
             child = subprocess.Popen(command, stdin=subprocess.DEVNULL)
             children.append(child)
-            with contextlib.suppress(OSError):  # only root may increase a process's priority
+            with contextlib.suppress(OSError):  # an ordinary user may not increase a process's priority
                 os.setpriority(os.PRIO_PROCESS, child.pid, _NICE)
         yield count
     finally:

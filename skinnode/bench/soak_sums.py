@@ -1,4 +1,4 @@
-"""Compares the numbers of frames sent and dropped in a soak test with the host's counters, by kind."""
+"""Compares the frames sent and dropped in a soak test, by kind, with the host's counters."""
 
 from __future__ import annotations
 
@@ -53,15 +53,16 @@ class FrameCounter:
 
 @dataclass(frozen=True, slots=True)
 class KindSums:
-    """Numbers of frames of one kind in a whole soak test."""
+    """Counts of one kind of frame over a complete soak test."""
 
     kind: str
     wanted: int
-    """Number of frames that were to be sent, including frames added by faults."""
+    """Number of frames to be sent, including frames added by faults."""
     dropped: int
-    """Number of frames that a fault dropped in transit."""
+    """Number of frames dropped in transit by a fault."""
     held_back: int
-    """Number of frames not sent or received, because the node was silent, unplugged, deaf or bus-off."""
+    """Number of frames that a node did not send or receive because it was silent, unplugged, deaf or
+    bus-off."""
     arrived: int
 
 
@@ -81,7 +82,7 @@ def of_nodes(fleet: Fleet) -> list[KindSums]:
 def of_host(fleet: Fleet) -> list[KindSums]:
     """Count the frames from the host to the nodes, by kind.
 
-    A frame is counted once for each node that could receive it.
+    A frame is counted once for each node on its bus.
     """
     sums = []
     for kind in Kind:
@@ -99,14 +100,14 @@ def of_host(fleet: Fleet) -> list[KindSums]:
 
 
 def received_otherwise(fleet: Fleet, counter: FrameCounter, before: Mapping[str, Counter[Kind]]) -> list[str]:
-    """Return one line of text for each mismatch in the counts of frames from the nodes to the host.
+    """Compare the counters of frames from the nodes to the host; return a line of text for each mismatch.
 
-    Call this function while the nodes are silent.
+    The nodes must be silent during the call.
 
     Args:
         fleet: Simulated nodes.
         counter: Counter attached to the host.
-        before: Number of frames that each bus carried before the host opened it.
+        before: Number of frames of each kind on each bus before the host opened the bus.
     """
     found = []
     for bus in fleet.hand.buses:
@@ -123,9 +124,9 @@ def received_otherwise(fleet: Fleet, counter: FrameCounter, before: Mapping[str,
 
 
 def sent_otherwise(fleet: Fleet, counter: FrameCounter) -> list[str]:
-    """Return one line of text for each mismatch in the counts of frames from the host to the nodes.
+    """Compare the counters of frames from the host to the nodes; return a line of text for each mismatch.
 
-    Call this function after the host has closed and the nodes have stopped.
+    The host must be closed and the nodes stopped before the call.
     """
     found = []
     for bus in fleet.hand.buses:
@@ -147,7 +148,7 @@ def sent_otherwise(fleet: Fleet, counter: FrameCounter) -> list[str]:
 
 
 def injected_otherwise(stats: HostStats, injected: Mapping[str, Injected]) -> list[str]:
-    """Return one line of text for each host counter that differs from the number of injected faults."""
+    """Compare the host's counters with the injected faults; return a line of text for each mismatch."""
     found = [
         f"{name}: the host counted {stats.patches[name].frames} chunks and summaries, {each.pdos} were sent"
         for name, each in injected.items()

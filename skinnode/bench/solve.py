@@ -1,8 +1,9 @@
-"""Solves one wire to 1e-9 from a nearby start, with our solvers and with other libraries on the same F and J.
+"""Compares our solvers with other libraries, using the same F and J for one wire at a time.
 
-The wire belongs to the reference patch. The start is the second-to-last sample of a ten-step path to a 10 %
-press. Every peer runs with the loosest tolerance at which the displacement error is at most 1e-9. A peer that
-never reaches this error is listed without a time.
+The benchmark solves each wire of the reference patch. The initial guess is the solution for a 9 % press, as
+in the last of ten steps to a 10 % press. Every solver is timed with its loosest tolerance that leads to a
+displacement error of at most 1e-9. A solver that does not reach this error with any tolerance is listed
+without a time.
 """
 
 from __future__ import annotations
@@ -26,14 +27,14 @@ from skinnode.solve.wires.patch_solver import PatchSolver
 from skinnode.solve.wires.problem import PatchProblem
 
 ACCURACY: Final = 1e-9
-"""Maximum error of a coordinate, relative to the largest displacement of its wire."""
+"""Maximum coordinate error, relative to the wire's largest displacement."""
 TOLERANCES: Final = (1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-9, 1e-10, 1e-11, 1e-12, 1e-13, 1e-14, 1e-15)
 
 Solve = Callable[["Case", float], Float]
 
 
 class Case:
-    """Test problem for a solver: residual r = a F − 1 of one wire, its Jacobian, a start and the solution."""
+    """Test problem for one wire: residual r = a F − 1, its Jacobian, initial guess and true solution."""
 
     def __init__(self, problem: PatchProblem, wire: int, a: Float, start: Float, truth: Float) -> None:
         self.wire, self.a, self.start, self.truth = wire, a, start, truth
@@ -54,7 +55,7 @@ class Case:
         return np.asarray(self._jt * self.a)
 
     def residual_beside_jacobian(self) -> Float:
-        """Return r at the point of the most recent Jacobian, which is computed together with r."""
+        """Return the residual at the point of the latest Jacobian; both were computed together."""
         return np.asarray(self.a * self._scratch - 1.0)
 
     def jacobian(self, x: Float) -> Float:
@@ -62,12 +63,12 @@ class Case:
         return self.jacobian_transposed(x).T
 
     def error(self, x: Float) -> float:
-        """Return the maximum error of a coordinate, relative to the largest displacement."""
+        """Return the maximum coordinate error of x, relative to the largest displacement."""
         return float(np.abs(x - self.truth).max()) / self.size
 
 
 def press(layout: PatchLayout, depth: float) -> Float:
-    """Return the displacement (U, N, 3), metres, of a smooth sheared dent that is ``depth`` heights deep."""
+    """Return the displacement (U, N, 3), metres, of a smooth sheared dent, ``depth`` heights deep."""
     middle = layout.upper_m[..., :2].mean(axis=(0, 1)) + 0.3 * layout.pitch_m
     away = ((layout.upper_m[..., :2] - middle) ** 2).sum(axis=-1) / (2.0 * layout.pitch_m) ** 2
     dent = depth * layout.height_m / (1.0 + away)
@@ -75,7 +76,7 @@ def press(layout: PatchLayout, depth: float) -> Float:
 
 
 def peers(problem: PatchProblem) -> dict[str, Solve]:
-    """Return all solvers by name, ours first; each is a function of case and tolerance that returns x."""
+    """Return all solvers by name, ours first; a solver maps a case and a tolerance to the solution x."""
     from scipy import optimize
 
     solver = PatchSolver(problem, 0)
@@ -138,7 +139,7 @@ def peers(problem: PatchProblem) -> dict[str, Solve]:
 
 
 def ceres() -> Solve:
-    """Return a solver that calls Ceres with dense QR and the traditional dogleg, without log output."""
+    """Return a solver that calls Ceres (dense QR, traditional dogleg) without log output."""
     pyceres = importlib.import_module("pyceres")
     options = pyceres.SolverOptions()
     options.trust_region_strategy_type = pyceres.TrustRegionStrategyType.DOGLEG
@@ -165,7 +166,7 @@ def ceres() -> Solve:
 
     def solve(case: Case, tolerance: float) -> Float:
         x = case.start.copy()
-        options.function_tolerance = tolerance**2  # this tolerance applies to the sum of squares
+        options.function_tolerance = tolerance**2  # Ceres compares this tolerance with a sum of squares
         options.gradient_tolerance = tolerance
         options.parameter_tolerance = tolerance
         problem = pyceres.Problem()
@@ -183,7 +184,7 @@ def _solve_all(solve: Solve, cases: list[Case], tolerance: float) -> None:
 
 
 def run(rounds: int) -> dict[str, Any]:
-    """Run the benchmark; return the time per wire (µs), the ratio to our dogleg, and the error."""
+    """Run the benchmark; return each solver's time per wire (µs), ratio to our dogleg's time, and error."""
     layout = PatchLayout.preset("staggered", pitch_m=4e-3, height_m=2e-3)
     problem = PatchProblem.of(layout)
     cases = []

@@ -1,4 +1,4 @@
-"""Solves every hard case for many seeds; reports error, uncertainty, status and verdict of each method."""
+"""Solves every hard case for many seeds; reports each method's error, uncertainty, status and verdict."""
 
 from __future__ import annotations
 
@@ -22,17 +22,18 @@ from skinnode.process.child_processes import starting_children
 from skinnode.text.json_values import plain
 
 TWIN_SEEDS: Final = 2
-"""Number of streams on which ``auto`` must match another method exactly before ``auto`` is skipped."""
+"""Number of streams on which ``auto`` must match another method exactly before the other method's results are
+reused for ``auto``."""
 
 
 @contextlib.contextmanager
 def processes(jobs: int) -> Iterator[ProcessPoolExecutor]:
-    """Yield a pool of ``jobs`` processes, which are killed if an exception leaves the ``with`` block."""
+    """Yield a pool of ``jobs`` processes; if the ``with`` block raises an exception, kill the processes."""
     spawn = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(jobs, spawn) as pool:
         try:
             yield pool
-        except BaseException:  # cancelling the jobs would make Python 3.11 print a traceback
+        except BaseException:  # kill, because cancelled jobs make Python 3.11 print a traceback
             for process in multiprocessing.active_children():
                 process.kill()
             raise
@@ -52,11 +53,11 @@ def run(
         seeds: Number of streams per case.
         cases: Cases to solve; default: all.
         only: Methods to use; default: all methods of each case.
-        jobs: Number of processes that solve cases in parallel; it does not affect streams or rows.
+        jobs: Number of processes that solve cases in parallel; the results do not depend on this number.
         report: Function that receives each row as soon as it is complete.
 
     Returns:
-        The rows and the number of wrong wires.
+        The rows, and the number of wrong wires not covered by a known limit.
     """
     rows: list[dict[str, Any]] = []
     with contextlib.ExitStack() as stack:
@@ -81,17 +82,17 @@ def run(
 
 
 def _numbered(seeds: int, only: Sequence[str] | None, number: int) -> list[dict[str, Any]]:
-    """Return the rows of a case; the case is passed by number, because its closures cannot be pickled."""
+    """Return the rows of case ``number``; a case cannot be pickled, because it contains closures."""
     return _rows(all_cases()[number], only, seeds)
 
 
 def _rows(case: Case, only: Sequence[str] | None, seeds: int) -> list[dict[str, Any]]:
-    """Solve the same streams with every method of a case, and return one row per method."""
+    """Solve a case's streams with each of its methods; return one row per method."""
     chosen = [name for name in case.methods if only is None or name in only]
     solvers = {name: methods.set_up(case, name) for name in chosen}
     tallies = {name: Tally(case.converter.exact) for name in chosen}
     twins = [other for other in ("exact", "posterior") if "auto" in chosen and other in chosen]
-    name_code = zlib.crc32(case.name.encode())  # independent of the other cases
+    name_code = zlib.crc32(case.name.encode())  # seeds do not depend on the other cases
     for seed in range(seeds):
         stream = case.make(np.random.default_rng([seed, name_code]))
         tracked = stream.every(case.stride)
@@ -140,7 +141,7 @@ def line(row: dict[str, Any]) -> str:
 
 
 def share(value: float) -> str:
-    """Format a fraction as a percentage, or as a power of ten if very small or large; NaN becomes a dash."""
+    """Format a fraction as a percentage, or in scientific notation if very small or large; NaN as a dash."""
     if not np.isfinite(value):
         return "-" if np.isnan(value) else "inf"
     if 1e-4 <= value < 1:

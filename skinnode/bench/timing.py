@@ -1,4 +1,4 @@
-"""Times functions fairly on a shared machine: candidates alternate, and ratios are formed per round."""
+"""Times functions on a shared machine: the functions take turns, and ratios are computed in each round."""
 
 from __future__ import annotations
 
@@ -15,22 +15,22 @@ from typing import Any, Final
 from skinnode.files.output_file import write_text
 
 ROUNDS: Final = 31
-"""Default number of rounds; an odd number, so that the median is one of the measured times."""
+"""Default number of rounds; odd, so that the median is one of the measured times."""
 TURN_S: Final = 4e-3
-"""Duration of a candidate's turn, s; long compared with the clock's resolution, but short compared with
-bursts of background load."""
+"""Duration of a function's turn, s: much longer than the clock's resolution, but much shorter than a burst of
+background load."""
 
 
 @dataclass(frozen=True)
 class Timing:
-    """Median time of one call, µs, and median ratio to the first candidate's time in the same round."""
+    """Median time of a call (µs), and median ratio to the first function's time in the same round."""
 
     call_us: float
     ratio: float
 
 
 def take_turns(candidates: Mapping[str, Callable[[], object]], *, rounds: int = ROUNDS) -> dict[str, Timing]:
-    """Time every candidate in every round, and compute its ratio to the first candidate."""
+    """Time every function in every round; return the median times and their ratios to the first function."""
     calls = {name: _calls_in_a_turn(function) for name, function in candidates.items()}
     times: dict[str, list[float]] = {name: [] for name in candidates}
     for _ in range(rounds):
@@ -58,7 +58,7 @@ def _calls_in_a_turn(function: Callable[[], object]) -> int:
 
 
 def machine() -> dict[str, str]:
-    """Return the library versions and the processor of this machine."""
+    """Return this machine's processor and the versions of the libraries."""
     import numba
     import numpy
     import scipy

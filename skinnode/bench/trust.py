@@ -1,11 +1,11 @@
-"""Benchmark ``skinnode bench trust``: tests that trusted values are right and that sound patches are trusted.
+"""Implements ``skinnode bench trust``: tests that trusted values are right and intact patches are trusted.
 
 ::
 
-    loads, faults -> signal (codes and truth) -> solver of the host -> score -> rows, verdicts
+    loads, faults -> signal (codes and truth) -> the host's solver -> score -> rows, verdicts
 
-The random numbers of each stream depend only on the seed and the stream's name, so any part of a run can be
-repeated on its own.
+Because a stream's random numbers depend only on the seed and the stream's name, a part of a run can be
+repeated separately.
 """
 
 from __future__ import annotations
@@ -36,21 +36,22 @@ from skinnode.process.child_processes import starting_children
 from skinnode.text.json_values import plain
 
 PAIRS: Final = 500
-"""Number of streams with a random pair of faults."""
+"""Default number of streams with two randomly chosen faults."""
 PARTS: Final = ("table", "speed", "road")
-"""Names of the additional parts: table of earlier failures, speed versus error, and faults over a bus."""
+"""Names of the additional parts: table of earlier failures, speed versus error, and fault injection on a
+simulated bus."""
 SHORT: Final[dict[str, Any]] = {
     "pairs": 20,
     "hours": 0.0,
     "settings": (Setting("staggered", 0.5, 1e-5), Setting("staggered", 0.5, 1e-4)),
 }
-"""Options of :func:`run` for a short run."""
+"""Options for a short run of :func:`run`."""
 WATCHED: Final = 4000
-"""Number of scans in a stream that counts false alarms; the stream contains ten touches."""
+"""Number of scans, with ten touches in total, in each stream for counting false alarms."""
 QUIET: Final = Timeline(rest=200, press=10, hold=30, slide=40, release=10, after=110)
-"""Phases of each touch in the streams that count false alarms."""
+"""Phases of each touch in the streams for counting false alarms."""
 PAIRED: Final = Timeline(rest=9, press=6, hold=7, slide=6, release=4, after=6)
-"""Phases of a stream with two faults; the phases are short because there are many such streams."""
+"""Phases of a stream with two faults; short, because there are many streams with two faults."""
 
 
 @dataclass(frozen=True)
@@ -59,7 +60,7 @@ class Item:
 
     section: str
     row: str
-    """Row of the report that includes this stream."""
+    """Report row to which the stream's score is added."""
     setting: Setting
     load: str
     faults: tuple[str, ...] = ()
@@ -67,7 +68,7 @@ class Item:
 
     @property
     def name(self) -> str:
-        """Unique name; it seeds the stream's random generator."""
+        """Unique name of the stream, from which its random generator is seeded."""
         return f"{self.section} {self.row} {self.setting.name} {self.load} {self.number}"
 
 
@@ -75,9 +76,9 @@ def items(seed: int, *, pairs: int = PAIRS, hours: float = 0.1, settings: Sequen
     """List all streams of a run.
 
     Args:
-        seed: Seed that selects the pairs of faults.
-        pairs: Number of pairs of faults.
-        hours: Duration in patch-hours of the streams that count false alarms.
+        seed: Seed for choosing the fault pairs.
+        pairs: Number of streams with two faults.
+        hours: Total duration of the streams for counting false alarms, in patch-hours.
         settings: Layouts and noise levels.
     """
     found = [Item("healthy", load, setting, load) for load in LOADS for setting in settings]
@@ -105,7 +106,7 @@ def _pair(rng: np.random.Generator, settings: Sequence[Setting], number: int) ->
 
 
 def solve_item(item: Item, seed: int) -> Score:
-    """Generate, solve and score a stream."""
+    """Generate a stream, solve it, and return its score."""
     rng = np.random.default_rng([seed, zlib.crc32(item.name.encode())])
     if item.section == "hours":
         return _watch(item, rng)
@@ -117,7 +118,7 @@ def solve_item(item: Item, seed: int) -> Score:
 
 
 def _watch(item: Item, rng: np.random.Generator) -> Score:
-    """Score the touches of one long fault-free stream, and count false alarms."""
+    """Score the touches in a long fault-free stream, and count its false alarms."""
     total, known, number = Score(), set[Naming](), 0
     patch = None
     for touch in range(WATCHED // QUIET.scans):
@@ -133,10 +134,10 @@ def _watch(item: Item, rng: np.random.Generator) -> Score:
 
 
 class Kept:
-    """File of the scores of solved streams, one line per stream, from which a run can be resumed.
+    """File with the scores of the solved streams (one line per stream); used to resume a run.
 
     Args:
-        path: File to which scores are appended; None to store no scores.
+        path: File to which scores are appended; None if scores are not stored.
         seed: Seed of the run; lines with another seed are ignored.
     """
 
@@ -193,20 +194,21 @@ def run(  # noqa: PLR0913 - options of a command
     progress: Callable[[str], object] = lambda line: None,
     kept: Path | None = None,
 ) -> dict[str, Any]:
-    """Solve fault-free streams, streams with one and two faults, and long streams, and check the targets.
+    """Solve fault-free, faulty (one or two faults) and long streams, and check the targets.
 
     Args:
         seed: Seed of all streams.
-        pairs: Number of pairs of faults.
-        hours: Duration in patch-hours of the streams that count false alarms.
+        pairs: Number of streams with two faults.
+        hours: Total duration of the streams for counting false alarms, in patch-hours.
         only: Substrings of the names of the sections and rows to run; default: all.
         settings: Layouts and noise levels; default: all.
-        jobs: Number of processes; it does not affect the streams.
+        jobs: Number of processes that solve streams in parallel; the results do not depend on this number.
         progress: Function that receives a line of text after every 20 streams.
-        kept: File to which the score of each stream is appended, and from which an interrupted run resumes.
+        kept: File for the scores of solved streams; if the file exists, the streams that it lists are not
+            solved again.
 
     Returns:
-        Rows and targets of the report, as plain values.
+        The report's rows and targets, as plain values.
     """
     chosen = all_settings() if settings is None else settings
     work = [
@@ -231,13 +233,13 @@ def run(  # noqa: PLR0913 - options of a command
 def with_parts(
     figures: dict[str, Any], seed: int, parts: Sequence[str], progress: Callable[[str], object]
 ) -> dict[str, Any]:
-    """Measure additional parts of the benchmark, and return ``figures`` with their results.
+    """Run additional parts of the benchmark; return ``figures`` extended by their results.
 
     Args:
         figures: Result of :func:`run`.
         seed: Seed of all streams.
         parts: Names from :data:`PARTS`.
-        progress: Function that receives a line of text for each completed step.
+        progress: Function that receives a line of text for each step.
     """
     found = dict(figures)
     if "table" in parts:

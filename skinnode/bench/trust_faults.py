@@ -1,6 +1,6 @@
 """Faults for ``skinnode bench trust``, applied to arrays of readings and codes.
 
-The set of faults includes all simulator faults that change values. Each fault acts at the stage at which it
+The faults include every simulator fault that changes values. Each fault is applied at the stage at which it
 occurs in a real patch:
 
 made    deviation of the patch from its layout, present when the baseline is measured
@@ -9,7 +9,8 @@ read    readings, after the converter has added noise
 sent    codes, on their way to the host
 stated  noise or tolerances stated in the hand file
 
-``Signal.bad`` marks the readings that a fault changes. Reporting any other reading is a false alarm.
+``Signal.bad`` marks the readings changed by a fault. If the host reports a fault of other readings, this is a
+false alarm.
 """
 
 from __future__ import annotations
@@ -28,16 +29,16 @@ from skinnode.protocol.codes import MISSING
 CHUNK: Final = 3
 """Number of 16-bit codes in a chunk on classic CAN."""
 NOISY: Final = 3e-3
-"""Relative noise of a wire with a bad contact, as in the simulator."""
+"""Relative noise of a wire with a bad contact; the simulator uses the same value."""
 SETTLE: Final = 50
-"""Number of scans at rest after which the host must have detected a wrong noise figure."""
+"""Number of scans at rest within which the host must detect that the stated noise is wrong."""
 
 InPlace = Callable[[Signal], None]
 
 
 @dataclass(frozen=True, eq=False)
 class Fault:
-    """A fault, whose location and time are chosen at random for each stream."""
+    """A fault; its location and time are chosen at random in each stream."""
 
     name: str
     made: Callable[[Skin, np.random.Generator], Skin] | None = None
@@ -48,25 +49,26 @@ class Fault:
     stated: float = 1.0
     """Ratio of the noise stated in the hand file to the true noise."""
     ordinary: bool = False
-    """Whether the hand file states ordinary tolerances, not exact positions."""
+    """Whether the hand file states ordinary tolerances; if False, it states exact positions."""
     local: bool = False
-    """Whether only single crossings or wires are affected, so that the rest of the patch can be trusted."""
+    """Whether the fault affects only single crossings or wires, so that the other wires can be trusted."""
     scored_from: int = 0
-    """First scan that is scored."""
+    """Index of the first scored scan."""
     group: str = ""
-    """Name of a group of mutually exclusive faults; empty if the fault can be combined with any other."""
+    """Name of the fault's group of mutually exclusive faults; empty if the fault may be combined with all
+    others."""
 
 
 # --- places and times
 
 
 def _one(signal: Signal, axis: int, many: int = 1) -> int:
-    """Choose the first of ``many`` neighbouring wires at random: upper if ``axis`` is 1, lower if it is 2."""
+    """Choose ``many`` adjacent upper (``axis`` 1) or lower (2) wires at random; return the lowest index."""
     return int(signal.rng.integers(signal.shape[axis] - many + 1))
 
 
 def _pressed_wire(signal: Signal, axis: int) -> int:
-    """Choose one of the three wires that the load changes most: upper if ``axis`` is 1, lower if it is 2."""
+    """Choose one of the three upper (``axis`` 1) or lower (2) wires whose readings the load changes most."""
     middle = (signal.pressed.start + signal.pressed.stop) // 2
     change = np.abs(signal.ohm[middle] / signal.rest_ohm - 1.0).max(axis=2 - axis)
     most = np.argsort(change)[-3:]
@@ -74,7 +76,7 @@ def _pressed_wire(signal: Signal, axis: int) -> int:
 
 
 def _crossing(signal: Signal) -> tuple[int, int]:
-    """Choose one of the 30 crossings that the load changes most."""
+    """Choose one of the 30 crossings whose readings the load changes most."""
     middle = (signal.pressed.start + signal.pressed.stop) // 2
     change = np.abs(signal.ohm[middle] / signal.rest_ohm - 1.0).ravel()
     at = int(signal.rng.choice(np.argsort(change)[-30:]))
@@ -86,13 +88,13 @@ def _at_rest(signal: Signal) -> int:
 
 
 def _pressing(signal: Signal) -> int:
-    """Choose a scan at random during which the load is being applied."""
+    """Choose a random scan while the load is being applied."""
     first = max(1, signal.pressed.start - 6)
     return int(signal.rng.integers(first, max(first + 1, signal.pressed.start - 1)))
 
 
 def _row(signal: Signal, axis: int, wire: int, start: int = 0) -> tuple[slice | int, ...]:
-    """Return the array index of a wire's readings in scan ``start`` and all later scans."""
+    """Return the array index of a wire's readings from scan ``start`` onwards."""
     scans = slice(start, None)
     return (scans, wire, slice(None)) if axis == 1 else (scans, slice(None), wire)
 
@@ -126,7 +128,7 @@ def _leave_one(signal: Signal) -> None:
 
 
 def _freeze(start: Callable[[Signal], int], *, counted: bool = True) -> InPlace:
-    """Repeat the codes of one scan in all later scans; ``counted``: whether the patch counts conversions."""
+    """Repeat a scan's codes in all later scans; ``counted`` states whether the patch counts conversions."""
 
     def sent(signal: Signal) -> None:
         t = start(signal)
@@ -153,7 +155,7 @@ def _stick(constant: bool) -> InPlace:
     def sent(signal: Signal) -> None:
         t, (u, k) = _at_rest(signal), _crossing(signal)
         value = signal.codes[t, u, k]
-        if constant:  # choose a constant R/R₀ between 0.6 and 1.1
+        if constant:  # a constant R/R₀ between 0.6 and 1.1
             value = np.uint32(round((float(signal.rng.uniform(0.6, 1.1)) - SCALE.lo) / SCALE.step))
         signal.codes[t + 1 :, u, k] = value
         signal.bad[t + 1 :, u, k] = True
@@ -168,7 +170,7 @@ def _flip(signal: Signal, scans: slice, u: int, k: int, bit: int) -> None:
 
 
 def _flip_once(signal: Signal) -> None:
-    """Flip one bit above the noise, in one code of one scan."""
+    """Flip a bit of one code in one scan; the bit is more significant than the noise."""
     t = int(signal.rng.integers(2, signal.shape[0] - 2))
     _flip(signal, slice(t, t + 1), *_crossing(signal), int(signal.rng.integers(6, 16)))
 
@@ -190,7 +192,7 @@ def _flip_for_ever(signal: Signal) -> None:
 
 
 def _corrupt(signal: Signal) -> None:
-    """Corrupt a byte of a random code in every tenth scan, as on a patch whose scans carry no check."""
+    """Corrupt a byte of a random code in every tenth scan, as is possible if scans have no checksum."""
     for t in range(4, signal.shape[0], 10):
         u, k = _one(signal, 1), _one(signal, 2)
         low = signal.rng.random() < 0.5
@@ -222,7 +224,7 @@ def _shorted_to_all(axis: int) -> InPlace:
 
 
 def _open_unmarked(axis: int) -> InPlace:
-    """Break a wire, so that the converter input floats near the top of its range."""
+    """Return a function that breaks a wire: its readings then float near the top of the converter range."""
 
     def wired(signal: Signal) -> None:
         at, t = _one(signal, axis), _pressing(signal)
@@ -235,7 +237,7 @@ def _open_unmarked(axis: int) -> InPlace:
 
 
 def _two_shorted(axis: int) -> InPlace:
-    """Short two neighbouring wires, so that both read the two resistances in parallel."""
+    """Return a function that shorts two adjacent wires, which then read their resistances in parallel."""
 
     def wired(signal: Signal) -> None:
         at, t = _one(signal, axis, 2), _pressing(signal)
@@ -248,7 +250,7 @@ def _two_shorted(axis: int) -> InPlace:
 
 
 def _crossed(axis: int, *, tared: bool) -> InPlace:
-    """Swap two wires that the load moves, before (``tared``) or after the baseline is measured."""
+    """Return a function that swaps adjacent wires before (``tared``) or after the baseline is measured."""
 
     def wired(signal: Signal) -> None:
         at = _pressed_wire(signal, axis)
@@ -265,7 +267,7 @@ def _crossed(axis: int, *, tared: bool) -> InPlace:
 
 
 def _gain(axis: int, by: float) -> InPlace:
-    """Change the gain of a wire after the baseline has been measured."""
+    """Return a function that changes the gain of a wire after the baseline has been measured."""
 
     def wired(signal: Signal) -> None:
         rows = _row(signal, axis, _pressed_wire(signal, axis), _at_rest(signal))
@@ -323,12 +325,12 @@ def _noise_stated(name: str, ratio: float) -> Fault:
 
 
 def some_bits() -> Fault:
-    """Return the fault that flips a bit in every third scan."""
+    """Return a fault that flips one bit in every third scan."""
     return Fault("a bit flipped in every third scan", sent=_flip_often, local=True)
 
 
 def singles() -> list[Fault]:
-    """Return all faults that the benchmark applies alone or in pairs."""
+    """Return all faults, which the benchmark applies singly and in pairs."""
     upper, lower = 1, 2
     return [
         Fault("5 % of chunks lost", sent=_lose(0.05)),

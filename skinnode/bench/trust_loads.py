@@ -1,10 +1,11 @@
-"""Loads for ``skinnode bench trust`` that violate the assumptions of the posterior's prior.
+"""Loads for ``skinnode bench trust``; they do not comply with the posterior's prior.
 
-The prior assumes independent loads on the cells of a lattice. The loads in this module use no lattice: closed
-forms for a sphere and a flat punch, line loads at any angle, a dent that no load on a half-space can produce,
-and a rigid plate on the whole patch. The force is known if the body presses on a half-space or on a layer.
+The prior assumes independent loads on the cells of a lattice. The loads in this module are independent of the
+lattice: closed-form solutions for a sphere and for a flat punch, line loads at any angle, a dent that no load
+on a half-space can produce, and a rigid plate that covers the whole patch. The true force is known for bodies
+that press on a half-space or on a layer.
 
-Frictional shear is proportional to the pressure. The rubber is incompressible (ν = ½). On a half-space,
+The shear traction is proportional to the pressure. The rubber is incompressible (ν = ½). On a half-space,
 pressure therefore causes no tangential displacement, and shear causes no normal displacement.
 """
 
@@ -21,23 +22,24 @@ from skinnode.model.layout import Float, PatchLayout
 
 LOADS: Final = ("sphere", "punch", "ridge", "dent", "edge", "whole patch")
 DEPTH: Final = (0.1, 0.3)
-"""Minimum and maximum depth of a load, as fractions of the layer height."""
+"""Minimum and maximum depth of a load, divided by the layer height."""
 SHEAR: Final = 0.3
 """Maximum coefficient of friction."""
 LINES: Final = 16
-"""Number of line loads across the width of a ridge; they are at most 0.15 pitches apart."""
+"""Number of parallel line loads that approximate a ridge; their spacing is at most 0.15 pitches."""
 
 WAVES: Final = 1500
-"""Number of wave numbers at which a Hankel transform is sampled."""
+"""Number of wave numbers at which Hankel transforms are sampled."""
 WAVE_MAX: Final = 60.0
-"""Maximum wave number times contact radius; higher wave numbers contain 1e-4 of Hertz's pressure."""
+"""Maximum product of wave number and contact radius; larger wave numbers contribute only 1e-4 of Hertz's
+pressure."""
 
 _UNKNOWN: Final = np.full(3, np.nan)
 
 
 @dataclass(frozen=True)
 class Punch:
-    """Press by a rigid, flat-ended cylinder (Johnson, Contact Mechanics, eqs. 3.34 to 3.37)."""
+    """A press by a rigid, flat-ended cylinder (Johnson, Contact Mechanics, eqs. 3.34 to 3.37)."""
 
     center_m: tuple[float, float]
     radius_m: float
@@ -45,7 +47,7 @@ class Punch:
     traction_ratio: tuple[float, float] = (0.0, 0.0)
 
     def displacement_m(self, points_m: Float, share: float) -> Float:
-        """Return the displacement under the pressure p₀/√(1 − r²/a²) and a proportional shear traction.
+        """Return the displacement due to the pressure p₀/√(1 − r²/a²) and a proportional shear traction.
 
         With Φ = ∫ p/|d| and S = ∫₀ʳ Φ s ds / r², ∫ p d dᵀ/|d|³ = (Φ − S) I + (2S − Φ) d dᵀ/r².
         """
@@ -59,7 +61,7 @@ class Punch:
         phi = np.where(r <= a, 2.0, phi)
         along = (offset / r[:, None]) @ np.array(self.traction_ratio)
         moved = np.empty((len(r), 3))
-        # The displacement is (1 − ν) Φ I + ν ∫ p d dᵀ/|d|³ with ν = ½, scaled to the depth (1 − ν) Φ(0) = 1.
+        # Displacement per unit depth: (1 − ν) Φ I + ν ∫ p d dᵀ/|d|³ with ν = ½, because (1 − ν) Φ(0) = 1.
         moved[:, :2] = (0.5 * phi + 0.5 * (phi - s))[:, None] * np.array(self.traction_ratio)
         moved[:, :2] += (0.5 * (2 * s - phi) * along / r)[:, None] * offset
         moved[:, 2] = -0.5 * phi
@@ -73,7 +75,7 @@ class Punch:
 
 @dataclass(frozen=True)
 class Ridge:
-    """Press by a straight edge of finite length: parallel line loads with an elliptic pressure profile."""
+    """A press by a straight edge of finite length, modelled as line loads with elliptic pressure."""
 
     center_m: tuple[float, float]
     angle: float
@@ -83,17 +85,17 @@ class Ridge:
     traction_ratio: tuple[float, float] = (0.0, 0.0)
 
     def _lines(self) -> tuple[Float, Float]:
-        """Return the lines' offsets (L,) from the ridge's axis, metres, and their fractions of the load."""
+        """Return each line's offset (L,) from the ridge's axis, metres, and its fraction (L,) of the load."""
         step = np.pi * np.arange(1, LINES + 1) / (LINES + 1)
         weight = np.sin(step) ** 2
         return self.half_width_m * np.cos(step), weight / weight.sum()
 
     def _unit(self, points_m: Float) -> Float:
-        """Return the displacement (P, 3, 3), m/N, by Boussinesq's and Cerruti's integrated solutions."""
+        """Return the displacement per force (P, 3, 3), m/N, from Boussinesq's and Cerruti's solutions."""
         turn = np.array([[np.cos(self.angle), np.sin(self.angle)], [-np.sin(self.angle), np.cos(self.angle)]])
         along, across = turn @ (points_m - self.center_m).T
         places, weight = self._lines()
-        # Each line has the width of the spacing between lines, which keeps its potential finite.
+        # To keep the potential finite, each line load is as wide as the spacing between lines.
         blur = self.half_width_m / LINES
         t = across[:, None] - places
         total = np.zeros((len(points_m), 3, 3))
@@ -116,18 +118,18 @@ class Ridge:
         return total
 
     def force_n(self, share: float) -> Float:
-        """Return the force (3,) that presses the middle of the ridge to its depth, newtons."""
+        """Return the force (3,), newtons, that presses the ridge's middle to the required depth."""
         normal = share * self.depth_m / self._unit(np.array([self.center_m]))[0, 2, 2]
         return np.asarray(normal * np.array([*self.traction_ratio, -1.0]))
 
     def displacement_m(self, points_m: Float, share: float) -> Float:
-        """Return the displacement (P, 3) caused by all line loads, metres."""
+        """Return the displacement (P, 3), metres, due to all line loads."""
         return np.asarray(self._unit(points_m) @ self.force_n(share))
 
 
 @dataclass(frozen=True)
 class Dent:
-    """Gaussian dent that pulls the skin towards its centre, which no load on a half-space does."""
+    """A Gaussian dent that pulls the skin towards its centre, unlike any load on a half-space."""
 
     center_m: tuple[float, float]
     spread_m: float
@@ -135,7 +137,7 @@ class Dent:
     traction_ratio: tuple[float, float] = (0.0, 0.0)
 
     def displacement_m(self, points_m: Float, share: float) -> Float:
-        """Return the displacement (P, 3) of the dent, metres."""
+        """Return the displacement (P, 3), metres."""
         offset = (points_m - self.center_m) / self.spread_m
         shape = share * self.depth_m * np.exp(-0.5 * (offset**2).sum(axis=1))
         moved = np.empty((len(points_m), 3))
@@ -144,38 +146,39 @@ class Dent:
         return moved
 
     def force_n(self, share: float) -> Float:
-        """Return NaN, because the shape of the dent does not determine a force."""
+        """Return NaN, because the force cannot be derived from the shape of the dent."""
         return _UNKNOWN
 
 
 @dataclass(frozen=True)
 class Plate:
-    """Press by a rigid, slightly tilted plate that covers the whole patch."""
+    """A press by a rigid, slightly tilted plate that covers the whole patch."""
 
     center_m: tuple[float, float]
     depth_m: float
     tilt: tuple[float, float]
-    """Relative change of the plate's depth along x and y, 1/m."""
+    """Relative change of the plate's depth per metre along x and along y."""
     traction_ratio: tuple[float, float] = (0.0, 0.0)
 
     def displacement_m(self, points_m: Float, share: float) -> Float:
-        """Return the displacement (P, 3) under the plate, metres."""
+        """Return the displacement (P, 3), metres, under the plate."""
         depth = share * self.depth_m * (1.0 + (points_m - self.center_m) @ np.array(self.tilt))
         return np.asarray(depth[:, None] * np.array([*self.traction_ratio, -1.0]))
 
     def force_n(self, share: float) -> Float:
-        """Return NaN, because the force also depends on the skin around the patch."""
+        """Return NaN, because the force also depends on the skin outside the patch."""
         return _UNKNOWN
 
 
 @dataclass(frozen=True)
 class Bonded:
-    """Hertz pressure on an incompressible rubber layer that is bonded to a rigid base.
+    """A press with Hertz's pressure on an incompressible rubber layer bonded to a rigid base.
 
-    The displacement is computed by Hankel transforms. With x = k h, the transformed deflection of the layer
-    is L(x) = (sinh 2x − 2x)/(cosh 2x + 2x² + 1) times that of a half-space. The tangential displacement is
-    −2x²/(sinh 2x − 2x) times the deflection. Both formulas follow from the biharmonic solution with no
-    displacement at the base and no shear stress at the surface.
+    The displacement is computed with Hankel transforms. For wave number k and layer height h, let x = k h.
+    The layer's transformed deflection is that of a half-space multiplied by L(x) = (sinh 2x − 2x)/(cosh 2x +
+    2x² + 1). The transformed tangential displacement is the deflection multiplied by −2x²/(sinh 2x − 2x).
+    Both formulas follow from the biharmonic equation with zero displacement at the base and zero shear stress
+    at the surface.
     """
 
     center_m: tuple[float, float]
@@ -185,13 +188,13 @@ class Bonded:
     depth_m: float
 
     def _unit(self, offset_m: Float) -> tuple[Float, Float]:
-        """Return the radial and the normal displacement (P,), metres per pascal of peak pressure."""
+        """Return the radial and normal displacements (P,) per peak pressure, m/Pa."""
         from scipy.special import j0, j1
 
         k = (np.arange(WAVES) + 0.5) * (WAVE_MAX / WAVES) / self.radius_m
         ka, x = k * self.radius_m, k * self.thickness_m
         pressure = self.radius_m**2 * (np.sin(ka) / ka - np.cos(ka)) / ka**2
-        x = np.minimum(x, 100.0)  # for larger x, the layer behaves like a half-space
+        x = np.minimum(x, 100.0)  # for larger x, the layer is equivalent to a half-space
         below = np.cosh(2 * x) + 2 * x * x + 1.0
         deflect = pressure * (2.0 / RUBBER.contact_modulus_pa) * (k[1] - k[0])
         r = np.hypot(*offset_m.T)
@@ -212,12 +215,12 @@ class Bonded:
         return np.asarray(moved * self._peak_pa(share))
 
     def force_n(self, share: float) -> Float:
-        """Return the force (3,), newtons; Hertz's normal force is ⅔ π a² p₀."""
+        """Return the force (3,), newtons; the normal force is ⅔ π a² p₀ (Hertz)."""
         return np.array([0.0, 0.0, -2.0 / 3.0 * math.pi * self.radius_m**2 * self._peak_pa(share)])
 
 
 def surface_m(layout: PatchLayout) -> tuple[Float, Float, Float]:
-    """Return the (x, y) positions (P, 2) of the upper electrodes, with their minimum and maximum, metres."""
+    """Return the upper electrodes' (x, y) positions (P, 2), and their minimum and maximum, metres."""
     points = layout.upper_m[..., :2].reshape(-1, 2)
     return points, points.min(axis=0), points.max(axis=0)
 
@@ -229,7 +232,7 @@ def draw(kind: str, layout: PatchLayout, rng: np.random.Generator, depth: float 
         kind: One of :data:`LOADS`.
         layout: Patch to press.
         rng: Random generator.
-        depth: Depth as a fraction of the layer height; default: random within :data:`DEPTH`.
+        depth: Depth divided by the layer height; default: random within :data:`DEPTH`.
     """
     pitch = layout.pitch_m
     _, low, high = surface_m(layout)
@@ -250,7 +253,7 @@ def draw(kind: str, layout: PatchLayout, rng: np.random.Generator, depth: float 
         middle = 0.5 * (low + high)
         tilt = 0.2 * tilts / (high - low)
         return Plate((float(middle[0]), float(middle[1])), sunk, (float(tilt[0]), float(tilt[1])), traction)
-    if kind == "edge":  # centred on an outermost column of electrodes or an outermost wire
+    if kind == "edge":  # centre on an outermost column of electrodes or an outermost wire
         border = (low, high)[side // 2]
         center = (float(border[0]), center[1]) if side % 2 else (center[0], float(border[1]))
     elif kind != "sphere":

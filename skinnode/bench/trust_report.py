@@ -1,4 +1,4 @@
-"""Targets and text output of ``skinnode bench trust``."""
+"""Checks the targets of ``skinnode bench trust`` and formats the report."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from skinnode.bench.trust_signal import RATE_HZ, Setting
 
 SECTIONS: Final = ("healthy", "single", "pair", "hours")
 HEALTHY: Final = 0.99
-"""Minimum fraction of fault-free fields that must be trusted, at relative noises of 1e-5 and 1e-4."""
+"""Minimum fraction of trusted fields among the fields without faults, at a relative noise of 1e-5 or 1e-4."""
 FALSE_PER_HOUR: Final = 0.1
 """Maximum number of false alarms per patch-hour."""
 
@@ -24,7 +24,7 @@ def _sum(rows: Iterable[dict[str, Any]], key: str) -> float:
 
 
 def verdicts(rows: Sequence[dict[str, Any]], settings: Sequence[Setting]) -> list[dict[str, Any]]:
-    """Return each target that applies to ``rows``, with its measured value and whether it was reached."""
+    """Return the targets that apply to ``rows``, including the measured values and verdicts."""
     by_section = {name: [row for row in rows if row["section"] == name] for name in SECTIONS}
     found = []
     for section, what in (("healthy", "no fault"), ("single", "one fault"), ("pair", "two faults")):
@@ -59,7 +59,7 @@ def verdicts(rows: Sequence[dict[str, Any]], settings: Sequence[Setting]) -> lis
 
 
 def part_verdicts(figures: dict[str, Any]) -> list[dict[str, Any]]:
-    """Return the targets for the table of earlier failures and for the faults over a bus."""
+    """Return the targets for the table of earlier failures and for fault injection on a bus."""
     found = []
     if "table" in figures:
         missed = sum(not row["reached"] for row in figures["table"])
@@ -76,7 +76,7 @@ def _must(what: str, got: float, asked: float, *, least: bool = False) -> dict[s
 
 
 def _false_namings(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """Compare the false-alarm rate with its target; the note gives the confidence bounds of the rate."""
+    """Compare the false-alarm rate with its target; the row's note states the rate's confidence bounds."""
     hours, events = _sum(rows, "frames") / RATE_HZ / 3600.0, round(_sum(rows, "false_names"))
     low, high = rate_bounds(events, hours)
     verdict = _must("false alarms per patch-hour", events / hours, FALSE_PER_HOUR)
@@ -102,7 +102,7 @@ LEGEND: Final = (
 
 
 def lines(figures: dict[str, Any]) -> Iterator[str]:
-    """Yield the lines of the whole report."""
+    """Yield the lines of the complete report."""
     if figures["rows"]:
         yield HEAD
     for section, rows in itertools.groupby(figures["rows"], key=lambda row: str(row["section"])):
@@ -117,7 +117,7 @@ def lines(figures: dict[str, Any]) -> Iterator[str]:
 
 
 def _parts(figures: dict[str, Any]) -> Iterator[str]:
-    """Yield the lines of the table, of the speed measurement and of the faults over a bus."""
+    """Yield the report lines of the additional parts: table, speed, and faults over a bus."""
     for name, title, head, text in (
         ("table", "scenes whose fields were trusted but wrong in an earlier version", "", trust_table.text),
         (

@@ -1,8 +1,7 @@
-"""Runs simulated nodes with faults and a host over virtual buses, for ``skinnode bench trust``.
+"""Runs a host and simulated nodes with faults on virtual buses, for ``skinnode bench trust``.
 
-The simulator's spheres press on a hand of full-size patches. Each patch has a different fault, which is
-injected after a period of fault-free operation. This module may import the simulator, because the simulator
-provides the faults.
+Simulated spheres press on a hand of full-size patches. After a fault-free period, a different fault is
+injected into each patch. This module may import the simulator, because the simulator injects the faults.
 """
 
 from __future__ import annotations
@@ -47,21 +46,21 @@ ROAD: Final[tuple[dict[str, Any], ...]] = (
     {"crossed_lower": 13},
     {"flipped": 0.2},
 )
-"""Injected faults by patch; each fault changes, withholds or repeats values. The first patch has none."""
+"""Faults injected into each patch: changed, missing or repeated values. The first patch has no faults."""
 AT_ONCE: Final = 4
-"""Number of patches that this process simulates at the same time."""
+"""Number of patches simulated simultaneously by this process."""
 CLEAN_S: Final = 1.2
-"""Fault-free time after bring-up, s: long enough for the first press to begin."""
+"""Fault-free time after bring-up, s; by the end of this time, the first press has begun."""
 FAULTY_S: Final = 4.0
 PERIOD_MS: Final = 80
 
 
 def rows(seed: int) -> list[dict[str, Any]]:
-    """Inject each fault and compare the resulting fields with the truth; return one row per fault."""
+    """Inject the faults and compare the resulting fields with the truth; return one row per patch."""
     found = []
     kept = logging.getLogger("skinnode")
     level = kept.level
-    kept.setLevel(logging.CRITICAL)  # the injected faults cause expected warnings
+    kept.setLevel(logging.CRITICAL)  # hide the warnings caused by injected faults
     try:
         for first in range(0, len(ROAD), AT_ONCE):
             found += _together(ROAD[first : first + AT_ONCE], seed)
@@ -93,7 +92,7 @@ def _together(kinds: tuple[dict[str, Any], ...], seed: int) -> list[dict[str, An
 
 
 def _patch(field: FieldFrame) -> str:
-    assert field.stamp is not None  # the host attaches a stamp to every field
+    assert field.stamp is not None  # always true: the host stamps every field
     return field.stamp.patch
 
 
@@ -139,7 +138,7 @@ def _row(
 
 
 def _truth_m(field: FieldFrame, source: SimulatedPatch) -> Float:
-    """Return the true electrode positions at the time of the conversion, or of the SYNC if there was none."""
+    """Return the true electrode positions at the time of conversion, or of the SYNC if that is unknown."""
     stamp = field.stamp
     assert stamp is not None
     try:

@@ -1,6 +1,6 @@
 """Scores trusted fields by comparison with the true displacement, for ``skinnode bench trust``.
 
-Scores consist of counts, so that the scores of several streams and processes can be added.
+A score consists of counts, so that the scores of several streams and processes can be added.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ LIMIT: Final = 5.0
 """Maximum error of a trusted coordinate, in reported standard deviations."""
 
 BEYOND: Final = 1e-3
-"""Maximum fraction of trusted coordinates whose error may exceed :data:`LIMIT`."""
+"""Maximum permissible fraction of trusted coordinates with an error above :data:`LIMIT`."""
 
 Mask = NDArray[np.bool_]
 
@@ -38,17 +38,18 @@ class Score:
     trusted: int = 0
     """Number of trusted fields."""
     coordinates: int = 0
-    """Number of trusted coordinates: those of trusted wires in trusted fields."""
+    """Number of trusted coordinates, i.e. coordinates of trusted wires in trusted fields."""
     beyond: int = 0
     """Number of trusted coordinates whose error exceeds :data:`LIMIT`."""
     worst: float = 0.0
     """Maximum error of a trusted coordinate, in reported standard deviations."""
     named: int = 0
-    """Number of streams in which the field reported the fault that was present."""
+    """Number of streams in which a field correctly reported the fault."""
     nameable: int = 0
     """Number of streams in which a fault changed at least one reading."""
     scans_to_name: list[int] = dataclasses.field(default_factory=list)
-    """Number of scans from the first changed reading to the first correct fault report, for each stream."""
+    """Number of scans from the first changed reading to the first correct fault report, one entry per
+    stream."""
     after: int = 0
     """Number of fields from the first correct fault report onwards."""
     after_trusted: int = 0
@@ -56,13 +57,15 @@ class Score:
     false_names: int = 0
     """Number of false alarms: faults reported for parts whose readings were correct."""
     touches: int = 0
-    """Number of trusted fields with the load at full depth or with the patch at rest."""
+    """Number of trusted fields while the load is at full depth or the patch is at rest."""
     touches_right: int = 0
-    """Number of fields in ``touches`` with the right number of contacts: one, or none at rest."""
+    """Number of fields counted in ``touches`` that have the right number of contacts: one, or none at
+    rest."""
     forces: int = 0
-    """Number of trusted fields with exactly one contact, whose true force is known."""
+    """Number of trusted fields with exactly one contact and a known true force."""
     forces_right: int = 0
-    """Number of fields in ``forces`` whose normal force is within :data:`LIMIT` standard deviations."""
+    """Number of fields counted in ``forces`` with a normal-force error of at most :data:`LIMIT` standard
+    deviations."""
 
     def add(self, other: Score) -> None:
         """Add the counts of ``other`` to this score."""
@@ -72,42 +75,42 @@ class Score:
 
     @property
     def share_beyond(self) -> float:
-        """Fraction of the trusted coordinates whose error exceeds the limit; 0 if there are none."""
+        """Fraction of trusted coordinates with an error above the limit; 0 if no coordinate is trusted."""
         return self.beyond / max(self.coordinates, 1)
 
     @property
     def share_trusted(self) -> float:
-        """Fraction of the fields that are trusted."""
+        """Fraction of trusted fields."""
         return self.trusted / self.frames if self.frames else math.nan
 
     @property
     def share_after(self) -> float:
-        """Fraction of the fields that are trusted, from the first correct fault report onwards."""
+        """Fraction of trusted fields after the first correct fault report."""
         return self.after_trusted / self.after if self.after else math.nan
 
     @property
     def share_named(self) -> float:
-        """Fraction of the streams in which the fault was identified correctly."""
+        """Fraction of the faulty streams in which the fault was identified correctly."""
         return self.named / self.nameable if self.nameable else math.nan
 
     @property
     def share_contacts(self) -> float:
-        """Fraction of the fields that have the right number of contacts."""
+        """Fraction of the scored fields with the right number of contacts."""
         return self.touches_right / self.touches if self.touches else math.nan
 
     @property
     def share_forces(self) -> float:
-        """Fraction of the contacts whose force is within the limit of its standard deviation."""
+        """Fraction of the contact forces with an error of at most :data:`LIMIT` standard deviations."""
         return self.forces_right / self.forces if self.forces else math.nan
 
     @property
     def median_scans(self) -> float:
-        """Median number of scans until a fault is identified."""
+        """Median number of scans before a fault is identified."""
         return float(np.median(self.scans_to_name)) if self.scans_to_name else math.nan
 
 
 def trusted_wires(field: FieldFrame) -> Mask:
-    """Return a mask (U,) of the trusted wires; all False if the field is not trusted."""
+    """Return a mask (U,) of trusted wires; all entries are False if the field is not trusted."""
     if not field.trusted:
         return np.zeros(len(field.status), bool)
     if field.wires_trusted is not None:
@@ -116,7 +119,7 @@ def trusted_wires(field: FieldFrame) -> Mask:
 
 
 def deviations(field: FieldFrame, truth_m: Float) -> Float:
-    """Return the errors (U, N, 3) in reported standard deviations; inf for values that are not finite."""
+    """Return the errors (U, N, 3) in reported standard deviations; undefined ratios become inf."""
     with np.errstate(all="ignore"):
         error = np.abs(field.displacement_m - truth_m)
         ratio = np.where(error == 0.0, 0.0, error / field.displacement_std_m)
@@ -124,7 +127,7 @@ def deviations(field: FieldFrame, truth_m: Float) -> Float:
 
 
 def covered(fault: DataFault, shape: tuple[int, int]) -> Mask:
-    """Return a mask (U, K) of the readings to which a reported fault refers."""
+    """Return a mask (U, K) of the readings covered by a reported fault."""
     mask = np.zeros(shape, bool)
     upper = slice(None) if fault.upper is None else fault.upper
     lower = slice(None) if fault.lower is None else fault.lower
@@ -133,21 +136,21 @@ def covered(fault: DataFault, shape: tuple[int, int]) -> Mask:
 
 
 def is_right(fault: DataFault, bad: Mask) -> bool:
-    """Return whether at least half of the readings that ``fault`` covers are marked in ``bad`` (U, K)."""
+    """Return whether ``bad`` (U, K) marks at least half of the readings covered by ``fault``."""
     return bool(bad[covered(fault, bad.shape)].mean() >= 0.5)
 
 
 Naming = tuple[FaultyPart, int | None, int | None, int]
-"""Part, upper wire, lower wire and first scan of a reported fault."""
+"""Reported fault: part, upper wire, lower wire, and number of the first affected scan."""
 
 
 def judge(taken: CodeStream, fields: Sequence[FieldFrame], known: set[Naming] | None = None) -> Score:
-    """Score the fields of a stream, which has one field per scan.
+    """Score the fields of a stream.
 
     Args:
         taken: The stream.
-        fields: The field of every scan.
-        known: False alarms that have already been counted; this stream's false alarms are added.
+        fields: Fields, one per scan.
+        known: False alarms that have already been counted; the stream's false alarms are added to this set.
     """
     score = Score(streams=1)
     bad_so_far = np.zeros(taken.bad.shape[1:], bool)
@@ -196,7 +199,7 @@ def _judge_field(score: Score, taken: CodeStream, t: int, field: FieldFrame) -> 
 
 
 def rate_bounds(events: int, hours: float) -> tuple[float, float]:
-    """Return the lower and the upper one-sided 95 % confidence bound of a Poisson rate, per hour."""
+    """Return the lower and upper one-sided 95 % confidence bounds of a Poisson rate, per hour."""
     from scipy.stats import chi2
 
     low = 0.0 if events == 0 else 0.5 * float(chi2.ppf(0.05, 2 * events)) / hours

@@ -1,11 +1,11 @@
-"""Generates streams of codes with known true displacements, for ``skinnode bench trust``.
+"""Generates code streams and their true displacements, for ``skinnode bench trust``.
 
 ::
 
     load, timeline -> displacement -> resistances of the true patch -> noise -> faults -> codes -> faults
 
-In each stream, the patch is first at rest. A load then presses, holds, slides and is released, and the patch
-rests again.
+A stream has six phases: the patch is at rest; a load is applied, held, moved sideways and released; the patch
+is at rest again.
 """
 
 from __future__ import annotations
@@ -26,16 +26,16 @@ if TYPE_CHECKING:
 
 PITCH_M: Final = 4e-3
 LAYOUTS: Final = (("staggered", 0.5), ("staggered", 1.0), ("aligned", 0.5))
-"""Preset names and layer heights in pitches."""
+"""Layouts as (preset name, layer height in pitches)."""
 NOISES: Final = (1e-5, 1e-4, 1e-3)
 SCALE: Final = CodeScale(16)
 RATE_HZ: Final = 100.0
-"""Scan rate of a patch, Hz; converts numbers of scans to hours."""
+"""Scan rate of a patch, Hz, for converting numbers of scans to hours."""
 
 
 @dataclass(frozen=True)
 class Timeline:
-    """Number of scans in each phase of a stream; at 12.5 scans/s, a stream lasts about five seconds."""
+    """Number of scans in each phase of a stream; the default stream lasts about 5 s at 12.5 scans/s."""
 
     rest: int = 12
     press: int = 8
@@ -51,7 +51,7 @@ class Timeline:
 
     @property
     def shares(self) -> Float:
-        """Depth of the load at each scan (T,), as a fraction of the full depth."""
+        """Depth (T,) of the load in each scan, as a fraction of the full depth."""
         ramp = 0.5 - 0.5 * np.cos(np.pi * np.arange(1, self.press + 1) / self.press)
         lift = 0.5 + 0.5 * np.cos(np.pi * np.arange(1, self.release + 1) / self.release)
         held = np.ones(self.hold + self.slide)
@@ -59,7 +59,7 @@ class Timeline:
 
     @property
     def slid(self) -> Float:
-        """Position of the load at each scan (T,), as a fraction of the slide's length."""
+        """Position (T,) of the load in each scan, as a fraction of the total sliding distance."""
         way = np.zeros(self.scans)
         start = self.rest + self.press + self.hold
         way[start : start + self.slide] = np.arange(1, self.slide + 1) / max(self.slide, 1)
@@ -69,19 +69,20 @@ class Timeline:
 
 @dataclass(eq=False)
 class Signal:
-    """Readings and codes of a converter, which faults modify in place."""
+    """Readings and codes of a converter; faults modify them in place."""
 
     rng: np.random.Generator
     rest_ohm: Float
-    """(U, K), resistances that the node stores as its baseline, ohm."""
+    """(U, K), baseline resistances stored in the node, ohm."""
     ohm: Float
     """(T, U, K), readings in ohm."""
     bad: NDArray[np.bool_]
-    """(T, U, K), whether a reading differs from that of the intact patch by more than noise."""
+    """(T, U, K), whether a fault changed the reading by more than noise."""
     pressed: slice
     """Range of the scans in which the load is at full depth."""
     phase: NDArray[np.int64]
-    """(T,), conversion phase in the summaries: 1, 2, 3, 1, …; 0 if the patch does not count conversions."""
+    """(T,), conversion phase sent in each summary: 1, 2, 3, 1, …; always 0 if the patch does not count
+    conversions."""
     codes: Codes = field(default_factory=lambda: np.zeros(0, np.uint32))
 
     @property
@@ -93,7 +94,7 @@ class Signal:
 
 @dataclass(frozen=True, eq=False)
 class CodeStream:
-    """Scans of a patch as the host receives them, with the true displacements and forces."""
+    """A patch's scans as received by the host, and the true displacements and forces."""
 
     layout: PatchLayout
     baseline_ohm: Float
@@ -103,7 +104,7 @@ class CodeStream:
     ordinary: bool
     """Whether the hand file states ordinary manufacturing tolerances for the patch."""
     codes: Codes
-    """(T, U, K), received codes; MISSING where the chunk was lost."""
+    """(T, U, K), received codes; MISSING if the chunk was lost."""
     truth_m: Float
     """(T, U, N, 3), true displacement, metres."""
     force_n: Float
@@ -115,14 +116,14 @@ class CodeStream:
     untouched: NDArray[np.bool_]
     """(T,), whether the patch is at rest."""
     phase: NDArray[np.int64]
-    """(T,), conversion phase in the summaries; 0 if the patch does not count conversions."""
+    """(T,), conversion phase received in each summary; always 0 if the patch does not count conversions."""
     scored_from: int = 0
-    """First scan that is scored."""
+    """Index of the first scored scan."""
 
 
 @dataclass(frozen=True)
 class Setting:
-    """Layout of a patch and noise of its converter."""
+    """A layout and a noise level."""
 
     preset: str
     height: float
@@ -131,7 +132,7 @@ class Setting:
 
     @property
     def name(self) -> str:
-        """Short description, used in reports and to seed streams."""
+        """Short description, which is printed in reports and seeds the streams."""
         return f"{self.preset} h={self.height:g}, {self.noise:.0e}".replace("e-0", "e-")
 
     def layout(self) -> PatchLayout:
@@ -147,12 +148,12 @@ def all_settings() -> list[Setting]:
 def make(
     setting: Setting, load: Load, faults: Sequence[Fault], rng: np.random.Generator, timeline: Timeline
 ) -> CodeStream:
-    """Generate the code stream of a loaded patch with faults.
+    """Generate the code stream of a loaded patch, with faults.
 
     Args:
         setting: Layout and noise.
         load: Load on the patch.
-        faults: Faults, in the order in which they take effect.
+        faults: Faults, in the order in which they are applied.
         rng: Random generator for noise and faults.
         timeline: Phases of the stream.
     """
@@ -208,9 +209,9 @@ def make(
 def motion(
     layout: PatchLayout, load: Load, timeline: Timeline, rng: np.random.Generator
 ) -> tuple[Float, Float]:
-    """Return the displacement (T, U, N, 3), metres, and the force (T, 3), newtons, of a sliding load.
+    """Return a sliding load's displacement (T, U, N, 3), metres, and force (T, 3), newtons.
 
-    The load slides by two pitches in a random direction that points towards the middle of the patch.
+    The load slides by two pitches in a random direction, roughly towards the middle of the patch.
     """
     points = layout.upper_m[..., :2].reshape(-1, 2)
     toward = 0.5 * (points.min(axis=0) + points.max(axis=0)) - load.center_m

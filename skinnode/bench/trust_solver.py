@@ -1,7 +1,8 @@
-"""Processes a code stream with the host's own solver and fault detection, for ``skinnode bench trust``.
+"""Processes a code stream with the host's solver and fault detection, for ``skinnode bench trust``.
 
-As in the host, each scan is first checked for frozen parts and open wires. The scan is then solved without
-the excluded readings, and finally added to the statistics that reveal slowly developing faults.
+Like in the host, each scan is first checked for frozen parts and open wires. It is then solved without the
+readings that the checks excluded. Finally, the scan is added to the statistics for detecting slowly
+developing faults.
 """
 
 from __future__ import annotations
@@ -29,13 +30,13 @@ PERIOD_NS: Final = 10_000_000
 
 @dataclass
 class HostPatch:
-    """State that a host keeps for a patch: solver and fault detection."""
+    """A patch's solver and fault detection, as in the host."""
 
     solver: ScanSolver
     watch: CodeWatch
 
     def field(self, codes: Codes, number: int, phase: int) -> FieldFrame:
-        """Solve scan ``number``, given its codes (U, K) and its conversion phase."""
+        """Solve scan ``number`` with the given codes (U, K) and conversion phase."""
         scan, stamp = _scan_of(self.solver.facts.profile, codes, number, phase)
         verdict = self.watch.judge(scan, number)
         field = verdict.applied(self.solver.solve(verdict.admitted(scan), stamp)[0])
@@ -44,12 +45,12 @@ class HostPatch:
 
 
 def host_patch(taken: CodeStream, config: PatchConfig | None = None, **options: Any) -> HostPatch:
-    """Create the host's state for a patch with the stream's layout, noise and tolerances.
+    """Create solver and fault detection for a patch with the stream's layout, noise and tolerances.
 
     Args:
         taken: The stream.
         config: Patch entry of a hand file; default: an entry with the stream's noise and tolerances.
-        **options: Keys of the table ``[solver]`` in a hand file.
+        **options: Options from the table ``[solver]`` of a hand file.
     """
     layout = taken.layout
     stated: dict[str, Any] = {
@@ -90,7 +91,7 @@ def _scan_of(profile: PatchProfile, codes: Codes, number: int, phase: int) -> tu
         chunks_expected=chunks,
         chunks_received=chunks - -(-lost // profile.codes_per_chunk),
         device_time_us=t_ns // 1000,
-        flags=phase * (CONVERSIONS & -CONVERSIONS),  # shift the phase to the position of the mask
+        flags=phase * (CONVERSIONS & -CONVERSIONS),  # shift the phase into its bit field
         t_first_ns=t_ns,
         t_last_ns=t_ns,
     )

@@ -1,4 +1,4 @@
-"""Measures speed and error for ``skinnode bench trust``: exact inverse without and with tests, posterior."""
+"""Compares the speed and error of the exact inverse (with and without tests) and the posterior."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ METHODS: Final = ("exact, no tests", "exact", "posterior")
 
 
 def rows(seed: int) -> list[dict[str, Any]]:
-    """Solve the same streams with each method; return the time per touched frame and the error."""
+    """Solve the same streams with each method; return one row per method with times and errors."""
     times: dict[str, list[float]] = {name: [] for name in METHODS}
     errors: dict[str, list[float]] = {name: [] for name in METHODS}
     worst = dict.fromkeys(METHODS, 0.0)
@@ -50,7 +50,7 @@ def rows(seed: int) -> list[dict[str, Any]]:
 
 
 def _fields(name: str, taken: CodeStream) -> list[tuple[Any, float]]:
-    """Solve every scan of a stream; return each field with its solution time, s."""
+    """Solve every scan of a stream; return the fields and the solution times (s)."""
     found = []
     if name == METHODS[0]:
         bare = _bare(taken)

@@ -1,10 +1,10 @@
-"""Generates ground truth for benchmarks, without any of the solvers' assumptions.
+"""Generates ground truth for benchmarks independently of the solvers' assumptions.
 
 Displacements are closed-form solutions for rigid spheres on rubber
-(:class:`skinnode.model.elastic.HertzContact`), so they use neither a grid nor a prior. Resistances are
-computed by :class:`Skin`, which can differ from the solver's model: electrodes of finite size,
-strain-dependent resistivity, a different thickness, or a series contact resistance. Converters add noise and
-quantise readings to codes, as real converters do.
+(:class:`skinnode.model.elastic.HertzContact`), which depend on neither a grid nor a prior. Resistances are
+computed by :class:`Skin`. Unlike the solver's model, a skin may have electrodes of finite size,
+strain-dependent resistivity, a different thickness, or a series contact resistance. Like real converters,
+simulated converters add noise and quantise readings to codes.
 """
 
 from __future__ import annotations
@@ -23,17 +23,18 @@ from skinnode.protocol.codes import CodeScale, decode, encode
 
 RUBBER: Final = Rubber()
 EXACT_NOISE: Final = 1e-9
-"""Relative noise passed to a tracker for noise-free data; it determines the solver's tolerance."""
+"""Relative noise passed to a tracker for noise-free data; the solver's tolerance depends on this noise."""
 RING: Final = 4
-"""Number of points on the rim of a finite electrode; a pair of electrodes has 16 distances."""
+"""Number of points on the rim of a finite electrode; the potential of an electrode pair is the mean over 16
+point pairs."""
 
 
 class Load(Protocol):
-    """Body that presses on the skin; ``share`` is the present depth as a fraction of the full depth."""
+    """A body that presses on the skin; ``share`` is the current depth divided by the full depth."""
 
     @property
     def center_m(self) -> tuple[float, float]:
-        """Centre (x, y) of the load at the start, metres."""
+        """Initial centre (x, y) of the load, metres."""
 
     @property
     def depth_m(self) -> float:
@@ -43,23 +44,23 @@ class Load(Protocol):
         """Return the displacement (P, 3) of surface points (P, 2), metres."""
 
     def force_n(self, share: float) -> Float:
-        """Return the force (3,) on the rubber, newtons; NaN if the body does not determine the force."""
+        """Return the force (3,) on the rubber, newtons; NaN if the force is unknown for this kind of body."""
 
 
 @dataclass(frozen=True)
 class Press:
-    """Press by a sphere; lengths are in metres. ``share`` is the fraction of the full depth."""
+    """A press by a sphere (lengths in metres); ``share`` is the current depth over the full depth."""
 
     center_m: tuple[float, float]
     radius_m: float
     depth_m: float
     traction_ratio: tuple[float, float] = (0.0, 0.0)
     shear_only: bool = False
-    """Whether only the tangential traction acts; computed as contact with friction minus frictionless
-    contact."""
+    """Whether only the tangential traction acts. The displacement is then that of a contact with friction
+    minus that of a frictionless contact."""
 
     def contacts(self, share: float) -> tuple[tuple[int, HertzContact], ...]:
-        """Return the closed-form solutions to superpose, each with its sign."""
+        """Return the closed-form solutions to be added or subtracted, with their signs."""
         depth = share * self.depth_m
         full = HertzContact(RUBBER, self.radius_m, depth, self.center_m, self.traction_ratio)
         if not self.shear_only:
@@ -83,19 +84,20 @@ class Press:
 
 @dataclass(frozen=True, eq=False)
 class Skin:
-    """Simulated real patch; the solver receives only its ``layout``.
+    """A simulated patch; the solver is given only its nominal ``layout``.
 
     Args:
-        layout: Layout passed to the solver.
-        height: True height of the upper layer, as a fraction of the height in the layout.
-        electrode: Radius of the electrodes, pitches; 0 for point electrodes, which the solver assumes.
+        layout: Nominal layout, which is passed to the solver.
+        height: True height of the upper layer divided by the nominal height.
+        electrode: Radius of the electrodes, pitches; 0 for point electrodes, as in the solver's model.
         strain: Coefficient β of the strain-dependent resistance ρ d (1 + β (d/d₀ − 1)), where d₀ is the
             distance d at rest.
         series: Contact resistance in series with each crossing, as a fraction of the crossing's R₀.
-        points_m: Positions (U, N, 2) of the electrodes along the surface, if it is not flat.
-        axes: Local axes (U, N, 3, 3) at each electrode; the rows point along, across and out of the surface.
-        upper_shift_m: Shifts (U, 3) of the upper wires from their places in the layout, metres.
-        lower_shift_m: Shifts (K, 3) of the lower wires from their places in the layout, metres.
+        points_m: Positions (U, N, 2) of the upper electrodes in surface coordinates, for a curved patch.
+        axes: Local axes (U, N, 3, 3) at each upper electrode; the rows are two tangents and the outward
+            normal.
+        upper_shift_m: Displacements (U, 3) of the upper wires from their nominal positions, metres.
+        lower_shift_m: Displacements (K, 3) of the lower wires from their nominal positions, metres.
     """
 
     layout: PatchLayout
@@ -116,7 +118,7 @@ class Skin:
         upper, lower = self.layout.upper_m, self.layout.lower_m
         if self.axes is None:
             upper = upper * np.array([1.0, 1.0, self.height])
-        else:  # on a curved patch, height is measured along the surface normals
+        else:  # on a curved patch, the height is measured along the normal
             upper = upper + (self.height - 1.0) * self._gap_m[..., None] * self.axes[:, :, 2]
         if self.upper_shift_m is not None:
             upper = upper + self.upper_shift_m[:, None]
@@ -126,7 +128,7 @@ class Skin:
 
     @property
     def _gap_m(self) -> Float:
-        """Heights (U, N), metres, of upper above nearest lower electrodes, along the surface normals."""
+        """Heights (U, N), metres, of the upper above the nearest lower electrodes, along the normals."""
         gap = self.layout.upper_m[:, :, None] - self.layout.lower_m.reshape(-1, 3)
         nearest = np.argmin((gap**2).sum(axis=-1), axis=-1)[..., None, None]
         assert self.axes is not None
@@ -145,7 +147,7 @@ class Skin:
 
     @functools.cached_property
     def rest_ohm(self) -> Float:
-        """Noise-free resistances (U, K) at rest, ohm; the solver receives them as its baseline."""
+        """Noise-free resistances (U, K) at rest, ohm, which are passed to the solver as the baseline."""
         return self.resistance_ohm(np.zeros(self.layout.upper_m.shape))
 
     def resistance_ohm(self, displacement_m: Float) -> Float:
@@ -164,7 +166,7 @@ class Skin:
         return self._points(self.body.upper_m)
 
     def _points(self, upper: Float) -> Float:
-        """Compute the same result as :func:`skinnode.model.forward.resistance_ohm`, five times as fast."""
+        """Return the result of :func:`skinnode.model.forward.resistance_ohm`, but five times as fast."""
         lower = self.body.lower_m.reshape(-1, 3)
         square = np.zeros((upper.shape[0] * upper.shape[1], len(lower)))
         for axis in range(3):
@@ -189,7 +191,7 @@ class Skin:
         return np.asarray(self.layout.resistivity_ohm_per_m / (1.0 / path).sum(axis=(2, 3)))
 
     def _finite(self, upper: Float) -> Float:
-        """Return the resistances (U, K) between electrodes of finite size, averaged over their rims, ohm."""
+        """Return the resistances (U, K), ohm, with potentials averaged over the rims of finite electrodes."""
         radius = self.electrode * self.layout.pitch_m
         rims = []
         for points, turned in ((upper, 0.0), (self.body.lower_m, 0.5)):
@@ -205,10 +207,10 @@ class Skin:
 
 @dataclass(frozen=True)
 class Converter:
-    """Converter with relative noise ``sigma`` that, unless ``bits`` is 0, quantises R/R₀ to codes.
+    """Converter with relative noise ``sigma``; quantises R/R₀ to ``bits``-bit codes if ``bits`` is not 0.
 
-    As in the protocol, the codes span the range from ``lo`` to ``hi``, and three codes are reserved. The
-    protocol's own codec encodes and decodes codes of 16 and 24 bits.
+    Like in the protocol, the codes cover the range from ``lo`` to ``hi``, and three codes are reserved. Codes
+    of 16 and 24 bits are encoded and decoded with the protocol's codec.
     """
 
     sigma: float = 0.0
@@ -223,7 +225,7 @@ class Converter:
 
     @property
     def relative_std(self) -> float:
-        """Relative standard deviation of a reading at rest, as stated to the solver."""
+        """Relative standard deviation of a reading at rest; passed to the solver as the noise."""
         if self.exact:
             return EXACT_NOISE
         rounding = (self.hi - self.lo) / ((1 << self.bits) - 4) / math.sqrt(12.0) if self.bits else 0.0
@@ -232,7 +234,7 @@ class Converter:
     def read(
         self, resistance: Float, rest: Float, rng: np.random.Generator
     ) -> tuple[Float, NDArray[np.bool_], Float]:
-        """Read resistances; return the readings, their validity, and their relative standard deviations."""
+        """Simulate the conversion; return the readings, their validity and their relative noise."""
         if self.exact:
             return resistance, np.ones(resistance.shape, bool), np.full(resistance.shape, EXACT_NOISE)
         noisy = resistance * (1.0 + self.sigma * rng.standard_normal(resistance.shape))
@@ -255,7 +257,7 @@ class Converter:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Stream:
-    """Sequence of frames to be solved, with the true displacements and forces."""
+    """A sequence of frames to be solved, and the true displacements and forces."""
 
     frames_ohm: Float
     """(T, U, K), readings in ohm; invalid readings are not finite."""
@@ -264,13 +266,13 @@ class Stream:
     noise: Float
     """(T, U, K), relative standard deviation of each reading."""
     truth_m: Float
-    """(T, U, N, 3), true displacement, metres; NaN in physically impossible frames."""
+    """(T, U, N, 3), true displacement, metres; NaN in frames of a physically impossible motion."""
     force_n: Float
-    """(T, 3), total force of all loads, newtons; NaN in physically impossible frames."""
+    """(T, 3), total force of all loads, newtons; NaN in frames of a physically impossible motion."""
     presses: tuple[Load, ...] = ()
 
     def every(self, stride: int) -> Stream:
-        """Return a stream of every ``stride``-th frame, beginning with the first."""
+        """Return a stream with only every ``stride``-th frame, starting with the first."""
         return Stream(
             self.frames_ohm[::stride],
             self.valid[::stride],
@@ -289,15 +291,16 @@ def stream(  # noqa: PLR0913 - the parts of a stream
     rng: np.random.Generator,
     gain: Float | None = None,
 ) -> Stream:
-    """Generate a stream of frames of one or more superposed presses.
+    """Generate a stream in which one or more superposed presses deform a patch.
 
     Args:
         skin: Patch to press.
-        presses: Presses whose displacements are added.
+        presses: Presses; their displacements are added.
         shares: Fractions (T,) of the full depth, one per frame.
         converter: Converter that reads the resistances.
         rng: Random generator for the noise.
-        gain: Factors that scale the resistances, (T, U, K) or broadcastable to that shape.
+        gain: Factors by which the resistances are multiplied, (T, U, K) or broadcastable to that shape;
+            default: 1.
     """
     truth = np.stack([skin.displacement_m(presses, share) for share in shares])
     resistance = np.stack([skin.resistance_ohm(moved) for moved in truth])
@@ -318,17 +321,17 @@ def random_press(  # noqa: PLR0913 - keyword arguments, each a range
     margin: float = 2.0,
     where: Literal["inside", "edge", "half off"] = "inside",
 ) -> Press:
-    """Choose a random press by a sphere.
+    """Return a random press by a sphere.
 
     Args:
         rng: Random generator.
         layout: Patch to press.
-        depth: Depth as a fraction of the layer height.
+        depth: Depth divided by the layer height.
         radius: Minimum and maximum radius of the sphere, pitches.
         shear: Maximum coefficient of friction.
         margin: Minimum distance from the centre to the border of the patch, pitches.
-        where: ``inside``; ``edge``, with the centre on the border in x; or ``half off``, with the centre half
-            a contact radius outside the border.
+        where: ``inside``, ``edge`` or ``half off``. For ``edge``, the centre is on the patch's border in x;
+            for ``half off``, it is half a contact radius outside this border.
     """
     pitch = layout.pitch_m
     points = layout.upper_m[..., :2].reshape(-1, 2)

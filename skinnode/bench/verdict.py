@@ -1,4 +1,4 @@
-"""Judges solved wires by comparison with the truth.
+"""Compares the solved wires with the truth and assigns verdicts.
 
 Each wire of a frame receives one of three verdicts:
 
@@ -7,21 +7,21 @@ flagged    no accuracy was claimed, because the status is not CONVERGED or the d
 accurate   accuracy was claimed, and every coordinate is within the reported uncertainty
 wrong      accuracy was claimed but an error is too large, or, whatever the status, a value is not finite
 
-With noise, an error may reach 5 reported standard deviations; 6e-7 of all coordinates exceed this limit by
-chance alone. A long run must not fail by chance, and a fault must not be attributed to chance. Each row must
-therefore meet two conditions. If errors are Gaussian with the reported standard deviation, each condition
-fails with a probability of 1e-4:
+With noise, errors up to 5 reported standard deviations are accepted, but 6e-7 of all coordinates exceed this
+limit by chance. A long run must not fail by chance, and a genuine fault must not be dismissed as chance. Each
+row is therefore tested for two conditions. For Gaussian errors with the reported standard deviation, the
+probability of violating a condition is 1e-4:
 
-- No coordinate exceeds z(n) or 5 standard deviations, whichever is larger. z(n) is the limit that any of n
-  independent coordinates exceeds with probability 1e-4: 5.7 for 9,000 coordinates and 6.4 for 1e6. The
-  limit is Bonferroni's bound; correlated coordinates only decrease the probability.
-- The number of seeds with an error beyond 5 standard deviations is within the limit of a binomial
-  distribution. The probability of the distribution is the expected number of such errors per seed (an upper
-  bound). Seeds are independent even though coordinates are not.
+- No error exceeds the larger of z(n) and 5 standard deviations. With a probability of 1e-4, at least one of n
+  independent coordinates exceeds z(n), which is 5.7 for 9,000 coordinates and 6.4 for 1e6. z(n) is
+  Bonferroni's bound, so the probability is lower if coordinates are correlated.
+- The number of seeds with an error above 5 standard deviations does not exceed a limit computed from a
+  binomial distribution. The probability per seed is bounded by the expected number of such errors per seed.
+  The test counts seeds instead of coordinates, because only seeds are independent.
 
-If the second condition fails, every wire with an error beyond 5 standard deviations is wrong. With exact
-data, chance plays no role: the limit is 5 reported standard deviations or 1e-6 of the wire's largest
-displacement, whichever is larger.
+If the second condition is violated, every wire with an error above 5 standard deviations is wrong. With exact
+data, no error is attributed to chance: the limit is 5 reported standard deviations or 1e-6 of the wire's
+largest displacement, whichever is larger.
 """
 
 from __future__ import annotations
@@ -37,11 +37,11 @@ from numpy.typing import NDArray
 from skinnode.model.layout import Float
 
 LIMIT: Final = 5.0
-"""Maximum error of a coordinate, in reported standard deviations."""
+"""Maximum permissible error of a coordinate, in reported standard deviations."""
 CHANCE: Final = 1e-4
-"""Probability that a correct row is judged wrong; 350 rows per run cause one false alarm in 30 runs."""
+"""Probability of a false alarm per row; with 350 rows per run, one in about 30 runs has a false alarm."""
 EXACT_SHARE: Final = 1e-6
-"""Maximum error with exact data, relative to the wire's largest displacement."""
+"""Maximum permissible error with exact data, relative to the wire's largest displacement."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -51,7 +51,7 @@ class Solved:
     displacement_m: Float
     """(F, U, N, 3)"""
     std_m: Float
-    """(F, U, N, 3), reported standard deviation, metres; for paths, a fifth of the error estimate."""
+    """(F, U, N, 3), reported standard deviation, metres; for path methods, error estimate / 5."""
     converged: NDArray[np.bool_]
     """(F, U), whether a wire is CONVERGED and, if trust was assessed, trusted."""
 
@@ -70,7 +70,7 @@ def beyond(deviations: float) -> float:
 
 
 def limit_of(coordinates: int) -> float:
-    """Return the limit z(n), as defined in the module docstring, for n ``coordinates``; at least 5."""
+    """Return the larger of 5 and z(n) for n ``coordinates``; the module docstring defines z(n)."""
     from scipy.special import ndtri
 
     if coordinates == 0:
@@ -79,7 +79,7 @@ def limit_of(coordinates: int) -> float:
 
 
 def allowed_seeds(coordinates: int, seeds: int) -> int:
-    """Return the maximum number of seeds in which chance can explain an error beyond 5 deviations."""
+    """Return the maximum number of seeds with errors above 5 standard deviations due to chance."""
     from scipy.stats import binom
 
     if seeds == 0:
@@ -89,7 +89,7 @@ def allowed_seeds(coordinates: int, seeds: int) -> int:
 
 @dataclass
 class Tally:
-    """Accumulates the row of the report for one case and one method, over all seeds."""
+    """Accumulates the results of one method on all streams of a case, for one row of the report."""
 
     exact: bool
     seeds: int = 0
@@ -101,10 +101,10 @@ class Tally:
     _reported: list[float] = field(default_factory=list)
     _worst_error: float = math.nan
     _deviations: list[tuple[float, int, int, int]] = field(default_factory=list)
-    """Wires with an error beyond :data:`LIMIT`: (error in deviations or inf, seed, frame, wire)."""
+    """Wires with an error above :data:`LIMIT`: (error in standard deviations or inf, seed, frame, wire)."""
 
     def add(self, seed: int, solved: Solved, truth_m: Float) -> None:
-        """Add a seed's result; frames whose true displacement ``truth_m`` (F, U, N, 3) is NaN are ignored."""
+        """Add a seed's result; ignore frames in which the true displacement (F, U, N, 3) is NaN."""
         self.seeds += 1
         kept = np.flatnonzero(np.isfinite(truth_m).all(axis=(1, 2, 3)))
         truth_m, moved, std = truth_m[kept], solved.displacement_m[kept], solved.std_m[kept]
@@ -127,8 +127,8 @@ class Tally:
     def _shares(self, error: Float, std: Float, truth: Float) -> None:
         """Add the error and standard deviation of the converged wires in the deepest frame.
 
-        Error and standard deviation are relative to the displacement in the deepest frame, as is the worst
-        error, which is the largest error in any frame.
+        Errors and standard deviations are divided by the displacement in the deepest frame. The worst error
+        is the largest such quotient of all frames.
         """
         deepest = int(np.argmax(np.linalg.norm(truth.reshape(len(truth), -1), axis=1)))
         used = np.isfinite(error[deepest])
@@ -144,7 +144,7 @@ class Tally:
             self._worst_error = float(np.fmax(self._worst_error, worst))
 
     def row(self) -> dict[str, Any]:
-        """Return the accumulated figures, and the numbers of wires by verdict."""
+        """Return the accumulated statistics and the number of wires for each verdict."""
         limit = LIMIT if self.exact else limit_of(self._coordinates)
         hit = {seed for _, seed, _, _ in self._deviations}
         by_count = self.exact or len(hit) > allowed_seeds(self._coordinates, self.seeds)
@@ -172,7 +172,7 @@ class Tally:
 
 
 def named(row: Mapping[str, Any]) -> str:
-    """Describe a wrong row in one line: the case, the size of the error, and how to reproduce it."""
+    """Describe a wrong row in one line: case, method, largest error, and where that error occurred."""
     worst = row["worst"]
     far = "not finite" if worst["deviations"] is None else f"{worst['deviations']:.3g} standard deviations"
     return (

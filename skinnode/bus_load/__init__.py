@@ -1,5 +1,5 @@
-"""Computes the bandwidth that a hand needs on its buses.
+"""Computes the bus load and worst-case latencies of a hand.
 
-``stuffing`` counts bits, ``timing`` computes frame durations, ``response`` bounds the worst-case
-latency, and ``plan`` combines the results for a hand.
+``stuffing`` counts bits, ``timing`` computes frame durations, ``response`` computes worst-case latencies, and
+``plan`` combines these results for a hand.
 """

@@ -1,10 +1,10 @@
-"""Plans the traffic on a hand's buses: all frames, their load, and their worst-case delay.
+"""Plans the traffic on a hand's buses: frames, bus loads, and worst-case response times.
 
-On each bus, the plan includes SYNC, the host's heartbeat if enabled, and the frames of other devices listed
-in the hand file. SDO transfers occupy the fraction :data:`SDO_SHARE` of the bandwidth. For each patch, the
-plan includes all chunks and the summary of a scan in every SYNC period, and a heartbeat and one EMCY in every
-heartbeat period. The SDO transfers that configure a returning node are not included, because SDO frames have
-a lower priority than any PDO and therefore use only spare bandwidth.
+On each bus, the plan includes SYNC, the host's heartbeat (if enabled), and the frames of other devices (if
+listed in the hand file). The fraction :data:`SDO_SHARE` of the bandwidth is reserved for SDO transfers. For
+each patch, the plan includes the chunks and the summary of one scan per SYNC period, and one heartbeat and
+one EMCY per heartbeat period. SDO transfers for configuring a node that has rejoined the bus are not
+included: SDO frames have a lower priority than PDOs, so these transfers use only spare bandwidth.
 """
 
 from __future__ import annotations
@@ -24,24 +24,26 @@ from skinnode.errors import BusLoadError, ConfigError, Shown
 from skinnode.protocol.profile import PatchProfile
 
 SCAN_SHARE: Final = 0.8
-"""Fraction of the SYNC period reserved for scans; the remainder is for SDO, EMCY and late frames."""
+"""Fraction of the SYNC period reserved for scans; the remainder is left for SDO, EMCY and late frames."""
 
 SDO_SHARE: Final = 0.01
-"""Fraction of the bandwidth reserved for SDO; at 1 Mbit/s, one request and one response every 27 ms."""
+"""Fraction of the bandwidth reserved for SDO: at 1 Mbit/s, enough for a request and a response every 27
+ms."""
 
 NODE_LATENCY_S: Final = 2e-3
-"""Maximum time from SYNC to the first chunk, s, as specified for a node on an otherwise idle machine."""
+"""Maximum delay from SYNC to the first chunk, s, specified for a node on an otherwise idle machine."""
 
 PACE_JITTER_S: Final = 0.2e-3
-"""Maximum deviation of a chunk from its scheduled time, s, as specified for an otherwise idle machine."""
+"""Maximum deviation of a chunk from its scheduled time, s, specified for an otherwise idle machine."""
 
 _SAMPLES: Final = 512
-"""Number of frames with random data whose lengths are averaged; the standard error is 0.1 bits."""
+"""Number of random frames for estimating the mean frame length; the standard error of the mean is 0.1
+bits."""
 
 
 @dataclass(frozen=True, slots=True)
 class PlannedFrame:
-    """Frames with one identifier in the traffic plan of a bus."""
+    """Entry of a bus's traffic plan: all frames with the same identifier."""
 
     name: str
     can_id: int
@@ -52,17 +54,17 @@ class PlannedFrame:
     count: int
     """Number of frames with this identifier per period."""
     spacing_s: float
-    """Minimum time between consecutive frames of a period, s."""
+    """Minimum time between consecutive frames with this identifier within a period, s."""
     jitter_s: float
     """Maximum deviation of a frame from its scheduled time, s."""
     worst_s: float
-    """Duration of a frame that has the maximum number of stuff bits, s."""
+    """Duration of a frame with the maximum number of stuff bits, s."""
     typical_s: float
-    """Mean duration of a frame that carries random data, s."""
+    """Mean duration of a frame with random data, s."""
     scans: bool = False
-    """Whether the frames repeat with the SYNC period."""
+    """Whether the frames are sent in every SYNC period."""
     response_s: float | None = None
-    """Worst-case time from queueing a frame to its end, s; None if there is no bound."""
+    """Worst-case response time, from queueing a frame to its last bit, s; None if unbounded."""
 
     @property
     def frames_per_s(self) -> float:
@@ -82,20 +84,20 @@ class PlannedFrame:
 
 @dataclass(frozen=True, slots=True)
 class ScanTime:
-    """Nominal and worst-case duration of a patch's scan."""
+    """Nominal and worst-case duration of a scan of one patch."""
 
     patch: str
     node_id: int
     chunks: int
     paced_s: float
-    """Time from the first chunk to the last chunk, determined by the inhibit time, s."""
+    """Nominal time from the first to the last chunk, s, as determined by the inhibit time."""
     worst_s: float | None
-    """Worst-case time from queueing the SYNC to the end of the summary, s; None if there is no bound."""
+    """Worst-case time from queueing the SYNC to the end of the summary, s; None if unbounded."""
 
 
 @dataclass(frozen=True, slots=True)
 class BusPlan:
-    """Traffic plan of one bus: its frames and the duration of its scans."""
+    """Traffic plan of one bus: frames and scan durations."""
 
     bus: BusConfig
     period_s: float
@@ -110,7 +112,7 @@ class BusPlan:
 
     @property
     def load(self) -> float:
-        """Bus load with maximum-length frames, as a fraction; 1 is a full bus."""
+        """Bus load if all frames have maximum length; 1 is a fully loaded bus."""
         return sum(frame.load for frame in self.frames)
 
     @property
@@ -120,13 +122,13 @@ class BusPlan:
 
     @property
     def others(self) -> tuple[PlannedFrame, ...]:
-        """Planned frames of other devices, which the hand file lists."""
+        """Planned frames of other devices listed in the hand file."""
         named = {other.can_id for other in self.bus.others}
         return tuple(frame for frame in self.frames if frame.can_id in named)
 
     @property
     def shortest_period_ms(self) -> int | None:
-        """Shortest SYNC period at which the load is within ``max_load``, ms; None if no period suffices."""
+        """Minimum SYNC period (ms) with a load of at most ``max_load``; None if no period suffices."""
         free = self.bus.max_load - sum(frame.load for frame in self.frames if not frame.scans)
         scan_s = sum(frame.count * frame.worst_s for frame in self.frames if frame.scans)
         return int(-(-scan_s * 1e3 // free)) if free > 0 else None
@@ -139,7 +141,7 @@ def check_plan(hand: HandConfig) -> tuple[BusPlan, ...]:
         hand: the hand.
 
     Raises:
-        BusLoadError: if the load of a bus exceeds its ``max_load``.
+        BusLoadError: if a bus's load exceeds its ``max_load``.
         ConfigError: as in :func:`plan_of`.
     """
     plans = plan_of(hand)
@@ -149,14 +151,14 @@ def check_plan(hand: HandConfig) -> tuple[BusPlan, ...]:
 
 
 def require_room(hand: HandConfig, plan: BusPlan) -> None:
-    """Check that the load of a plan does not exceed the limit of its bus.
+    """Check that a plan's bus load does not exceed the bus's ``max_load``.
 
     Args:
         hand: the hand.
         plan: the traffic plan of one of the hand's buses.
 
     Raises:
-        BusLoadError: if the load exceeds the ``max_load`` of the bus.
+        BusLoadError: if the load exceeds the bus's ``max_load``.
     """
     bus, needed = plan.bus, plan.load
     if needed <= bus.max_load:
@@ -191,8 +193,8 @@ def plan_of(hand: HandConfig) -> tuple[BusPlan, ...]:
         hand: the hand.
 
     Raises:
-        ConfigError: if the wire format cannot carry the data of a patch, or another device's frame uses one
-            of the hand's identifiers.
+        ConfigError: if a patch's data do not fit the wire format, or a frame of another device has one of the
+            hand's identifiers.
     """
     profiles = {patch.name: _profile(hand, i, patch) for i, patch in enumerate(hand.patches)}
     return tuple(
@@ -201,7 +203,7 @@ def plan_of(hand: HandConfig) -> tuple[BusPlan, ...]:
 
 
 def inhibit_time_100us(period_ms: int, frames: int) -> int:
-    """Return the inhibit time (0x1800:3), in units of 100 µs, to spread a scan over SCAN_SHARE of a period.
+    """Return the inhibit time (0x1800:3), in 100 µs, that spreads a scan over SCAN_SHARE of a period.
 
     Args:
         period_ms: SYNC period, ms.
@@ -225,9 +227,7 @@ def _plan_of_bus(hand: HandConfig, i: int, bus: BusConfig, profiles: dict[str, P
     for patch in patches:
         frames += _of_a_patch(hand, bus, patch, profiles[patch.name])
     ours = {frame.can_id: frame.name for frame in frames}
-    for (
-        patch
-    ) in patches:  # the plan contains one SDO channel per bus, but every node occupies SDO identifiers
+    for patch in patches:  # the plan contains one SDO channel, but every node has its own SDO identifiers
         ours |= {
             od.command_cob_id(patch.node_id): f"commands to {patch.name}",
             od.sdo_response_cob_id(patch.node_id): f"SDO answers of {patch.name}",
@@ -309,7 +309,7 @@ def _typical_fd_bits(can_id: int, length: int) -> tuple[float, float]:
 
 
 def _responses_s(frames: tuple[PlannedFrame, ...], bus: BusConfig) -> dict[int, float | None]:
-    """Compute the worst-case response time of each frame, s, by identifier; None if there is no bound."""
+    """Return a mapping from identifier to worst-case response time, s; None if unbounded."""
     messages = [
         Message(
             frame.can_id,
@@ -336,7 +336,7 @@ def _ceil_ns(time_s: float) -> int:
 def _scan_time(
     patch: PatchConfig, profile: PatchProfile, hand: HandConfig, answers: dict[int, float | None]
 ) -> ScanTime:
-    """Compute a patch's scan time; the worst case adds SYNC, latency, pacing, last chunk and summary."""
+    """Compute a patch's scan time; the worst case sums SYNC, latency, pacing, last chunk and summary."""
     spacing_s = inhibit_time_100us(hand.sync.period_ms, profile.n_chunks + 1) * 1e-4
     paced_s = (profile.n_chunks - 1) * spacing_s
     parts = [

@@ -1,18 +1,18 @@
-"""Computes worst-case response times on a CAN bus, from queueing a frame to the end of its last bit.
+"""Computes worst-case response times on a CAN bus: from queueing a frame to the end of its last bit.
 
 The analysis follows Davis, Burns, Bril, Lukkien, "Controller Area Network (CAN) schedulability analysis:
-Refuted, revisited and revised", Real-Time Systems 35, 2007, section 3. The lowest identifier wins
-arbitration, and the transmission of a frame is never interrupted. The analysis examines every instance of a
-message in the longest busy period of its priority, because the first instance does not always have the
-longest response time.
+Refuted, revisited and revised", Real-Time Systems 35, 2007, section 3. The frame with the lowest identifier
+wins arbitration, and a transmission is never preempted. The analysis examines all instances of a message in
+its longest priority-level busy period, because the worst response time is not always that of the first
+instance.
 
 This module extends the analysis to messages that are sent in bursts, such as the chunks of a scan: each
-period begins with ``count`` frames that are ``spacing_ns`` apart. A window that starts with a burst contains
-the maximum number of frames. The analysis therefore remains valid if this number replaces the paper's ⌈(t +
-J) / T⌉.
+period starts with ``count`` frames at intervals of ``spacing_ns``. The number of frames in a time window is
+greatest if the window starts with a burst. With this maximum number instead of the paper's ⌈(t + J) / T⌉, the
+analysis remains valid.
 
-The analysis covers neither retransmission after errors nor controllers that may send a frame of lower
-priority first.
+Retransmissions after errors are not modelled, nor are controllers that do not always send their
+highest-priority frame first.
 """
 
 from __future__ import annotations
@@ -23,24 +23,24 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True, slots=True)
 class Message:
-    """Message of the analysis: all frames with the same identifier. Times are integers in nanoseconds.
+    """A message, i.e. all frames with the same identifier. Times are integers in nanoseconds.
 
     Raises:
         ValueError: if a burst is longer than its period, or a time is not positive.
     """
 
     can_id: int
-    """Identifier, unique on the bus; it is also the priority, and the lowest identifier wins."""
+    """Identifier, unique on the bus; a lower identifier has a higher priority."""
     time_ns: int
     """Maximum duration of a frame, including the inter-frame space, ns."""
     period_ns: int
-    """Minimum time from the start of one burst to the start of the next, ns."""
+    """Minimum time between the starts of consecutive bursts, ns."""
     count: int = 1
     """Number of frames per burst."""
     spacing_ns: int = 0
     """Minimum time between consecutive frames of a burst, ns."""
     jitter_ns: int = 0
-    """Maximum queueing jitter of a frame, ns; frames of the same message keep their order."""
+    """Maximum queueing jitter of a frame, ns; jitter does not change the order of frames."""
 
     def __post_init__(self) -> None:
         for name, least in (
@@ -57,7 +57,7 @@ class Message:
             raise ValueError(f"spacing_ns: got {burst}, must fit {self.period_ns} ns")
 
     def due_ns(self, instance: int) -> int:
-        """Return the time at which an instance is due, relative to instance 0, ns."""
+        """Return an instance's due time relative to instance 0, ns."""
         burst, number = divmod(instance, self.count)
         return burst * self.period_ns + number * self.spacing_ns
 
@@ -73,17 +73,16 @@ class Message:
 
 
 def response_time_ns(message: Message, others: Sequence[Message], bit_ns: int) -> int | None:
-    """Return the maximum time from a message's due time to the end of its last bit, ns.
+    """Return the maximum time from the due time of a frame to the end of the frame's last bit, ns.
 
     Args:
         message: the message.
         others: the other messages on the bus.
-        bit_ns: bit time, ns; a frame that is queued up to one bit time after the start of arbitration still
-            competes.
+        bit_ns: bit time, ns; a frame queued up to one bit time after the start of arbitration can still win.
 
     Returns:
-        The response time; None if there is no bound, because the message and all messages of higher priority
-        need the whole bandwidth.
+        The response time; None if it is unbounded, because the message and all higher-priority messages
+        together need the whole bandwidth.
     """
     higher = [other for other in others if other.can_id < message.can_id]
     blocking_ns = max((other.time_ns for other in others if other.can_id > message.can_id), default=0)
@@ -97,7 +96,7 @@ def response_time_ns(message: Message, others: Sequence[Message], bit_ns: int) -
     longest_ns, wait_ns = 0, blocking_ns
     for instance in range(message.most_in(busy_ns)):
         own_ns = blocking_ns + instance * message.time_ns
-        wait_ns = max(wait_ns, own_ns)  # the waiting time of the previous instance is a lower bound
+        wait_ns = max(wait_ns, own_ns)  # lower bound for the search: the previous instance's waiting time
         while (longer_ns := own_ns + _work_ns(higher, wait_ns + bit_ns)) > wait_ns:
             wait_ns = longer_ns
         passed_ns = wait_ns - message.due_ns(instance) + message.time_ns

@@ -1,7 +1,7 @@
-"""Compiled kernels for :mod:`skinnode.bus_load.timing`, which count the bits of frames, including stuff bits.
+"""Compiled kernels of :mod:`skinnode.bus_load.timing` that count a frame's bits, including stuff bits.
 
-The kernels operate on arrays with identifiers of type uint32, lengths and payloads of type uint8, and bit
-counts of type int64.
+Identifiers are arrays of uint32, lengths and payloads are arrays of uint8, and bit counts are arrays of
+int64.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from skinnode.compiled.jit import njit_brief
 HEAD_BITS: Final = 19  # head: SOF, 11-bit identifier, RTR, IDE, r0, 4-bit DLC
 CRC_BITS: Final = 15
 TAIL_BITS: Final = 13
-"""Length of CRC delimiter, ACK slot, ACK delimiter, end of frame (7) and inter-frame space (3), bits."""
+"""Number of bits in CRC delimiter, ACK slot, ACK delimiter, end of frame (7) and inter-frame space (3)."""
 FD_NOMINAL_BITS: Final = 17 + 12  # SOF, 11-bit identifier, RRS, IDE, FDF, res, BRS, and the tail
 _CRC_POLYNOMIAL: Final = 0x4599
 _RUN: Final = 5
@@ -29,10 +29,11 @@ _Bytes = NDArray[np.uint8]
 
 @functools.cache
 def tables() -> tuple[tuple[int, ...], tuple[int, ...], tuple[int, ...]]:
-    """Return the CRC by byte, and the next run and the number of stuff bits by ``run << 8 | byte``.
+    """Return three tables: CRC, next run, and number of stuff bits.
 
-    A run is encoded as 0 before the first bit, otherwise as (value << 2 | length − 1) + 1 with a length of 1
-    to 4. After the fifth equal bit, a stuff bit is inserted, which begins a new run.
+    The CRC table is indexed by byte, the other tables by ``run << 8 | byte``. A run of 1 to 4 equal bits is
+    encoded as (value << 2 | length − 1) + 1; before the first bit of a frame, the run is 0. After five equal
+    bits, a stuff bit is inserted, and this bit begins a new run.
     """
     crc_table = []
     for byte in range(256):
@@ -75,8 +76,8 @@ def are_loaded() -> bool:
 def load_kernels() -> None:
     """Compile the kernels, or load them from the cache.
 
-    Call this function in advance: loading takes half a second, during which a receiving thread cannot answer
-    requests.
+    Call this function before communication starts: loading takes half a second, and a receiving thread cannot
+    answer requests during this time.
     """
     global _loaded
     _loaded = True
@@ -86,14 +87,14 @@ def load_kernels() -> None:
 
 
 def classic_bits(ids: NDArray[np.uint32], lengths: _Bytes, payload: _Bytes, stride: int, bits: _Int) -> int:
-    """Count the bits of classic data frames.
+    """Count the bits of each classic data frame.
 
     Args:
         ids: (n,) identifiers.
         lengths: (n,) data lengths, bytes.
         payload: the data of all frames, concatenated.
-        stride: distance in ``payload`` between the starts of consecutive frames, bytes; 0 if there are no
-            gaps.
+        stride: distance between the data of consecutive frames in ``payload``, bytes; 0 if the data are
+            contiguous.
         bits: (n,) output, number of bits in each frame.
 
     Returns:
@@ -103,7 +104,7 @@ def classic_bits(ids: NDArray[np.uint32], lengths: _Bytes, payload: _Bytes, stri
 
 
 def fd_bits(ids: NDArray[np.uint32], lengths: _Bytes, payload: _Bytes, nominal: _Int, fast: _Int) -> None:
-    """Count the bits of CAN FD frames.
+    """Count the bits of each CAN FD frame.
 
     Args:
         ids: (n,) identifiers.
@@ -128,9 +129,8 @@ def _classic(  # noqa: PLR0913 - arrays of a compiled kernel
         crc = (crc << 8 & 0x7FFF) ^ np.int64(crc_of[crc >> 7 ^ (head & 0xFF)])
         for k in range(begin, begin + length):
             crc = (crc << 8 & 0x7FFF) ^ np.int64(crc_of[crc >> 7 ^ np.int64(payload[k])])
-        # Head and CRC have 19 + 15 bits, two more than four bytes, so six filler bits complete five bytes.
-        # The bytes of the stuffed region straddle payload bytes, so each is assembled from two adjacent
-        # payload bytes.
+        # The head has 19 bits and the CRC 15 bits; six filler bits extend them to five bytes. In the stuffed
+        # region, the payload is not byte-aligned, so each byte is assembled from two adjacent payload bytes.
         stream = (ALTERNATING & 0x3F) << 18 | head >> 1
         stuff: Any = 0
         run: Any = 0
@@ -166,9 +166,9 @@ def _fd(  # noqa: PLR0913 - arrays of a compiled kernel
         else:
             code = 11 + length // 16  # 32, 48, 64
 
-        # Two filler bits extend the 22 bits up to and including the length code to three bytes, and the data
-        # bytes follow. FDF, res and BRS alternate, so no stuff bit falls between the first two bytes
-        # (nominal) and ESI.
+        # Two filler bits extend the 22 bits from SOF to the length code to three bytes; the data bytes
+        # follow. FDF, res and BRS alternate, so no stuff bit is inserted between the first two bytes (sent at
+        # the nominal bit rate) and ESI.
         stream = 0b01 << 22 | np.int64(ids[i] & 0x7FF) << 10 | 0b10100000 | code
         slow: Any = 0
         stuff: Any = 0
@@ -185,7 +185,7 @@ def _fd(  # noqa: PLR0913 - arrays of a compiled kernel
             entry = np.int64(run_of[run << 8 | np.int64(payload[k])])
             stuff, run = stuff + (entry & 0xFF), entry >> 8
             last = np.int64(payload[k]) & 1
-        # A stuff bit due after the last bit is not sent, because the first fixed stuff bit replaces it.
+        # If a stuff bit is due after the last bit, the first fixed stuff bit replaces it.
         if run - 1 >> 2 != last:
             stuff -= 1
         crc_bits, fixed = (17, 6) if length <= 16 else (21, 7)

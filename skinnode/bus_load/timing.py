@@ -1,20 +1,22 @@
 """Computes the exact duration of CAN frames on the bus (ISO 11898-1:2015), and the resulting bus load.
 
-Classic frames. From start of frame to the end of the CRC sequence, a stuff bit of the opposite value follows
-every five equal bits. Stuff bits themselves count towards the next five equal bits. The 13-bit tail is not
-stuffed: CRC delimiter, ACK slot, ACK delimiter, 7-bit end of frame and 3-bit inter-frame space. The CRC has
-15 bits, the polynomial 0x4599 and the initial value 0.
+Classic frames. From the start of frame to the end of the CRC sequence, five consecutive equal bits are
+followed by a stuff bit of the opposite value. A stuff bit may itself be the first of the next five equal
+bits. The 13-bit tail is not stuffed; it consists of CRC delimiter, ACK slot, ACK delimiter, 7-bit end of
+frame and 3-bit inter-frame space. The CRC has 15 bits, the polynomial 0x4599 and the initial value 0.
 
-Tables are used to compute CRC and stuffing byte by byte. The head of a frame is padded on the left to whole
-bytes. For the CRC, the padding consists of zeros, which leave the CRC at 0. For stuffing, the padding
-consists of alternating bits that end in a 1, so the dominant start of frame begins a new run.
+CRC and stuff bits are computed from tables, one byte at a time. The head of a frame is therefore padded to
+whole bytes with leading filler bits. For the CRC, the filler bits are zeros, which do not change the initial
+CRC of 0. For stuffing, the filler bits alternate and end with a 1, so that the dominant start of frame begins
+a new run.
 
-The CAN FD frames of a hand have an 11-bit identifier and switch the bit rate; only :func:`exact_fd_bits`
-counts other CAN FD frames. Bit stuffing follows the same rule up to the end of the data. The CRC field holds
-a 4-bit stuff count, 17 CRC bits (21 for more than 16 data bytes), and fixed stuff bits: one at the start of
-the field and one after every 4 bits. The bits from ESI to the CRC delimiter are sent at the data bit rate.
-The 17 bits before ESI (36 bits with a 29-bit identifier) and the 12 bits after the CRC delimiter (ACK slot,
-ACK delimiter, 7-bit end of frame and 3-bit inter-frame space) are sent at the nominal bit rate.
+The CAN FD frames of a hand have an 11-bit identifier and switch the bit rate. Other CAN FD frames are
+supported only by :func:`exact_fd_bits`. In CAN FD frames, the stuffing rule of classic CAN applies up to the
+end of the data. The CRC field contains a 4-bit stuff count, 17 CRC bits (21 for more than 16 data bytes), and
+fixed stuff bits: one before the first bit and one after every 4 bits. The bits from ESI to the CRC delimiter
+are sent at the data bit rate. The 17 bits before ESI (36 bits with a 29-bit identifier) and the 12 bits after
+the CRC delimiter (ACK slot, ACK delimiter, 7-bit end of frame and 3-bit inter-frame space) are sent at the
+nominal bit rate.
 """
 
 from __future__ import annotations
@@ -59,7 +61,7 @@ def nominal_bits(dlc: int, *, extended: bool = False) -> int:
 
 
 def worst_case_bits(dlc: int, *, extended: bool = False) -> int:
-    """Return the maximum length of a frame, bits: one stuff bit after 5 bits and after every 4 thereafter.
+    """Return the maximum frame length (bits), with a stuff bit after the first 5 bits and after every 4 more.
 
     Source: Davis, Burns, Bril, Lukkien, "Controller Area Network (CAN) schedulability analysis", 2007, eq. 1.
     """
@@ -70,17 +72,17 @@ def worst_case_bits(dlc: int, *, extended: bool = False) -> int:
 def exact_bits(
     can_id: int, data: bytes, *, extended: bool = False, remote: bool = False, dlc: int | None = None
 ) -> int:
-    """Return the number of bits that a classic frame takes on the bus, including the inter-frame space.
+    """Return the exact number of bits of a classic frame, including stuff bits and inter-frame space.
 
     Args:
         can_id: identifier.
         data: data bytes.
         extended: whether the identifier has 29 bits.
-        remote: whether the frame is a remote frame, which carries no data.
+        remote: whether the frame is a remote frame, which has no data.
         dlc: length code of a remote frame.
 
     Raises:
-        ValueError: if the identifier does not fit, or there are more than 8 bytes.
+        ValueError: if the identifier is too large, or there are more than 8 data bytes.
     """
     if not 0 <= can_id < 1 << (29 if extended else 11):
         raise ValueError(f"can_id: got 0x{can_id:X}, must fit {29 if extended else 11} bits")
@@ -118,28 +120,29 @@ def exact_bits(
 def exact_fd_bits(
     can_id: int, data: bytes, *, extended: bool = False, brs: bool = True, esi: bool = False
 ) -> tuple[int, int]:
-    """Return the number of bits that a CAN FD frame takes on the bus, including the inter-frame space.
+    """Return the exact number of bits of a CAN FD frame, including stuff bits and inter-frame space.
 
     Args:
         can_id: identifier.
         data: data bytes.
         extended: whether the identifier has 29 bits.
-        brs: whether the frame switches to the data bit rate; otherwise all bits have the nominal bit rate.
+        brs: whether the frame switches to the data bit rate; if False, all bits are sent at the nominal bit
+            rate.
         esi: whether the error state indicator is recessive, as sent by an error-passive node.
 
     Returns:
         The numbers of bits at the nominal bit rate and at the data bit rate.
 
     Raises:
-        ValueError: if the identifier does not fit, or the length is not valid in CAN FD.
+        ValueError: if the identifier is too large, or the length is not valid in CAN FD.
     """
     if not 0 <= can_id < 1 << (29 if extended else 11):
         raise ValueError(f"can_id: got 0x{can_id:X}, must fit {29 if extended else 11} bits")
     code = _FD_CODES.get(len(data))
     if code is None:
         raise ValueError(f"data: got {counted(len(data), 'byte')}, must be one of {FD_LENGTHS}")
-    # FDF, res, BRS, ESI and the length code are the last byte of the head. FDF and res differ, and so do res
-    # and BRS if the bit rate is switched, so no stuff bit falls between FDF and ESI.
+    # The last byte of the head consists of FDF, res, BRS, ESI and the length code. FDF and res differ; if the
+    # bit rate is switched, res and BRS also differ. No stuff bit is therefore inserted between FDF and ESI.
     last = 0x80 | brs << 5 | esi << 4 | code
     if extended:  # filler, SOF, base identifier, SRR, IDE, identifier extension, RRS
         before = (0b1010101 << 33 | (can_id >> 18) << 21 | 0b11 << 19 | (can_id & 0x3FFFF) << 1).to_bytes(5)
@@ -159,7 +162,7 @@ def exact_fd_bits(
         at = run << 8 | byte
         stuff += stuffed[at]
         run = next_run[at]
-    # A stuff bit due after the last bit is not sent, because the first fixed stuff bit replaces it.
+    # If a stuff bit is due after the last bit, the first fixed stuff bit replaces it.
     if run - 1 >> 2 != ((data[-1] if data else code) & 1):
         stuff -= 1
     crc_bits, fixed = (17, 6) if len(data) <= 16 else (21, 7)
@@ -168,14 +171,15 @@ def exact_fd_bits(
 
 
 def fd_bits(can_id: ArrayLike, data: ArrayLike) -> tuple[_Int, _Int]:
-    """Count the bits of each of several CAN FD frames of the same length.
+    """Count the bits of each CAN FD frame; all frames have the same length.
 
     Args:
         can_id: (n,) identifiers.
         data: (n, length) bytes.
 
     Returns:
-        (n,) bits at the nominal bit rate, including inter-frame space, and (n,) bits at the data bit rate.
+        (n,) numbers of bits at the nominal bit rate, including inter-frame space, and (n,) at the data bit
+        rate.
 
     Raises:
         ValueError: if a shape is wrong, an identifier has more than 11 bits, or the length is not valid in
@@ -197,7 +201,7 @@ def fd_bits(can_id: ArrayLike, data: ArrayLike) -> tuple[_Int, _Int]:
 
 @functools.cache
 def fd_worst_case_bits(length: int) -> tuple[int, int]:
-    """Return the maximum number of bits that a CAN FD frame of a given length can have.
+    """Return the maximum number of bits of a CAN FD frame with the given data length.
 
     Args:
         length: number of data bytes.
@@ -210,9 +214,9 @@ def fd_worst_case_bits(length: int) -> tuple[int, int]:
     """
     if length not in FD_LENGTHS:
         raise ValueError(f"length: got {length}, must be one of {FD_LENGTHS}")
-    # In the 14 bits from SOF to IDE, a stuff bit may follow the first 5 bits and every 4 thereafter. FDF, res
-    # and BRS alternate, ESI is 0, and the length code is known. The data are those of the worst case. The
-    # initial run is a single recessive bit, BRS.
+    # In the 14 bits from SOF to IDE, there may be a stuff bit after the first 5 bits and after every 4 more.
+    # FDF, res and BRS alternate, ESI is 0, and the length code is known. The data are chosen for the worst
+    # case. The first run is a single recessive bit, BRS.
     stuff = {(1 << 2) + 1: 0}
     code = FD_LENGTHS.index(length)
     choices: list[tuple[int, ...]] = [(0,), *((code >> shift & 1,) for shift in (3, 2, 1, 0))]
@@ -235,7 +239,7 @@ def fd_worst_case_bits(length: int) -> tuple[int, int]:
 
 
 def exact_bits_batch(can_id: ArrayLike, dlc: ArrayLike, data: ArrayLike) -> _Int:
-    """Count the bits of each of many classic data frames, as :func:`exact_bits` does for one frame.
+    """Count the bits of each classic data frame, like :func:`exact_bits` for a single frame.
 
     Args:
         can_id: (n,) identifiers of 11 bits.
@@ -267,7 +271,7 @@ def exact_bits_batch(can_id: ArrayLike, dlc: ArrayLike, data: ArrayLike) -> _Int
 class BusLoad:
     """Counts frames and their exact total length in bits.
 
-    Adding a frame is fast, because bits are counted in batches. An instance is not thread-safe.
+    Frames are added quickly, because their bits are counted later in batches. An instance is not thread-safe.
 
     Args:
         bitrate_bps: nominal bit rate, bit/s.
@@ -300,9 +304,9 @@ class BusLoad:
         dlc: int = 0,
         fd: bool = False,
     ) -> None:
-        """Count a frame and its bits, as given by :func:`exact_bits` or, for CAN FD, :func:`fd_bits`.
+        """Add a frame; its bits are counted like in :func:`exact_bits` or, for CAN FD, :func:`fd_bits`.
 
-        ``data`` is kept until the next batch, without being copied.
+        Until the bits are counted, the counter keeps a reference to ``data``, not a copy.
         """
         if extended or remote:
             self._bits += exact_bits(can_id, data, extended=extended, remote=remote, dlc=dlc)
@@ -314,7 +318,7 @@ class BusLoad:
         """Count data frames with 11-bit identifiers.
 
         Args:
-            frames: for each frame a tuple of identifier, data and any further items, which are ignored.
+            frames: for each frame, a tuple of identifier and data; further items of a tuple are ignored.
             fd: whether the frames are CAN FD frames.
         """
         ids, data = self._fd if fd else self._classic
@@ -330,12 +334,12 @@ class BusLoad:
 
     @property
     def bits(self) -> int:
-        """Number of bits counted so far, in nominal bit times; bits of the data phase are shorter."""
+        """Total length of all counted frames, in nominal bit times; bits of the data phase are shorter."""
         self._work_off()
         return self._bits + round(self._fast_bits * self._data_bit)
 
     def load(self, time_s: float) -> float:
-        """Return the fraction of a time interval that the counted frames occupy; it can exceed 1.
+        """Return the total duration of the counted frames divided by ``time_s``; the quotient may exceed 1.
 
         Args:
             time_s: length of the interval, s.
@@ -347,7 +351,7 @@ class BusLoad:
         self._frames += len(ids)
         if (
             not stuffing.are_loaded()
-        ):  # loading the kernels would noticeably delay a command that runs for 1 or 2 s
+        ):  # do not load the kernels: this would noticeably delay a command that runs for 1 or 2 s
             self._bits += sum(map(exact_bits, ids, data))
         elif ids:
             self._bits += stuffing.classic_bits(*_packed(ids, data), 0, np.empty(len(ids), np.int64))
@@ -369,7 +373,7 @@ def _packed(
 ) -> tuple[NDArray[np.uint32], NDArray[np.uint8], NDArray[np.uint8]]:
     """Return (n,) identifiers, (n,) lengths and the concatenated data, in writable arrays.
 
-    The data are copied, because numba would compile a kernel a second time for read-only arrays.
+    The data are copied, because numba would compile the kernels again for read-only arrays.
     """
     lengths, joined = bytearray(map(len, data)), bytearray().join(data)
     return np.array(array("I", ids)), np.frombuffer(lengths, np.uint8), np.array(joined, np.uint8)

@@ -5,6 +5,6 @@
     hand -> vcan_sim.fleet (nodes on a virtual bus) -> skinnode.host -> run (score against the truth) -> view,
     plot
 
-Only this package and some benchmarks import both the simulator and the host. Simulator and host communicate
-only over the bus. The simulator's true displacements are used only for scoring.
+No other package except some benchmarks imports both the simulator and the host. The simulator and the host
+communicate only over the bus. The simulator's true displacements are used only for scoring.
 """

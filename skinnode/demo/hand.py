@@ -9,11 +9,12 @@ from skinnode.config import HandConfig, parse_hand
 
 _NAMES: Final = ("palm", "thumb", "index", "middle", "ring", "little", "wrist", "back")
 _SYNC_MS_PER_PATCH: Final = 20
-"""SYNC period per patch, ms; 101 frames of up to 135 bits per scan then load a 1 Mbit/s bus to 68 %."""
+"""SYNC period (ms) divided by the number of patches; with 101 frames of up to 135 bits per scan, the load of
+a 1 Mbit/s bus is 68 %."""
 
 
 def demo_hand(patches: int, seed: int) -> HandConfig:
-    """Return a hand of reference patches on one virtual bus that no other program uses.
+    """Return a hand of reference patches on a virtual bus not used by any other program.
 
     Args:
         patches: Number of patches, 1 to 127.

@@ -1,4 +1,4 @@
-"""Plots a demo run: true displacement, estimate and error of each patch."""
+"""Plots a demo run: each patch's true displacement, estimate and error."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from skinnode.model.layout import Float
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PatchTrace:
-    """Plot data of one patch; times are in seconds since the first scan, lengths in metres."""
+    """Plot data of one patch; times are in seconds since the start, lengths in metres."""
 
     name: str
     rest_m: Float
@@ -23,11 +23,11 @@ class PatchTrace:
     time_s: Float
     """(T,)"""
     depth_m: Float
-    """(T,), true depth of the deepest electrode in each scan."""
+    """(T,), true depth of each scan's deepest electrode."""
     error_m: Float
-    """(T,), RMS error of the field of each scan."""
+    """(T,), RMS error of each scan's field."""
     reported_m: Float
-    """(T,), RMS reported standard deviation of the field of each scan."""
+    """(T,), RMS reported standard deviation of each scan's field."""
     snapshot_truth_m: Float
     """(U, N, 3), true displacement in the deepest scan."""
     snapshot_m: Float
@@ -37,7 +37,7 @@ class PatchTrace:
 def _map(  # noqa: PLR0913 - the options of an image
     axes: Any, field_m: Float, rest_m: Float, *, scale_um: float, colours: str, low: float
 ) -> Any:
-    """Plot the depth of a displacement field as an image of the patch; the axes are in mm."""
+    """Plot the depth of a displacement field as a colour image of the patch."""
     x, y = 1e3 * rest_m[..., 0], 1e3 * rest_m[..., 1]
     half = 0.5 * (x[0, 1] - x[0, 0]) if x.shape[1] > 1 else 1.0
     extent = (x.min() - half, x.max() + half, y.min() - half, y.max() + half)
@@ -73,7 +73,7 @@ def draw_demo(file: Path, traces: Sequence[PatchTrace]) -> None:
     FigureCanvasAgg(figure)
     grid = figure.subplots(4, count, squeeze=False, height_ratios=[1, 1, 1, 0.9])
     deepest_um = 1e6 * max(float(-trace.snapshot_truth_m[..., 2].min()) for trace in traces)
-    full_um = max(deepest_um, 1.0)  # an axis must not have zero range, even if no patch has been pressed
+    full_um = max(deepest_um, 1.0)  # avoids an axis with zero range if no patch has been pressed
     shear_um = 1e6 * max(float(np.abs(trace.snapshot_truth_m[..., :2]).max()) for trace in traces)
     highest_um = 1e6 * max(float(np.fmax(trace.error_m, trace.reported_m).max()) for trace in traces)
     errors = [trace.snapshot_m - trace.snapshot_truth_m for trace in traces]

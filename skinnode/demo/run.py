@@ -35,22 +35,23 @@ BITRATE_BPS: Final = 1_000_000
 _REDRAW_S: Final = 0.2
 _LINE_S: Final = 1.0
 _LULL_S: Final = 0.004
-"""Time without a new field after which all scans of a SYNC are assumed to be solved, s."""
+"""Waiting time for a new field, s; after this time, all scans of the current SYNC are assumed to be
+solved."""
 
 
 @dataclass(frozen=True, slots=True)
 class PatchReport:
-    """Results for one patch, shown as one row of the report."""
+    """Results for one patch: one row of the report."""
 
     patch: str
     node_id: int
     scans_sent: int
     scans_solved: int
     scans_skipped: int
-    """Number of scans that were skipped because a newer scan arrived before a solver was free."""
+    """Number of scans skipped because a newer scan arrived before a solver became free."""
     scans_torn: int
     frames_lost: int
-    """Number of PDOs that the node sent but that the host did not assemble into a scan."""
+    """Number of PDOs sent by the node but not assembled into a scan by the host."""
     latency_p50_ms: float
     latency_p99_ms: float
     score: Score
@@ -66,12 +67,13 @@ class Report:
     scan_rate_hz: float
     patches: tuple[PatchReport, ...]
     frames_sent: int
-    """Number of PDOs that the nodes sent."""
+    """Number of PDOs sent by the nodes."""
     frames_received: int
-    """Number of PDOs that the host assembled into scans."""
+    """Number of PDOs assembled into scans by the host."""
     frames_lost: int
     bus_load: float
-    """Load that all frames of the scan phase would cause on a 1 Mbit/s bus, as a fraction."""
+    """Equivalent bus load: time that all frames would occupy on a 1 Mbit/s bus, as a fraction of the run's
+    duration."""
     faults: tuple[str, ...]
     """Reasons for exit status 1; empty if the run succeeded."""
 
@@ -86,14 +88,14 @@ class Run:
 
 @dataclass
 class _Watch:
-    """Data collected for one patch during the run; only the main thread uses this object."""
+    """Data collected for one patch during a run; used only by the main thread."""
 
     config: PatchConfig
     scorer: Scorer
     arrivals_s: deque[float] = field(default_factory=lambda: deque(maxlen=32))
     latency_ms: list[float] = field(default_factory=list)
     history: list[tuple[float, float, float, float]] = field(default_factory=list)
-    """For each scan: time (s), true depth, RMS error and RMS reported standard deviation (m)."""
+    """For each scan: time (s), true depth (m), RMS error (m) and RMS reported standard deviation (m)."""
     deepest: tuple[float, Float, Float] | None = None
     newest: FieldFrame | None = None
     distrust: str = ""
@@ -143,13 +145,13 @@ class _Watch:
 
 
 def _depth_std_m(frame: FieldFrame) -> float:
-    """Return the reported standard deviation of the depth at the deepest electrode."""
+    """Return the standard deviation reported for the deepest electrode's depth."""
     deepest = frame.displacement_m[..., 2].argmin()
     return float(frame.displacement_std_m[..., 2].flat[deepest])
 
 
 class _Progress:
-    """Displays the progress of a run: a live view on a terminal, one line per second on other outputs."""
+    """Displays the progress of a run: as a live view on a terminal, otherwise as one line per second."""
 
     def __init__(self, console: Console, hand: HandConfig, watches: Sequence[_Watch], seconds: float) -> None:
         self._console, self._watches, self._seconds = console, watches, seconds
@@ -194,12 +196,12 @@ class _Progress:
 
 
 def play(hand: HandConfig, seconds: float, console: Console) -> Run:
-    """Run a hand, and score the decoded fields by comparison with the true displacements.
+    """Run a simulated hand, and compare the decoded fields with the true displacements.
 
     Args:
-        hand: Hand whose patches are on a virtual bus.
-        seconds: Duration of the run, from the first scan.
-        console: Console on which progress is printed.
+        hand: Hand with all patches on virtual buses.
+        seconds: Duration of the run.
+        console: Console for the progress display.
 
     Raises:
         SkinError: The simulated patches or the host cannot run.
@@ -218,7 +220,7 @@ def play(hand: HandConfig, seconds: float, console: Console) -> Run:
         soft_wrap=True,
     )
     with responsive_threads(), Fleet(hand) as fleet:
-        # Entering this block collects garbage before the first SYNC.
+        # Entering this ``with`` block triggers a garbage collection before the first SYNC.
         with without_long_collections(), Host.from_config(hand) as host:
             bits_before = _bits(host)
             t_start_ns = time.monotonic_ns()
@@ -232,12 +234,12 @@ def play(hand: HandConfig, seconds: float, console: Console) -> Run:
                     if frame is not None:
                         unscored.append(frame)
                         continue
-                    # Score and display fields between two scans, so as not to delay the host.
+                    # Score and display fields only between scans, to avoid delaying the host.
                     if unscored:
                         _take(unscored.popleft(), watches, fleet, t_start_ns)
                     progress.update(host, elapsed_s, bits_before)
             bits, elapsed_s = _bits(host) - bits_before, (time.monotonic_ns() - t_start_ns) * 1e-9
-        while (frame := subscription.get(0.0)) is not None:  # fields solved while the host was closing
+        while (frame := subscription.get(0.0)) is not None:  # fields solved while the host closed
             unscored.append(frame)
         for frame in unscored:
             _take(frame, watches, fleet, t_start_ns)
@@ -287,7 +289,7 @@ def _bits(host: Host) -> int:
 
 
 def _losses(host: Host) -> int:
-    """Return the number of losses counted by the host: frames dropped from its queues, and lost chunks."""
+    """Return the host's loss count: frames dropped from the host's queues plus lost chunks."""
     stats = host.stats()
     dropped = sum(bus.dropped for bus in stats.buses.values())
     return dropped + sum(stream.assembler.chunks_lost for stream in stats.patches.values())
@@ -323,7 +325,7 @@ def _faults(rows: Sequence[PatchReport], lost: int) -> tuple[str, ...]:
 
 
 def print_report(console: Console, report: Report) -> None:
-    """Print the results of all patches as a table, and each fault on a line."""
+    """Print the results of all patches as a table, and then one line per fault."""
     table = Table(box=None, header_style="dim", padding=(0, 1, 0, 0))
     table.add_column("\npatch")
     for heading in (
@@ -385,6 +387,6 @@ def print_report(console: Console, report: Report) -> None:
 
 
 def as_json(report: Report) -> dict[str, Any]:
-    """Convert the report to types that JSON supports; missing values become None."""
+    """Convert the report to JSON-compatible types; missing values become None."""
     result: dict[str, Any] = plain(dataclasses.asdict(report))
     return result

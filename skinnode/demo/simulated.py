@@ -1,7 +1,7 @@
-"""Runs simulated patches for commands that demonstrate a host.
+"""Runs simulated patches for commands that demonstrate the host.
 
-The patches run in a separate process. Simulated patches, like those of a real hand, do not share a Python
-interpreter with the host, so performance figures measure only the host.
+The patches run in a separate process, so that they do not share a Python interpreter with the host.
+Performance figures are therefore those of the host only, as with a real hand.
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ from skinnode.process.child_processes import starting_children
 
 
 def on_simulated_buses(hand: HandConfig) -> HandConfig:
-    """Return a copy of the hand in which virtual buses between local processes replace the real buses.
+    """Return a copy of the hand with virtual buses (UDP multicast) in place of the real buses.
 
-    Simulated nodes must never send on a bus with real nodes. Simulated patches match their layouts exactly,
-    so the copy states exact tolerances.
+    The buses are replaced because simulated nodes must never send on a bus with real nodes. The copy states
+    exact tolerances, because simulated patches match their layouts exactly.
     """
     exact = TolerancesConfig.model_validate("exact")
     patches = tuple(patch.model_copy(update={"tolerances": exact}) for patch in hand.patches)
@@ -42,7 +42,7 @@ def on_simulated_buses(hand: HandConfig) -> HandConfig:
 
 @contextmanager
 def simulated(hand: HandConfig) -> Iterator[None]:
-    """Run a hand's patches as nodes on its buses, in a child process that exits with this process.
+    """Run a hand's patches as nodes in a child process, which exits when its parent exits.
 
     Raises:
         SkinError: The child process cannot run the patches.
@@ -62,7 +62,7 @@ def simulated(hand: HandConfig) -> Iterator[None]:
             raise SkinError(f"simulated patches: {complaint}")
         yield
     finally:
-        ours.close()  # the child process exits when the pipe is closed
+        ours.close()  # makes the child process exit
         process.join()
 
 

@@ -1,4 +1,4 @@
-"""Displays the demo on a terminal: each patch's height map, health and scan rate, and the bus load."""
+"""Displays the demo on a terminal: bus load, and each patch's height map, health and scan rate."""
 
 from __future__ import annotations
 
@@ -20,19 +20,19 @@ from skinnode.monitor.field_map import MapStyle, Surface, mean_shear_m, paint_ma
 from skinnode.monitor.patch_panel import shear_text
 
 MAP_SIZE = 16
-"""Width of a square height map, characters; each character is two pixels high."""
+"""Width of a square height map, characters; each character consists of two pixels, one above the other."""
 
 
 @dataclass(frozen=True, slots=True)
 class PatchView:
-    """Data of one patch to display; lengths are in metres, and NaN if not yet known."""
+    """Display data of one patch; lengths are in metres; unknown lengths are NaN."""
 
     name: str
     health: str
     displacement_m: Float | None
     """(U, N, 3)"""
     depth_std_m: float
-    """Reported standard deviation of the depth at the deepest electrode."""
+    """Standard deviation reported for the deepest electrode's depth."""
     error_m: float
     """RMS error of the newest field."""
     rate_hz: float
@@ -43,7 +43,7 @@ class PatchView:
 
 @dataclass(frozen=True, slots=True)
 class BusView:
-    """Data of the bus and of the run to display."""
+    """Display data of the bus and the run."""
 
     elapsed_s: float
     seconds: float
@@ -55,7 +55,7 @@ class BusView:
 
 
 class HeightMap:
-    """Draws the depth of a patch in the monitor's style, with the first upper wire at the bottom."""
+    """Renders the depth of a patch like the monitor; the first upper wire is at the bottom."""
 
     def __init__(self, surface: Surface, full_scale_m: float) -> None:
         height = MAP_SIZE // 2
@@ -71,7 +71,7 @@ class HeightMap:
 
 
 def _surface(displacement_m: Float | None) -> Surface:
-    """Return a field's surface with zero standard deviations, or a flat surface if there is no field yet."""
+    """Return the surface to render: the field's, or a flat surface if there is no field yet."""
     moved = np.zeros((2, 2, 3)) if displacement_m is None else displacement_m
     unknown = np.zeros(moved.shape[:2], dtype=np.bool_)
     return Surface(-moved[..., 2], np.moveaxis(moved[..., :2], -1, 0), np.zeros(unknown.shape), unknown, 1.0)
@@ -105,7 +105,7 @@ def _patch_panel(patch: PatchView, full_scale_m: float) -> Panel:
 
 
 def panels_in(columns: int, lines: int) -> int:
-    """Return how many patches fit on a terminal with the given numbers of columns and lines."""
+    """Return the number of patches that fit on a terminal with the given number of columns and lines."""
     across, down = columns // (MAP_SIZE + 4), (lines - 4) // (MAP_SIZE // 2 + 8)
     return max(1, across) * max(1, down)
 
@@ -113,7 +113,7 @@ def panels_in(columns: int, lines: int) -> int:
 def render(
     patches: Sequence[PatchView], bus: BusView, full_scale_m: float, room: int = 1000
 ) -> RenderableType:
-    """Return the contents of the whole screen.
+    """Return the complete screen contents.
 
     Args:
         patches: Data of each patch.

@@ -1,14 +1,14 @@
 """Compare the results of two commits bit by bit: ``python -m tools.compare OLD [NEW]``.
 
-NEW is the working tree by default. The old commit generates the inputs: recordings of simulated hands, and
-streams of resistances on five layouts, with two noise levels, with and without faults. Both commits then
-process the inputs with the forward model, every method of the tracker, path following with every operator,
-and the solver for systems of equations. Both commits also replay the recordings and generate files. For each
-part, the report contains one hash per commit over all arrays of the part. For each array that differs, the
-report states the largest relative difference.
+By default, NEW is the working tree. The old commit generates the inputs: recordings of simulated hands, and
+streams of resistances. There are streams for five layouts and two noise levels, each with and without faults.
+Each commit then computes the forward model and solves the streams with every tracker method, with every path
+operator, and with the solver for systems of equations. Each commit also replays the recordings and generates
+files, such as EDS files. For each part, the report contains one hash per commit, computed from all arrays of
+the part. For each array that differs between the commits, it also contains the largest relative difference.
 
-The exit status is 0 if every array is equal in both commits, or if all differences between float arrays are
-at most ``--rtol``. Otherwise the exit status is 1.
+The exit status is 0 if all arrays are equal, or if the relative differences between float arrays do not
+exceed ``--rtol`` and all other arrays are equal. Otherwise, the exit status is 1.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ HERE: Final = Path(__file__).parent
 
 
 def tree_of(commit: str | None, folder: Path) -> Path:
-    """Extract the files of ``commit`` to ``folder``, and return the folder; None selects the working tree."""
+    """Extract ``commit`` to ``folder`` and return the folder; for None, return the working tree."""
     if commit is None:
         return ROOT
     folder.mkdir()
@@ -40,7 +40,7 @@ def tree_of(commit: str | None, folder: Path) -> Path:
 
 
 def run_in(tree: Path, script: str, *arguments: str) -> None:
-    """Run a script from the folder of this module, with the packages in ``tree``."""
+    """Run a script from this module's folder with the packages in ``tree``."""
     code = (
         f"import runpy, sys, skinnode; assert skinnode.__file__.startswith({str(tree)!r}), 'another tree'; "
         f"sys.argv = {[script, *arguments]!r}; runpy.run_path({str(HERE / script)!r}, run_name='__main__')"
@@ -50,10 +50,9 @@ def run_in(tree: Path, script: str, *arguments: str) -> None:
 
 
 def relative_difference(old: Any, new: Any) -> float:
-    """Return the largest difference between arrays, relative to the largest finite value in the old array.
+    """Return the largest difference between two arrays, relative to the largest finite value in ``old``.
 
-    Returns inf if shapes, types, or positions of NaN and infinity differ, or if the arrays do not contain
-    floats.
+    Returns inf if the arrays do not contain floats, or if they differ in shape, type, or non-finite values.
     """
     if old.shape != new.shape or old.dtype != new.dtype or old.dtype.kind != "f":
         return np.inf
@@ -66,7 +65,7 @@ def relative_difference(old: Any, new: Any) -> float:
 
 
 def report(old: Any, new: Any, rtol: float) -> Iterable[tuple[str, bool]]:
-    """Yield each line of the report, and whether the reported difference is allowed."""
+    """Yield each report line, together with whether the difference that it reports is permissible."""
     names = dict.fromkeys([*old.files, *new.files])
     for part in dict.fromkeys(name.partition(":")[0] for name in names):
         mine = [name for name in names if name.startswith(f"{part}:")]
@@ -99,7 +98,9 @@ def main() -> int:
     )
     parser.add_argument("--part", action="append", default=[], help="part to compare; default all")
     parser.add_argument(
-        "--folder", type=Path, help="keep trees, inputs and outputs in this folder, and reuse its contents"
+        "--folder",
+        type=Path,
+        help="folder in which trees, inputs and outputs are kept for reuse",
     )
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as temporary:

@@ -1,10 +1,10 @@
-"""Generates the inputs for a comparison of two commits: streams of resistances, and recordings of hands.
+"""Generates the inputs for comparing two commits: streams of resistances, and recordings of hands.
 
-Both commits read the same files, so the files should depend on neither commit. The displacements are
-therefore sums of Gaussian bumps, not solutions of the elastic model, and the noise has a fixed seed.
+Both commits process the same inputs, which should not depend on the code of either commit. The displacements
+are therefore sums of Gaussian bumps instead of solutions of the elastic model, and the noise has a fixed
+seed.
 
-Run this script in the tree of the old commit: ``python inputs.py FOLDER``. The script uses only the public
-API.
+Run ``python inputs.py FOLDER`` in the old commit's tree. The script uses only the public API.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ RECORDINGS = {
 
 
 def layouts() -> dict[str, sk.PatchLayout]:
-    """Return two preset layouts, a layout bent round a cylinder, and two with different numbers of wires."""
+    """Return two presets, a layout bent around a cylinder, and two layouts with other numbers of wires."""
     flat = sk.PatchLayout.preset("staggered")
     middle, radius_m = flat.upper_m[..., 0].mean(), 25e-3
 
@@ -83,7 +83,7 @@ def layouts() -> dict[str, sk.PatchLayout]:
 
 
 def displacements(layout: sk.PatchLayout) -> Float:
-    """Return the displacements (T, U, N, 3), metres: rest, a sliding press, a second press, and release."""
+    """Return the displacements (T, U, N, 3), metres: rest, a sliding press, a second press, and rest."""
     pitch, height = layout.pitch_m, layout.height_m
     x, y = layout.upper_m[..., 0], layout.upper_m[..., 1]
     low, high = np.array([x.min(), y.min()]), np.array([x.max(), y.max()])
@@ -102,7 +102,7 @@ def displacements(layout: sk.PatchLayout) -> Float:
 
 
 def streams() -> dict[str, Float]:
-    """Return ``LAYOUT/NOISE/ohm`` (T, U, K), and ``LAYOUT/NOISE/faulty`` with invalid and wrong readings."""
+    """Return streams (T, U, K): ``LAYOUT/NOISE/ohm`` and, with bad readings, ``LAYOUT/NOISE/faulty``."""
     made: dict[str, Float] = {}
     for number, (name, layout) in enumerate(layouts().items()):
         exact = np.array([sk.resistance_ohm(layout, layout.upper_m + d) for d in displacements(layout)])
@@ -123,7 +123,7 @@ def streams() -> dict[str, Float]:
 
 
 def record(folder: Path, name: str) -> None:
-    """Record a simulated hand by running the simulator's and the recorder's commands."""
+    """Record a simulated hand with the commands of the simulator and the recorder."""
     method, faults = RECORDINGS[name]
     group = f"239.74.{random.randrange(256)}.{random.randrange(1, 255)}"
     hand = folder / f"{name}.toml"

@@ -1,11 +1,11 @@
-"""Time a benchmark for two commits alternately on one machine: ``python -m tools.compare.speed OLD [NEW]``.
+"""Compare the benchmark times of two commits: ``python -m tools.compare.speed OLD [NEW]``.
 
-NEW is the working tree by default. Each round runs the benchmark once in each tree. The order alternates, so
-that changes in the machine's speed affect both trees equally. For each row, the report contains the shortest
-time in each commit, and the ratio of the two times. The rows for NumPy and LAPACK indicate the timing noise
-of the machine.
+By default, NEW is the working tree. Each round runs the benchmark once per commit. The order alternates from
+round to round, so that changes in the machine's speed affect both commits equally. For each benchmark row,
+the report contains each commit's shortest time and the ratio of the two times. The rows for NumPy and LAPACK
+do not depend on the commit; their ratios indicate the machine's timing noise.
 
-The exit status is 1 if any row takes more than ``--limit`` times as long as in the old commit, otherwise 0.
+The exit status is 1 if the ratio of new to old time exceeds ``--limit`` in any row, otherwise 0.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from tools.compare.__main__ import tree_of
 
 
 def rows_of(report: Any) -> dict[str, float]:
-    """Return all times in the JSON report of a benchmark; the keys consist of the row's name and the unit."""
+    """Return all times in a benchmark's JSON report; a key consists of a row's name and the time's name."""
     found: dict[str, float] = {}
 
     def collect(part: Any, label: str) -> None:
@@ -43,7 +43,7 @@ def rows_of(report: Any) -> dict[str, float]:
 
 
 def run(tree: Path, benchmark: str, arguments: list[str], out: Path) -> dict[str, float]:
-    """Run ``skinnode bench BENCHMARK`` with the packages in ``tree`` and return its times."""
+    """Run ``skinnode bench BENCHMARK`` with the packages in ``tree``, and return the times."""
     code = (
         f"import sys, skinnode; assert skinnode.__file__.startswith({str(tree)!r}), 'another tree'; "
         f"sys.argv = {['skinnode', 'bench', benchmark, '--json', str(out), *arguments]!r}; "
@@ -69,7 +69,7 @@ def main() -> int:
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
         trees = [tree_of(options.old, folder / "old"), tree_of(options.new, folder / "new")]
-        for tree in trees:  # the first run only fills the cache of compiled kernels
+        for tree in trees:  # this run only fills the cache of compiled kernels
             run(tree, options.benchmark, arguments, folder / "out.json")
         best: list[dict[str, float]] = [{}, {}]
         for turn in range(options.rounds):

@@ -1,4 +1,4 @@
-"""Generates the command reference; arguments and options are read from the Typer applications."""
+"""Generates the command reference from the Typer applications."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""Generates the reference of hand.toml and of scene files from their models.
+"""Generates the references of hand.toml and scene files from their models. For each key, a reference states
 
-The reference contains the purpose, type, unit, default and range of each key.
+purpose, type, unit, default and range.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Generates tables of a patch's conditions and of the simulator's faults from their definitions."""
+"""Generates tables of patch conditions and simulator faults from their definitions."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _PLAIN: Final = {
     "NEVER_SEEN": "No frame from the patch has arrived since the host started.",
     "OPERATIONAL": "All is well.",
 }
-"""Descriptions of conditions whose definitions have no docstring."""
+"""Descriptions of the conditions that have no docstring."""
 
 
 def conditions() -> str:
@@ -52,7 +52,7 @@ def faults() -> str:
 
 
 def bus_faults() -> str:
-    """Return the table of the faults of a bus."""
+    """Return a table of the faults that the simulator can inject into a bus."""
     docs, kinds = md.member_docs(BusFaults), {"bool": "on or off", "int": "integer"}
     rows = []
     for name, kind in inspect.get_annotations(BusFaults).items():
@@ -62,7 +62,7 @@ def bus_faults() -> str:
 
 
 def imperfections() -> str:
-    """Return a table of a simulated patch's imperfections, with their values in an ordinary patch."""
+    """Return a table of simulated patches' imperfections, with the values for an ordinary patch."""
     docs, ordinary = md.member_docs(Imperfections), Imperfections.ordinary()
     rows = [
         (md.code(name), docs[name], _size(getattr(ordinary, name)))

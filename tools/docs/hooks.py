@@ -1,6 +1,6 @@
-"""MkDocs hooks that replace each line `<!-- generated: NAME -->` with a table generated from the code.
+"""MkDocs hooks that replace each `<!-- generated: NAME -->` line with a table generated from the code.
 
-The build fails if there is no table with this name, or if a table is not used by any page.
+The build fails if NAME is not the name of a table, or if no page uses a table.
 """
 
 from __future__ import annotations

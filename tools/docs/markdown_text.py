@@ -1,4 +1,4 @@
-"""Helpers that format Markdown for the documentation generators."""
+"""Formats Markdown for the documentation generators."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def c_hex(value: int, digits: int = 4) -> str:
 
 
 def member_docs(kind: type) -> dict[str, str]:
-    """Return the docstring that follows each member of a class in its source."""
+    """Return a mapping from each class member to the docstring that follows the member in the source."""
     (body,) = ast.parse(inspect.getsource(kind)).body
     assert isinstance(body, ast.ClassDef)
     docs: dict[str, str] = {}

@@ -20,11 +20,12 @@ _NOT_TUNED: Final = {
     *("PREDICT", "HOLD", "COVARIANCE", "SKIP", "REUSE", "TASKS"),
     *("ROWS", "TILE", "REST", "TINY", "SQUARE_FLOOR", "A_MIN", "A_MAX", "NOISE_MAX"),
 }
-"""Names of constants that do not affect any result: task flags, tile sizes and overflow limits."""
+"""Names of constants that are omitted because they do not affect results: task flags, tile sizes, overflow
+limits."""
 
 
 def constants() -> str:
-    """Return a table of all documented constants whose values are numbers or accuracies."""
+    """Return a table of all documented constants with numeric or accuracy values."""
     rows = [
         (md.code(f"{module.__name__.removeprefix('skinnode.solve.')}.{name}"), value, text)
         for module in _modules()

@@ -1,12 +1,12 @@
 """Select random mutants of the source: ``python -m tools.mutation.draw`` writes ``mutants.json``.
 
-The mutation operators are those of cosmic-ray. The selection first chooses places in the source with equal
-probability, and then one mutation at each place. If mutations were chosen directly, a ``+`` would be selected
-eleven times as often as a ``not``.
+The mutation operators are those of cosmic-ray. First, places in the source are chosen with equal probability;
+then, one mutation is chosen for each place. If the choice were made directly among all mutations, a ``+``
+would be mutated eleven times as often as a ``not``, because it has eleven mutations.
 
-A mutant is identified by its change (file, function, operator, text before and after), not by a line number.
-The selection depends only on the seed and on digests of the places. A list of mutants therefore remains valid
-when code moves, and edits elsewhere do not change which mutants are selected.
+A mutant is identified by file, function, operator, and the text before and after the change. It has no line
+number, so a list of mutants remains valid when code moves. The selection depends only on the seed and on
+digests of the places, so edits to other code do not affect whether a place is selected.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ GROUPS: Final = {
     "solve": ("solve",),
     "host": ("host",),
 }
-"""Packages of ``skinnode`` from which the mutants of each group are selected."""
+"""Groups of packages; each group's mutants are selected from its packages."""
 SEED: Final = 20260
 PER_PACKAGE: Final = 50
 
@@ -46,24 +46,24 @@ _DECORATORS_FOR_SPEED: Final = ("njit", "njit_part", "njit_body", "njit_brief", 
 
 @dataclass(frozen=True)
 class Mutant:
-    """Mutant of the source: one change to one file."""
+    """A mutant of the source: a single change to a single file."""
 
     file: str
     """Path relative to the root of the repository."""
     function: str
-    """Qualified name of the innermost function or class around the change, or ``<module>``."""
+    """Qualified name of the innermost function or class that contains the change, or ``<module>``."""
     operator: str
     """Operator name in cosmic-ray."""
     before: str
-    """Lines that the change removes."""
+    """Lines removed by the change."""
     after: str
-    """Lines that the change adds."""
+    """Lines added by the change."""
     nth: int
-    """Number of mutants earlier in this file that are equal in all other fields."""
+    """Number of preceding mutants in the file with the same values of all other fields."""
 
     @property
     def name(self) -> str:
-        """Name of ten hexadecimal digits, computed from the other fields."""
+        """Name: ten hexadecimal digits of a digest of all fields."""
         return _digest(self.file, self.function, self.operator, self.before, self.after, self.nth)[:10]
 
     @property
@@ -85,7 +85,7 @@ class _Candidate:
 
 
 class _OnlyBehaviour(ast.NodeTransformer):
-    """Removes code that tests need not check: annotations, strings, and decorators that affect only speed."""
+    """Removes code that need not be tested: annotations, strings, and decorators that affect only speed."""
 
     def visit_AnnAssign(self, node: ast.AnnAssign) -> Any:
         node.annotation = ast.Constant(0)
@@ -117,7 +117,7 @@ class _OnlyBehaviour(ast.NodeTransformer):
 
     def visit_Call(self, node: ast.Call) -> Any:
         if isinstance(node.func, ast.Name) and node.func.id == "dataclass":
-            node.keywords = []  # frozen and slots prevent mistakes that mypy reports anyway
+            node.keywords = []  # mypy reports the mistakes prevented by frozen and slots
         return self.generic_visit(node)
 
     def visit_If(self, node: ast.If) -> Any:
@@ -134,9 +134,9 @@ def _for_speed(decorator: ast.expr) -> bool:
 
 
 def _behaviour(source: str) -> str | None:
-    """Return a string that represents the behaviour of ``source``; None if ``source`` does not compile."""
+    """Return a representation of ``source`` that reflects only its behaviour; None if it does not compile."""
     try:
-        with warnings.catch_warnings(action="ignore"):  # Python warns of "is" with a literal, for example
+        with warnings.catch_warnings(action="ignore"):  # for example, about "is" with a literal
             compile(source, "mutant", "exec")
     except (SyntaxError, ValueError):
         return None
@@ -144,7 +144,7 @@ def _behaviour(source: str) -> str | None:
 
 
 def _functions(source: str) -> dict[int, str]:
-    """Return, for each line in a function or class, the qualified name of the innermost function or class."""
+    """Return a mapping from each line to the qualified name of the innermost function or class around it."""
     names: dict[int, str] = {}
 
     def walk(node: ast.AST, prefix: str) -> None:
@@ -193,7 +193,7 @@ def _changed_lines(source: str, other: str) -> tuple[str, str]:
 
 
 def _name(file: str, source: str, wanted: _Candidate) -> Mutant:
-    """Convert a candidate to a mutant, and count the preceding mutations that are equal to it."""
+    """Convert a candidate to a mutant; count preceding equal mutations to determine ``nth``."""
     functions = _functions(source)
     function = functions.get(wanted.line, "<module>")
     before, after = _changed_lines(source, mutated(source, wanted.operator, wanted.occurrence))
@@ -226,7 +226,7 @@ def find(mutant: Mutant, source: str) -> str:
 
 
 def draw(group: str, count: int, seed: int, root: Path = ROOT) -> list[Mutant]:
-    """Select ``count`` mutants from a group's packages, each at a different place."""
+    """Select ``count`` mutants at different places in a group's packages."""
     sources: dict[str, str] = {}
     places: dict[str, list[tuple[str, _Candidate]]] = defaultdict(list)
     folders = [root / "skinnode" / package for package in GROUPS[group]]

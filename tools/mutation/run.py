@@ -1,13 +1,13 @@
 """Run the tests on each selected mutant: ``python -m tools.mutation.run --package protocol``.
 
-Each mutant is applied to a private copy of the repository. The test stages of ``stages.toml`` then run on the
-copy until the first failure, which kills the mutant. A failure of a real-time test counts only if the test
-also fails when run alone. A stage that exceeds its time limit also kills the mutant. Verdicts are written to
-``results.json`` immediately. The next run skips all mutants with a verdict; with ``--again``, it repeats the
+Each mutant is applied to a private copy of the repository. The test stages listed in ``stages.toml`` are then
+run on the copy. The first failed test kills the mutant, as does a stage that exceeds its time limit. A
+failure of a real-time test is ignored unless the test also fails when run alone. Each verdict is written to
+``results.json`` immediately, and mutants with a verdict are skipped in later runs; ``--again`` repeats the
 survivors.
 
-One process imports the libraries and forks for every pytest run, because the imports take longer than most
-tests.
+A server process imports the libraries once and forks for each pytest run, because importing takes longer than
+most tests.
 """
 
 from __future__ import annotations
@@ -50,7 +50,8 @@ _FILE_BYTES: Final = 1 << 30
 _TEST_S: Final = 120
 """Time limit for a single test, s."""
 _GRACE_S: Final = 60.0
-"""Constant part of a stage's time limit, s; the other part is six times the duration without a mutant."""
+"""Constant part of a stage's time limit, s, which is added to six times the stage's duration without a
+mutant."""
 _PR_SET_CHILD_SUBREAPER: Final = 36
 _PASSED, _FAILED = 0, 1
 
@@ -67,7 +68,7 @@ class Outcome:
 
 
 class Tree:
-    """Private copy of the repository, together with the kernels compiled from the copy."""
+    """Private copy of the repository, with the kernels compiled from this copy."""
 
     def __init__(self, folder: Path) -> None:
         self.source, self.cache, self.warm = folder / "tree", folder / "cache", folder / "warm"
@@ -76,7 +77,7 @@ class Tree:
         self.log = folder / "log"
         self._copy()
         if self.warm.exists() and not (self.warm / "skinnode" / self._leaf()).exists():
-            shutil.rmtree(self.warm)  # these kernels were compiled from a different source
+            shutil.rmtree(self.warm)  # remove kernels compiled from different source code
 
     def _copy(self) -> None:
         listed = subprocess.run(
@@ -101,10 +102,10 @@ class Tree:
             shutil.copy2(here, there)
 
     def put(self, mutant: Mutant) -> None:
-        """Apply a mutant to the copy, but keep the compiled kernels that the mutant does not affect.
+        """Apply a mutant to the copy, and remove only those compiled kernels that the mutant affects.
 
-        numba recompiles a kernel if the kernel's own file has changed. This method also removes the kernels
-        of all files that import the mutated file.
+        numba itself recompiles the kernels of the mutated file. This method removes the kernels of all files
+        that import the mutated file.
         """
         path = self.source / mutant.file
         found = path.stat()
@@ -138,7 +139,7 @@ class Tree:
             ).stdout.strip()
 
     def _reached(self, file: str) -> set[str]:
-        """Return the names of files with kernels that import ``file``, directly or indirectly."""
+        """Return the names of kernel files that import ``file`` directly or indirectly."""
         package = ROOT / "skinnode"
         imports: dict[str, set[str]] = {}
         for path in (path for pattern in _KERNELS for path in package.glob(pattern)):
@@ -153,7 +154,7 @@ class Tree:
         return {module.rpartition(".")[2] for module in reached}
 
     def put_back(self) -> None:
-        """Restore the file that :meth:`put` changed."""
+        """Restore the file changed by :meth:`put`."""
         path, text, times_ns = self._original
         path.write_text(text, "utf-8")
         os.utime(path, ns=times_ns)  # numba recompiles files whose modification time has changed
@@ -186,7 +187,7 @@ class _Failures:
 
 
 def run_tests(tree: Tree, arguments: Sequence[str], limit_s: float) -> Outcome:
-    """Run pytest in a new process group, and then kill all processes that pytest started."""
+    """Run pytest in a new process group; afterwards, kill all processes started by pytest."""
     answer, begin_s = tree.log.with_name("answer"), time.monotonic()
     answer.unlink(missing_ok=True)
     child = os.fork()
@@ -223,7 +224,7 @@ def _be_pytest(tree: Tree, arguments: Sequence[str], answer: Path, limit_s: floa
         os.environ |= {
             "PYTHONPATH": str(tree.source),
             "SKINNODE_CACHE_DIR": str(tree.cache),
-            "PYTHONDONTWRITEBYTECODE": "1",  # stale bytecode might run instead of a mutant
+            "PYTHONDONTWRITEBYTECODE": "1",  # otherwise, stale bytecode might run instead of the mutant
         }
         sys.dont_write_bytecode = True
         sys.path[:] = [str(tree.source), *(each for each in sys.path if Path(each or ".").resolve() != ROOT)]
@@ -234,7 +235,7 @@ def _be_pytest(tree: Tree, arguments: Sequence[str], answer: Path, limit_s: floa
         failures = _Failures()
         options = ["-q", "-n", "0", "--tb=short", "-p", "no:cacheprovider", "-o", f"timeout={_TEST_S}"]
         options += ["-W", "ignore::pytest.PytestAssertRewriteWarning"]
-        options += ["-W", "ignore::SyntaxWarning"]  # Python warns of "is" with a literal, for example
+        options += ["-W", "ignore::SyntaxWarning"]  # for example, about "is" with a literal
         status = int(pytest.main([*options, *arguments], plugins=[failures]))
         answer.write_text(json.dumps(failures.failed), "utf-8")
     except BaseException:
@@ -246,7 +247,7 @@ def _be_pytest(tree: Tree, arguments: Sequence[str], answer: Path, limit_s: floa
 
 
 def _end_children(group: int) -> None:
-    """Kill a process group, and the processes that left the group and were adopted by this process."""
+    """Kill a process group, and all processes that left the group and were re-parented to this process."""
     with contextlib.suppress(ProcessLookupError):
         os.killpg(group, signal.SIGKILL)
     for _ in range(100):
@@ -261,7 +262,7 @@ def _end_children(group: int) -> None:
 
 
 def _stages(mutant: Mutant, table: dict[str, Any]) -> list[list[str]]:
-    """Return the test files for a mutant, grouped by stage; each file is listed once."""
+    """Return the test files for a mutant, grouped by stage, without duplicates."""
     group = table[mutant.group]
     first = group.get("first", {}).get(Path(mutant.file).stem, [])
     stages, seen = [], set[str]()
@@ -281,7 +282,7 @@ def _expand(pattern: str) -> list[str]:
 
 
 class Session:
-    """Runs tests on one tree, and stores the results of the tests without a mutant."""
+    """Runs the tests on one tree, and stores the results without a mutant for reference."""
 
     def __init__(self, tree: Tree, table: dict[str, Any], *, quick: bool) -> None:
         self._tree, self._table, self._quick = tree, table, quick
@@ -290,7 +291,7 @@ class Session:
         self._kept = tree.log.with_name("unmutated.json")
 
     def measure(self, mutants: Sequence[Mutant], *, trust: bool) -> None:
-        """Run the test files without a mutant, to measure durations and to find tests that fail anyway."""
+        """Run the test files without a mutant, to measure durations and to exclude tests that fail."""
         if self._kept.exists() and trust:
             self._known = json.loads(self._kept.read_text("utf-8"))
         files = {path: None for each in mutants for stage in self._stages(each) for path in stage}
@@ -304,7 +305,7 @@ class Session:
                 raise SystemExit(f"{path}: exit status {run.status} without a mutant; see {self._tree.log}")
             failed = [
                 test for test in run.failed if run_tests(self._tree, [test], 900.0).status != _PASSED
-            ]  # a test that passes when run alone probably failed because of load
+            ]  # if the test passes when run alone, the failure was probably caused by CPU load
             for test in failed:
                 print(f"test excluded because it fails without a mutant: {test}", flush=True)
             self._known[path] = {"took_s": run.took_s, "failed": failed}
@@ -317,7 +318,7 @@ class Session:
         return stages[:1] if self._quick else stages
 
     def judge(self, mutant: Mutant) -> dict[str, Any]:
-        """Run the tests on a mutant; return the verdict and its cause."""
+        """Run the tests on a mutant; return the verdict and the reason for it."""
         begin_s = time.monotonic()
         try:
             self._tree.put(mutant)
@@ -331,7 +332,7 @@ class Session:
             files = sorted(files, key=lambda path: self._known[path]["took_s"])
             left_out = [test for path in files for test in self._known[path]["failed"]]
             limit_s = _GRACE_S + 6.0 * sum(self._known[path]["took_s"] for path in files)
-            for _ in range(8):  # each repetition excludes one more flaky test
+            for _ in range(8):  # repeat without the flaky test
                 deselected = [word for test in left_out for word in ("--deselect", test)]
                 run = run_tests(self._tree, ["-x", *deselected, *files], limit_s)
                 if run.status is None:
@@ -358,13 +359,13 @@ def _equivalent() -> dict[str, str]:
 
 
 def show(mutant: Mutant) -> str:
-    """Format a mutant as several lines of text."""
+    """Format a mutant as text."""
     before, after = mutant.before.replace("\n", "\n  - "), mutant.after.replace("\n", "\n  + ")
     return f"{mutant.name} {mutant.file}, {mutant.function}\n  - {before}\n  + {after}"
 
 
 def summary(mutants: Sequence[Mutant], results: dict[str, Any]) -> str:
-    """Return one line of text per group, followed by all survivors that are not equivalent."""
+    """Return a line of text per group, followed by the survivors that are not known to be equivalent."""
     equivalent, lines = _equivalent(), []
     verdict = {each.name: results.get(each.name, {}).get("verdict", "not run") for each in mutants}
     verdict |= dict.fromkeys(equivalent, "equivalent")
@@ -381,7 +382,7 @@ def summary(mutants: Sequence[Mutant], results: dict[str, Any]) -> str:
 
 
 def _preload() -> None:
-    """Import libraries that are slow to import and are never mutated."""
+    """Import slow-loading libraries, which are never mutated."""
     import can  # noqa: F401
     import canopen  # noqa: F401
     import hypothesis  # noqa: F401

@@ -53,11 +53,14 @@ If the noise is half a code, a tenth of the readings repeat in all four frames. 
 of the codes no longer equals the noise variance plus the rounding variance.
 """
 ALIVE: Final = 4
-"""Minimum number of changed readings in a block of mostly repeated readings; a frozen converter changes none."""
+"""Minimum number of changed readings in a block of mostly repeated readings; 0 for a frozen converter."""
 SAME: Final = 1e-14
 """Maximum contrast of a repeated reading, as a fraction of the reading; allows for float64 rounding."""
 DEVIATIONS: Final = 4.0
-"""Margin of each threshold, in standard deviations of the scatter; one block in 16,000 exceeds it by chance."""
+"""Margin of each threshold, in standard deviations of the scatter.
+
+By chance, one block in 16,000 exceeds it.
+"""
 DEPARTED: Final = math.log(1.5)
 """Logarithm of the ratio of estimated to stated noise above which the estimate replaces the stated noise.
 Below this ratio, the results are bit-identical to those with the stated noise."""

@@ -15,21 +15,21 @@ from skinnode.node.emcy import EmcyProducer
 from skinnode.node.object_dictionary import ObjectStore
 
 _BOOTED: Final = 1
-"""Second detail byte of an emergency message that reports a monitored node's restart instead of its
-silence."""
+"""Second detail byte of an emergency message that reports the restart, not the silence, of a monitored
+node."""
 
 
 class HeartbeatProducer:
-    """Schedule of a node's heartbeats, which shifts if a heartbeat is late by at least one period."""
+    """Schedule of a node's heartbeats; a heartbeat that is late by a period or more shifts the schedule."""
 
     def __init__(self) -> None:
         self.period_ns = 0
         """Heartbeat period, ns; 0 if the node sends no heartbeats."""
         self.deadline_ns = NO_DEADLINE_NS
-        """Time at which the next heartbeat is due, ns."""
+        """Time (ns) at which the next heartbeat must be sent."""
 
     def boot_up(self, period_ms: int, t_ns: int) -> None:
-        """Start the schedule, with the boot-up message as the first heartbeat.
+        """Start the schedule; the boot-up message is the first heartbeat.
 
         Args:
             period_ms: heartbeat period, ms; 0 for no heartbeats.
@@ -39,7 +39,7 @@ class HeartbeatProducer:
         self.deadline_ns = t_ns + self.period_ns if period_ms else NO_DEADLINE_NS
 
     def set_period(self, period_ms: int, t_ns: int) -> None:
-        """Change the heartbeat period, and make a heartbeat due immediately.
+        """Change the heartbeat period; the next heartbeat is due immediately.
 
         Args:
             period_ms: heartbeat period, ms; 0 for no heartbeats.
@@ -63,7 +63,7 @@ class _Monitored:
     node_id: int
     within_ns: int
     deadline_ns: int = NO_DEADLINE_NS
-    """Time at which the next heartbeat counts as missed, ns; monitoring starts at the first heartbeat."""
+    """Time (ns) at which the next heartbeat is overdue. Monitoring starts at the first heartbeat."""
 
 
 class HeartbeatConsumer:
@@ -72,14 +72,14 @@ class HeartbeatConsumer:
     Args:
         store: object dictionary.
         emcy: emergency producer, which reports missed heartbeats and restarts of monitored nodes.
-        failed: called after the emergency message, with the time at which a heartbeat was missed, ns.
+        failed: called after the emergency message with the time of the heartbeat event, in ns.
     """
 
     def __init__(self, store: ObjectStore, emcy: EmcyProducer, failed: Callable[[int], None]) -> None:
         self._store, self._emcy, self._failed = store, emcy, failed
         self._monitored: dict[int, _Monitored] = {}
         self.deadline_ns = NO_DEADLINE_NS
-        """Time at which the next heartbeat counts as missed, ns."""
+        """Earliest time (ns) at which a monitored node's heartbeat is overdue."""
         store.guard(od.HEARTBEAT_CONSUMER, self._guard)
 
     @property
@@ -110,7 +110,7 @@ class HeartbeatConsumer:
     def on_heartbeat(self, node_id: int, state: int, t_ns: int) -> None:
         """Handle a heartbeat or boot-up message from a monitored node.
 
-        A boot-up message does not start monitoring, because not every node sends heartbeats after it boots. A
+        A boot-up message does not start monitoring, because some nodes send no heartbeats after they boot. A
         boot-up message after a heartbeat means that the node has restarted.
 
         Args:
@@ -128,7 +128,7 @@ class HeartbeatConsumer:
         self._plan()
 
     def on_timer(self, t_ns: int) -> None:
-        """Report each node whose heartbeat is overdue at ``t_ns``, once until the node's next heartbeat."""
+        """Report each node with an overdue heartbeat at ``t_ns``, once until its next heartbeat."""
         if t_ns < self.deadline_ns:
             return
         for item in self._monitored.values():
@@ -144,11 +144,11 @@ class HeartbeatConsumer:
         )
 
     def _guard(self, subindex: int, value: int) -> None:
-        """Refuse a second entry for the same node. An entry with node-ID 0 or time 0 is unused."""
+        """Refuse a second entry for one node. Entries with node-ID 0 or heartbeat time 0 are unused."""
         if value >> 24:
             raise Refused(AbortCode.INVALID_VALUE)
         node_id, time_ms = value >> 16, value & 0xFFFF
         others = (i for i in range(1, od.HEARTBEAT_CONSUMERS + 1) if i != subindex)
         taken = {self._store.integer(od.HEARTBEAT_CONSUMER, i) for i in others}
         if node_id and time_ms and any(word >> 16 == node_id and word & 0xFFFF for word in taken):
-            raise Refused(AbortCode.INCOMPATIBLE)  # CiA 301 forbids two entries for one node
+            raise Refused(AbortCode.INCOMPATIBLE)  # CiA 301 forbids duplicate entries for a node

@@ -1,8 +1,8 @@
-"""LSS slave (CiA 305 v3.0), which receives the node-ID and bit rate and answers searches for nodes.
+"""LSS slave (CiA 305 v3.0), which accepts a node-ID and a bit rate, and responds to node searches.
 
-The slave takes requests and returns responses as bytes; it needs neither a bus nor a clock. Callbacks store
+The slave receives requests and returns responses as bytes, independently of any bus or clock. Callbacks store
 the configuration and change the bit rate. :attr:`LssSlave.may_boot` tells the caller that the node must boot.
-LSS requests are served in every NMT state. A node without a node-ID serves only LSS requests.
+The slave processes LSS requests in every NMT state. A node without a node-ID processes only LSS requests.
 """
 
 from __future__ import annotations
@@ -29,8 +29,7 @@ _OUT_OF_RANGE, _CANNOT_STORE, _STORE_FAILED = 1, 1, 2
 """Error codes in responses to configuration requests; the meaning of code 1 depends on the request."""
 
 
-# For each request of *switch state selective* and *identify*: the field of the LSS address that is compared,
-# and the comparison.
+# LSS address field and comparison for each request of *switch state selective* and *identify*.
 _QUESTIONS: Final[dict[int, tuple[int, Callable[[int, int], bool]]]] = {
     0x40: (0, operator.eq),
     0x41: (1, operator.eq),
@@ -50,10 +49,10 @@ class LssSlave:
     """LSS slave of one node.
 
     Args:
-        address: LSS address of the slave, which is its identity (0x1018).
+        address: LSS address of the slave, equal to the node's identity object (0x1018).
         node_id: persistent node-ID, 1 to 127, or :data:`NOT_CONFIGURED`.
         bit_rates_bps: supported bit rates, bit/s; empty if the slave cannot change its bit rate.
-        bit_rate_bps: previously configured bit rate, bit/s; None if there is none.
+        bit_rate_bps: previously configured bit rate, bit/s; None if no bit rate has been configured.
         store: saves the pending node-ID and bit rate permanently, or raises OSError; None if the node has no
             memory.
         activate: called with the pending bit rate and the delay in ms, to start the bit rate change; None if
@@ -81,13 +80,13 @@ class LssSlave:
         """Node-ID that takes effect at the next *reset communication*."""
         self._persistent_node_id = node_id
         self.pending_bit_rate_bps = bit_rate_bps
-        """Bit rate that takes effect at the next activation, bit/s; None to keep the current bit rate."""
+        """Bit rate (bit/s) that takes effect at the next activation; None to keep the current bit rate."""
         self._next_question = 0
         self._scan_part = 0
 
     @property
     def configured(self) -> bool:
-        """Whether the node has a node-ID; a node without a node-ID serves only LSS requests."""
+        """Whether the node has a node-ID; a node without a node-ID processes only LSS requests."""
         return self.node_id != NOT_CONFIGURED
 
     @property
@@ -102,11 +101,11 @@ class LssSlave:
 
         A pending node-ID that was not stored is lost. The caller must then call :meth:`reset_communication`.
 
-        Two open-source CiA 305 stacks behave in the same way. In the NMT sub-state *reset application*, the
-        stack c-open copies the persistent node-ID to the pending node-ID. In *reset communication*, it copies
-        the pending node-ID to the active node-ID (src/co_nmt.c). The stack CANopenNode initialises the
-        pending node-ID from non-volatile memory after *reset node*, and does not change it at *reset
-        communication* (305/CO_LSSslave.h).
+        Two open-source CiA 305 stacks treat the persistent and the pending node-ID in the same way. In the
+        NMT sub-state *reset application*, the stack c-open copies the persistent node-ID to the pending
+        node-ID. In *reset communication*, it copies the pending node-ID to the active node-ID (src/co_nmt.c).
+        The stack CANopenNode initialises the pending node-ID from non-volatile memory after *reset node*, and
+        does not change it at *reset communication* (305/CO_LSSslave.h).
         """
         self.pending_node_id = self._persistent_node_id
 
@@ -119,12 +118,13 @@ class LssSlave:
     def on_request(self, data: bytes) -> bytes | None:
         """Process a request from the LSS master and return the response.
 
-        As the standard requires, a frame is ignored if it does not have 8 bytes, if its command is unknown,
-        or if the request is not allowed in the current state. Such a frame may be intended for other slaves.
+        As the standard requires, a frame with a length other than 8 bytes or with an unknown command is
+        ignored. A request that is not allowed in the current state is also ignored, because it may be
+        intended for other slaves.
 
-        After *activate bit timing*, the node stops sending immediately and changes its bit rate after one
-        delay. The node may send again after a second delay, when all other nodes have changed their bit
-        rates.
+        After *activate bit timing*, the node stops sending immediately and changes its bit rate after a
+        delay. After a second delay, when all other nodes have changed their bit rates, the node may send
+        again.
 
         Args:
             data: payload of the frame.
@@ -163,7 +163,7 @@ class LssSlave:
         self._next_question = 0
 
     def _agrees(self, command: int, value: int) -> bool:
-        """Return whether the LSS address matches this request and all earlier requests of its sequence."""
+        """Return whether the LSS address matches this request and all previous requests in the sequence."""
         part, holds = _QUESTIONS[command]
         in_turn = command in _FIRST_QUESTIONS or command == self._next_question
         agreed = in_turn and holds(self._address[part], value)
@@ -171,9 +171,9 @@ class LssSlave:
         return agreed
 
     def _fastscan(self, value: int, bit: int, part: int, next_part: int) -> bytes | None:
-        """Return the response to a fastscan request; None unless bits ``bit`` to 31 match ``value``.
+        """Return the response to a fastscan request; None if bits ``bit`` to 31 differ from ``value``.
 
-        A slave that does not match sends no response, so a single request can test many slaves.
+        Only matching slaves respond, so a single request tests all slaves on the bus.
         """
         if bit == RESET_SCAN:
             self._scan_part = 0
@@ -226,7 +226,7 @@ class LssSlave:
 
 
 class BitRateChange:
-    """Bit rate change requested by *activate bit timing*, with a delay before and after the change.
+    """Bit rate change requested by *activate bit timing*, with one delay before and one after the change.
 
     Args:
         set_bit_rate: changes the bit rate (bit/s); None if the node cannot change it.
@@ -237,14 +237,14 @@ class BitRateChange:
         self._bit_rate_bps: int | None = None
         self._change_ns = self._over_ns = NO_DEADLINE_NS
         self.deadline_ns = NO_DEADLINE_NS
-        """Time at which :meth:`silent` must be called next, ns."""
+        """Time (ns) at which :meth:`silent` must be called next."""
 
     def begin(self, bit_rate_bps: int | None, delay_ms: int, t_ns: int) -> None:
         """Start a bit rate change.
 
         Args:
             bit_rate_bps: new bit rate, bit/s; None to keep the current bit rate.
-            delay_ms: delay that the request specifies, ms.
+            delay_ms: delay specified in the request, ms.
             t_ns: time at which the request was received, ns.
         """
         self._bit_rate_bps = bit_rate_bps
@@ -252,7 +252,7 @@ class BitRateChange:
         self._over_ns = t_ns + 2 * delay_ms * 1_000_000
 
     def silent(self, t_ns: int) -> bool:
-        """Change the bit rate if due; return whether the node must neither send nor receive."""
+        """Change the bit rate if due; return whether the node must stop sending and receiving."""
         if self.deadline_ns == NO_DEADLINE_NS:
             return False
         if t_ns >= self._change_ns:

@@ -1,7 +1,8 @@
-"""Values that a node keeps across a power cycle, and the interface of the memory that stores them.
+"""Values that survive a node's power cycle, and the interface of the memory that stores these values.
 
-A memory saves a :class:`Kept` as a unit. If saving is interrupted, the memory returns either the old or the
-new content, never a mixture. The module :mod:`skinnode.node.memory_file` implements a memory in a file.
+A memory saves a :class:`Kept` atomically. After an interrupted save, the memory contains either the complete
+old values or the complete new values. The module :mod:`skinnode.node.memory_file` implements a memory in a
+file.
 """
 
 from __future__ import annotations
@@ -16,10 +17,10 @@ from skinnode.errors import SkinError
 
 @dataclass(frozen=True, slots=True)
 class Parameters:
-    """Saved parameters of one group (CiA 301 v4.2, 7.5.2.13): those that differ from their defaults."""
+    """Saved parameters of one group (CiA 301 v4.2, 7.5.2.13): only values other than the defaults."""
 
     node_id: int = 0
-    """Node-ID at the time of saving, to which saved COB-IDs that include a node-ID refer."""
+    """Node-ID of the node when the parameters were saved; some saved COB-IDs include this node-ID."""
     values: Mapping[tuple[int, int], bytes] = field(default_factory=dict)
     """Saved bytes of each parameter, by index and sub-index."""
 
@@ -29,7 +30,7 @@ class Kept:
     """Content of a memory: all values that survive a power cycle."""
 
     patch: str = ""
-    """Sizes and layout of the patch that saved the content, which a different patch must not use."""
+    """Sizes and layout of the patch that saved this content. A different patch must not use the content."""
     node_id: int | None = None
     """Node-ID stored by LSS: 1 to 127, or 255 for no node-ID; None if LSS has not stored a configuration."""
     bit_rate_bps: int | None = None
@@ -39,11 +40,11 @@ class Kept:
     application: Parameters = Parameters()
     """Saved application parameters (0x2000 to 0x9FFF)."""
     baseline_ohm: tuple[tuple[float, ...], ...] = ()
-    """(U, K) REAL32, ohm: baseline R0, measured or written by a client; empty if none has been saved."""
+    """(U, K) baseline R0 with REAL32 precision, ohm; empty if no baseline has been saved."""
 
 
 class Fault(IntEnum):
-    """Fault of a memory; its value is sent in the emergency message."""
+    """Fault of a memory; the numeric value is the first detail byte of the emergency message."""
 
     UNREADABLE = 1
     DAMAGED = 2
@@ -52,7 +53,7 @@ class Fault(IntEnum):
     REFUSED = 4
     """The object dictionary does not accept a saved parameter."""
     NOT_SAVED = 5
-    """A value that the node saves without a command, such as the baseline, could not be saved."""
+    """The node failed to save a value that it saves automatically, such as the baseline."""
 
 
 class MemoryFault(SkinError):
@@ -74,7 +75,7 @@ class Memory(Protocol):
         """
 
     def save(self, kept: Kept) -> None:
-        """Replace the saved content, and return as soon as the new content is stored safely.
+        """Replace the saved content, and return when the new content would survive a power failure.
 
         Raises:
             OSError: if saving fails; the memory then keeps its old content.
@@ -82,7 +83,7 @@ class Memory(Protocol):
 
 
 class VolatileMemory:
-    """Non-volatile memory of a simulated board, whose content is lost with this object."""
+    """Non-volatile memory of a simulated board. The content exists only as long as this object."""
 
     def __init__(self) -> None:
         self._kept: Kept | None = None

@@ -21,24 +21,25 @@ from skinnode.node.memory import Fault, Kept, MemoryFault, Parameters
 
 _FORMAT: Final = "skinnode node memory 1"
 _MOST_BYTES: Final = 1 << 24
-"""Maximum number of bytes read from a memory file; a node with 512 PDOs and the largest baseline needs less
-than a tenth of this."""
+"""Maximum accepted size of a memory file, in bytes. The file of a node with 512 PDOs and the largest baseline
+is less than a tenth of this size."""
 
 
 class FileMemory:
     """Non-volatile memory of a node in a human-readable JSON file with a checksum.
 
-    Saving takes a few milliseconds, during which the node and all other nodes on its thread are blocked.
+    Saving takes a few milliseconds and blocks all nodes that run on the same thread.
 
     A ``FileMemory`` has exclusive access to its file from :meth:`claim` or the first :meth:`save` until
     :meth:`close`, the end of a ``with`` block or the deletion of the object. The lock is a kernel lock on a
-    separate file in the same folder, so it is released when the process ends, even if the process is killed.
+    separate file in the same folder, so the lock is released when the process ends, even if the process is
+    killed.
 
-    Saving writes a temporary file, flushes it to the storage medium and renames it. After a power failure or
-    a killed process, the file therefore has either its old or its new content. Only the owner can read the
-    file (mode 0600). A symbolic link in place of the file is refused. A file that is damaged or belongs to
-    another patch is not overwritten: it is renamed, with ``.unused-`` and a digest of its content added to
-    its name.
+    Saving writes a temporary file, flushes this file to the storage medium and renames it to the memory file.
+    After a power failure or the death of the process, the memory file therefore has either its old or its new
+    content. Only the owner can read the file (mode 0600). If the path is a symbolic link, access is refused.
+    A file that is damaged or belongs to another patch is preserved: before saving, the file is renamed by
+    appending ``.unused-`` and a digest of its content.
 
     Args:
         path: path of the file; its folder must exist.
@@ -53,7 +54,7 @@ class FileMemory:
         """Lock the file for exclusive access.
 
         Raises:
-            FileInUse: if the file is locked, in this process or another.
+            FileInUse: if this process or another process has locked the file.
             OSError: if the file cannot be locked.
         """
         if self._release is None:
@@ -62,7 +63,7 @@ class FileMemory:
             discard_leftovers(self.path)
 
     def close(self) -> None:
-        """Release the lock on the file. A later :meth:`claim` is allowed."""
+        """Release the lock on the file. The file can be locked again with :meth:`claim`."""
         release, self._release = self._release, None
         if release is not None:
             release()
@@ -90,14 +91,14 @@ class FileMemory:
             raise MemoryFault(error.fault, f"{self.path}: {error}") from None
 
     def save(self, kept: Kept) -> None:
-        """Replace the content of the file, and return as soon as the new content is on the storage medium.
+        """Replace the content of the file, and return when the new content is on the storage medium.
 
         Args:
             kept: the new content.
 
         Raises:
             FileInUse: if another memory owns the file.
-            OSError: if the file cannot be written; it then keeps its old content.
+            OSError: if the file cannot be written; the old content is then preserved.
         """
         self.claim()
         beside = create_beside(self.path, pack(kept), durable=True)
@@ -110,7 +111,7 @@ class FileMemory:
         flush_folder(self.path.parent)
 
     def _read(self) -> bytes:
-        # O_NONBLOCK: opening a pipe must not block.
+        # O_NONBLOCK prevents blocking if the path is a named pipe.
         flags = os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
         try:
             descriptor = os.open(self.path, flags)

@@ -1,4 +1,4 @@
-"""NMT slave, which controls the NMT state of a node (CiA 301 v4.2, 7.2.8 and 7.3.2)."""
+"""NMT slave, which controls a node's NMT state (CiA 301 v4.2, 7.2.8 and 7.3.2)."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ class NmtSlave:
     """NMT state machine of a node.
 
     Args:
-        store: object dictionary, of which 0x1029 (error behaviour) is used.
+        store: object dictionary, which contains the error behaviour (0x1029).
         rejected: counters of rejected frames.
         entered: called after each change of state, with the new state, the previous state and the time in ns.
     """
@@ -43,7 +43,7 @@ class NmtSlave:
             return None
 
     def obey(self, command: NmtCommand, t_ns: int) -> None:
-        """Enter the NMT state that a command requests; the command must not be a reset."""
+        """Enter the NMT state requested by a command other than a reset."""
         self.enter(AFTER_COMMAND[command], t_ns)
 
     def enter(self, state: NmtState, t_ns: int) -> None:
@@ -55,8 +55,8 @@ class NmtSlave:
     def on_communication_error(self, t_ns: int) -> None:
         """Apply the error behaviour (0x1029) after a missed heartbeat, a life guarding event or bus-off.
 
-        If 0x1029:1 is 0, the state changes from OPERATIONAL to PRE-OPERATIONAL. If it is 1, the state does
-        not change. If it is 2, the node enters STOPPED.
+        If 0x1029:1 is 0, the state changes from OPERATIONAL to PRE-OPERATIONAL. If 0x1029:1 is 1, the state
+        does not change. If 0x1029:1 is 2, the node enters STOPPED.
         """
         behaviour = self._store.integer(od.ERROR_BEHAVIOUR, 1)
         if behaviour == 2:

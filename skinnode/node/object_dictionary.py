@@ -1,12 +1,12 @@
-"""Object dictionary of a running node, with the declarations and the current values of its objects.
+"""Object dictionary of a running node: declarations and current values of the objects.
 
-The declarations come from :mod:`skinnode.protocol.objects`, from which the EDS files are also generated. Each
-value is stored as the bytes sent on the bus (little-endian), so an SDO response contains a slice of a value,
-and a PDO is a concatenation of values. Services can register functions for an object:
-:meth:`ObjectStore.bind` registers a function that computes the value, :meth:`ObjectStore.guard` a check
-before each write, and :meth:`ObjectStore.watch` a callback after each write. The value of a DOMAIN can be
-stored outside the object dictionary (:meth:`ObjectStore.bind_domain`). A refused write does not change the
-object.
+The declarations are in :mod:`skinnode.protocol.objects`; the EDS files are generated from the same
+declarations. Each value is stored as the little-endian bytes sent on the bus. An SDO response therefore
+contains a slice of these bytes, and a PDO payload is a concatenation of values. Services can register
+functions for an object: :meth:`ObjectStore.bind` registers a function that computes the value,
+:meth:`ObjectStore.guard` a check before each write, and :meth:`ObjectStore.watch` a callback after each
+write. The value of a DOMAIN can be stored outside the object dictionary (:meth:`ObjectStore.bind_domain`). A
+refused write does not change the object.
 """
 
 from __future__ import annotations
@@ -19,23 +19,23 @@ from skinnode.canopen.abort import AbortCode, Refused
 from skinnode.canopen.dictionary import DataType, Entry, Object, Value
 
 MAX_BYTES: Final = 1 << 16
-"""Maximum length of a value whose data type has no fixed length, bytes."""
+"""Maximum length, in bytes, of a value with a variable-length data type."""
 
 Reader = Callable[[int], bytes]
-"""Callback that takes a sub-index and returns its value as bytes; may raise Refused."""
+"""Callback that computes and returns the value of a sub-index as bytes, or raises Refused."""
 Guard = Callable[[int, int], None]
-"""Callback that takes a sub-index and the new value (a bit pattern for REAL32), and raises Refused to reject
-it."""
+"""Callback that checks a new value and raises Refused to reject the value. Arguments: the sub-index and the
+value (for REAL32, its bit pattern)."""
 Watcher = Callable[[int], None]
-"""Callback that takes the sub-index that a client has written."""
+"""Callback invoked after a client's write; the argument is the sub-index."""
 ChangeWatcher = Callable[[int, int], None]
-"""Callback that takes the index and sub-index of a parameter whose value a client has changed."""
+"""Callback invoked after a client has changed a parameter; the arguments are the index and sub-index."""
 DomainWriter = Callable[[bytes], None]
-"""Callback that takes a complete value and stores it, or raises Refused and stores nothing."""
+"""Callback that stores a complete value, or raises Refused and stores nothing."""
 
 
 class Lengths(NamedTuple):
-    """Permitted length of the data that a client writes to an object, bytes."""
+    """Permitted length, in bytes, of the data written to an object by a client."""
 
     least: int
     """Minimum length, bytes."""
@@ -43,7 +43,7 @@ class Lengths(NamedTuple):
     """Maximum length, bytes."""
 
     def check(self, length: int) -> None:
-        """Check the length of a complete value.
+        """Check the length of a complete value written by a client.
 
         Raises:
             Refused: if the object does not accept a value of that length.
@@ -53,10 +53,10 @@ class Lengths(NamedTuple):
             raise Refused(AbortCode.TOO_SHORT)
 
     def check_not_above(self, length: int) -> None:
-        """Check whether the part of a value received so far is already too long.
+        """Check that the part of a value received so far does not exceed the maximum length.
 
         Raises:
-            Refused: if the part exceeds the maximum length.
+            Refused: if the part of the value exceeds the maximum length.
         """
         if length > self.most:
             raise Refused(AbortCode.TOO_LONG if self.most == self.least else AbortCode.OUT_OF_MEMORY)
@@ -67,11 +67,11 @@ def to_bytes(entry: Entry, value: Value | bytes) -> bytes:
 
     Args:
         entry: declaration of the object.
-        value: value of the object; bytes are returned unchanged.
+        value: value to convert; bytes are returned unchanged.
 
     Raises:
-        OverflowError: if the integer type cannot hold the value.
-        struct.error: if REAL32 cannot hold the value.
+        OverflowError: if the value is out of range for the integer type.
+        struct.error: if the value cannot be packed as REAL32.
     """
     if isinstance(value, bytes):
         return value
@@ -83,11 +83,11 @@ def to_bytes(entry: Entry, value: Value | bytes) -> bytes:
 
 
 class ObjectStore:
-    """Object dictionary of one node, with the current values of all objects.
+    """Object dictionary of one node: the declarations and current values of all objects.
 
-    The methods ``read`` and ``write`` perform an access by a client and may raise
-    :class:`~skinnode.canopen.abort.Refused`. The methods ``raw``, ``integer`` and ``put`` perform an access
-    by the node itself, which requires that the object exists.
+    The methods ``read`` and ``write`` provide access for clients and may raise
+    :class:`~skinnode.canopen.abort.Refused`. The methods ``raw``, ``integer`` and ``put`` provide access for
+    the node itself and require that the object exists.
 
     Args:
         objects: declarations of all objects.
@@ -128,7 +128,7 @@ class ObjectStore:
 
         Args:
             index: index of the object.
-            length: length of every value, bytes.
+            length: length of the value, bytes.
             reader: returns the value.
             writer: stores the value.
         """
@@ -136,15 +136,15 @@ class ObjectStore:
         self._domains[index] = Lengths(length, length), writer
 
     def guard(self, index: int, guard: Guard) -> None:
-        """Register ``guard``, which checks every value before it is written to ``index``."""
+        """Register ``guard`` to check each new value of ``index`` before a client's write takes effect."""
         self._guards[index] = guard
 
     def watch(self, index: int, watcher: Watcher) -> None:
-        """Register ``watcher``, which is called after each write to ``index``."""
+        """Register ``watcher`` to be called after each write to ``index``."""
         self._watchers[index] = watcher
 
     def watch_changes(self, watcher: ChangeWatcher) -> None:
-        """Register ``watcher``, called after a client has changed any object that is not computed."""
+        """Register ``watcher`` to be called after a client has changed an object that is not computed."""
         self._change_watcher = watcher
 
     def find(self, index: int, subindex: int) -> Entry:
@@ -163,7 +163,7 @@ class ObjectStore:
         return (index, subindex) in self._entries
 
     def lengths(self, index: int, subindex: int) -> Lengths:
-        """Return the permitted length of a value that a client writes to an object.
+        """Return the permitted length of a value written to an object by a client.
 
         Raises:
             Refused: if the object does not exist or is read-only.
@@ -187,10 +187,10 @@ class ObjectStore:
         return self.raw(index, subindex)
 
     def write(self, index: int, subindex: int, data: bytes) -> None:
-        """Write an object for a client: check and store the value, then call the object's watcher.
+        """Write an object for a client: check the value, store the value, call the object's watcher.
 
         Raises:
-            Refused: if the value is not allowed; the object then keeps its old value.
+            Refused: if the value is not allowed; the old value is then preserved.
         """
         self.lengths(index, subindex).check(len(data))
         if index in self._domains:
@@ -216,12 +216,12 @@ class ObjectStore:
             guard(subindex, value)
 
     def raw(self, index: int, subindex: int) -> bytes:
-        """Return the current bytes of an object, whether stored or computed."""
+        """Return the current bytes of a stored or computed object."""
         reader = self._readers.get((index, subindex))
         return self._values[index, subindex] if reader is None else reader(subindex)
 
     def written(self, index: int, subindex: int) -> bytes:
-        """Return the bytes that a client wrote last, even if reads of the object are computed."""
+        """Return the bytes last written by a client, even if the object is computed on reading."""
         return self._values[index, subindex]
 
     def integer(self, index: int, subindex: int = 0) -> int:
@@ -229,18 +229,18 @@ class ObjectStore:
         return int.from_bytes(self._values[index, subindex], "little")
 
     def put(self, index: int, subindex: int, value: Value | bytes) -> None:
-        """Set an object from within the node, without calling its guard or watcher."""
+        """Set an object for the node itself, without calling the object's guard or watcher."""
         self._values[index, subindex] = to_bytes(self._entries[index, subindex], value)
 
     def restore(self, first: int, last: int) -> None:
-        """Reset the writable objects from index ``first`` to ``last`` to their defaults."""
+        """Reset the writable objects from index ``first`` to index ``last`` to their defaults."""
         for key in self._writable(first, last):
             self._values[key] = self._at_start(self._entries[key])
 
     def not_at_default(self, first: int, last: int) -> dict[tuple[int, int], bytes]:
         """Return the parameters from index ``first`` to ``last`` that differ from their defaults.
 
-        Computed objects are not parameters, so the result does not contain them.
+        Computed objects are not parameters and are therefore excluded.
         """
         return {
             key: self._values[key]
@@ -256,7 +256,8 @@ class ObjectStore:
     def renumber(self, node_id: int) -> None:
         """Change the node-ID.
 
-        Read-only COB-IDs change immediately, writable COB-IDs at the next :meth:`restore`.
+        The new node-ID changes read-only COB-IDs immediately, and writable COB-IDs at the next
+        :meth:`restore`.
         """
         self.node_id = node_id
         for key, entry in self._entries.items():

@@ -1,4 +1,4 @@
-"""Counters of rejected frames (0x2040), to which the standard defines no response."""
+"""Counters of rejected frames (0x2040), for which the standard defines no response."""
 
 from __future__ import annotations
 
@@ -15,24 +15,23 @@ class Rejected(IntEnum):
     """Reason for rejecting a frame; the value is the sub-index of object 0x2040."""
 
     NMT = 1
-    """NMT frame that is not two bytes long, or that contains an unknown command for this node."""
+    """NMT frame whose length is not two bytes, or which addresses this node with an unknown command."""
     SYNC = 2
-    """SYNC message that is longer or shorter than 0x1019 requires."""
+    """SYNC message with a length other than that required by 0x1019."""
     TIME = 3
-    """TIME message that is not six bytes long, or that does not contain a valid time of day."""
+    """TIME message whose length is not six bytes, or whose time of day is invalid."""
     HEARTBEAT = 4
-    """Heartbeat of a monitored node that is not one byte long."""
+    """Heartbeat from a monitored node with a length other than one byte."""
     SDO = 5
-    """SDO request that is not eight bytes long."""
+    """SDO request with a length other than eight bytes."""
     RPDO = 6
-    """RPDO that is shorter than its mapped objects."""
+    """RPDO that is shorter than the total length of its mapped objects."""
     OWN_ERROR_CONTROL = 7
-    """Boot-up message or heartbeat with this node's own node-ID, which shows that another node uses this
-    node-ID."""
+    """Boot-up message or heartbeat that another node sends with this node's node-ID."""
 
 
 class RejectedFrames:
-    """Counters of rejected frames (0x2040), which *reset node* sets to 0 and which stop at their maximum.
+    """Counters of rejected frames (0x2040). *Reset node* clears the counters; they stop at their maximum.
 
     Args:
         store: object dictionary.
@@ -47,7 +46,7 @@ class RejectedFrames:
         self._counts[kind] = min(self._counts[kind] + 1, _MOST)
 
     def counted(self, kind: Rejected) -> int:
-        """Return the number of frames rejected for this reason."""
+        """Return the number of frames rejected for a given reason."""
         return self._counts[kind]
 
     def reset(self) -> None:

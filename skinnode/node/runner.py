@@ -1,4 +1,4 @@
-"""Runner of nodes on a bus, which uses one thread for all nodes that share a port."""
+"""Runner of nodes on a bus, with one thread for all nodes that share a CAN port."""
 
 from __future__ import annotations
 
@@ -17,30 +17,31 @@ from skinnode.transport.frame import Frame
 from skinnode.transport.port import CanPort
 
 _IDLE_S: Final = 0.1
-"""Maximum wait for a frame, s; also the maximum time that the thread takes to notice a stop request."""
+"""Maximum time to wait for a frame, in seconds; also the maximum delay before the thread responds to a stop
+request."""
 
 _RETRY_S: Final = 0.02
-"""Pause after a bus error, s; a full transmit queue drains within this time."""
+"""Pause after a bus error, in seconds, which is long enough to drain a full transmit queue."""
 
 _CATCH_UP_FRAMES: Final = 4096
-"""Maximum number of waiting frames that are served before a heartbeat counts as missed; at full load, a bus
-at 1 Mbit/s carries this number of frames in half a second."""
+"""Maximum number of queued frames to process before a heartbeat is declared missed: as many as a fully loaded
+1 Mbit/s bus carries in half a second."""
 
 OFF_AFTER_S: Final = 0.1
-"""Time of continuous bus errors after which the nodes treat their CAN controller as bus-off, s. A full
+"""Duration (s) of continuous bus errors after which the nodes treat their CAN controller as bus-off. A full
 transmit queue drains in less time."""
 
 REOPEN_S: Final = 1.0
-"""Time of continuous bus errors after which the CAN interface is reopened, s; the interface may have been
-unplugged and plugged in again."""
+"""Duration (s) of continuous bus errors after which the CAN interface is reopened. The interface may have
+been unplugged and reconnected."""
 
 
 class NodeRunner:
-    """Runner that powers nodes on and runs them until :meth:`stop`.
+    """Runner that powers on its nodes and runs these nodes until :meth:`stop`.
 
     A runner can be started only once. Bus errors do not stop a runner. From :meth:`start` to :meth:`stop`,
     only the runner's thread may use the nodes; other threads may read the nodes' counters. The runner does
-    not close the port. All timers have the precision that the most demanding node requires.
+    not close the port. All timers run at the precision required by the most demanding node.
 
     Args:
         port: CAN port that all nodes share.
@@ -63,7 +64,8 @@ class NodeRunner:
         self.bus_errors = 0
         """Number of bus errors since the runner was created."""
         self.bus_error = ""
-        """First error of the latest series of bus errors, in one line; empty before the first bus error."""
+        """One-line description of the first error in the latest series of bus errors; empty before any bus
+        error."""
         self._heard = 0
         self._bus_state = BusState.ACTIVE
         # Number of frames sent before bus-off; a larger number shows that the bus has recovered.
@@ -74,13 +76,13 @@ class NodeRunner:
 
     @property
     def failed(self) -> bool:
-        """Whether an error has ended the runner's thread; :meth:`stop` raises this error."""
+        """Whether an error has terminated the runner's thread; :meth:`stop` raises this error."""
         return self._error is not None
 
     def start(self) -> None:
-        """Start the thread, and return after all nodes have been powered on and have loaded their memories.
+        """Start the thread; return when all nodes have been powered on and have loaded their memories.
 
-        If an error ends the thread, :meth:`stop` raises this error.
+        An error that terminates the thread is raised by :meth:`stop`.
         """
         self._thread.start()
         self._powered.wait()
@@ -89,7 +91,7 @@ class NodeRunner:
         """Power the nodes off and end the runner's thread. Further calls have no effect.
 
         Raises:
-            BaseException: any error that ended the thread before.
+            BaseException: if an error has terminated the thread; the error is re-raised.
         """
         if self._stopping.is_set():
             return
@@ -109,7 +111,7 @@ class NodeRunner:
         try:
             self.stop()
         except Exception:
-            if error is None:  # the error of the ``with`` block has precedence
+            if error is None:  # an error from the ``with`` block takes precedence
                 raise
 
     def _run(self) -> None:
@@ -134,7 +136,7 @@ class NodeRunner:
             try:
                 self._turn()
             except BusError as error:
-                # A frame that cannot be sent is lost, as in a hardware node, and the nodes continue to run.
+                # As in a hardware node, a frame that cannot be sent is lost; the nodes continue to run.
                 self.bus_errors += 1
                 now_s = clock.monotonic()
                 if failing_since_s is None:
@@ -148,7 +150,7 @@ class NodeRunner:
                     with contextlib.suppress(BusError):
                         self._port.reopen()
                 self._stopping.wait(_RETRY_S)
-            # Only a frame that was sent or received shows that the bus works.
+            # Only the sending or reception of a frame proves that the bus works.
             if self._port.sent + self._heard > moved:
                 failing_since_s = None
             if self._bus_state is BusState.OFF and self._port.sent > self._sent_before:
@@ -158,21 +160,22 @@ class NodeRunner:
         self._bus_state = state
         now_ns = clock.monotonic_ns()
         for node in self.nodes:
-            with contextlib.suppress(BusError):  # the node keeps the emergency message in its queue
+            with contextlib.suppress(BusError):  # the unsent emergency message stays in the node's queue
                 node.on_bus(state, now_ns)
 
     def _on_error_frame(self, frame: Frame) -> None:
-        # Error frames of other interfaces have a different meaning.
+        # Error frames are interpreted only on SocketCAN; on other interfaces, they have a different meaning.
         if self._port.config.interface == "socketcan":
             state = bus_state(frame)
             if state is not None:
                 self._set_bus_state(state)
-                self._sent_before = 1 << 63  # a queued frame does not show that the bus has recovered
+                self._sent_before = 1 << 63  # queuing a frame does not prove that the bus has recovered
 
     def _turn(self) -> None:
-        """Serve all timers that are due, then wait for a frame, until the next timer is due."""
+        """Process all due timers, then wait for a frame or for the next timer."""
         nodes, now = self.nodes, clock.monotonic_ns
-        # All nodes receive the same time, so that a single wake-up serves nodes that were started together.
+        # All nodes receive the same time, so a single wake-up handles the timers of all nodes that were
+        # started together.
         now_ns, first_ns = now(), NO_DEADLINE_NS
         silent = any(now_ns >= node.silent_from_ns for node in nodes)
         failure = self._catch_up(now_ns) if silent else None
@@ -194,10 +197,10 @@ class NodeRunner:
             raise failure
 
     def _catch_up(self, now_ns: int) -> BusError | None:
-        """Serve the waiting frames that were received before ``now_ns``.
+        """Process the queued frames that were received before ``now_ns``.
 
-        If this thread was delayed, a heartbeat may have been received in time but not yet served. Without
-        this method, such a heartbeat would count as missed.
+        After a delay of this thread, a heartbeat that arrived in time may still be in the queue. Without this
+        method, the heartbeat would be reported as missed.
         """
         failure: BusError | None = None
         for _ in range(_CATCH_UP_FRAMES):

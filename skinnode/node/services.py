@@ -1,4 +1,4 @@
-"""Resources that a node's communication services share."""
+"""Resources shared by a node's communication services."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from skinnode.node.object_dictionary import ObjectStore
 from skinnode.node.rejected import RejectedFrames
 
 Send = Callable[[int, bytes], None]
-"""Callback that takes a COB-ID and a payload and sends the frame."""
+"""Callback that sends a frame; the arguments are the COB-ID and the payload."""
 
 
 @dataclass(frozen=True, slots=True)
 class NodeServices:
-    """Resources that all communication services of a node share."""
+    """Resources shared by all communication services of a node."""
 
     store: ObjectStore
     """Object dictionary."""
@@ -27,4 +27,4 @@ class NodeServices:
     send: Send
     """Function that sends a frame."""
     now: Clock
-    """Function that returns the time of the event being handled, ns."""
+    """Function that returns the time (ns) of the event being handled."""

@@ -1,4 +1,4 @@
-"""Saving of parameters: objects 0x1010 (store), 0x1011 (restore defaults) and 0x1020 (verify), CiA 301 v4.2.
+"""Saving of parameters by 0x1010 (store), 0x1011 (restore defaults) and 0x1020 (verify); CiA 301 v4.2.
 
 This module also saves the baseline and the LSS configuration of a node. A *parameter* is an object that a
 client can write and read back; commands and computed objects are not parameters.
@@ -33,15 +33,15 @@ Rows = tuple[tuple[float, ...], ...]
 
 
 class Storage:
-    """Storage of the values that survive a power cycle, with the objects that save and restore them.
+    """Storage of the values that survive a power cycle, including the store and restore objects.
 
-    If a value cannot be saved or restored, the node sends EMCY 0x6300, whose first manufacturer-specific byte
+    If a value cannot be saved or restored, the node sends EMCY 0x6300. The first manufacturer-specific byte
     is a :class:`~skinnode.node.memory.Fault`.
 
     Args:
         services: resources that all services of the node share.
-        memory: memory of the node; None if there is no memory, in which case 0x1010 and 0x1011 read 0 and
-            refuse writes (CiA 301).
+        memory: memory of the node; None for a node without a memory. Without a memory, 0x1010 and 0x1011 read
+            as 0 and refuse writes (CiA 301).
         patch: sizes and layout of the patch; see :class:`~skinnode.node.memory.Kept`.
     """
 
@@ -52,10 +52,10 @@ class Storage:
         self._lasting: dict[Fault, bytes] = {}
         self._kept = Kept(patch)
         self.problem = ""
-        """Latest problem with the memory, in one line; empty if no problem has occurred."""
+        """One-line description of the latest memory problem; empty if no problem has occurred."""
         self.baseline_ohm: Callable[[], Rows] = tuple
-        """Function that returns the current R0, ohm; set by the application."""
-        # Value 1 means that the node saves and restores on command.
+        """Function that returns the current baseline R0 in ohms; set by the application."""
+        # The value 1 indicates that the node saves and restores parameters on command.
         able = int(memory is not None).to_bytes(4, "little")
         for index, signature, command in (
             (od.STORE, od.STORE_SIGNATURE, self._save),
@@ -67,7 +67,7 @@ class Storage:
 
     @property
     def kept(self) -> Kept:
-        """Content of the memory that this node can use."""
+        """Usable content of the memory."""
         return self._kept
 
     @property
@@ -99,7 +99,7 @@ class Storage:
             fault: type of the fault.
             index: index of a refused parameter.
             subindex: sub-index of a refused parameter.
-            why: description of the fault, in one line; if empty, the description names the refused parameter.
+            why: one-line description of the fault; if empty, the refused parameter is reported.
         """
         self.problem = why or f"the stored value of 0x{index:04X}:{subindex} is not allowed"
         detail = struct.pack("<BHB", fault, index, subindex)
@@ -111,8 +111,8 @@ class Storage:
     def report(self, t_ns: int) -> None:
         """Send emergency messages for the faults recorded since the last call.
 
-        A fault of the whole memory stays active in the error register until the memory is reliable again,
-        even after a reset.
+        A fault of the whole memory remains active in the error register until the memory is reliable again,
+        even across resets.
         """
         for fault, detail in self._lasting.items():
             self._emcy.report(EmcyCode.DATA_SET, detail, t_ns, fault)
@@ -121,7 +121,7 @@ class Storage:
             self._emcy.report_once(EmcyCode.DATA_SET, detail, t_ns)
 
     def restore(self, first: int, last: int) -> None:
-        """Set the objects from index ``first`` to ``last`` to their power-on values.
+        """Set the objects from index ``first`` to index ``last`` to their power-on values.
 
         A saved value must pass the same checks as a value written by a client. An object is set to its
         default if it has no saved value, or if its saved value is not allowed.
@@ -140,7 +140,7 @@ class Storage:
             self._clear_verification()  # the restored configuration differs from the verified one
 
     def keep_baseline(self) -> None:
-        """Save the baseline, and no other value, if the node has a memory."""
+        """Save only the baseline, if the node has a memory."""
         if self._memory is None:
             return
         try:
@@ -149,7 +149,7 @@ class Storage:
             self.note(Fault.NOT_SAVED, why=f"baseline not saved: {error}")
 
     def keep_lss(self, node_id: int, bit_rate_bps: int | None) -> None:
-        """Save the node-ID and bit rate that LSS has configured.
+        """Save the node-ID and bit rate configured by LSS.
 
         Args:
             node_id: 1 to 127, or 255 for no node-ID.
@@ -167,7 +167,7 @@ class Storage:
         self._settle(Fault.NOT_SAVED)
 
     def _settle(self, *faults: Fault) -> None:
-        """Report the end of faults, because the memory is reliable again."""
+        """Report the end of memory faults, because the memory is reliable again."""
         for fault in faults:
             if self._lasting.pop(fault, None) is not None:
                 self._emcy.clear(EmcyCode.DATA_SET, self._now(), fault)
@@ -182,8 +182,8 @@ class Storage:
                 self._keep(command(subindex))
             except OSError:
                 raise Refused(AbortCode.HARDWARE) from None
-            # A save on command means that the user accepts the current parameters, so these faults end. An
-            # automatic save of the baseline does not end them.
+            # A save command means that the user accepts the current parameters, so the memory faults end.
+            # Automatic saving of the baseline does not end memory faults.
             self._settle(Fault.UNREADABLE, Fault.DAMAGED, Fault.FOREIGN)
 
         return guard
@@ -196,13 +196,13 @@ class Storage:
         if subindex in (_ALL, _APPLICATION_ONLY):
             application_kept = Parameters(node_id, application)
             kept = replace(kept, application=application_kept, baseline_ohm=self.baseline_ohm())
-        # Object 0x1020 refers to the whole configuration, so it is saved only if the memory then contains the
-        # whole configuration.
+        # Object 0x1020 verifies the whole configuration, so 0x1020 is saved only if the memory then contains
+        # the whole configuration.
         whole = kept.communication.values == communication and kept.application.values == application
         return kept if whole else _unverified(kept)
 
     def _forget(self, subindex: int) -> Kept:
-        """Return the memory's content without the saved parameters, so that a reset restores the defaults."""
+        """Return the memory's content without the saved parameters; a reset then restores the defaults."""
         kept = _unverified(self._kept)
         if subindex in (_ALL, _COMMUNICATION_ONLY):
             kept = replace(kept, communication=Parameters())
@@ -224,7 +224,7 @@ class Storage:
         return {key: value for key, value in changed.items() if key not in od.COMMANDS}
 
     def _for_this_node(self, key: Key, value: bytes, node_id: int) -> bytes:
-        """Convert a saved COB-ID: the default COB-ID for ``node_id`` becomes this node's default COB-ID."""
+        """Convert a saved value: a COB-ID that is the default for ``node_id`` becomes this node's default."""
         if not self._store.has(*key):
             return value
         entry = self._store.find(*key)

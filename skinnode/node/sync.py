@@ -18,17 +18,17 @@ from skinnode.node.rejected import Rejected
 from skinnode.node.services import NodeServices
 
 PRODUCER_BIT: Final = 1 << 30
-"""Bit of 0x1005 that makes the node produce SYNC."""
+"""Bit in 0x1005 that enables SYNC production."""
 
 SHORTEST_PERIOD_US: Final = 100
-"""Minimum cycle period (0x1006), µs; a SYNC message takes half of this time at 1 Mbit/s."""
+"""Minimum cycle period (0x1006) in µs: twice the duration of a SYNC message at 1 Mbit/s."""
 
 _DO_NOT_CARE_BIT: Final = 1 << 31
-"""Bit of 0x1005 that a client may set, without effect (CiA 301 v4.2, table 44)."""
+"""Bit in 0x1005 that has no effect, but that a client may set (CiA 301 v4.2, table 44)."""
 
 
 class SyncWindow:
-    """Time window after a SYNC (0x1007, µs; 0 for no limit) in which synchronous PDOs are valid."""
+    """Synchronous window (0x1007): time after a SYNC during which synchronous PDOs are valid."""
 
     def __init__(self, store: ObjectStore, emcy: EmcyProducer) -> None:
         self._store, self._emcy = store, emcy
@@ -36,11 +36,11 @@ class SyncWindow:
         self._missed: set[int] = set()
 
     def start(self, t_ns: int) -> None:
-        """Open the window, because a SYNC was received at ``t_ns``."""
+        """Open the synchronous window at ``t_ns``, the time of a SYNC."""
         self._sync_ns = t_ns
 
     def forget(self, t_ns: int) -> None:
-        """Reset the window and end its errors, because the node has entered another NMT state."""
+        """Reset the synchronous window and its errors, because the NMT state has changed."""
         self._sync_ns = None
         for number in tuple(self._missed):
             self._clear(number, t_ns)
@@ -53,7 +53,7 @@ class SyncWindow:
     def lets_out(self, number: int, t_ns: int) -> bool:
         """Return whether a synchronous TPDO may be sent; if not, the caller must discard it.
 
-        An emergency message reports a discarded TPDO once, until the TPDO is sent within the window again.
+        An emergency message reports a discarded TPDO once, until this TPDO is again sent within the window.
 
         Args:
             number: number of the TPDO, counted from 0.
@@ -73,7 +73,7 @@ class SyncWindow:
 
 
 class Sync:
-    """SYNC consumer, which checks message lengths, and SYNC producer if 0x1005 enables production.
+    """SYNC consumer, which checks message lengths, and SYNC producer, if enabled by 0x1005.
 
     A SYNC producer also consumes its own SYNC messages: the caller must treat a SYNC returned by
     :meth:`on_timer` like a SYNC accepted by :meth:`accept`.
@@ -91,11 +91,11 @@ class Sync:
         self._communicates = False
         self._counter = 0  # counter of the last SYNC sent
         self._period_ns = 0
-        self._wrong_length: int | None = None  # length of the last SYNC received; None if it was right
+        self._wrong_length: int | None = None  # incorrect length of the last SYNC received; None if correct
         self.cob_id = od.SYNC_COB_ID
         """COB-ID of SYNC messages."""
         self.deadline_ns = NO_DEADLINE_NS
-        """Time at which the next SYNC is due, ns."""
+        """Time (ns) at which the next SYNC must be sent."""
         store.guard(od.COB_ID_SYNC, self._guard_cob_id)
         store.guard(od.CYCLE_PERIOD, _guard_period)
         store.guard(od.SYNC_COUNTER_OVERFLOW, self._guard_overflow)
@@ -111,7 +111,7 @@ class Sync:
     def reload(self) -> None:
         """Apply 0x1005 and 0x1006 after a write or a reset.
 
-        A producer sends its next SYNC one period later. The counter of its first SYNC is 1.
+        A SYNC producer sends its next SYNC one period later. The SYNC counter starts at 1.
         """
         self.cob_id = self._store.integer(od.COB_ID_SYNC) & COB_ID_MASK
         self._start()
@@ -120,7 +120,7 @@ class Sync:
         """Handle a change of the NMT state.
 
         SYNC is produced and consumed in PRE-OPERATIONAL and OPERATIONAL. The SYNC counter restarts at 1 when
-        the node enters one of these two states from any other state.
+        the node enters these states from another NMT state.
         """
         if communicates != self._communicates:
             self._communicates, self._wrong_length, self._period_ns = communicates, None, 0
@@ -134,7 +134,7 @@ class Sync:
         self.deadline_ns = self._now() + self._period_ns if runs else NO_DEADLINE_NS
 
     def on_timer(self, t_ns: int) -> bytes | None:
-        """Send and return the SYNC if it is due. If SYNCs were missed, they are skipped, without drift."""
+        """Send and return the SYNC if one is due. Missed SYNCs are skipped without drift."""
         if t_ns < self.deadline_ns:
             return None
         self.deadline_ns += (t_ns - self.deadline_ns) // self._period_ns * self._period_ns + self._period_ns
@@ -148,10 +148,10 @@ class Sync:
     def accept(self, message: bytes, t_ns: int) -> bool:
         """Return whether a SYNC message has the length that 0x1019 requires.
 
-        A wrong length is reported once, until the length changes.
+        An incorrect length is reported once, until a different length is received.
 
         Args:
-            message: the payload.
+            message: payload of the SYNC message.
             t_ns: time of reception, ns.
         """
         counted = self._overflow > 0

@@ -1,8 +1,8 @@
 """TIME consumer, which receives the time of day (CiA 301 v4.2, 7.2.6 and object 0x1012).
 
-A node has no real-time clock. The node stores the last time received, together with the time on its own clock
-at that moment. From these two times, it computes the current time of day (0x2022), and a host can convert the
-device time of a scan to a date.
+A node has no real-time clock. The node stores the last time of day received, and the simultaneous time on its
+own clock. The node computes the current time of day (0x2022) from these two times. A host can also use them
+to convert the device time of a scan to a date.
 """
 
 from __future__ import annotations
@@ -35,7 +35,8 @@ class TimeConsumer:
 
     def __init__(self, store: ObjectStore, now: Clock) -> None:
         self._store, self._now = store, now
-        # Last time received, counted from 1984-01-01; the node's clock then showed _received_ns.
+        # Last time of day received, as the time since 1984-01-01. The time of reception on the node's clock
+        # is _received_ns.
         self._received_ms = 0
         self._received_ns = 0
         self._messages = 0
@@ -44,7 +45,7 @@ class TimeConsumer:
 
     @property
     def cob_id(self) -> int | None:
-        """COB-ID of TIME messages; None if the node does not consume them."""
+        """COB-ID of TIME messages; None if the node ignores TIME messages."""
         word = self._store.integer(od.COB_ID_TIME)
         return word & COB_ID_MASK if word & _CONSUMES else None
 
@@ -56,7 +57,7 @@ class TimeConsumer:
             t_ns: time of reception, ns.
 
         Returns:
-            Whether the payload is a valid time of day; if not, the stored time does not change.
+            Whether the payload is a valid time of day. An invalid payload does not change the stored time.
         """
         if len(data) != _FORMAT.size:
             return False
@@ -69,7 +70,7 @@ class TimeConsumer:
         return True
 
     def reset(self) -> None:
-        """Discard the time received, as after *reset node*."""
+        """Discard the time received, because of power-on or *reset node*."""
         self._received_ms = self._received_ns = self._messages = 0
 
     def _read(self, subindex: int) -> bytes:
@@ -87,11 +88,11 @@ class TimeConsumer:
                 return (self._received_ns // 1000 & 0xFFFF_FFFF).to_bytes(4, "little")
 
     def _guard(self, _: int, value: int) -> None:
-        """Refuse a COB-ID that enables TIME production, or that changes while the node consumes TIME."""
+        """Refuse a COB-ID that enables TIME production, or a change while the node consumes TIME."""
         current = self._store.integer(od.COB_ID_TIME)
         if value & _PRODUCES:
             raise Refused(AbortCode.INVALID_VALUE)
-        # In this object, bit 31 means "in use", not "invalid" as in other COB-IDs. Restricted CAN-IDs are
+        # In 0x1012, bit 31 means "in use"; in other COB-IDs, bit 31 means "invalid". Restricted CAN-IDs are
         # never allowed.
         check_cob_id(value ^ _CONSUMES, current ^ _CONSUMES)
         check_cob_id(value & ~_CONSUMES, INVALID_BIT)

@@ -1,4 +1,4 @@
-"""Timers, one per key, served in order of time."""
+"""Collection of timers, one per key, which elapse in order of time."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ from skinnode.node.clock import NO_DEADLINE_NS
 
 
 class Timers:
-    """Timers, one per key, in a heap. Each operation takes O(log n) time, amortised."""
+    """Collection of timers, one per key, stored in a heap. Operations take amortised O(log n) time."""
 
     def __init__(self) -> None:
         self._due: dict[int, int] = {}
-        self._heap: list[tuple[int, int]] = []  # also contains timers that were changed or cancelled
+        self._heap: list[tuple[int, int]] = []  # includes stale entries of changed or cancelled timers
 
     @property
     def deadline_ns(self) -> int:
-        """Time of the earliest timer, ns; NO_DEADLINE_NS if no timer is set."""
+        """Time (ns) of the earliest timer; NO_DEADLINE_NS if no timer is set."""
         heap, due = self._heap, self._due
         while heap and due.get(heap[0][1]) != heap[0][0]:
             heapq.heappop(heap)
@@ -48,7 +48,7 @@ class Timers:
         """Yield the keys of the timers that are due at ``t_ns``, earliest first.
 
         A timer is removed when its key is yielded, so an exception in the caller's loop does not affect the
-        other timers. If the caller sets a timer again to a time up to ``t_ns``, its key is yielded again.
+        other timers. If the caller resets a timer to a time no later than ``t_ns``, the key is yielded again.
         """
         while self.deadline_ns <= t_ns:
             _, key = heapq.heappop(self._heap)

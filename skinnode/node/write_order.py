@@ -1,4 +1,4 @@
-"""Restoring of a saved configuration, in an order in which CiA 301 allows the values to be written."""
+"""Restoring of a saved configuration, with values written in an order that CiA 301 permits."""
 
 from __future__ import annotations
 
@@ -14,30 +14,31 @@ Key = tuple[int, int]
 
 _PDO_END: Final = 0x1C00
 _LATE: Final = (od.CYCLE_PERIOD, od.COB_ID_SYNC, od.VERIFY_CONFIGURATION)
-"""Indices of the objects that are written last, in this order. The cycle period must follow the SYNC counter
-overflow, which cannot change while a cycle period is set. The COB-ID of SYNC, which starts the producer,
-comes next. Object 0x1020 must be last, because any other write clears it."""
+"""Indices of the objects that must be written last, in writing order. The cycle period follows the SYNC
+counter overflow, because the overflow cannot change while a cycle period is set. The COB-ID of SYNC follows
+the cycle period, because writing it starts the SYNC producer. Object 0x1020 must be the last, because any
+other write clears 0x1020."""
 
 
 def write_configuration(store: ObjectStore, values: Mapping[Key, bytes]) -> list[Key]:
     """Write the values of a saved configuration to an object dictionary that contains the defaults.
 
-    Each PDO is switched off while its mapping and its parameters are written. EMCY is switched off before its
-    COB-ID changes.
+    Each PDO is disabled while its mapping and communication parameters are written. EMCY is disabled before
+    its COB-ID changes.
 
     Args:
         store: object dictionary whose objects have their defaults.
         values: saved bytes, by index and sub-index.
 
     Returns:
-        Index and sub-index of each value that was refused. The object then keeps its default. If the object
-        is a mapping entry, the whole mapping keeps its default.
+        Index and sub-index of each refused value. An object with a refused value keeps its default; for a
+        mapping entry, the whole mapping keeps its default.
     """
     known = {key: value for key, value in values.items() if store.has(*key)}
     refused = [key for key in values if key not in known]
     pdos = {index & ~od.PDO_MAPPING_OFFSET for index, _ in known if od.RPDO1_PARAMETER <= index < _PDO_END}
     defaults = {pdo: store.raw(pdo, od.PDO_COB_ID) for pdo in sorted(pdos)}
-    # All PDOs are switched off first, because a saved COB-ID may be another PDO's default.
+    # All PDOs are disabled first, because a saved COB-ID may equal another PDO's default COB-ID.
     for pdo, default in defaults.items():
         _accepted(store, [((pdo, od.PDO_COB_ID), _switched_off(default))])
     for pdo, default in defaults.items():
@@ -57,7 +58,7 @@ def _write_pdo(store: ObjectStore, values: Mapping[Key, bytes], pdo: int, defaul
     """Write both records of a PDO, and yield the index and sub-index of each refused value.
 
     The argument ``pdo`` is the index of the communication record. The argument ``default`` is the PDO's
-    COB-ID if ``values`` does not contain it.
+    COB-ID for the case that ``values`` does not contain one.
     """
     cob_id, count = (pdo, od.PDO_COB_ID), (pdo + od.PDO_MAPPING_OFFSET, 0)
     own = sorted(item for item in values.items() if item[0][0] == pdo and item[0] != cob_id)

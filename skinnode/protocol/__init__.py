@@ -1,4 +1,4 @@
-"""Object dictionary and PDO payloads of a patch, in pure functions that need neither a bus nor a clock.
+"""Object dictionary and PDO payloads of a patch, as pure functions without bus or clock access.
 
 Node:  resistances → ``codes`` → codes → ``chunk``, ``summary`` → PDO payloads, mapped as ``profile`` defines.
 Host:  PDO payloads → ``chunk``, ``summary`` → ``assembler`` → one complete scan → ``codes`` → resistances.

@@ -1,36 +1,37 @@
-"""Assembly of one patch's received chunks and summaries into scans; not thread-safe, and without a clock.
+"""Assembly of one patch's chunks and summaries into scans. The code is not thread-safe and reads no clock.
 
 **Scans are never mixed.** A scan contains only frames with the scan's own counter that arrived within the
 *timeout* after its first frame. The scan is closed permanently as soon as a frame of a newer scan arrives.
 Frames of two scans can therefore be mixed only if both scans have the same counter and the frames arrive
-within the timeout. Mixing is impossible if counter range × period is longer than the timeout plus the maximum
-age of a frame, which is the time from its scan's SYNC to its arrival. The timeout is three periods, or less
-if the counter range is short. With the usual range of 240 scans, a frame may therefore be 237 periods old.
+within the timeout. The age of a frame is the time from its scan's SYNC to its arrival. Mixing is impossible
+if counter range × period is longer than the timeout plus the maximum age. The timeout is three periods, or
+less if the counter range is short. With the usual counter range of 240 scans, a frame may therefore be up to
+237 periods old.
 
 **Two scans with the same counter.** Two scans have the same counter if a node did not increment it, or if two
-nodes have the same node-ID. The assembler detects this if two frames with the same index and different
-content arrive. The other frames then cannot be assigned to either scan, so the assembler discards the whole
-scan. The assembler also discards an incomplete scan whose chunks arrived more than two periods apart. The
-first chunk of such a scan had the counter of a later scan, whose own chunks may arrive after the timeout. If
-two mixed scans have no chunk index in common, only the check detects the mixing.
+nodes have the same node-ID. The assembler detects the conflict if two frames with the same index and
+different content arrive. The remaining frames then cannot be assigned to one of the two scans, so the
+assembler discards the whole scan. The assembler also discards an incomplete scan whose chunks arrived more
+than two periods apart. The first chunk of such a scan had the counter of a later scan, whose own chunks may
+arrive after the timeout. If the frames of two mixed scans have no chunk index in common, only the scan check
+detects the mixing.
 
 **The check.** A summary with :attr:`~skinnode.protocol.summary.SummaryFlag.CHECKED` carries a CRC over all
-codes that the receiver must have after the scan (:mod:`skinnode.protocol.scan_check`). A failed check does
-not show which chunk is wrong. The assembler therefore discards the whole scan and the codes kept for chunks
-that were not sent. A stream is *checked* from the first check that passes, or from a
-:meth:`ScanAssembler.reset` with ``checked``. In a checked stream, a scan is complete only if its check
-passed, and a summary without a check is rejected. A scan is published as *unchecked* if its summary was lost,
-or if the codes of chunks that were not sent are unknown. Patches of revision 1.0 send no checks, so their
-scans are complete as soon as all chunks have been received.
+codes at the receiver after the scan (:mod:`skinnode.protocol.scan_check`). A failed check does not identify
+the wrong chunk. The assembler therefore discards the whole scan, and the stored codes of unsent chunks. A
+stream is *checked* from the first check that passes, or from a :meth:`ScanAssembler.reset` with ``checked``.
+In a checked stream, a scan is complete only if its check passed, and a summary without a check is rejected. A
+scan is published as *unchecked* if its summary was lost, or if the codes of chunks that were not sent are
+unknown. Patches of revision 1.0 send no checks, so their scans are complete as soon as all chunks have been
+received.
 
-**Order of counters.** A frame whose counter is ahead of the last scan's counter by at most half the counter
-range belongs to a newer scan. A frame with any other counter is late and is dropped. If no frame has been
-accepted for the timeout, the next frame is accepted with any counter, because the node or the SYNC producer
-may have restarted.
+**Order of counters.** A counter that leads the last scan's counter by at most half the counter range
+indicates a newer scan. Frames with other counters are late and are dropped. After a silence as long as the
+timeout, a frame with any counter is accepted, because the node or the SYNC producer may have restarted.
 
 **Chunks that were not sent.** If the summary indicates that only changed chunks were sent, the other chunks
 keep their last codes (:mod:`skinnode.protocol.partial_scan`). A lost, torn or overrun scan may have changed
-these codes, and so may a scan lost during a long silence. In either case the codes are invalid until their
+the codes of unsent chunks, and so may a scan during a long silence. These codes are then invalid until their
 chunks are sent again.
 """
 
@@ -53,11 +54,11 @@ from skinnode.text.words import counted
 
 _CHUNK_INDICES: Final = 256
 _NOT_EXPECTED: Final = b""
-"""Placeholder payload for chunk numbers that the patch does not have; it saves a bounds check for each chunk
-received."""
-_NONE_OPEN: Final = -1  # a negative number, so that no scan counter equals it
+"""Placeholder payload for chunk numbers beyond the patch's last chunk, which saves a bounds check per
+received chunk."""
+_NONE_OPEN: Final = -1  # negative, and therefore different from every scan counter
 _NEVER: Final = -1
-# Testing an enum flag takes as long as processing a whole chunk; testing an int takes a tenth of that.
+# Testing an enum flag takes as long as processing a whole chunk; testing an int is ten times as fast.
 _CHANGED_ONLY, _OVERRUN = int(SummaryFlag.CHANGED_ONLY), int(SummaryFlag.OVERRUN)
 _BASELINE_CHANGED: Final = int(SummaryFlag.BASELINE_CHANGED)
 
@@ -66,15 +67,15 @@ class ScanAssembler:
     """Assembler of one patch's scans. Each method call returns at most one scan; scans are returned in order.
 
     Call :meth:`poll` after each batch of frames and at :meth:`next_deadline_ns`. The method ``poll`` returns
-    a scan whose missing frames have timed out. If a single frame ended two scans, ``poll`` returns the second
-    of them.
+    a scan whose missing frames have timed out. If a single frame closed two scans, ``poll`` returns the
+    second scan.
 
     Args:
         profile: sizes of the patch.
-        counter_overflow: value of 0x1019, up to which the SYNC counter numbers the scans from 1; 0 if the
+        counter_overflow: value of 0x1019 if SYNC counters from 1 to this value number the scans; 0 if the
             patch numbers its scans from 0 to 255.
-        period_ns: time from one scan to the next, ns; determines the timeout.
-        grace_ns: maximum wait for late frames after the summary or all chunks have arrived, ns.
+        period_ns: scan period (ns), which determines the timeout.
+        grace_ns: maximum wait (ns) for late frames after the summary or the last missing chunk has arrived.
         node_id: node-ID shown in the errors passed to ``on_reject``.
         on_reject: called with a CodecError for each frame with a wrong length, and for each summary that
             lacks a check.
@@ -112,7 +113,7 @@ class ScanAssembler:
         self._node_id = node_id
         self._on_reject = on_reject
         self.on_discarded: Callable[[], None] | None = None
-        """Callback for a discarded scan that may have announced a new baseline; None for no callback."""
+        """Callback invoked if a discarded scan may have announced a new baseline; None for no callback."""
 
         # The following attributes describe the open scan or, if no scan is open, the last scan.
         self._counter = _NONE_OPEN
@@ -124,11 +125,11 @@ class ScanAssembler:
         self._received = 0
         self._sent = _NEVER
         self._summary: Summary | None = None
-        self._head = b""  # the bytes of the summary that the check covers
+        self._head = b""  # bytes of the summary covered by the scan check
         self._checked = False
         self._device_time = DeviceTimeTracker()
         self._expires_ns = self._t_first_ns = self._t_last_ns = 0
-        self._t_chunk_ns = self._t_summary_ns = 0  # times of reception: frame before the summary, and summary
+        self._t_chunk_ns = self._t_summary_ns = 0  # reception of the frame before the summary, of the summary
 
         self._held = HeldChunks(profile)
         self._follows = False  # whether the open scan follows the last scan without a gap
@@ -207,7 +208,7 @@ class ScanAssembler:
         return closed
 
     def poll(self, t_ns: int) -> Scan | None:
-        """Close and return the open scan if the wait for its missing frames is over.
+        """Close and return the open scan if its missing frames have timed out.
 
         Args:
             t_ns: current time, ns.
@@ -216,9 +217,9 @@ class ScanAssembler:
         return self._close() if deadline is not None and t_ns >= deadline else None
 
     def next_deadline_ns(self) -> int | None:
-        """Return the time at which :meth:`poll` will close the open scan, ns; None if no scan is open.
+        """Return the time (ns) at which :meth:`poll` will close the open scan; None if no scan is open.
 
-        If another frame arrives first, this time may change.
+        Each received frame may change the closing time.
         """
         if self._counter == _NONE_OPEN:
             return None
@@ -232,10 +233,10 @@ class ScanAssembler:
         """Discard the open scan, the last codes and the scan counter, as after a boot-up of the node.
 
         Args:
-            under_way: whether the node may already be sending scans; if so, chunks missing at the start of
-                the first scan do not count as lost.
-            checked: whether the node is known to send a check in every summary; if false, checks are required
-                only after the first check that passes.
+            under_way: whether the node may already be sending scans. If so, chunks missing at the start of
+                the first scan are not counted as lost.
+            checked: whether the node is known to send a check in every summary; if false, a passed check
+                makes all subsequent checks mandatory.
         """
         if self._counter != _NONE_OPEN:
             self._discarded += 1
@@ -314,7 +315,7 @@ class ScanAssembler:
             self._on_reject(CodecError(cob_id, data, allowed))
 
     def _is_news(self, counter: int, t_ns: int, *, known: bool) -> bool:
-        """Return whether a frame that does not fit the open scan starts a new scan; if not, count it.
+        """Return whether a frame outside the open scan starts a new scan; if not, count the frame.
 
         The argument ``known`` indicates whether the last scan contains an identical frame.
         """
@@ -344,7 +345,7 @@ class ScanAssembler:
     def _open(self, counter: int, t_ns: int, *, from_its_begin: bool) -> None:
         self._follows = False
         self._joined_late, self._may_join = self._may_join and not from_its_begin, False
-        if self._last_counter == _NEVER:  # this is the first scan, or the first after a reset
+        if self._last_counter == _NEVER:  # first scan, or first scan after a reset
             self._scan = counter if self._scan == _NEVER else self._scan + self._steps_to(counter, self._scan)
         else:
             ahead = self._steps_to(counter, self._last_counter)
@@ -364,7 +365,7 @@ class ScanAssembler:
         self._expires_ns = t_ns + self._timeout_ns
 
     def _steps_to(self, counter: int, last: int) -> int:
-        """Return the number of scans, at least 1, from scan counter ``last`` to the next ``counter``."""
+        """Return the number of scans (at least 1) between the scan counters ``last`` and ``counter``."""
         return (counter - last) % self._range or self._range
 
     def _book(self) -> None:
@@ -373,7 +374,7 @@ class ScanAssembler:
         self._summaries += self._summary is not None
 
     def _close(self) -> Scan | None:
-        """Close the open scan; return it, or None if it must be discarded."""
+        """Close the open scan; return the scan, or None if the scan must be discarded."""
         self._book()
         self._counter = _NONE_OPEN
         summary = self._summary
@@ -430,7 +431,7 @@ class ScanAssembler:
         )
 
     def _discard(self, *, doubt: bool = True) -> None:
-        """Discard a scan and all codes kept for later scans.
+        """Discard a scan, and all codes stored for later scans.
 
         The argument ``doubt`` indicates whether the scan may have announced a new baseline.
         """

@@ -1,4 +1,4 @@
-"""Packing and unpacking of chunks, the parts of a scan that TPDO1 carries."""
+"""Packing and unpacking of chunks: the parts of a scan, which are sent in TPDO1."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ class Chunk(NamedTuple):
     """Contents of a chunk, as sent on a classic CAN bus."""
 
     chunk: int
-    """Chunk index; the chunk starts with code number ``chunk · codes_per_chunk`` of the scan, counted from
-    0."""
+    """Chunk index. The first code in the chunk is code number ``chunk · codes_per_chunk`` of the scan,
+    counted from 0."""
     scan: int
     """Scan counter, u8."""
     codes: tuple[int, ...]
@@ -41,7 +41,7 @@ def pack_chunk(chunk: int, scan: int, codes: Sequence[int], bits: int = 16) -> b
         bits: width of a code, 16 or 24.
 
     Raises:
-        ValueError: if a number does not fit its field, or if there are too many codes.
+        ValueError: if a number exceeds the range of its field, or if there are too many codes.
     """
     width = bits // 8
     if not (0 <= chunk <= 255 and 0 <= scan <= 255):
@@ -145,7 +145,8 @@ def _places_of_codes(profile: PatchProfile) -> NDArray[np.intp]:
     """Return the position of each code in the concatenated payloads of a scan.
 
     For 16-bit codes the result has shape (U, K) and counts 16-bit words. For 24-bit codes the result has
-    shape (U, K, 4) and counts bytes; the fourth position is that of a zero byte appended to the payloads.
+    shape (U, K, 4) and counts bytes. The fourth position of each code refers to a zero byte appended to the
+    payloads.
     """
     width, per, head = profile.code_bits // 8, profile.codes_per_chunk, profile.chunk_head_bytes
     lines, shape = profile.lines, (profile.rows, profile.columns)
@@ -159,7 +160,7 @@ def _places_of_codes(profile: PatchProfile) -> NDArray[np.intp]:
 
 @functools.lru_cache(maxsize=64)
 def chunk_of_code(profile: PatchProfile) -> NDArray[np.intp]:
-    """Return, for each of the (U, K) codes, the number of its chunk, counted from 0 in sending order."""
+    """Return the chunk number of each code in a (U, K) array; chunks are numbered from 0 in sending order."""
     lines, per_line = profile.lines, profile.n_codes // profile.lines
     within = np.arange(per_line) // profile.codes_per_chunk
     chunks = np.arange(lines)[:, None] * profile.chunks_per_line + within
@@ -169,10 +170,10 @@ def chunk_of_code(profile: PatchProfile) -> NDArray[np.intp]:
 
 
 def chunk_indexer(profile: PatchProfile) -> Callable[[bytes], int]:
-    """Return a function that takes a chunk's payload and returns the chunk's number (:func:`chunk_of_code`).
+    """Return a function that maps a chunk's payload to the chunk's number (:func:`chunk_of_code`).
 
-    If the patch has no such chunk, the function returns ``n_chunks`` or more. The function does not check the
-    length of the payload.
+    For a chunk that the patch does not have, the returned function yields ``n_chunks`` or more. The function
+    does not check the payload length.
     """
     if profile.bus == "classic":
         return operator.itemgetter(0)
@@ -181,7 +182,7 @@ def chunk_indexer(profile: PatchProfile) -> Callable[[bytes], int]:
 
     def index(data: bytes) -> int:
         column = data[2]
-        # A patch has fewer than 256 columns.
+        # The upper byte of the first column must be 0, because a patch has fewer than 256 columns.
         if data[0] >= rows or data[3] or column >= columns or column % per:
             return n
         return data[0] * per_line + column // per

@@ -1,8 +1,9 @@
 """Public names of the modules that define a patch's wire format.
 
 The module ``codes`` converts resistances to codes. The modules ``chunk`` and ``summary`` pack and unpack PDO
-payloads, and ``command`` those of the host's commands. The modules ``scan_check`` and ``device_time`` compute
-two fields of the summary, and ``self_test`` packs the record 0x2023. No function needs a bus or a clock.
+payloads, and ``command`` packs and unpacks the host's commands. The modules ``scan_check`` and
+``device_time`` compute the summary's scan check and device time, and ``self_test`` packs the record 0x2023.
+None of the functions accesses a bus or a clock.
 """
 
 from skinnode.protocol.chunk import (

@@ -1,8 +1,8 @@
-"""Conversion of resistances to the codes that are sent on the bus, and back.
+"""Conversion between resistances and the codes sent on the bus.
 
 A resistance R has the n-bit code round((R/R0 − lo) / (hi − lo) · (2ⁿ − 4)). Codes from 0 to 2ⁿ − 4 are
-measurements. The three codes above are reserved: in ascending order, they mean over-range, short and open.
-Live streams use a compiled version of the decoder, ``skinnode.solve.wires.decode``.
+measurements. The three highest codes are reserved: in ascending order, over-range, short and open. Live
+streams are decoded by a compiled function, ``skinnode.solve.wires.decode``.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from skinnode.protocol.objects import DEFAULT_CODE_HI, DEFAULT_CODE_LO
 Codes = NDArray[np.uint32]
 
 MISSING: Final = 0xFFFF_FFFF
-"""Marker for a code that was not received; it exceeds every valid code."""
+"""Marker for a code that was not received, greater than any valid code."""
 
 CODE_BITS: Final = (16, 24)
 """Allowed code widths, bits."""
@@ -41,7 +41,7 @@ class CodeScale:
     lo: float = DEFAULT_CODE_LO
     """R/R0 at code 0."""
     hi: float = DEFAULT_CODE_HI
-    """R/R0 at the highest measurement code."""
+    """R/R0 value of the highest measurement code."""
 
     def __post_init__(self) -> None:
         if self.bits not in CODE_BITS:
@@ -64,7 +64,7 @@ class CodeScale:
 
     @property
     def short(self) -> int:
-        """Reserved code for zero resistance between upper and lower wire."""
+        """Reserved code for a short circuit between upper and lower wire."""
         return self.steps + 2
 
     @property
@@ -79,12 +79,12 @@ class CodeScale:
 
     @property
     def relative_std(self) -> float:
-        """Standard deviation of the rounding error relative to R0: step / √12, for a uniform distribution."""
+        """Standard deviation of the rounding error, relative to R0: step / √12 for a uniform distribution."""
         return self.step / math.sqrt(12.0)
 
 
 def as_baseline(baseline_ohm: ArrayLike) -> Float:
-    """Round R0 to REAL32, the precision that node and host use.
+    """Round R0 to REAL32, the precision used by the node and the host.
 
     Args:
         baseline_ohm: R0, ohm; any shape.
@@ -98,10 +98,10 @@ def as_baseline(baseline_ohm: ArrayLike) -> Float:
 def encode(resistance_ohm: ArrayLike, baseline_ohm: ArrayLike, scale: CodeScale) -> Codes:
     """Encode resistances.
 
-    +inf and NaN become the code for open, and zero and negative resistances the code for short. R/R0 outside
-    ``lo`` to ``hi`` becomes the over-range code, but a value up to half a step outside is rounded to the
-    nearest limit. A measurement without a baseline (R0 not positive and finite) also becomes the over-range
-    code.
+    Resistances of +inf and NaN become the code for open; zero and negative resistances become the code for
+    short. R/R0 values outside ``lo`` to ``hi`` become the over-range code, except that values up to half a
+    step outside are rounded to the nearest limit. A measurement without a baseline (R0 not positive and
+    finite) also becomes the over-range code.
 
     Args:
         resistance_ohm: resistances, ohm; any shape.

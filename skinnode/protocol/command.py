@@ -1,4 +1,4 @@
-"""Packing and unpacking of the commands that a host sends to a patch in RPDO1."""
+"""Packing and unpacking of commands, which a host sends to a patch in RPDO1."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _COB_ID: Final = od.command_cob_id(0)
 
 
 class SendMode(enum.IntEnum):
-    """Send mode of a patch (0x2020:1): all chunks of each scan, or changed chunks only."""
+    """Send mode of a patch (0x2020:1): all chunks of each scan, or only changed chunks."""
 
     FULL = 0
     CHANGED = 1
@@ -42,7 +42,7 @@ def pack_command(
     Args:
         tare: whether to make the current resistances the baseline.
         single_scan: whether to take one scan immediately.
-        send_mode: send mode, which every command sets and which applies until the next command.
+        send_mode: send mode until the next command; every command sets the send mode.
     """
     return _COMMAND.pack(od.TARE_SIGNATURE if tare else 0, single_scan, send_mode)
 

@@ -1,8 +1,8 @@
-"""Packing and unpacking of object 0x2300, which contains a patch's electrode coordinates.
+"""Packing and unpacking of a patch's electrode coordinates (object 0x2300).
 
 Coordinates are signed 32-bit integers in nanometres, little-endian: x, y, z of every upper electrode, wire by
 wire, then x, y, z of every lower electrode. The layout hash is also computed from coordinates rounded to
-nanometres, so a layout keeps its hash when it is packed and unpacked.
+nanometres, so packing and unpacking does not change a layout's hash.
 """
 
 from __future__ import annotations

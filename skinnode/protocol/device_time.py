@@ -1,4 +1,4 @@
-"""Reconstruction of a node's 32-bit device time in µs from the 16 bits that a checked summary carries."""
+"""Reconstruction of a node's 32-bit device time (µs) from the 16-bit time in a checked summary."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ The resolution is a power of two, so the 16-bit time consists of bits 6 to 21 of
 bits.
 """
 TIME_SHIFT: Final = 6
-"""Number of bits by which a time in µs is shifted to obtain a time in steps of 64 µs."""
+"""Right shift, in bits, that converts a time in µs to a time in steps of 64 µs."""
 TIME_WRAP_US: Final = TIME_STEP_US << 16
-"""Interval after which the 16-bit device time wraps, µs (4.2 s)."""
+"""Interval (µs) after which the 16-bit device time wraps: about 4.2 s."""
 
 
 def restore_time_us(low_us: int, expected_us: int) -> int:
-    """Return the device time nearest to an expected time, µs, given its low bits.
+    """Return the device time (µs) with the given low bits that is nearest to the expected time.
 
     Args:
         low_us: device time from a checked summary, without its upper bits, µs.
@@ -28,10 +28,10 @@ def restore_time_us(low_us: int, expected_us: int) -> int:
 
 
 class DeviceTimeTracker:
-    """Tracker that restores the upper bits of the device times in one stream."""
+    """Tracker that restores the upper bits of the device times in a stream of scans."""
 
     def __init__(self) -> None:
-        # Last device time with upper bits, and its time of reception; 0 if none.
+        # Last restored device time (µs), and its time of reception (ns); both 0 before the first summary.
         self._time_us = self._t_time_ns = 0
 
     def reset(self) -> None:
@@ -39,11 +39,11 @@ class DeviceTimeTracker:
         self._time_us = self._t_time_ns = 0
 
     def restore_us(self, low_us: int, t_ns: int) -> int:
-        """Return the 32-bit device time, µs, with its upper bits predicted from the last device time.
+        """Return the 32-bit device time (µs), with upper bits predicted from the last device time.
 
-        The prediction is the last device time plus the time elapsed on the host's clock since then. The upper
-        bits of the first device time come from the host's clock. These bits are correct if node and host
-        share a clock and the summary arrives within three seconds of the scan.
+        The prediction is the last device time plus the time that has since elapsed on the host's clock. The
+        upper bits of the first device time come from the host's clock. The first upper bits are correct if
+        node and host share a clock and the summary arrives within three seconds of the scan.
 
         Args:
             low_us: device time from a checked summary, without its upper bits, µs.

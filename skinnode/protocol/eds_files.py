@@ -18,12 +18,12 @@ def eds_name(profile: PatchProfile) -> str:
 
 
 def eds_text(profile: PatchProfile) -> str:
-    """Return the text of a patch's electronic data sheet (EDS, CiA 306); equal profiles give equal text."""
+    """Return the text of a patch's electronic data sheet (EDS, CiA 306), the same for equal profiles."""
     return render_eds(_device_info(profile, eds_name(profile)), profile.objects())
 
 
 def dcf_text(profile: PatchProfile, node_id: int, bitrate_bps: int) -> str:
-    """Return the text of a patch's device configuration file (DCF, CiA 306); equal arguments give equal text.
+    """Return the text of a patch's device configuration file (DCF, CiA 306), the same for equal arguments.
 
     Args:
         profile: sizes of the patch.

@@ -1,7 +1,7 @@
 """Object dictionary of a patch.
 
-This module declares the manufacturer objects (0x2000 to 0x2301) and the default PDO mappings. Only settings
-and constants have a default value; values that a patch measures, counts or sends have none.
+This module declares the manufacturer objects (0x2000 to 0x2301) and the default PDO mappings. Settings and
+constants have default values; measured, counted or transmitted values have none.
 """
 
 from __future__ import annotations
@@ -18,13 +18,14 @@ if TYPE_CHECKING:
 _U8, _U16, _U32, _REAL32 = DataType.UNSIGNED8, DataType.UNSIGNED16, DataType.UNSIGNED32, DataType.REAL32
 
 DEFAULT_CODE_LO: Final = 0.25
-"""Default R/R0 at code 0."""
+"""Default R/R0 value of code 0."""
 DEFAULT_CODE_HI: Final = 1.25
-"""Default R/R0 at the highest measurement code. A press moves electrodes together and reduces R, but sliding
-moves some electrodes apart and increases R."""
+"""Default R/R0 value of the highest measurement code. The range extends above 1, because sliding moves some
+electrodes apart and increases R, whereas a press reduces R."""
 DEFAULT_REFRESH_SCANS: Final = 10
-"""Default number of scans from one full scan to the next, if only changed chunks are sent. At the default
-period, lost codes are sent again within 0.8 s, at a tenth of the traffic of continuous full scans."""
+"""Default interval between full scans, as a number of scans, if only changed chunks are sent. At the default
+period, lost codes are sent again within 0.8 s. The resulting traffic is a tenth of that of continuous full
+scans."""
 
 
 def patch_objects(profile: PatchProfile) -> tuple[Object, ...]:

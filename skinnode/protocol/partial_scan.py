@@ -1,4 +1,4 @@
-"""Decoding of partial scans, in which chunks that were not sent keep their last codes."""
+"""Decoding of partial scans, in which unsent chunks keep their last codes."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class HeldChunks:
         self.forget()
 
     def forget(self) -> None:
-        """Discard all payloads, because a scan that was not received may have changed them."""
+        """Discard all payloads, because a missed scan may have changed the codes."""
         self._payloads = [None] * self._profile.n_chunks
 
     def update(self, received: Sequence[bytes | None], *, carry: bool) -> None:
@@ -34,7 +34,7 @@ class HeldChunks:
 
         Args:
             received: payload of each chunk; None for a chunk that did not arrive.
-            carry: whether a chunk that did not arrive is unchanged and keeps its last payload.
+            carry: whether chunks that did not arrive are unchanged and keep their last payloads.
         """
         if carry and None in received:
             held = self._payloads

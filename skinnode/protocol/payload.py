@@ -1,4 +1,4 @@
-"""Length of PDO payloads, and a function that checks it. All payloads are little-endian."""
+"""Payload length of PDOs, and a function that checks payload lengths. All payloads are little-endian."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from skinnode.errors import CodecError
 from skinnode.text.words import counted
 
 PDO_BYTES: Final = 8
-"""Length of every summary, and of a chunk on a classic CAN bus, bytes."""
+"""Length, in bytes, of a summary, and of a chunk on a classic CAN bus."""
 
 
 def require_length(data: bytes, length: int, cob_id: int, what: str) -> None:

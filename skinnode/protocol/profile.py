@@ -2,13 +2,13 @@
 
 A patch sends its U×K codes in *chunks*: TPDO1 carries a u8 chunk index, a u8 scan counter and 3 codes of 16
 bits (or 2 codes of 24 bits). The codes are in row-major order: all codes of upper wire 0 first, then those of
-upper wire 1, and so on. TPDO2, the *summary*, ends each scan and carries a check over all codes of the matrix
-(:mod:`skinnode.protocol.scan_check`).
+upper wire 1, and so on. TPDO2 carries the *summary*, which ends each scan and contains a check over all codes
+of the matrix (:mod:`skinnode.protocol.scan_check`).
 
 Over CAN FD, a chunk carries codes of a single upper wire: u8 wire, u8 scan counter, u16 first column and up
-to 30 codes of 16 bits (or 20 codes of 24 bits). All chunks of a patch have the same length: the length of the
-PDO mapping, padded to the next valid CAN FD length. If a patch has more columns than a chunk can carry, the
-codes of each upper wire are split evenly into several chunks.
+to 30 codes of 16 bits (or 20 codes of 24 bits). All chunks of a patch have the same length: the total length
+of the mapped objects, padded to the next valid CAN FD length. If a patch has more columns than fit into a
+chunk, the codes of each upper wire are split evenly into several chunks.
 
 The command ``python -m skinnode.protocol.profile eds/`` regenerates the reference EDS files
 (:mod:`skinnode.protocol.eds_files`).
@@ -32,13 +32,13 @@ if TYPE_CHECKING:
     from skinnode.config import BusConfig, PatchConfig
 
 DEFAULT_PERIOD_MS: Final = 80
-"""SYNC period for which the default settings are chosen, ms; at this period, the bus load of four 10×30
-patches at 1 Mbit/s is about 2/3."""
+"""SYNC period (ms) for which the default settings are chosen. With this period, four 10×30 patches load a 1
+Mbit/s bus to about 2/3."""
 
 BusType = Literal["classic", "fd"]
 """Type of the frames that carry PDOs: classic CAN with up to 8 bytes, or CAN FD with up to 64 bytes."""
 
-_MOST_SUBINDICES: Final = 254  # CiA 301 reserves sub-index 255
+_MOST_SUBINDICES: Final = 254  # sub-index 255 is reserved by CiA 301
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,8 +68,8 @@ class PatchProfile:
     bus: BusType = "classic"
     """Type of the frames that carry PDOs: classic CAN or CAN FD."""
     checked: bool = True
-    """Whether summaries carry a check of the scan; false for a patch of revision 1.0, whose summaries carry
-    the 32-bit device time instead."""
+    """Whether summaries contain a scan check; false for patches of revision 1.0, which send the 32-bit device
+    time instead."""
 
     def __post_init__(self) -> None:
         for name, least, most in (
@@ -109,7 +109,7 @@ class PatchProfile:
 
     @classmethod
     def from_config(cls, patch: PatchConfig, bus: BusConfig) -> PatchProfile:
-        """Return the profile of a patch from the hand file's configuration of the patch and its bus."""
+        """Return the profile of a patch, based on the configurations of patch and bus in the hand file."""
         return cls.from_layout(patch.layout.build(), patch.code_bits, "fd" if bus.fd else "classic")
 
     @property
@@ -119,7 +119,7 @@ class PatchProfile:
 
     @property
     def pdo_bytes(self) -> int:
-        """Maximum length of a PDO, bytes; also the maximum number of objects mapped into it."""
+        """Maximum PDO length in bytes, which is also the maximum number of objects in a PDO mapping."""
         return 8 if self.bus == "classic" else 64
 
     @property
@@ -133,7 +133,7 @@ class PatchProfile:
 
     @property
     def lines(self) -> int:
-        """Number of code sequences that are split into chunks: 1, or over CAN FD one per upper wire."""
+        """Number of code sequences to split into chunks: 1 on classic CAN, one per upper wire on CAN FD."""
         return 1 if self.bus == "classic" else self.rows
 
     @property
@@ -143,7 +143,10 @@ class PatchProfile:
 
     @property
     def codes_per_chunk(self) -> int:
-        """Number of codes per chunk: 3 (16-bit) or 2 (24-bit); over CAN FD, up to 30 or 20."""
+        """Number of codes per chunk.
+
+        Classic CAN: 3 (16-bit codes) or 2 (24-bit codes); CAN FD: up to 30 or 20.
+        """
         return self._most_codes if self.bus == "classic" else -(-self.columns // self.chunks_per_line)
 
     @property
@@ -153,7 +156,7 @@ class PatchProfile:
 
     @property
     def chunk_bytes(self) -> int:
-        """Length of a chunk, bytes."""
+        """Length of a chunk's payload, bytes."""
         if self.bus == "classic":
             return 8
         return fd_length(self.chunk_head_bytes + self.codes_per_chunk * self.code_bits // 8)

@@ -1,4 +1,4 @@
-"""Classes for a scan that a host has received, and for the counters of a scan assembler."""
+"""Classes for a received scan and for the counters of a scan assembler."""
 
 from __future__ import annotations
 
@@ -18,23 +18,24 @@ class Scan:
     codes: Codes
     """(U, K) codes; :data:`~skinnode.protocol.codes.MISSING` where the code is unknown."""
     valid: NDArray[np.bool_]
-    """(U, K) mask: True where the code is known and is a measurement, not a reserved code."""
+    """(U, K) mask of the known codes that are measurements (reserved codes are excluded)."""
     counter: int
     """Scan counter as sent on the bus."""
     scan: int
     """Unwrapped scan counter, which starts at the first scan counter received and never decreases."""
     complete: bool
-    """Whether the codes are certain to equal the codes that the node packed. A scan is complete if the node
-    sent all required chunks, if all of them arrived and, in a checked stream, if the check passed."""
+    """Whether the received codes are known to equal the codes packed by the node. A scan is complete if the
+    node sent all required chunks and all of these chunks arrived. In a checked stream, the check must also
+    have passed."""
     chunks_expected: int
-    """Number of chunks sent, according to the summary; without a summary, the number of chunks in a full
-    scan."""
+    """Number of chunks sent, according to the summary; if the summary was lost, the number of chunks in a
+    full scan."""
     chunks_received: int
     """Number of chunks received for this scan."""
     device_time_us: int | None
-    """Time of the scan on the node's clock, µs, which wraps at 2³²; None if the summary was lost.
+    """Time of the scan on the node's clock in µs, modulo 2³²; None if the summary was lost.
 
-    A checked summary carries this time in steps of 64 µs and without the upper 10 bits, which the host
+    A checked summary carries the device time in steps of 64 µs and without the upper 10 bits, which the host
     restores (:mod:`skinnode.protocol.device_time`)."""
     flags: int
     """Summary flags (:class:`~skinnode.protocol.summary.SummaryFlag`); 0 if the summary was lost."""
@@ -56,38 +57,37 @@ class Scan:
 
 @dataclass(frozen=True, slots=True)
 class AssemblerStats:
-    """Counters of a scan assembler. Each frame counts in exactly one of the fields marked *."""
+    """Counters of a scan assembler. Each frame is counted in exactly one of the fields marked with *."""
 
     scans_complete: int
     """Scans published as complete."""
     scans_torn: int
     """Scans published with chunks missing."""
     scans_unchecked: int
-    """Scans of a checked stream that were published with all their chunks, but not as complete. Either the
-    summary was lost, or some codes of chunks that were not sent are unknown."""
+    """Scans of a checked stream that were published as incomplete although all their chunks arrived. Either
+    the summary was lost, or the codes of unsent chunks were unknown."""
     scans_missed: int
-    """Scans of which no frame was received; their number follows from gaps in the scan counter."""
+    """Scans of which no frame was received, counted from gaps in the scan counter."""
     scans_discarded: int
-    """Scans that a reset discarded before they were published."""
+    """Scans discarded by a reset before publication."""
     scans_mixed: int
-    """Scans discarded because they seem to contain frames of two scans with the same counter."""
+    """Scans discarded because they appear to contain frames of two scans with the same counter."""
     scans_corrupt: int
-    """Scans discarded because their check failed: the codes received differ from the codes that the node
-    packed."""
+    """Scans discarded because of a failed check: the received codes differ from the codes packed by the
+    node."""
     scans_joined: int
-    """Scans that were already being sent when reception began; such a scan is incomplete and is not
-    published."""
+    """Scans not published because reception began after their first chunks had been sent."""
     chunks_accepted: int
     """* Chunks assigned to a scan."""
     summaries_accepted: int
     """* Summaries assigned to a scan."""
     chunks_lost: int
-    """Chunks missing when their scan was published. Chunks of missed scans are not counted. While only
-    changed chunks are sent, chunks of scans without a summary are not counted either."""
+    """Chunks missing when their scan was published, not including the chunks of missed scans. If only changed
+    chunks are sent, chunks of scans without a summary are also excluded."""
     summaries_lost: int
     """Summaries missing when their scan was published."""
     duplicates: int
-    """* Frames that repeat an earlier frame of the same scan with the same content."""
+    """* Frames identical to an earlier frame of the same scan."""
     conflicts: int
     """* Frames that repeat an earlier frame of the same scan with different content; the scan is
     discarded."""
@@ -96,11 +96,11 @@ class AssemblerStats:
     bad_length: int
     """* Frames with the wrong length for a chunk or a summary."""
     bad_index: int
-    """* Chunks with an index that the patch does not have, and summaries with too large a number of
+    """* Chunks with an index beyond the patch's last chunk, and summaries with an excessive number of
     chunks."""
     bad_counter: int
     """* Frames whose scan counter is outside the range of the SYNC counter."""
     bad_form: int
-    """* Summaries in a checked stream that lack a check."""
+    """* Summaries without a check in a checked stream."""
     resyncs: int
-    """Number of times that the scan counter was out of sequence when a stream resumed after a silence."""
+    """Number of silences of a stream after which the scan counter resumed out of sequence."""

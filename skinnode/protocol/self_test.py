@@ -1,4 +1,4 @@
-"""Result of a patch's self-test, which object 0x2023 contains."""
+"""Result of a patch's self-test (object 0x2023)."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ class SelfTestFault(enum.IntFlag):
     OPEN_WIRE = 0x04
     SHORTED_WIRE = 0x08
     OUT_OF_RANGE = 0x10
-    """At least one crossing with a baseline gave no measurement, because it is open, shorted or out of
-    range."""
+    """At least one crossing with a baseline is open, shorted or out of range and therefore yielded no
+    measurement."""
     NO_BASELINE = 0x20
 
 
@@ -51,6 +51,6 @@ def pack_self_test(test: SelfTest) -> bytes:
     """Pack the findings of a self-test into the content of record 0x2023.
 
     Args:
-        test: findings of the self-test, which has passed if there are no faults.
+        test: findings of the self-test. The self-test has passed if the findings contain no faults.
     """
     return _SELF_TEST.pack(SelfTestStatus.FAILED if test.faults else SelfTestStatus.PASSED, *test)

@@ -1,4 +1,4 @@
-"""Packing and unpacking of the scan summary, which TPDO2 carries at the end of each scan."""
+"""Packing and unpacking of the scan summary, which is sent in TPDO2 at the end of each scan."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _SUMMARY: Final = struct.Struct("<BBHI")
 _HEAD: Final = struct.Struct("<BBHH")
 
 HEAD_BYTES: Final = _HEAD.size
-"""Number of bytes at the beginning of a summary that the scan check covers."""
+"""Number of bytes at the beginning of a summary covered by the scan check."""
 
 
 class SummaryFlag(enum.IntFlag):
@@ -29,8 +29,8 @@ class SummaryFlag(enum.IntFlag):
     WIRE_FAULT = 0x04
     """At least one wire is open or shorted; see 0x2030 and 0x2031."""
     BASELINE_CHANGED = 0x08
-    """This scan is the first with a new baseline; the host must read the baseline (0x2200 and above)
-    again."""
+    """This scan is the first scan with a new baseline. The host must re-read the baseline (0x2200 and
+    above)."""
     SOURCE_FAILED = 0x10
     """The converter returned no valid reading, so no chunks were sent and the codes of this scan are
     unknown."""
@@ -38,9 +38,10 @@ class SummaryFlag(enum.IntFlag):
     """Bytes 4 to 7 of the summary contain the u16 device time in steps of 64 µs and the u16 scan check.
     Without this flag, as in patches of revision 1.0, bytes 4 to 7 contain the u32 device time in µs."""
     CONVERSIONS = 0xC0
-    """Conversion phase, a two-bit number. The phase is 0 if the patch does not supply it. Otherwise, it
-    advances cyclically from 1 to 3 with each scan before which the converter has completed a new conversion
-    of all crossings. Two successive scans with the same phase therefore contain the same conversion."""
+    """Conversion phase, a two-bit number. The phase is 0 if the patch does not supply a phase. Otherwise, the
+    phase cycles from 1 to 3. It advances with a scan if the converter has completed a new conversion of all
+    crossings since the previous scan. Two successive scans with the same phase therefore contain the same
+    conversion."""
 
 
 class Summary(NamedTuple):
@@ -53,15 +54,15 @@ class Summary(NamedTuple):
     chunks: int
     """Number of chunks sent in this scan."""
     device_time_us: int
-    """Device time, µs, 0 to 2³² − 1. In a summary with a ``check``, the device time is a multiple of 64 from
-    0 to 2²² − 64; see :mod:`skinnode.protocol.device_time`."""
+    """Device time in µs, from 0 to 2³² − 1. In a summary with a ``check``, the device time is a multiple of
+    64 from 0 to 2²² − 64; see :mod:`skinnode.protocol.device_time`."""
     check: int | None = None
     """Scan check (:mod:`skinnode.protocol.scan_check`); None if :attr:`SummaryFlag.CHECKED` is not set."""
 
 
 PHASES: Final = 3
-"""Number of conversion phases. After missed scans, the phase of the next scan is meaningless, because the
-phase may have advanced by any number of steps."""
+"""Number of conversion phases. After missed scans, the conversion phase of the next scan is not meaningful,
+because the phase may have advanced by any number of steps."""
 _PHASE_SHIFT: Final = 6
 
 _CHECKED: Final = int(SummaryFlag.CHECKED)  # testing an int is ten times as fast as testing an enum flag
@@ -105,8 +106,8 @@ def pack_checked_summary(
         flags: bits of :class:`SummaryFlag`.
         chunks: number of chunks sent in this scan.
         device_time_us: time on the node's clock, µs; wraps at 2³².
-        check_of_codes: result of :func:`~skinnode.protocol.scan_check.check_of_codes` for the codes that a
-            receiver must have after this scan.
+        check_of_codes: result of :func:`~skinnode.protocol.scan_check.check_of_codes` for the codes at a
+            receiver after this scan.
 
     Raises:
         ValueError: if the scan counter, the flags or the number of chunks do not fit their fields.
@@ -120,7 +121,7 @@ def pack_checked_summary(
 
 
 def pack_summary_record(payload: bytes, device_time_us: int) -> bytes:
-    """Return the content of record 0x2011 that corresponds to a summary.
+    """Return the content of record 0x2011 for a given summary.
 
     Args:
         payload: the payload of TPDO2.
@@ -132,7 +133,7 @@ def pack_summary_record(payload: bytes, device_time_us: int) -> bytes:
 
 
 def unpack_summary(data: bytes, *, cob_id: int = _COB_ID) -> Summary:
-    """Unpack a summary, with or without a check, from the payload of TPDO2.
+    """Unpack a summary (with or without a check) from the payload of TPDO2.
 
     Args:
         data: payload of the frame.

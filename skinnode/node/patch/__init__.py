@@ -7,6 +7,6 @@
 
 The module ``patch_node`` combines the device and the application. The module ``objects`` connects the
 application to the object dictionary. The modules ``wire_faults``, ``source_monitor`` and ``self_test`` detect
-faults of the patch; the node reports these faults in emergency messages, summary flags and objects. The
-module ``find_source`` loads the source that is named on the command line.
+faults of the patch. The node reports patch faults in emergency messages, summary flags and objects. The
+module ``find_source`` loads the source given on the command line.
 """

@@ -1,4 +1,4 @@
-"""Acquisition of a patch's codes from its analogue port: sampling and tare."""
+"""Acquisition of a patch's codes by sampling the analogue port, and taring of the baseline."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ from skinnode.protocol.profile import PatchProfile
 from skinnode.protocol.summary import PHASES
 
 TARE_READS: Final = 16
-"""Number of readings averaged for a baseline. The baseline's noise is a quarter of the noise of one reading,
-and increases the noise of R/R0 by 3 %."""
+"""Number of readings averaged to measure a baseline. Averaging reduces the baseline's noise to a quarter of
+one reading's noise, which increases the noise of R/R0 by 3 %."""
 
 
 class Acquisition:
-    """Acquisition of codes from a source; keeps the codes of the last scan and the baseline.
+    """Acquisition of codes from a source, which also stores the baseline and the last scan's codes.
 
     Args:
         profile: sizes of the patch.
         source: analogue port of the patch.
         scale: mapping of R/R0 to codes.
-        baseline_ohm: (U, K) initial R0, ohm; None if there is no baseline yet.
+        baseline_ohm: (U, K) initial R0, ohm; None if the patch has no baseline yet.
 
     Raises:
         ValueError: if the baseline has the wrong shape or a negative value.
@@ -46,20 +46,21 @@ class Acquisition:
         if (given < 0).any():
             raise ValueError(f"baseline_ohm: got {given.min()}, must not be negative")
         self.baseline_ohm: NDArray[np.float32] = given.astype(np.float32)
-        """(U, K) baseline R0 with the precision of the object dictionary, ohm; 0 where R0 is unknown."""
+        """(U, K) baseline R0 in ohms, with REAL32 precision as in the object dictionary; 0 where R0 is
+        unknown."""
         self.codes: Codes = np.full(shape, scale.open, dtype=np.uint32)
-        """(U, K) codes of the last scan; before the first scan, all codes are open."""
+        """(U, K) codes of the last scan; before the first scan, all elements are the code for open."""
         self.faults = WireFaults.none(profile)
         """Wire faults of the last scan."""
         self.phase = 0
         """Conversion phase of the last scan; 0 if the source does not count its conversions."""
-        # Number of conversions that the source had completed at the last scan.
+        # Conversion count of the source at the last scan.
         self._conversions: int | None = None
         self.selection = ChunkSelection(profile, scale)
-        """Selector of the chunks to send, for the send mode in which only changed chunks are sent."""
+        """Selector of the chunks to send when only changed chunks are sent (send mode 0x2020:1)."""
 
     def read(self, t_ns: int) -> Float:
-        """Read the source and return (U, K) resistances at ``t_ns``, ohm.
+        """Read the source at ``t_ns`` and return (U, K) resistances in ohms.
 
         Raises:
             SourceFailed: if the source returns no valid reading.
@@ -87,7 +88,7 @@ class Acquisition:
         self.faults = find_faults(self.codes, self.scale)
 
     def _total(self, t_ns: int, readings: int) -> Float:
-        """Return the (U, K) sum of several readings, ohm; NaN, which counts as open, for ∞ − ∞."""
+        """Return the (U, K) sum of several readings in ohms; ∞ − ∞ gives NaN, which is encoded as open."""
         total = self.read(t_ns)
         with np.errstate(over="ignore", invalid="ignore"):
             for _ in range(readings - 1):
@@ -95,7 +96,9 @@ class Acquisition:
         return total
 
     def tare(self, t_ns: int, readings: int = TARE_READS) -> None:
-        """Make the current resistances the baseline. A crossing without a valid resistance keeps its R0.
+        """Measure the current resistances and make them the baseline.
+
+        R0 remains unchanged at crossings without a valid resistance.
 
         Args:
             t_ns: current time, ns.
@@ -104,9 +107,7 @@ class Acquisition:
         Raises:
             SourceFailed: if the source returns no valid reading.
         """
-        with np.errstate(
-            over="ignore", under="ignore"
-        ):  # a value that overflows REAL32 is not a valid resistance
+        with np.errstate(over="ignore", under="ignore"):  # resistances above the REAL32 range are invalid
             mean = (self._total(t_ns, readings) / readings).astype(np.float32)
         measured = np.isfinite(mean) & (mean > 0)
         self.baseline_ohm = np.where(measured, mean, self.baseline_ohm)
@@ -114,13 +115,13 @@ class Acquisition:
         self.selection.forget()
 
     def set_baseline(self, row: int, column: int, value_ohm: float) -> None:
-        """Set R0 of one crossing, ohm. Afterwards, the node does not tare without a command."""
+        """Set R0 (ohm) of one crossing. The node then no longer tares automatically, but only on command."""
         self.baseline_ohm[row, column] = value_ohm
         self.tared = True
         self.selection.forget()
 
     def set_baselines(self, values_ohm: NDArray[np.float32]) -> None:
-        """Set the baseline of all crossings, (U, K) ohm."""
+        """Set the baseline R0 of all crossings: (U, K) values in ohms."""
         self.baseline_ohm = values_ohm
         self.tared = True
         self.selection.forget()

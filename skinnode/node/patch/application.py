@@ -42,7 +42,7 @@ class PatchApplication:
         serial: serial number (0x2000:11), u32.
         acquisition: acquisition of the patch's codes, with its baseline.
         services: services that the device provides.
-        pacing: timer precision of the node, with which chunks are paced.
+        pacing: timer precision of the node, also used to pace the chunks.
     """
 
     def __init__(
@@ -73,11 +73,11 @@ class PatchApplication:
         self._baseline_changed = False
         self._test = SELF_TEST_NEVER_RUN
         self.overruns = 0
-        """Number of scans skipped because two earlier scans had not been sent completely."""
+        """Number of scans skipped because one scan was still being sent and another was waiting."""
         self.slow_overruns = 0
-        """Number of scans skipped because the computer or the bus is too slow, not because the scan period is
-        too short."""
-        self._scan_ns = NO_DEADLINE_NS  # time of the next scan that the node's timer triggers
+        """Number of scans skipped because of a slow computer or bus. Scans skipped because of a short scan
+        period are excluded."""
+        self._scan_ns = NO_DEADLINE_NS  # time of the next scan triggered by the node's timer
         describe(services.store, layout, acquisition.scale, serial)
         self._connect()
 
@@ -85,16 +85,16 @@ class PatchApplication:
 
     @property
     def deadline_ns(self) -> int:
-        """Time at which :meth:`on_timer` must be called next to take or send a scan, ns."""
+        """Time (ns) at which :meth:`on_timer` must be called next, to take or send a scan."""
         return min(self._scan_ns, self.stream.deadline_ns)
 
     @property
     def baseline_ohm(self) -> Float:
-        """(U, K) baseline R0 in use, ohm; 0 where R0 is unknown."""
+        """(U, K) current baseline R0 in ohms; 0 where R0 is unknown."""
         return self._acquisition.baseline_ohm.astype(np.float64)
 
     def power_on(self, t_ns: int) -> None:
-        """Load the baseline from the memory; if there is none, tare unless a baseline was given.
+        """Load the baseline from the memory; tare if neither the memory nor the caller has supplied one.
 
         Args:
             t_ns: current time, ns.
@@ -108,7 +108,7 @@ class PatchApplication:
                 self._storage.keep_baseline()
 
     def reset(self) -> None:
-        """Restart the scan counter, and report faults that are still present again."""
+        """Restart the scan counter, and report all persisting faults again."""
         self._counter, self._late = -1, False
         self._wire_faults.reset()
         self._test = SELF_TEST_NEVER_RUN
@@ -125,7 +125,7 @@ class PatchApplication:
         self._plan()
 
     def on_sync(self, counter: int | None, turns: frozenset[int], t_ns: int) -> None:
-        """Take a scan at a SYNC in OPERATIONAL, unless the node's timer triggers the scans.
+        """Take a scan at a SYNC in OPERATIONAL, unless the node's timer triggers scans.
 
         Args:
             counter: SYNC counter; None if the SYNC message contains no counter.
@@ -139,7 +139,7 @@ class PatchApplication:
             self._scan(self._following() if counter is None else counter, turns, t_ns)
 
     def on_timer(self, t_ns: int) -> None:
-        """Send the chunks and summaries that are due at ``t_ns``, and take a scan if a scan is due."""
+        """Send the chunks and summaries due at ``t_ns``, and take a scan if the scan period has elapsed."""
         self.stream.on_timer(t_ns)
         if t_ns >= self._scan_ns:
             self._scan_ns = max(self._scan_ns + self._period_ns, t_ns)
@@ -162,13 +162,13 @@ class PatchApplication:
         return None
 
     def _new_baseline(self) -> None:
-        """Announce and save a complete new baseline, without waiting for a save command."""
+        """Announce a complete new baseline, and save it without waiting for a save command."""
         self._mark_baseline()
         self._storage.keep_baseline()
         self._storage.report(self._now())
 
     def _mark_baseline(self) -> None:
-        """Set the flag of the next summary that announces a new baseline."""
+        """Announce a new baseline by a flag in the next summary."""
         self._baseline_changed = True
 
     # --- scans
@@ -202,7 +202,7 @@ class PatchApplication:
             self._end_overrun(t_ns)
 
     def _end_overrun(self, t_ns: int) -> None:
-        """Report the end of an overrun, because the queue has space again or scanning has stopped."""
+        """Report the end of an overrun, because a new scan can be queued again or scanning has stopped."""
         self._late = False
         self._emcy.clear(EmcyCode.CAN_OVERRUN, t_ns)
 
@@ -213,7 +213,7 @@ class PatchApplication:
         Raises SourceFailed if the source returns no valid reading.
         """
         store, acquisition = self._store, self._acquisition
-        if not acquisition.tared:  # the source failed when the node tried to tare at power-on
+        if not acquisition.tared:  # no baseline yet, because taring at power-on failed
             self._tare(t_ns)
             self._new_baseline()
         with self.source.watch(t_ns):
@@ -259,8 +259,8 @@ class PatchApplication:
             case od.SELF_TEST if value not in (0, od.SELF_TEST_SIGNATURE):
                 raise Refused(AbortCode.CANNOT_STORE)
             case od.SINGLE_SCAN if value:
-                # If the SYNC counter numbers the scans, this scan would have the same number as the scan at
-                # the next SYNC.
+                # If SYNC counters serve as scan counters, a single scan would have the same scan counter as
+                # the scan at the next SYNC.
                 numbered_by_sync = not self._period_ns and self._store.integer(od.SYNC_COUNTER_OVERFLOW)
                 if numbered_by_sync or not self._operational:
                     raise Refused(AbortCode.DEVICE_STATE)

@@ -1,4 +1,4 @@
-"""Selection of the chunks to send, for the send mode in which only changed chunks are sent (0x2020:1)."""
+"""Selection of the chunks to send when only changed chunks are sent (send mode 0x2020:1)."""
 
 from __future__ import annotations
 
@@ -23,23 +23,22 @@ class ChunkSelection:
         self._since_full = 0  # number of scans since the last full scan
         self._full_scan_due = True
         self.sent: Codes = np.full((profile.rows, profile.columns), scale.open, dtype=np.uint32)
-        """(U, K) codes that each chunk contained when it was last sent; before the first scan, all codes are
-        open."""
+        """(U, K) codes in the chunks last sent; before the first scan, all elements are the code for open."""
 
     def forget(self) -> None:
-        """Make the next scan a full scan, because the receiver may not have the codes sent before."""
+        """Make the next scan a full scan, because the receiver may lack the codes sent earlier."""
         self._full_scan_due = True
 
     def changed_chunks(self, codes: Codes, threshold: int, full_every: int) -> list[int] | None:
         """Return the indices of the chunks to send, and record them as sent.
 
-        A chunk is selected if, since the chunk was last sent, one of its codes has changed by more than the
-        threshold, or to or from a reserved code.
+        A chunk is selected if one of its codes differs from the code last sent by more than the threshold, or
+        by any amount if either of the two codes is reserved.
 
         Args:
             codes: (U, K) codes of the scan.
-            threshold: maximum change of a code that does not cause its chunk to be sent.
-            full_every: number of scans from one full scan to the next; 0 for no further full scans.
+            threshold: maximum code change for which a chunk is not sent.
+            full_every: interval between full scans, as a number of scans; 0 for no further full scans.
 
         Returns:
             Indices of the chunks in ascending order; None if a full scan is due.

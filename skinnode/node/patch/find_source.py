@@ -1,4 +1,4 @@
-"""Lookup of sources by name, so that users can add sources without changing this project."""
+"""Lookup of sources by name. Users can add sources without changing this project."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def load(reference: str, option: str) -> Any:
 
 
 def make_source(name: str, layout: PatchLayout, option: str = "source") -> ResistanceSource:
-    """Create a source for a patch, and read it once, to detect faults before the node starts.
+    """Create a source for a patch, and read the source once to detect faults before the node starts.
 
     Args:
         name: name of an entry point, or ``MODULE:NAME``, for a class or function that takes the layout and

@@ -1,4 +1,4 @@
-"""Connection of the manufacturer objects (0x2000 to 0x2301) to the values of a running patch."""
+"""Functions that connect the manufacturer objects (0x2000 to 0x2301) to the values of a running patch."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def bind_baseline(
     Args:
         store: object dictionary.
         acquisition: owner of the baseline.
-        changed: called after a client has written R0 of one crossing.
+        changed: called after a client has written one crossing's R0.
         replaced: called after a client has written the whole baseline.
     """
     profile = acquisition.profile
@@ -84,7 +84,7 @@ def bind_baseline(
 
 
 def fields_of(store: ObjectStore, index: int) -> dict[int, slice]:
-    """Return the position of each sub-object in the concatenated bytes of a record.
+    """Return the slice of each sub-object within the concatenated bytes of a record.
 
     Args:
         store: object dictionary.
@@ -120,7 +120,7 @@ def _bind_baseline_row(
 
 
 def _fault_word(masks: tuple[Mask, ...], subindex: int) -> bytes:
-    """Return a mask of open wires (odd sub-indices) or shorted wires (even sub-indices), 32 wires each."""
+    """Return a mask of 32 wires: open wires for odd sub-indices, shorted wires for even sub-indices."""
     first = (subindex - 1) // 2 * 32
     bits = masks[(subindex - 1) % 2][first : first + 32]
     return np.packbits(bits, bitorder="little").tobytes().ljust(4, b"\0")

@@ -27,18 +27,18 @@ class PatchNode(CanopenDevice):
     """CANopen node of one patch. The node sends nothing before :meth:`power_on`.
 
     Args:
-        node_id: 1 to 127, or 255 to wait until LSS assigns a node-ID; a node-ID that LSS has stored in the
-            memory takes precedence.
+        node_id: 1 to 127, or 255 to wait until LSS assigns a node-ID. A node-ID stored in the memory by LSS
+            takes precedence.
         layout: electrodes of the patch, which determine the sizes of the object dictionary.
         source: analogue port of the patch, read once per scan.
         send: called with the COB-ID and payload of each frame that the node sends, in order.
         profile: wire format of the patch; by default the layout's format with 16-bit codes.
         serial: serial number (0x1018:4 and 0x2000:11), u32.
-        baseline_ohm: (U, K) initial R0, ohm; None to tare at the first power-on; a baseline in the memory
+        baseline_ohm: (U, K) initial R0, ohm; None to tare at the first power-on. A baseline in the memory
             takes precedence.
         pacing: :data:`~skinnode.node.clock.EXACT` for a node on its own board,
             :data:`~skinnode.node.clock.THRIFTY` for many nodes on one computer.
-        memory: memory for configuration, baseline and node-ID; None for a node that loses them at power-off.
+        memory: memory for the configuration, baseline and node-ID; None for a node without a memory.
         set_bit_rate: changes the bit rate (bit/s) for LSS; None if the node cannot change it.
 
     Raises:
@@ -87,17 +87,17 @@ class PatchNode(CanopenDevice):
 
     @property
     def baseline_ohm(self) -> Float:
-        """(U, K) baseline R0 in use, ohm; 0 where R0 is unknown."""
+        """(U, K) current baseline R0 in ohms; 0 where R0 is unknown."""
         return self._patch.baseline_ohm
 
     @property
     def source_failures(self) -> int:
-        """Number of scans, tares and self-test readings that failed because of the source."""
+        """Number of scans, tares and self-test readings that failed because the source failed."""
         return self._patch.source.failures
 
     @property
     def source_error(self) -> str:
-        """Last failure of the source, in one line; empty before the first failure."""
+        """One-line description of the source's last failure; empty before the first failure."""
         return self._patch.source.error
 
     @property
@@ -107,12 +107,12 @@ class PatchNode(CanopenDevice):
 
     @property
     def memory_problem(self) -> str:
-        """Latest problem with the memory, in one line; empty if no problem has occurred."""
+        """One-line description of the latest memory problem; empty if no problem has occurred."""
         return self._storage.problem
 
     @property
     def overruns(self) -> int:
-        """Number of scans skipped because two earlier scans had not been sent completely."""
+        """Number of scans skipped because one scan was still being sent and another was waiting."""
         return self._patch.overruns
 
     @property

@@ -1,23 +1,23 @@
-"""Scan stream, which sends the chunks of each scan at the pace of the inhibit time, and then the summary.
+"""Scan stream, which sends each scan's chunks, spaced by the inhibit time, followed by the summary.
 
-A TPDO whose first mapped object is 0x2010 carries the chunks of a scan if it is event-driven, or if it was
-due at the SYNC that started the scan. TPDOs whose first mapped object is 0x2011 carry the summary after the
-chunks. An event-driven summary TPDO is sent immediately after the chunks. A synchronous summary TPDO is also
-sent immediately if it was due at the SYNC that started the scan; otherwise, it is sent at the next SYNC at
-which it is due. Event-driven TPDOs with other objects are also sent after the chunks.
+Chunks are sent in a TPDO whose first mapped object is 0x2010. This TPDO must be event-driven, or must have
+been due at the SYNC that started the scan. After the chunks, the summary is sent in all TPDOs whose first
+mapped object is 0x2011. An event-driven summary TPDO is sent immediately after the chunks. A synchronous
+summary TPDO that was due at the SYNC that started the scan is also sent immediately. Otherwise, it waits for
+a later SYNC at which it is due. Event-driven TPDOs for other objects are sent after the chunks, too.
 
 **Pacing.** The standard defines the inhibit time as a minimum interval between frames. On a general-purpose
-operating system, however, threads wake up late, so that with a strict minimum interval a scan could take
-longer than the SYNC period. The stream therefore makes up for delays of up to ``catch_up_ns``, if necessary
+operating system, however, threads wake up late, so a scan could take longer than the SYNC period if the
+minimum interval were strict. The stream therefore makes up for delays of up to ``catch_up_ns``, if necessary
 by sending several frames at once. The mean frame rate never exceeds the rate that the inhibit time allows
 (generic cell rate algorithm, ITU-T I.371). If ``catch_up_ns`` is 0, the minimum interval is strict.
 
-The caller passes the time of a SYNC to the node, but the node cannot measure the time that the subsequent
-sampling takes. The stream therefore requests a timer event immediately after the first chunk of a scan. This
-timer event provides the current time, from which the interval to the second chunk is measured.
+The node receives the time of a SYNC from its caller, but cannot measure the duration of the subsequent
+sampling. The stream therefore requests a timer event immediately after a scan's first chunk. The interval to
+the second chunk is then measured from the time of this timer event.
 
-**Synchronous window (0x1007).** Chunks and summaries in synchronous TPDOs are discarded if they have not been
-sent before the window closes. The window does not apply to event-driven TPDOs.
+**Synchronous window (0x1007).** Chunks and summaries in synchronous TPDOs that are still unsent when the
+window closes are discarded. The window does not apply to event-driven TPDOs.
 
 **Queue.** A scan waits while another scan is being sent; only one scan can wait. Chunks of two scans are
 never interleaved. If the node leaves OPERATIONAL, the scan being sent ends without a summary. If the chunk
@@ -38,8 +38,8 @@ from skinnode.node.pdo.tpdo import Tpdo, TpdoEngine
 from skinnode.protocol.summary import SummaryFlag, pack_checked_summary, pack_summary, pack_summary_record
 
 _HELD_UP: Final = 0.1
-"""Maximum fraction of the sending time that may be lost to delays before the stream counts as held up; jitter
-of the thread causes smaller losses."""
+"""Maximum fraction of the sending time lost to delays before a skipped scan is attributed to a slow computer
+or bus. Normal thread jitter causes smaller losses."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,9 +53,9 @@ class OutgoingScan:
     flags: int
     """Bits of :class:`~skinnode.protocol.summary.SummaryFlag`."""
     device_time_us: int
-    """Time of the scan on the node's clock, µs; wraps at 2³²."""
+    """Time of the scan on the node's clock in µs, modulo 2³²."""
     check_of_codes: int | None = None
-    """CRC over the codes that a receiver must have after this scan; None for a summary without a check."""
+    """CRC over the codes at a receiver after this scan; None for a summary without a scan check."""
     turns: frozenset[int] = frozenset()
     """Numbers of the synchronous TPDOs that were due at the SYNC that started the scan."""
 
@@ -66,8 +66,8 @@ class ScanStream:
     Args:
         store: object dictionary.
         tpdos: the TPDOs of the node.
-        chunk: value of the chunk record (0x2010) until the first chunk is sent.
-        catch_up_ns: maximum delay that the stream makes up for, ns.
+        chunk: content of the chunk record (0x2010) before the first chunk is sent.
+        catch_up_ns: maximum delay (ns) that the stream makes up for by sending later chunks sooner.
     """
 
     def __init__(self, store: ObjectStore, tpdos: TpdoEngine, chunk: bytes, catch_up_ns: int) -> None:
@@ -75,15 +75,15 @@ class ScanStream:
         self._whole_record = [(od.CHUNK, sub) for sub in range(1, store.integer(od.CHUNK, 0) + 1)]
         self._scan: OutgoingScan | None = None
         self._next_scan: OutgoingScan | None = None
-        self._carrier: Tpdo | None = None  # TPDO that carries the chunks of the current scan
+        self._carrier: Tpdo | None = None  # TPDO for the current scan's chunks
         self._unsent: deque[bytes] = deque()
-        self._verbatim = False  # whether the mapping of the carrier is the whole chunk record
+        self._verbatim = False  # whether the carrier maps the whole chunk record
         self._chunks_sent = 0
-        self._busy_ns = 0  # start of the current series of scans without a pause
+        self._busy_ns = 0  # time at which the current uninterrupted series of scans began
         self._just_begun = False
-        self._paced_ns = 0  # sum of the inhibit times since the start of the series
+        self._paced_ns = 0  # sum of inhibit times in the current series of scans
         self.chunk = chunk
-        """Content of the chunk record (0x2010): the chunk sent last."""
+        """Content of the chunk record (0x2010): the last chunk sent."""
         self.summary = bytes(12)
         """Content of the summary record (0x2011): the summary of the last scan."""
         self.scans_sent = 0
@@ -97,9 +97,10 @@ class ScanStream:
         return self._next_scan is not None
 
     def is_held_up(self, t_ns: int) -> bool:
-        """Return whether the current scans take longer to send than the inhibit time requires.
+        """Return whether sending the current scans takes longer than the inhibit time requires.
 
-        If so, the node's thread receives too little processor time, or the bus refuses frames.
+        A result of True means that the thread receives too little processor time or that the bus refuses
+        frames.
         """
         busy_ns = t_ns - self._busy_ns
         lost_ns = busy_ns - self._paced_ns
@@ -107,19 +108,19 @@ class ScanStream:
 
     @property
     def deadline_ns(self) -> int:
-        """Time at which :meth:`on_timer` must be called next, ns."""
+        """Time (ns) at which :meth:`on_timer` must be called next."""
         if self._scan is None:
             return NO_DEADLINE_NS
         return 0 if self._carrier is None or self._just_begun else self._carrier.ready_ns
 
-    # --- methods that the TPDO engine calls
+    # --- methods called by the TPDO engine
 
     def sends(self, tpdo: Tpdo) -> bool:
         """Return whether a TPDO is carrying the chunks of the current scan."""
         return tpdo is self._carrier
 
     def on_reload(self, tpdo: Tpdo) -> None:
-        """Drop the remaining chunks of the current scan if their TPDO was disabled or mapped differently."""
+        """Drop the current scan's remaining chunks if their TPDO was disabled or mapped differently."""
         if tpdo is not self._carrier:
             return
         if tpdo.parameters.enabled and tpdo.first_index == od.CHUNK:
@@ -131,7 +132,7 @@ class ScanStream:
     # --- events
 
     def stop(self) -> None:
-        """Drop all scans, without a summary, because the node has left OPERATIONAL."""
+        """Drop all scans without sending a summary, because the node has left OPERATIONAL."""
         self._unsent.clear()
         self._scan = self._next_scan = self._carrier = None
 
@@ -142,7 +143,9 @@ class ScanStream:
                 self._tpdos.transmit(tpdo, t_ns)
 
     def offer(self, scan: OutgoingScan, t_ns: int) -> None:
-        """Send a scan, immediately or after the current scan. Must not be called if :attr:`full` is true.
+        """Send a scan, immediately or after the current scan.
+
+        The caller must first check that :attr:`full` is false.
 
         Args:
             scan: the scan.
@@ -157,7 +160,7 @@ class ScanStream:
             self._next_scan = scan
 
     def on_timer(self, t_ns: int) -> None:
-        """Send the chunks and summaries that are due at ``t_ns``."""
+        """Send the chunks and summaries due at ``t_ns``."""
         carrier = self._carrier
         if self._just_begun and carrier is not None:
             earliest_ns = t_ns - self._catch_up_ns + carrier.parameters.inhibit_ns
@@ -171,7 +174,7 @@ class ScanStream:
             following, self._next_scan = self._next_scan, None
             try:
                 self._end(ended, t_ns)
-            finally:  # the bus may refuse the summary
+            finally:  # start the next scan even if the bus refuses the summary
                 if following is not None:
                     self._begin(following, t_ns)
 
@@ -182,14 +185,14 @@ class ScanStream:
                 self._carrier, self._verbatim = tpdo, self._carries_record(tpdo)
                 tpdo.waiting = False
                 self._unsent.extend(scan.chunks)
-                tpdo.ready_ns = max(tpdo.ready_ns, t_ns)  # no burst after a pause
+                tpdo.ready_ns = max(tpdo.ready_ns, t_ns)  # prevents a burst of chunks after a pause
                 return
 
     def _carries_record(self, tpdo: Tpdo) -> bool:
         return [(each.index, each.subindex) for each in tpdo.parameters.mapping] == self._whole_record
 
     def _stream(self, t_ns: int) -> bool:
-        """Send the chunks that are due; return whether all chunks of the scan have been sent or discarded."""
+        """Send the due chunks; return whether all chunks of the scan have been sent or discarded."""
         unsent, carrier = self._unsent, self._carrier
         if carrier is None:
             return True

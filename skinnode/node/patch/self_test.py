@@ -1,7 +1,7 @@
 """Self-test of a patch (0x2021:3), which reads the source several times and checks the readings.
 
-A software node has no board that it could test, so the self-test checks only the source. The skin must not be
-touched during the self-test, because a touch would be measured as noise.
+A software node has no board to test, so the self-test checks only the source. The skin must not be touched
+during the self-test, because a touch would be measured as noise.
 """
 
 from __future__ import annotations
@@ -18,18 +18,18 @@ from skinnode.protocol.codes import CodeScale, encode
 from skinnode.protocol.self_test import SelfTest, SelfTestFault
 
 READINGS: Final = 16
-"""Number of readings in a self-test; the same as for a tare.
+"""Number of readings in a self-test, which equals the number for a tare.
 
-From 16 readings, the standard deviation of one crossing is known to within 18 % (1/√30), and that of a patch
-with 300 crossings to within 1 %.
+16 readings determine the standard deviation of one crossing's resistance to within 18 % (1/√30). Over a patch
+with 300 crossings, the uncertainty is 1 %.
 """
 
 NOISE_LIMIT: Final = 1e-3
-"""Maximum relative noise of a reading that passes the self-test; a hundred times the noise for which the
+"""Maximum relative noise of a reading for the self-test to pass: a hundred times the noise for which the
 solver's accuracy is specified."""
 
 
-@np.errstate(over="ignore", invalid="ignore")  # overflow occurs only for values that no converter returns
+@np.errstate(over="ignore", invalid="ignore")  # no converter returns values large enough to overflow
 def self_test(read: Callable[[], Float], baseline_ohm: Float, scale: CodeScale) -> SelfTest:
     """Perform a self-test of a patch.
 
@@ -75,7 +75,7 @@ def self_test(read: Callable[[], Float], baseline_ohm: Float, scale: CodeScale) 
 
 
 def _noise(readings: Float) -> float:
-    """Return the relative noise: RMS over all crossings of the readings' relative standard deviation."""
+    """Return the relative noise of the readings: the RMS of all crossings' relative standard deviations."""
     if len(readings) < 2 or not readings.shape[1]:
         return 0.0
     relative = readings.std(axis=0, ddof=1) / readings.mean(axis=0)

@@ -12,19 +12,19 @@ from skinnode.model.layout import Float, require_array
 class ResistanceSource(Protocol):
     """Source of the resistances between a patch's upper and lower wires.
 
-    A source may also have an attribute ``conversions``: an integer of any size, which is the number of
-    conversions of all crossings that the converter has completed. The node reads this number after
-    :meth:`read`, and each summary tells the host whether the number has changed, so that the host detects a
-    stopped converter immediately. If the attribute is missing or None, the host must detect a stopped
-    converter from the codes. The conversions must be counted in the converter itself, not in :meth:`read`. A
-    source may supply the number only if its converter completes at least one conversion per scan.
+    A source may also have an attribute ``conversions``: the number of conversions of all crossings completed
+    by the converter, an integer of any size. The node reads ``conversions`` after :meth:`read`. Each summary
+    indicates whether the number has changed, so the host detects a stopped converter immediately. If the
+    attribute ``conversions`` is missing or None, the host must detect a stopped converter from the codes. The
+    conversions must be counted in the converter itself, not in :meth:`read`. A source may supply
+    ``conversions`` only if its converter completes at least one conversion per scan.
     """
 
     def read(self, t_ns: int) -> Float:
-        """Return (U, K) resistances, ohm: infinite if a crossing is open, 0 if it is shorted.
+        """Return (U, K) resistances in ohms: infinite for an open crossing, 0 for a shorted crossing.
 
-        The node copies the array. If this method raises an exception, the node reports a failure of the
-        source, and reads the source again at the next scan.
+        The node copies the returned array. If this method raises an exception, the node reports a failure of
+        the source, and reads the source again at the next scan.
 
         Args:
             t_ns: current time on the monotonic clock, ns.
@@ -33,7 +33,7 @@ class ResistanceSource(Protocol):
 
 
 def conversions_of(source: ResistanceSource) -> int | None:
-    """Return the number of conversions that a source has completed; None if it does not count conversions.
+    """Return a source's number of completed conversions; None if it does not count conversions.
 
     Raises:
         SourceFailed: if the attribute raises an exception or is not an integer.
@@ -48,16 +48,16 @@ def conversions_of(source: ResistanceSource) -> int | None:
 
 
 class SourceFault(IntEnum):
-    """Type of a source failure, sent as the first detail byte of the emergency message."""
+    """Type of source failure, which is the first detail byte of the emergency message."""
 
     RAISED = 1
     """The source raised an exception."""
     WRONG_ARRAY = 2
-    """The source did not return an array of numbers with the right shape."""
+    """The source returned something other than an array of numbers with shape (U, K)."""
 
 
 class SourceFailed(Exception):
-    """Error raised inside a node if a reading fails; the node handles every such error."""
+    """Error raised and handled inside a node if reading the source fails."""
 
     def __init__(self, fault: SourceFault, message: str) -> None:
         self.fault = fault
@@ -76,8 +76,8 @@ def read_source(source: ResistanceSource, shape: tuple[int, int], t_ns: int) -> 
         (U, K) float64, ohm; a copy.
 
     Raises:
-        SourceFailed: if the source raises an exception, or does not return an array of numbers with that
-            shape. The message has one line.
+        SourceFailed: if the source raises an exception, or returns something other than an array of numbers
+            with the required shape. The error message is a single line.
     """
     try:
         reading = source.read(t_ns)

@@ -25,16 +25,16 @@ class SourceMonitor:
         self.failures = 0
         """Number of failed scans, tares and self-test readings."""
         self.error = ""
-        """Last failure of the source, in one line; empty before the first failure."""
+        """One-line description of the source's last failure; empty before the first failure."""
 
     def reset(self, t_ns: int) -> None:
-        """Report a failure that is still present again, after a reset."""
+        """Report a persisting failure again after a reset."""
         if self._fault is not None:
             self._report(self._fault, t_ns)
 
     @contextlib.contextmanager
     def watch(self, t_ns: int) -> Iterator[None]:
-        """Report a source failure in the ``with`` block and re-raise it, or report the end of a failure.
+        """Report and re-raise a source failure in the ``with`` block; report the end of an earlier failure.
 
         Args:
             t_ns: current time, ns.

@@ -1,4 +1,4 @@
-"""Detection of open and shorted wires from the codes of a scan, and reporting by EMCY 0x5000."""
+"""Detection of open and shorted wires from a scan's codes, and reporting of wire faults by EMCY 0x5000."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class WireFaults:
 
     @classmethod
     def none(cls, profile: PatchProfile) -> WireFaults:
-        """Return wire faults in which no wire is open or shorted."""
+        """Return masks without any wire fault."""
         rows, columns = np.zeros(profile.rows, dtype=np.bool_), np.zeros(profile.columns, dtype=np.bool_)
         return cls(rows, rows, columns, columns)
 
@@ -47,7 +47,7 @@ class WireFaults:
 
 
 def find_faults(codes: Codes, scale: CodeScale) -> WireFaults:
-    """Return the wires whose crossings are all open, and those whose crossings are all shorted.
+    """Return the open wires (all crossings open) and the shorted wires (all crossings shorted).
 
     Args:
         codes: (U, K) codes.
@@ -58,7 +58,7 @@ def find_faults(codes: Codes, scale: CodeScale) -> WireFaults:
 
 
 class WireFaultReporter:
-    """Reporter that sends emergency messages when wire faults begin and end.
+    """Reporter of wire faults, which sends emergency messages when faults begin and end.
 
     Args:
         profile: sizes of the patch.
@@ -70,14 +70,14 @@ class WireFaultReporter:
         self._reported = WireFaults.none(profile)
 
     def reset(self) -> None:
-        """Forget the faults reported so far, after a reset."""
+        """Forget the reported faults, because the node was reset."""
         self._reported = WireFaults.none(self._profile)
 
     def report(self, faults: WireFaults, t_ns: int) -> None:
-        """Report new wire faults by one emergency message, or the end of all wire faults.
+        """Report new wire faults, or the end of all wire faults, by a single emergency message.
 
         The message contains the type and wire number of the first new fault, and the number of faulty wires.
-        Several faults that begin together, for example because a connector was pulled, cause a single
+        Several faults that begin in the same scan, for example when a connector is unplugged, cause a single
         message.
 
         Args:

@@ -1,6 +1,6 @@
 """PDO parameters: their permitted values and their meaning (CiA 301 v4.2, 7.5.2.33 to 7.5.2.38).
 
-If the standard does not define an abort code for an error, a node sends the same abort code as CANopenNode.
+For errors without an abort code in the standard, a node sends the same abort code as CANopenNode.
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ from skinnode.node.object_dictionary import ObjectStore
 
 INVALID_BIT: Final = od.PDO_INVALID
 NO_RTR_BIT: Final = 1 << 30
-"""Bit of a COB-ID that forbids remote frames."""
+"""Bit in a TPDO's COB-ID that forbids requests by remote frame."""
 EXTENDED_BIT: Final = 1 << 29
-"""Bit of a COB-ID that marks a 29-bit CAN-ID."""
+"""Bit in a COB-ID that indicates a 29-bit CAN-ID."""
 COB_ID_MASK: Final = 0x7FF
 """Mask for the 11-bit CAN-ID in a COB-ID."""
 SYNC_CYCLIC_MAX: Final = 240
@@ -41,18 +41,19 @@ _RESTRICTED: Final = (
     range(0x6E0, 0x700),
     range(0x701, 0x800),
 )
-"""CAN-IDs that no configurable service may use (CiA 301 v4.2, table 40)."""
+"""Restricted CAN-IDs, which configurable services must not use (CiA 301 v4.2, table 40)."""
 
 
 def check_cob_id(value: int, current: int) -> None:
-    """Check a COB-ID that a client writes.
+    """Check a COB-ID written by a client.
 
     Args:
         value: new COB-ID, with its flag bits.
         current: current COB-ID, with its flag bits.
 
     Raises:
-        Refused: if the new COB-ID is restricted or malformed, or if the CAN-ID changes while it is in use.
+        Refused: if the new COB-ID is restricted or malformed, or if the client tries to change the CAN-ID of
+            an enabled service.
     """
     if value & EXTENDED_BIT or value & ~(INVALID_BIT | NO_RTR_BIT) > COB_ID_MASK:
         raise Refused(AbortCode.INVALID_VALUE)
@@ -65,7 +66,10 @@ def check_cob_id(value: int, current: int) -> None:
 
 @dataclass(frozen=True, slots=True)
 class Mapped:
-    """Object mapped into a PDO. The index of a data type denotes a dummy, whose bytes are ignored."""
+    """Object mapped into a PDO.
+
+    If ``index`` is the index of a data type, the object is a dummy, whose bytes are ignored.
+    """
 
     index: int
     subindex: int
@@ -75,14 +79,14 @@ class Mapped:
 
 @dataclass(frozen=True, slots=True)
 class PdoParameters:
-    """Parameters of a PDO, from its two records. Times are in ns; a time of 0 is not used."""
+    """Parameters of a PDO from its communication and mapping records. Times are in ns; 0 disables a time."""
 
     enabled: bool
     """Whether the PDO is enabled and has at least one mapped object."""
     cob_id: int
     """CAN-ID of the PDO, 11 bits."""
     answers_rtr: bool
-    """Whether the PDO is a TPDO that may be requested by remote frames."""
+    """Whether remote frames may request the PDO; always false for an RPDO."""
     kind: int
     """Transmission type of the PDO."""
     inhibit_ns: int
@@ -100,19 +104,19 @@ class PdoParameters:
 
     @property
     def synchronous(self) -> bool:
-        """Whether SYNC triggers the PDO; false for a PDO that is sampled at SYNC but sent on request."""
+        """Whether SYNC triggers the PDO; false for type 252, which is sampled at SYNC but sent on request."""
         return self.kind <= SYNC_CYCLIC_MAX
 
 
 class PdoRecords:
-    """Communication record and mapping record of one PDO, with checks of the values that clients write.
+    """Communication record and mapping record of one PDO; values written by clients are checked.
 
     Args:
         store: object dictionary.
         parameter: index of the communication record.
         mapping: index of the mapping record.
         transmits: whether the PDO is a TPDO.
-        taken: returns whether another PDO already uses a CAN-ID; None if PDOs may share a CAN-ID.
+        taken: returns whether another PDO already uses the given CAN-ID; None if PDOs may share a CAN-ID.
     """
 
     def __init__(
@@ -127,14 +131,14 @@ class PdoRecords:
         self._store = store
         self._parameter, self._mapping, self._transmits = parameter, mapping, transmits
         self._taken = taken
-        # The maximum length of a PDO in bytes equals its maximum number of mapped objects, because the
-        # smallest object has one byte.
+        # The maximum number of mapped objects equals the maximum PDO length in bytes, because the smallest
+        # object has one byte.
         self._longest = sum([store.has(mapping, sub) for sub in range(1, _MOST_MAPPED + 1)])
         store.guard(parameter, self._guard_parameter)
         store.guard(mapping, self._guard_mapping)
 
     def _word(self, subindex: int) -> int:
-        """Return the communication parameter at a sub-index; 0 if this PDO does not have the parameter."""
+        """Return the communication parameter at a sub-index; 0 if this PDO lacks the parameter."""
         has = self._store.has(self._parameter, subindex)
         return self._store.integer(self._parameter, subindex) if has else 0
 
@@ -187,7 +191,7 @@ class PdoRecords:
             raise Refused(AbortCode.UNSUPPORTED_ACCESS)
         if not subindex:
             self._check_mapping(value)
-        elif value:  # an unused entry may be 0; sub-index 0 must not count it
+        elif value:  # an entry of 0 is unused; sub-index 0 must not include it in its count
             self._mapped_bytes(value)
 
     def _check_mapping(self, count: int) -> None:
@@ -198,7 +202,7 @@ class PdoRecords:
             raise Refused(AbortCode.PDO_TOO_LONG)
 
     def _mapped_bytes(self, word: int) -> int:
-        """Return the length in bytes of the object that a mapping entry refers to."""
+        """Return the length, in bytes, of the object specified by a mapping entry."""
         index, subindex, bits = word >> 16, word >> 8 & 0xFF, word & 0xFF
         if not self._transmits and not subindex and index in od.DUMMY_BITS:
             allowed, size = True, od.DUMMY_BITS[index]

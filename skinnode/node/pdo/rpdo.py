@@ -1,10 +1,11 @@
 """RPDO engine, which writes received RPDOs to the object dictionary (CiA 301 v4.2, 7.2.2 and 7.5.2.33).
 
 A synchronous RPDO (types 0 to 240) is applied at the SYNC after its reception, if it was received within the
-synchronous window (0x1007). If several arrive, the last is applied. An RPDO of type 254 or 255 is applied
-immediately. If an RPDO is too long, its excess bytes are ignored; if it is too short, it is not applied.
-Either error is reported once by an emergency message, until an RPDO of the right length arrives. In
-OPERATIONAL, an event timer monitors the reception of an RPDO after it has been received for the first time.
+synchronous window (0x1007). Of several RPDOs with the same number received between two SYNCs, only the last
+is applied. An RPDO of type 254 or 255 is applied immediately. Excess bytes of an RPDO are ignored; an RPDO
+that is too short is not applied. An emergency message reports a length error once, until an RPDO with the
+correct length arrives. In OPERATIONAL, an event timer monitors the reception of an RPDO after it has been
+received for the first time.
 """
 
 from __future__ import annotations
@@ -25,12 +26,12 @@ from skinnode.node.timers import Timers
 
 
 class _Rpdo:
-    """State of one RPDO: its parameters and its current length error."""
+    """State of one RPDO, including its parameters and its current length error."""
 
     def __init__(self, number: int, records: PdoRecords) -> None:
         self.number, self._records = number, records
         self.wrong: EmcyCode | None = None
-        """Length error of the last PDO received; None if its length was right."""
+        """Length error of the last PDO received; None if the length was correct."""
         self.parameters = records.read()
         self.fields = self._fields()
 
@@ -40,7 +41,7 @@ class _Rpdo:
         self.fields = self._fields()
 
     def _fields(self) -> list[tuple[int, int, int, int]]:
-        """Return the index, sub-index, first byte and end byte of each mapped object except dummies."""
+        """Return index, sub-index, start byte and end byte of each mapped object except dummies."""
         at, fields = 0, []
         for each in self.parameters.mapping:
             if each.index not in od.DUMMY_BITS:
@@ -65,9 +66,9 @@ class RpdoEngine:
         self._operational = False
         self._timers = Timers()
         self._by_cob_id: dict[int, list[_Rpdo]] = {}
-        self._pending: dict[int, bytes] = {}  # payloads of synchronous RPDOs, to be applied at the next SYNC
+        self._pending: dict[int, bytes] = {}  # payloads of synchronous RPDOs to apply at the next SYNC
 
-        # Numbers of the RPDOs that are too short, and of those that are late.
+        # Numbers of the RPDOs with an active error: received too short, or overdue.
         self._short: set[int] = set()
         self._late: set[int] = set()
         self._rpdos: list[_Rpdo] = []
@@ -81,13 +82,13 @@ class RpdoEngine:
 
     @property
     def deadline_ns(self) -> int:
-        """Time at which the next monitored RPDO counts as late, ns."""
+        """Earliest time (ns) at which a monitored RPDO is overdue."""
         return self._timers.deadline_ns
 
     # --- parameters
 
     def restore(self) -> None:
-        """Apply all parameters, and forget all errors, after a reset."""
+        """Apply all parameters after a reset, and discard all errors."""
         self._by_cob_id.clear()
         self._pending.clear()
         self._timers.clear()
@@ -116,9 +117,9 @@ class RpdoEngine:
     # --- events
 
     def enter(self, *, operational: bool) -> None:
-        """Handle a change of the NMT state: drop the RPDOs not yet applied, and end monitoring.
+        """Handle a change of the NMT state: drop the pending RPDOs, and end deadline monitoring.
 
-        Deadlines are monitored only in OPERATIONAL (CiA 301 v4.2, 7.5.2.33), so errors of late RPDOs end.
+        Deadlines are monitored only in OPERATIONAL (CiA 301 v4.2, 7.5.2.33), so RPDO timeout errors end.
         """
         self._operational = operational
         self._pending.clear()
@@ -145,7 +146,7 @@ class RpdoEngine:
             self._execute(self._rpdos[number], pending[number])
 
     def on_timer(self, t_ns: int) -> None:
-        """Report each RPDO that is late at ``t_ns``. Monitoring restarts when the RPDO is received again."""
+        """Report each RPDO that is overdue at ``t_ns``. Its monitoring restarts when it is received again."""
         for number in self._timers.take(t_ns):
             self._late.add(number)
             self._emcy.report(EmcyCode.RPDO_TIMEOUT, (number + 1).to_bytes(2, "little"), t_ns)
@@ -155,7 +156,7 @@ class RpdoEngine:
         wrong = None
         if len(data) < parameters.size:
             wrong = EmcyCode.PDO_NOT_PROCESSED
-        elif len(data) > fd_length(parameters.size):  # lengths up to 8 bytes need no padding
+        elif len(data) > fd_length(parameters.size):  # CAN FD pads lengths above 8 bytes
             wrong = EmcyCode.PDO_LENGTH_EXCEEDED
         self._set_wrong(rpdo, wrong, data, t_ns)
         if wrong is EmcyCode.PDO_NOT_PROCESSED:

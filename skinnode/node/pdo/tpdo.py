@@ -1,4 +1,4 @@
-"""TPDO engine, which transmits mapped objects as the PDO parameters require (CiA 301 v4.2, 7.2.2, 7.5.2.37).
+"""TPDO engine, which transmits mapped objects according to PDO parameters (CiA 301 v4.2, 7.2.2, 7.5.2.37).
 
 =========  =======================================================================================
 type       sent
@@ -12,7 +12,7 @@ type       sent
 =========  =======================================================================================
 
 An application can *claim* an object. The application then sends all TPDOs whose first mapped object is the
-claimed object, and SYNC and events do not trigger these TPDOs. The engine still counts SYNCs, answers remote
+claimed object. SYNC and events do not trigger claimed TPDOs. The engine still counts SYNCs, answers remote
 frames and runs the event timers for claimed TPDOs.
 
 The processing time of a SYNC depends only on the number of enabled TPDOs that are sent or sampled at SYNC.
@@ -35,7 +35,7 @@ from skinnode.node.timers import Timers
 
 
 class Tpdo:
-    """State of one TPDO: its parameters, and the times at which it may and must be sent.
+    """State of one TPDO: parameters, earliest sending time and event timer.
 
     Args:
         number: number of the TPDO, counted from 0.
@@ -45,15 +45,16 @@ class Tpdo:
     def __init__(self, number: int, records: PdoRecords) -> None:
         self.number, self._records = number, records
         self.ready_ns = 0
-        """Earliest time at which the inhibit time allows the TPDO to be sent again, ns."""
+        """End (ns) of the inhibit time, when the TPDO may be sent again."""
         self.timer_ns = NO_DEADLINE_NS
-        """Time at which the TPDO's event timer elapses, ns."""
+        """Time (ns) at which the TPDO's event timer elapses."""
         self.waiting = False
-        """Whether the TPDO must be sent at a SYNC or after the inhibit time."""
+        """Whether the TPDO is waiting for a SYNC or for the end of the inhibit time."""
         self.last: bytes | None = None
-        """Payload sent last or, for transmission type 252, sampled last; None if there is none."""
+        """Last payload sent or, for transmission type 252, last payload sampled; None before the first
+        payload."""
         self.owner: Owner | None = None
-        """Part of the application that sends the TPDO; None if the engine sends it."""
+        """Part of the application that sends the TPDO; None if the TPDO engine sends the TPDO."""
         self._in_step = False
         self._syncs = 0
         self.parameters = records.read()
@@ -66,12 +67,12 @@ class Tpdo:
 
     @property
     def deadline_ns(self) -> int:
-        """Time at which the TPDO's timers must be served next, ns."""
+        """Time (ns) at which the TPDO's timers must be handled next."""
         held = self.waiting and self.parameters.event_driven
         return min(self.timer_ns, self.ready_ns) if held else self.timer_ns
 
     def reload(self, t_ns: int) -> None:
-        """Apply the parameters in the object dictionary, which were written at ``t_ns``."""
+        """Apply the object dictionary's parameters for this TPDO, which were written at ``t_ns``."""
         old, new = self.parameters, self._records.read()
         self.parameters = new
         if (old.enabled, old.kind, old.sync_start) != (new.enabled, new.kind, new.sync_start):
@@ -80,18 +81,18 @@ class Tpdo:
             self.start_timer(t_ns)
 
     def start(self, t_ns: int) -> None:
-        """Start the TPDO in OPERATIONAL, without its previous state."""
+        """Reset the TPDO's state and start its event timer, because the node has entered OPERATIONAL."""
         self.waiting, self.last, self._in_step, self._syncs = False, None, False, 0
         self.start_timer(t_ns)
 
     def start_timer(self, t_ns: int) -> None:
-        """Restart the event timer at ``t_ns``, if the TPDO has an event timer."""
+        """Restart the event timer at ``t_ns``, if an event timer is configured."""
         parameters = self.parameters
         timed = parameters.enabled and parameters.event_driven and parameters.event_timer_ns > 0
         self.timer_ns = t_ns + parameters.event_timer_ns if timed else NO_DEADLINE_NS
 
     def elapse(self, t_ns: int) -> None:
-        """Restart the event timer after it has elapsed, without drift unless it was served a period late."""
+        """Restart an elapsed event timer, without drift unless the delay exceeds one period."""
         self.timer_ns += self.parameters.event_timer_ns
         if self.timer_ns <= t_ns:
             self.start_timer(t_ns)
@@ -110,7 +111,7 @@ class Tpdo:
             if counter != parameters.sync_start:
                 return False
             self._in_step, self._syncs = True, 0
-            return True  # the SYNC with the start value counts as the first
+            return True  # the SYNC with the start value is the first SYNC of the TPDO
         self._syncs += 1
         if self._syncs < parameters.kind:
             return False
@@ -119,14 +120,14 @@ class Tpdo:
 
 
 class Owner(Protocol):
-    """Part of an application that has claimed objects, and sends the TPDOs with these objects."""
+    """Part of an application that has claimed objects and sends the corresponding TPDOs."""
 
     def sends(self, tpdo: Tpdo) -> bool:
         """Return whether the owner will send this TPDO soon, without a request."""
         ...
 
     def on_reload(self, tpdo: Tpdo) -> None:
-        """Handle a change of a TPDO's parameters, after which the TPDO may have another owner."""
+        """Handle a change of a TPDO's parameters, which may also change the TPDO's owner."""
         ...
 
 
@@ -143,7 +144,7 @@ class TpdoEngine:
         store = services.store
         self._store, self._send, self._now = store, services.send, services.now
         self.window = window
-        """Synchronous window, in which TPDO owners must send their synchronous TPDOs."""
+        """Synchronous window (0x1007), within which owners must send their synchronous TPDOs."""
         self._claims: dict[int, Owner] = {}
         self._running = False
         self._timers = Timers()
@@ -164,7 +165,7 @@ class TpdoEngine:
 
     @property
     def deadline_ns(self) -> int:
-        """Time at which :meth:`on_timer` must be called next, ns."""
+        """Time (ns) at which :meth:`on_timer` must be called next."""
         return self._timers.deadline_ns
 
     def claim(self, index: int, owner: Owner) -> None:
@@ -227,7 +228,7 @@ class TpdoEngine:
         self._timers.clear()
 
     def count_sync(self, counter: int | None) -> frozenset[int]:
-        """Count a SYNC for all TPDOs, and determine which are due.
+        """Count a SYNC for all TPDOs, and determine the synchronous TPDOs that are due.
 
         Args:
             counter: SYNC counter; None if the SYNC message contains no counter.
@@ -264,7 +265,7 @@ class TpdoEngine:
             self.request(self._tpdos[number], t_ns)
 
     def request(self, tpdo: Tpdo, t_ns: int) -> None:
-        """Send an event-driven TPDO as soon as its inhibit time allows."""
+        """Send an event-driven TPDO when its inhibit time has elapsed."""
         tpdo.waiting = True
         self._let_out(tpdo, t_ns)
 
@@ -326,7 +327,7 @@ class TpdoEngine:
         if timer:
             tpdo.start_timer(t_ns)
         self._plan(tpdo)
-        # This call comes last, because the bus may refuse the frame.
+        # The frame is sent after the state has been updated, because the bus may refuse the frame.
         self._send(tpdo.parameters.cob_id, payload)
 
     def _plan(self, tpdo: Tpdo) -> None:
@@ -334,7 +335,7 @@ class TpdoEngine:
 
 
 def _keep(numbers: list[int], number: int, wanted: bool) -> None:
-    """Add ``number`` to the ascending list if ``wanted`` is true; otherwise, remove it."""
+    """Add ``number`` to the ascending list if ``wanted`` is true; otherwise, remove ``number``."""
     at = bisect_left(numbers, number)
     there = at < len(numbers) and numbers[at] == number
     if wanted and not there:

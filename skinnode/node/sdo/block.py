@@ -1,9 +1,9 @@
 """SDO block transfer, with one acknowledgement per block of segments (CiA 301 v4.2, 7.2.4.3.9 to 7.2.4.3.15).
 
-CAN may deliver a frame twice if the last bit of its end-of-frame field is disturbed (ISO 11898-1). A frame
-contains no block number, so a repeated acknowledgement could be mistaken for the acknowledgement of the next
-block, and segments would be skipped. For this reason, a frame equal to the previous frame is ignored, unless
-the protocol allows two equal frames in succession.
+CAN may deliver a frame twice if the last bit of its end-of-frame field is disturbed (ISO 11898-1). Frames
+contain no block number, so a repeated acknowledgement could be mistaken for that of the next block, and
+segments would be skipped. A frame identical to the previous frame is therefore ignored, unless the protocol
+allows two identical frames in succession.
 """
 
 from __future__ import annotations
@@ -20,28 +20,29 @@ from skinnode.errors import BusError
 from skinnode.node.sdo.transfer import MULTIPLEXER_U32, Channel, Incoming, Target, Transfer
 
 SEGMENT_NS: Final = 500_000
-"""Minimum mean time between two segments, ns.
+"""Minimum mean interval between segments, in ns.
 
-PDOs may cause a bus load of 70 %. At 1 Mbit/s, this leaves at least 2200 frames/s, of which block transfers
-use 2000, so the transmit queue does not fill up. A block takes 64 ms, or 100 ms if the thread wakes up late.
-Clients wait longer than this for a frame: at least 300 ms (canopen library). Whenever the bus refuses a
-segment, as a slower bus may do, the time between segments is doubled for the rest of the transfer.
+PDOs may cause a bus load of 70 %. At 1 Mbit/s, the remaining capacity is at least 2200 frames/s. Block
+transfers use 2000 frames/s, so the transmit queue does not fill up. A block takes 64 ms, or 100 ms if the
+thread wakes up late. Clients wait longer than one block for a frame: at least 300 ms (canopen library).
+Each time the bus refuses a segment, for example because of a lower bit rate, the interval is doubled for the
+remainder of the transfer.
 """
 SLOWEST_SEGMENT_NS: Final = 8 * SEGMENT_NS
-"""Maximum mean time between two segments, ns; at this pace, the segments use a quarter of a 125 kbit/s bus.
-If the bus refuses segments even at this pace, a slower pace would not help."""
+"""Maximum mean interval between segments, in ns. At this interval, the segments use a quarter of the capacity
+of a 125 kbit/s bus. If the bus still refuses segments, a longer interval would not help."""
 SEGMENTS_AT_ONCE: Final = 4
-"""Maximum number of segments sent per timer event. Several segments per event compensate for a thread that
-wakes up late, by default up to 2 ms late.
+"""Maximum number of segments sent per timer event. Sending several segments compensates for late wake-ups of
+the thread, by default up to 2 ms late.
 
 The transmit queue of a Linux CAN interface has space for 10 frames, and a delayed thread may handle two timer
 events in succession.
 """
 TWICE_NS: Final = 3_000_000
-"""Maximum time between two receptions of the same frame, ns: the duration of two frames of maximum length and
-an error frame at 125 kbit/s.
+"""Maximum interval (ns) between the two receptions of a duplicated frame: the duration of two maximum-length
+frames and an error frame at 125 kbit/s.
 
-An intended second acknowledgement differs from the first, because the client has received more segments.
+A genuine second acknowledgement differs from the first, because the client has received more segments.
 """
 
 _LAST: Final = 0x80
@@ -70,23 +71,23 @@ class _Upload(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Upload:
-    """Value to be sent by a block upload, and the options that the client requested."""
+    """Value to send in a block upload, and the options requested by the client."""
 
     data: bytes
     """Value to be sent."""
     block_size: int
-    """Number of segments per block, which the client can change in each acknowledgement."""
+    """Number of segments per block, which the client can change with each acknowledgement."""
     crc: bool
     """Whether the client supports a CRC."""
 
 
 class BlockUpload(Transfer):
-    """Block upload; its constructor sends the response to the initiate request.
+    """Block upload. The constructor sends the response to the initiate request.
 
     Args:
         channel: SDO server channel.
         target: object to read or write.
-        upload: value of the object, and the options that the client requested.
+        upload: value of the object, and the options requested by the client.
         t_ns: time at which the initiate request was received, ns.
 
     Raises:
@@ -104,8 +105,8 @@ class BlockUpload(Transfer):
         self._sent = 0  # number of segments of the current block sent so far
         self._waits_for = _Upload.START
         self._previous, self._previous_ns = b"", t_ns
-        # The server offers a CRC only if the client does: some clients expect a CRC whenever the server
-        # offers it, even if they have not requested one.
+        # The server offers a CRC only if the client supports one: some clients expect a CRC whenever the
+        # server offers it, even without having requested it.
         channel.send(MULTIPLEXER_U32.pack(0xC2 | crc << 2, target.index, target.subindex, len(data)))
 
     def wants(self, request: bytes) -> bool:
@@ -130,7 +131,7 @@ class BlockUpload(Transfer):
         return False
 
     def on_timer(self, t_ns: int) -> None:
-        """Send the segments that are due at ``t_ns``, or abort if the client has not responded."""
+        """Send the segments due at ``t_ns``, or abort if the client has not responded in time."""
         if self._waits_for is not _Upload.TIME:
             super().on_timer(t_ns)
         due_ns = max(self.deadline_ns, t_ns - (SEGMENTS_AT_ONCE - 1) * self._pace_ns)
@@ -153,7 +154,7 @@ class BlockUpload(Transfer):
         head = self._sent + 1 | (_LAST if last else 0)
         try:
             self._channel.send(bytes((head,)) + segment.ljust(SEGMENT_BYTES, b"\0"))
-        except BusError:  # the segment was not sent, so it will be sent again
+        except BusError:  # the bus refused the segment, which is therefore sent again later
             self._pace_ns = min(2 * self._pace_ns, SLOWEST_SEGMENT_NS)
             raise
         self._sent += 1
@@ -161,7 +162,7 @@ class BlockUpload(Transfer):
             self._waits_for = _Upload.ACKNOWLEDGEMENT
 
     def _acknowledge(self, received: int, block_size: int, t_ns: int) -> None:
-        """Continue after segment ``received`` of the current block, which the client received last."""
+        """Continue after segment ``received`` of the current block, the last that the client received."""
         if received > self._sent:
             raise Refused(AbortCode.INVALID_SEQUENCE)
         self._block_size = _checked(block_size)
@@ -177,10 +178,10 @@ class BlockUpload(Transfer):
 
 
 class BlockDownload(Transfer):
-    """Block download; its constructor sends the response to the initiate request.
+    """Block download. The constructor sends the response to the initiate request.
 
-    At the end of each block, the server acknowledges the last segment before any gap. If the end of a block
-    is lost, the transfer times out.
+    At the end of each block, the server acknowledges the last segment received without a gap. If the last
+    segment of a block is lost, the transfer times out.
 
     Args:
         channel: SDO server channel.
@@ -201,7 +202,7 @@ class BlockDownload(Transfer):
         self._crc = crc
         self._received = 0  # number of segments of the current block received without a gap
         self._last: bytes | None = (
-            None  # last segment of the transfer; only the end request contains the number of its data bytes
+            None  # last segment of the transfer; its number of data bytes follows in the end request
         )
         self._previous = b""  # the last request if it was acknowledged, so that its repetition can be ignored
         channel.send(MULTIPLEXER_U32.pack(0xA0 | crc << 2, target.index, target.subindex, MAX_BLOCK_SEGMENTS))
@@ -212,7 +213,7 @@ class BlockDownload(Transfer):
 
     def on_request(self, request: bytes, t_ns: int) -> bool:
         """Process a request that belongs to this transfer; return whether the transfer has ended."""
-        # Checked first, because an end request may equal the previous frame.
+        # End requests must be checked before duplicates, because an end request may equal the previous frame.
         if self._last is not None and _is_end(request):
             self._end(request, self._last)
             return True

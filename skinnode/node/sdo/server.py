@@ -19,8 +19,8 @@ from skinnode.node.sdo.block import BlockDownload, BlockUpload, Upload
 from skinnode.node.sdo.transfer import MULTIPLEXER, MULTIPLEXER_U32, Channel, Incoming, Target, Transfer
 
 TIMEOUT_NS: Final = 1_000_000_000
-"""Maximum time between two requests of a client before its transfer is aborted, ns; CiA 301 does not define
-this time."""
+"""Maximum interval (ns) between two requests from a client, after which the transfer is aborted. CiA 301 does
+not define this time-out."""
 
 _TOGGLE: Final = 0x10
 
@@ -43,13 +43,13 @@ _NAMELESS: Final = (0, 3, 5, 6)
 class SdoServer:
     """SDO server with one channel, which performs one transfer at a time.
 
-    An initiate request ends an unfinished transfer, because it shows that the client has abandoned that
-    transfer. An error raised by ``send`` propagates to the caller; the next call then continues the transfer.
+    A new initiate request ends an unfinished transfer, because the client has evidently abandoned it. Errors
+    raised by ``send`` propagate to the caller; the transfer continues with the next call.
 
     Args:
         store: object dictionary.
         send: called with the eight bytes of each response.
-        timeout_ns: maximum time between two requests of a client, ns.
+        timeout_ns: maximum interval between two requests from a client, ns.
     """
 
     def __init__(
@@ -60,7 +60,7 @@ class SdoServer:
 
     @property
     def deadline_ns(self) -> int:
-        """Time at which :meth:`on_timer` must next send block segments or an abort, ns."""
+        """Time (ns) at which :meth:`on_timer` must be called next, to send block segments or an abort."""
         return self._transfer.deadline_ns if self._transfer is not None else NO_DEADLINE_NS
 
     def reset(self) -> None:
@@ -68,7 +68,7 @@ class SdoServer:
         self._transfer = None
 
     def on_timer(self, t_ns: int) -> None:
-        """Continue a block upload if this is due at ``t_ns``, or abort a transfer that has timed out."""
+        """Send block upload segments due at ``t_ns``, or abort a transfer that has timed out."""
         transfer = self._transfer
         if transfer is not None and t_ns >= transfer.deadline_ns:
             try:
@@ -77,7 +77,7 @@ class SdoServer:
                 self._abort(transfer.target, refused.code)
 
     def on_request(self, request: bytes, t_ns: int) -> None:
-        """Handle a request from the client. An abort has no response.
+        """Handle a request from the client. The server does not respond to an abort from the client.
 
         Args:
             request: eight bytes.
@@ -139,7 +139,7 @@ class SdoServer:
     def _block_upload(self, request: bytes, target: Target, t_ns: int) -> None:
         data = self._read(target)
         block_size, switch_threshold, crc = request[4], request[5], bool(request[0] & 4)
-        if 0 < len(data) <= switch_threshold:  # up to this size, the client prefers a segmented transfer
+        if 0 < len(data) <= switch_threshold:  # the client prefers segmented transfers up to this size
             self._start_upload(target, data, t_ns)
         else:
             self._transfer = BlockUpload(self._channel, target, Upload(data, block_size, crc), t_ns)
@@ -152,7 +152,7 @@ class SdoServer:
             self._transfer = _Download(self._channel, target, announced, t_ns)
             return
         store = self._channel.store
-        # If the request contains no size, the size is the length of the object, but at most four bytes.
+        # For a request without a size, the object's length is used, limited to four bytes.
         index, subindex = target.index, target.subindex
         size = 4 - (command >> 2 & 3) if size_given else min(store.lengths(index, subindex).most, 4)
         store.write(index, subindex, request[4 : 4 + size])

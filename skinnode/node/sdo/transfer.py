@@ -1,4 +1,4 @@
-"""Classes that all SDO transfers share: channel, base class with time-out, and value of a download."""
+"""Classes shared by all SDO transfers: channel, base class with a time-out, and value being downloaded."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ class Channel:
     send: Callable[[bytes], None]
     """Function that sends a response of eight bytes."""
     timeout_ns: int
-    """Maximum time between two requests of a client, ns."""
+    """Maximum interval (ns) between two requests from a client."""
 
 
 @dataclass(frozen=True, slots=True)
 class Target:
-    """Index and sub-index that a transfer reads or writes."""
+    """Index and sub-index of the object that a transfer reads or writes."""
 
     index: int
     """Index of the object."""
@@ -40,7 +40,7 @@ class Target:
 
 
 class Transfer(ABC):
-    """Base class of transfers with more than one request. A transfer raises Refused to be aborted.
+    """Base class of transfers with several requests. A transfer aborts itself by raising Refused.
 
     Args:
         channel: SDO server channel.
@@ -53,7 +53,7 @@ class Transfer(ABC):
         self.target = target
         """The object."""
         self.deadline_ns = t_ns + channel.timeout_ns
-        """Time at which :meth:`on_timer` must be called next, ns."""
+        """Time (ns) at which :meth:`on_timer` must be called next."""
 
     @abstractmethod
     def wants(self, request: bytes) -> bool:
@@ -67,7 +67,7 @@ class Transfer(ABC):
         """Abort the transfer, because the client has sent no request before the time-out.
 
         Raises:
-            Refused: always; a transfer that also sends at timer events overrides this method.
+            Refused: always. Transfers that also send frames at timer events override this method.
         """
         raise Refused(AbortCode.TIMED_OUT)
 
@@ -76,7 +76,7 @@ class Transfer(ABC):
 
 
 class Incoming:
-    """Value that a download receives in parts and writes to the object as a whole.
+    """Value of a download, which is received in parts and then written to the object as a whole.
 
     Args:
         store: object dictionary.

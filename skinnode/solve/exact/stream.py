@@ -26,15 +26,13 @@ from skinnode.solve.wires.patch_solver import PatchSolver
 from skinnode.solve.wires.problem import PatchProblem
 
 TOLERANCE: Final = 1e-9
-"""Tolerance for r, and for x in pitches.
-
-The tolerance is four orders of magnitude below the noise of a 24-bit converter. A single Newton step reduces
-an error of 1e-5 to less than this tolerance.
-"""
+"""Tolerance of r and, in pitches, of x. The value is four orders of magnitude below the noise of a 24-bit
+converter; a single Newton step leads from an error of 1e-5 to this tolerance."""
 FRAME_STEPS: Final = 12
-"""Maximum number of steps per solve; Newton's method takes 3 to 6 steps within the trust region."""
+"""Maximum number of steps per solve; quadratic convergence from within the trust region takes 3 to 6
+steps."""
 TASKS: Final = wires.COVARIANCE | wires.REUSE
-"""Additional tasks for solves whose result can become the frame's result."""
+"""Additional tasks of each solve whose result may become the result of the frame."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -44,13 +42,13 @@ class Frame:
     sigma: float
     """Smallest relative standard deviation of the resistances."""
     order: Index
-    """(U,) indices of the wires, in processing order."""
+    """(U,) wires in processing order."""
     until: float
     """Deadline on the ``perf_counter`` clock, s; inf if there is none."""
 
     @property
     def expired(self) -> bool:
-        """True once the deadline has passed."""
+        """Whether the deadline has passed."""
         return self.until < math.inf and perf_counter() >= self.until
 
 
@@ -126,7 +124,7 @@ class StreamState:
         return todo
 
     def roots(self) -> NDArray[np.bool_]:
-        """Return a mask (U,) of wires at a root that is within reach and on the rest position's branch."""
+        """Return the wires (U,) at a root that is within reach and on the branch of the rest position."""
         solver = self.solver
         report, out_of_reach = solver.report, self.problem.out_of_reach(solver.x)
         return on_rest_branch(
@@ -134,7 +132,7 @@ class StreamState:
         )
 
     def solvable(self) -> NDArray[np.bool_]:
-        """Return a mask (U,) of wires with at least as many usable resistances as unknowns."""
+        """Return the wires (U,) with enough usable resistances in the frame for their unknowns."""
         count = np.count_nonzero(self.arrays.used, axis=1)
         return np.asarray((count > 0) & (count >= self.unknowns))
 

@@ -1,4 +1,4 @@
-"""Checks of a tracker's arguments: a wrong shape raises an exception, a resistance value never does."""
+"""Checks of a tracker's arguments. Wrong shapes raise an exception; resistance values never do."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from skinnode.model.layout import Float, PatchLayout
 
 NOISE_MAX: Final = 1e12
-"""Largest relative noise in a usable resistance; its square must not overflow."""
+"""Maximum relative noise of a usable resistance, small enough that its square does not overflow."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -34,7 +34,7 @@ class CodeMap:
     """(U, K) or (U, 1) gain of the front end; None for a gain of 1."""
 
     def decode(self, codes: NDArray[np.uint32]) -> tuple[Float, NDArray[np.bool_]]:
-        """Return the resistances (U, K) in ohm, NaN for an invalid code, and the mask of the valid codes."""
+        """Return the resistances (U, K) in ohm (NaN for invalid codes) and a mask of the valid codes."""
         valid = (codes <= self.steps) & (self.baseline_ohm > 0) & (self.baseline_ohm < np.inf)
         ohm = (self.lo + codes * self.step) * self.baseline_ohm
         ohm = ohm if self.gain is None else ohm * self.gain
@@ -48,7 +48,7 @@ def broadcast_noise(relative_noise: ArrayLike, layout: PatchLayout) -> Float:
         ValueError: If the noise is neither a number nor of that shape.
     """
     if isinstance(relative_noise, np.ndarray) and relative_noise.shape == layout.shape:
-        return np.asarray(relative_noise, np.float64)  # fast path: a host passes an array with every frame
+        return np.asarray(relative_noise, np.float64)  # fast path: hosts pass an array with every frame
     try:
         return np.asarray(np.broadcast_to(np.asarray(relative_noise, np.float64), layout.shape))
     except (TypeError, ValueError) as error:

@@ -1,4 +1,4 @@
-"""Upper bound on the force of a contact on a layer that is not calibrated.
+"""Upper bound on the force of a contact on an uncalibrated layer.
 
 The solver computes forces from the displacement of an elastic half-space, but real skin is a layer on a
 support. The stiffest case is a layer of incompressible rubber bonded to a rigid support. For the same
@@ -10,8 +10,8 @@ thickness t is indented by
 
 where f = 1 for the half-space (Johnson, Contact Mechanics, 1985, 5.8; the thin-layer limit F ∝ G a⁴ δ / t³ is
 from Barber, International Journal of Mechanical Sciences 32, 129, 1990). At the same δ, the ratio of the
-bonded layer's force to the half-space's force is a function of a/t. The force on any real layer lies between
-these two forces. The sum of the half-space's pressing loads is a second bound: on thicker layers, pulling
+bonded layer's force to the half-space's force is a function of a/t. The force on any real layer is between
+these two limits. The sum of the half-space's pressing loads is a second bound: on thicker layers, pulling
 loads cancel part of this sum.
 """
 
@@ -23,15 +23,18 @@ from typing import Final
 from skinnode.model.elastic import Rubber
 
 LINEAR: Final = 1.05
-"""Coefficient of a/t in the ratio of the bonded layer's force to the half-space's force. Fitted together with
-:data:`CUBIC` to the exact integral for a/t from 0.05 to 20, with errors of at most 12 %."""
+"""Coefficient of a/t in the ratio of the bonded layer's force to the half-space's force.
+
+This coefficient and :data:`CUBIC` were fitted to the exact integral for a/t from 0.05 to 20; the error is at
+most 12 %.
+"""
 CUBIC: Final = 0.51
 """Coefficient of (a/t)³ in the ratio of the bonded layer's force to the half-space's force."""
 SPAN: Final = 2.5
-"""Number of standard deviations between the half-space's force and the bonded layer's force. The standard
-deviation expresses a bound on the model error, not noise. With a value of 3, force errors reached 4.3
-standard deviations (layers of 2, 4, 8 and 16 mm, contact radii from 1.6 to 10 mm, clearance of 2 mm). A value
-of 2.5 keeps force errors below 5 standard deviations with some margin."""
+"""Difference between the half-space's force and the bonded layer's force, in standard deviations. This
+standard deviation represents a bound on the model error rather than noise. At a value of 3, force errors
+reached 4.3 standard deviations (layers of 2, 4, 8 and 16 mm, contact radii from 1.6 to 10 mm, clearance of
+2 mm). A value of 2.5 keeps force errors below 5 standard deviations with some margin."""
 
 
 def stiffening(radius_m: float, thickness_m: float) -> float:

@@ -7,17 +7,17 @@ independent and have the same variance:
 quadratic  (r₀ − r₁ − r₂ + r₃) / 2
 cubic      (r₀ − 3 r₁ + 3 r₂ − r₃) / √20
 
-A block is used only if it contains nothing but noise. Motion of the skin is slow, so its quadratic contrast
-is larger than its cubic contrast; a step or a lost scan also makes the two contrasts unequal. Motion also
-shifts neighbouring readings in the same direction, whereas the signs of their noise are independent. A robust
-mean over the readings (Huber, Robust Statistics, 1981, proposal 2) prevents a few bad readings, or a touch on
-a few wires, from raising a block's noise level. The median over the last blocks prevents a bad block from
-distorting the estimate.
+A block is used only if the two contrasts indicate pure noise. Motion of the skin is slow, so its quadratic
+contrast is larger than its cubic contrast; a step or a lost scan also makes the two contrasts unequal. Motion
+also shifts neighbouring readings in the same direction, whereas the signs of their noise are independent. A
+robust mean over the readings (Huber, Robust Statistics, 1981, proposal 2) prevents a few bad readings, or a
+touch on a few wires, from raising a block's noise level. The median over the last blocks prevents a bad block
+from distorting the estimate.
 
-Readings that repeat exactly carry no information about the noise: the converter may be quiet or frozen. If
-the rounding to codes is known, the estimate applies only to the noise before the converter, not to the
-rounding error. If most codes repeat and the others change by a single code, the noise is at most half a code,
-and the estimator assumes half a code.
+Exactly repeated readings carry no information about the noise, because the converter may be noiseless or
+frozen. If the rounding to codes is known, the estimate applies only to the noise before the converter, not to
+the rounding error. If most codes repeat and the others change by only one code, the estimator assumes a noise
+of half a code, the maximum.
 """
 
 from __future__ import annotations
@@ -34,34 +34,41 @@ from skinnode.model.layout import Float
 BLOCK: Final = 4
 """Number of frames in a block, the minimum for two contrasts."""
 WINDOW: Final = 11
-"""Maximum number of blocks in the estimate (44 frames). The number is odd, so that the median of a full
-window is the level of one block, never a mean of an old and a new noise level."""
+"""Maximum number of blocks in the estimate (44 frames).
+
+The number is odd, so that the median of a full window is one block's noise level, and never the mean of an
+old and a new level.
+"""
 LEAST_BLOCKS: Final = 5
 """Minimum number of blocks in the estimate (20 frames)."""
 PAUSE: Final = 12
-"""Number of frames skipped after a block if the window is full and the block agrees with it, or after several
-rejected blocks. Evaluating every frame would take 8 % of the computing time of a patch at rest."""
+"""Number of frames skipped after several rejected blocks, or after a block that agrees with a full window.
+
+Evaluating every frame would take 8 % of the computing time of a patch at rest.
+"""
 REPEATED: Final = 0.15
-"""Maximum share of repeated readings in a block whose contrasts are used. With noise of half a code, a tenth
-of the readings repeat in all four frames. With less noise, the variance of the codes is no longer the sum of
-the variances of noise and rounding."""
+"""Maximum share of repeated readings in a usable block.
+
+If the noise is half a code, a tenth of the readings repeat in all four frames. At lower noise, the variance
+of the codes no longer equals the noise variance plus the rounding variance.
+"""
 ALIVE: Final = 4
-"""Minimum number of readings that change by one code in a block in which most readings repeat; with a frozen
-converter, no reading changes."""
+"""Minimum number of changed readings in a block of mostly repeated readings; 0 for a frozen converter."""
 SAME: Final = 1e-14
-"""Maximum contrast of a repeated reading, as a fraction of the reading; allows for the rounding of
-float64."""
+"""Maximum contrast of a repeated reading, as a fraction of the reading; allows for float64 rounding."""
 DEVIATIONS: Final = 4.0
-"""Number of standard deviations of random scatter added to each threshold; chance exceeds the threshold in
-one block in 16,000."""
+"""Margin of each threshold, in standard deviations of the scatter.
+
+By chance, one block in 16,000 exceeds it.
+"""
 DEPARTED: Final = math.log(1.5)
 """Logarithm of the ratio of estimated to stated noise above which the estimate replaces the stated noise.
 Below this ratio, the results are bit-identical to those with the stated noise."""
 RETURNED: Final = math.log(1.25)
 """Logarithm of the ratio of estimated to stated noise below which the stated noise is used again."""
 STEP: Final = math.log(1.05)
-"""Logarithm of the relative change, in addition to random scatter, at which an estimate in use is updated.
-Smaller changes are ignored because every update requires another solve of the frame."""
+"""Minimum change in the logarithm of the noise, in addition to the scatter margin, that updates an
+estimate in use. Smaller changes are ignored because every update requires another solve of the frame."""
 UNEQUAL: Final = 0.3
 """Maximum mean logarithm of the power ratio of the two contrasts. Motion that reaches this limit raises the
 estimate by 8 %. Noise of half a code, whose contrasts have few possible values, stays below 0.15."""
@@ -69,17 +76,19 @@ LEAST: Final = 1.0 / 30.0
 """Minimum ratio of estimated to stated noise."""
 
 _CLIP: Final = 1.0
-"""Square, in units of the variance, at which Huber's proposal 2 clips. With this limit, one noisy lower wire
-and one noisy upper wire (13 % of the readings) raise the estimate by 20 %."""
+"""Clipping limit for squared values in Huber's proposal 2, in units of the variance. At this limit, one
+noisy lower wire and one noisy upper wire (13 % of the readings) raise the estimate by 20 %."""
 _CLIPPED_MEAN: Final = 0.5160585
 """Mean of min(z², 1) for a normal z: 1 − 2 φ(1)."""
 _STD: Final = 2.03
-"""Standard deviation of ln(variance) estimated from one value, from the influence function of the robust
-mean. For the mean square, this standard deviation would be 1.41."""
+"""Standard deviation of ln(variance) for a single value, derived from the robust mean's influence function.
+
+For an ordinary mean square, the corresponding value is 1.41.
+"""
 _ITERATIONS: Final = 30
 """Maximum number of Newton steps; convergence takes 4 to 8 steps."""
 _ONE_CODE: Final = 12.5
-"""Squared contrast of readings that differ by one code, in units of the rounding variance, plus a margin."""
+"""Squared contrast of readings that differ by one code, plus a margin, in units of the rounding variance."""
 _HALF_A_CODE: Final = 4.0
 """Total variance of half a code of noise plus rounding, in units of the rounding variance."""
 _CUBIC: Final = 1.0 / math.sqrt(20.0)
@@ -116,10 +125,10 @@ def _contrasts(
 ) -> tuple[int, int, int, float, float, float]:
     """Write the squared contrasts of the readings that changed, relative to their stated variances.
 
-    The arguments are those of :func:`assess_block`. Returns six values: the number of changed readings, the
-    number of repeated readings, the number of pairs of neighbouring readings, the sum of the products of
-    their signs, the share of the stated variance that is not due to rounding, and the largest squared
-    contrast in units of the rounding variance.
+    The arguments are the same as for :func:`assess_block`. Returns six values: the number of changed
+    readings, the number of repeated readings, the number of pairs of neighbouring readings, the sum of the
+    products of their signs, the share of the stated variance that is not due to rounding, and the largest
+    squared contrast in units of the rounding variance.
     """
     count, silent, pairs, signs, share, largest = 0, 0, 0, 0.0, 0.0, 0.0
     for u in range(frames.shape[1]):

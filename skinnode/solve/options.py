@@ -31,27 +31,26 @@ class EstimateOptions:
         rubber: Material of the skin. Forces are proportional to the rubber's modulus; the displacement does
             not depend on the modulus.
         estimate_noise: Whether to estimate a scale factor for ``relative_noise`` from the data.
-        follow_noise: Whether to scale ``relative_noise`` if the stream shows that this value is wrong by a
-            factor of more than 1.5 (:mod:`skinnode.solve.noise_estimate`); ignored if ``estimate_noise`` is
-            set.
+        follow_noise: Whether to scale ``relative_noise`` if the stream's noise differs by a factor of more
+            than 1.5 (:mod:`skinnode.solve.noise_estimate`); ignored if ``estimate_noise`` is set.
         drift: Gain errors to estimate: ``patch`` for one gain common to all resistances, ``wire`` for one
             gain per upper wire, or ``none``.
         drift_std: Prior standard deviation of a gain error, as a fraction.
-        model_error: Standard error of the forward model, as a fraction of the change in each resistance
-            (from thickness, electrode size and conductivity under strain): the full value for an error common
-            to all resistances, and 0.7 times this value for an independent error in each resistance.
-        tolerances: Manufacturing tolerances of the patch, which the standard deviations then include; the
-            default None means an exact patch. The resistances at rest are assumed to be measured on the patch
+        model_error: Standard error of the forward model (due to thickness, electrode size and conductivity
+            under strain), as a fraction of each resistance's change. The full value applies to an error
+            common to all resistances; 0.7 times this value applies to each resistance's independent error.
+        tolerances: Manufacturing tolerances of the patch, to be included in the standard deviations; the
+            default None means an exact patch. Tolerances require resistances at rest measured on the patch
             itself.
         contacts: Whether to estimate contacts and forces.
         force_calibrated: Whether ``rubber`` reproduces known forces on this patch, for instance from presses
-            with a load cell. A modulus from a data sheet is not a calibration: forces are computed for a
-            half-space, but the skin is a layer on a support, which may carry fifty times as much force. If
-            False, the standard deviation of each normal force covers this difference.
+            with a load cell. A data sheet's modulus is not a calibration: forces are computed for a
+            half-space, but a layer on a support, like the skin, may carry fifty times as much force. If
+            ``force_calibrated`` is False, each normal force's standard deviation covers this difference.
         normal_only: Whether only z is unknown, which reduces the number of unknowns to a third.
         hold: Whether to keep the last solution of wires whose resistances changed no more than their noise.
-        deadline_us: Time limit of an update, µs; the update may exceed it by one step. Wires not solved by
-            the deadline have the status DEADLINE.
+        deadline_us: Time limit of an update, µs; the update may exceed it by one step. Wires still unsolved
+            at the deadline have the status DEADLINE.
 
     Raises:
         ValueError: If an option is out of range.
@@ -94,7 +93,7 @@ class PosteriorOptions(EstimateOptions):
     """Options of :class:`skinnode.Posterior`: all options of :class:`EstimateOptions`, and ``scale_m``.
 
     Args:
-        scale_m: RMS normal displacement that the prior expects, metres; by default set from the data.
+        scale_m: RMS normal displacement expected by the prior, metres; by default estimated from the data.
 
     Raises:
         ValueError: If an option is out of range.
@@ -110,22 +109,23 @@ class PosteriorOptions(EstimateOptions):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class TrackerOptions(EstimateOptions):
-    """Options of :class:`skinnode.Tracker`: all options of :class:`EstimateOptions`, and seven more options.
+    """Options of :class:`skinnode.Tracker`: all options of :class:`EstimateOptions`, and seven others.
 
     The method ``auto`` chooses the posterior if ``drift``, ``model_error``, ``tolerances`` or
-    ``estimate_noise`` is set, since only the posterior supports them.
+    ``estimate_noise`` is set, since only the posterior supports these options.
 
     Args:
         method: ``exact``, ``posterior`` or ``auto``.
         operator: ``levenberg_marquardt``, ``dogleg`` or ``gauss_newton``; exact inverse only.
-        stiffness_n_per_m: Stiffness k of the paper's law F = k Δs, N/m, from which ``force_n`` of exact
-            fields is then computed. All other forces, including contact forces, are computed from ``rubber``.
+        stiffness_n_per_m: Stiffness k in the paper's law F = k Δs, N/m; if given, this law determines
+            ``force_n`` of exact fields. All other forces, including contact forces, are computed from
+            ``rubber``.
         active_only: Whether to solve only for electrodes that contacts move; exact inverse only.
         codes: Mapping from the codes passed to :meth:`skinnode.Tracker.update_codes` to resistances.
-        max_std_m: Largest standard deviation of a coordinate of a precise field, metres; by default set from
-            the layout and the noise (:mod:`skinnode.solve.precision`).
-        max_force_std_n: Largest standard deviation of a contact's normal force in a precise field, N; by
-            default set from the layout and the rubber, for calibrated forces only.
+        max_std_m: Maximum standard deviation of the coordinates of a precise field, metres; the default
+            depends on the layout and the noise (:mod:`skinnode.solve.precision`).
+        max_force_std_n: Maximum standard deviation of a contact's normal force in a precise field, N; the
+            default depends on the layout and the rubber, and applies to calibrated forces only.
 
     Raises:
         ValueError: If an option is out of range.
@@ -205,7 +205,7 @@ _Options = TypeVar("_Options", PosteriorOptions, TrackerOptions)
 
 
 def merged(kind: type[_Options], options: _Options | None, arguments: Any) -> _Options:
-    """Return ``options``, or the defaults of ``kind``, overridden by the keyword arguments.
+    """Return ``options`` (by default, ``kind``'s defaults) with the keyword arguments applied.
 
     Raises:
         TypeError: If an argument is not an option, or ``options`` is not of type ``kind``.

@@ -1,4 +1,4 @@
-"""Precision of a field: whether its standard deviations are within the limits that the user set.
+"""Precision of a field: whether its standard deviations are within the user's limits.
 
 The default limit for the displacement depends on the layout, the noise and the tolerances. The limit is
 :data:`MULTIPLE` times the standard deviation of the exact inverse at rest, plus (in quadrature) a part for
@@ -23,22 +23,24 @@ from skinnode.solve.options import TrackerOptions
 from skinnode.solve.wires.problem import PatchProblem
 
 MULTIPLE: Final = 15.0
-"""Limit of a standard deviation, as a multiple of the RMS standard deviation of the exact inverse at rest.
-In 2,640 healthy fields, the largest standard deviation was up to 8.5 times this RMS at rest and up to 12.2
+"""Maximum standard deviation, as a multiple of the exact inverse's RMS standard deviation at rest. In
+2,640 healthy fields, the largest standard deviation was up to 8.5 times this RMS at rest and up to 12.2
 times under a press (ten layouts, noise from 3e-6 to 1e-3, presses from 5 to 30 %)."""
 MOST: Final = 0.3
-"""Limit of a standard deviation, clearances, for layouts and noise levels at which mainly the prior
-determines the displacement. In the 2,640 fields measured for :data:`MULTIPLE`, only thick patches (h = 1)
-with a noise of 1e-3 exceeded this limit. They did so in 5 of 66 fields on `staggered`, and in 20 of 66 fields
-on `aligned`."""
+"""Maximum standard deviation, in clearances, for layouts and noise levels at which the displacement mainly
+depends on the prior. In the 2,640 fields measured for :data:`MULTIPLE`, only thick patches (h = 1) with a
+noise of 1e-3 exceeded this limit. On `staggered`, 5 of 66 such fields exceeded the limit; on `aligned`, 20
+of 66."""
 TOLERANCE_SHARE: Final = 0.06
-"""Part of the limit for a patch made to the ordinary tolerances, clearances; proportional to the largest
-tolerance. In the presses measured for :data:`MULTIPLE`, the ordinary tolerances caused standard deviations of
-up to 0.028 clearances at noise levels of 3e-6 and 1e-5."""
+"""Contribution of ordinary manufacturing tolerances to the limit, in clearances; scaled with the largest
+tolerance. In the presses measured for :data:`MULTIPLE`, the ordinary tolerances caused standard deviations
+of up to 0.028 clearances at noise levels of 3e-6 and 1e-5."""
 FORCE_SHARE: Final = 0.3
-"""Limit of a normal force's standard deviation, as a share of the modulus times clearance times pitch. In the
-fields measured for :data:`MULTIPLE`, the share was at most 0.1. Presses of 50 % that lie half outside the
-patch reach a share of 0.26."""
+"""Maximum standard deviation of a normal force, divided by the product of modulus, clearance and pitch.
+
+In the fields measured for :data:`MULTIPLE`, this ratio was at most 0.1. In presses of 50 % that are half
+outside the patch, the ratio reaches 0.26.
+"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,7 +56,7 @@ class PrecisionLimits:
 
 
 def limits_of(layout: PatchLayout, options: TrackerOptions) -> PrecisionLimits:
-    """Return the limits that the user set, or the defaults for the layout and the noise.
+    """Return the user's limits, or the defaults for the layout and the noise.
 
     By default, uncalibrated forces have no limit; ``Contact.force_calibrated`` shows whether a force is
     calibrated.

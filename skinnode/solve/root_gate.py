@@ -1,9 +1,9 @@
 """Gate for the exact inverse: finds doubtful wires and checks them with the posterior.
 
-A wire is doubtful if it has no root, if it jumped, or if its displacement is too rough to be a press. If a
-layout has folds within the reach of a press, every solved wire is doubtful, because F = b has nearby roots
-that the inverse alone cannot tell apart. The posterior, which uses the neighbouring wires, confirms the root
-of a doubtful wire, replaces it, or leaves the wire without a root. The thresholds are in
+A wire is doubtful if it has no root, if it moved a long way between two frames, or if its displacement is too
+rough to be a press. If presses can reach folds of a layout, every solved wire is doubtful, because the
+inverse alone cannot distinguish nearby roots of F = b. The posterior, which uses the neighbouring wires,
+confirms the root of a doubtful wire, replaces it, or leaves the wire without a root. The thresholds are in
 :mod:`skinnode.solve.roots`.
 """
 
@@ -28,12 +28,17 @@ from skinnode.solve.wires.problem import PatchProblem
 from skinnode.solve.wires.root_check import SOME_ROUGH, SOME_SUSPECT, RootCheck, check_roots
 
 PAUSE: Final = 16
-"""Number of frames without a posterior solve after the posterior has missed a deadline. A futile solve in
-every frame would delay the other patches on the same thread by 2 ms."""
+"""Number of frames to skip posterior solves after one has missed its deadline.
+
+If every frame's solve missed its deadline, other patches on the same thread would be delayed by 2 ms per
+frame.
+"""
 APART: Final = 3.0
-"""Factor applied to the distance between a root near a fold and the posterior estimate that confirms it. The
-product is added in quadrature to the standard deviation, because two roots may be too close for the posterior
-to distinguish."""
+"""Factor for the distance between a root near a fold and the posterior estimate that confirms the root.
+
+The distance times this factor is added in quadrature to the standard deviation, because the posterior cannot
+distinguish roots that are very close.
+"""
 NEAR_FOLD: Final = 2.0
 """Factor applied, for the same reason as :data:`APART`, to the standard deviation of a posterior estimate
 that replaces a root near a fold."""
@@ -60,9 +65,9 @@ class RootGate:
         clearance_m = float(problem.clearance.min()) * layout.pitch_m
         self._last_m = np.zeros_like(layout.upper_m)
         self._lost, self._unsure, self._rough = np.zeros((3, layout.shape[0]), np.bool_)
-        self._pause = 0  # frames until the next posterior solve
+        self._pause = 0  # number of frames until the next posterior solve
         self.hurried = False
-        """Whether a doubtful wire of the last field was not checked for lack of time."""
+        """True if there was not enough time to check all doubtful wires of the last field."""
         self._confirmed: Float | None = None  # displacement at which a rough wire was last confirmed
         self._apart = np.zeros((len(problem.rest), 1, 1))  # m; see APART
         self._any_apart = False
@@ -89,7 +94,7 @@ class RootGate:
         self._doubtful()  # compiles the kernel before a stream starts
 
     def _folded_with(self, noise_factor: float) -> Mask:
-        """Return the wires (U,) with doubtful roots at this multiple of the stated noise."""
+        """Return a mask (U,) of the wires whose roots are doubtful at a multiple of the stated noise."""
         layout, normal_only = self._exact.layout, self._options.normal_only
         noise = np.multiply(noise_factor, self._options.relative_noise)
         if roots.nonlinear_in_noise(layout, noise, normal_only):
@@ -109,7 +114,7 @@ class RootGate:
         self._pause = 0
 
     def check(self, field: FieldFrame, start: float, *, again: bool = False) -> FieldFrame:
-        """Return the field with each doubtful wire confirmed, replaced or left without a root.
+        """Return the field after confirming, replacing or rejecting the root of each doubtful wire.
 
         Args:
             field: Field of the exact tracker.
@@ -128,7 +133,7 @@ class RootGate:
                     self._posterior.reset()  # anneal from rest: tracking would confirm a wrong root
                 its = self._exact.arrays
                 self._posterior.stop_at(until)
-                # non-positive noise is kept: it marks a resistance that the posterior cannot use either
+                # keep non-positive noise, which marks resistances that the posterior cannot use either
                 noise = np.where(its.noise > 0.0, np.maximum(its.noise, roots.REFEREE_NOISE), its.noise)
                 estimate = self._posterior.estimate(its.ohm.copy(), its.valid.copy(), noise)
                 if Status.DEADLINE in estimate.status:
@@ -152,7 +157,7 @@ class RootGate:
         return found & SOME_SUSPECT != 0 or bool(found & SOME_ROUGH and self._rough.any())
 
     def _keep_apart(self, field: FieldFrame, unasked: Mask) -> FieldFrame:
-        """Restore the standard deviation that held wires had when the posterior confirmed them."""
+        """Restore held wires' standard deviations from the time when the posterior confirmed these wires."""
         if field.held is None:
             return field
         self._apart[unasked & ~field.held] = 0.0
@@ -211,7 +216,7 @@ class RootGate:
 
         self._apart[doubtful] = 0.0
         self._apart[agreed & self._folded] = apart[agreed & self._folded]
-        self._any_apart = True  # assumed until the next frame is checked
+        self._any_apart = True  # assume True until the next frame is checked
 
         assert estimate.core_std_m is not None
         self._exact.adopt(replaced, moved)
@@ -248,7 +253,7 @@ def _mixed_share(estimate: FieldFrame, replaced: Mask) -> Float | None:
 
 
 def _selected(status: tuple[Status, ...], changed: Mask, replaced: Mask) -> tuple[Status, ...]:
-    """Return the statuses, with ``replaced`` wires CONVERGED and other ``changed`` wires not CONVERGED."""
+    """Return the statuses: CONVERGED for ``replaced`` wires, not CONVERGED for other ``changed`` wires."""
     found = list(status)
     for u in np.flatnonzero(changed).tolist():
         if replaced[u]:

@@ -1,6 +1,6 @@
-"""Exact tracker for a live stream, which solves each wire of a frame from the previous frame.
+"""Exact tracker for a live stream: solves each wire from its solution in the previous frame.
 
-``tracker`` runs the stages, ``stream`` stores the arrays of a stream and accepts roots, ``recover`` retries
-wires that failed, and ``leave_out`` reduces the number of unknowns. ``contacts`` finds loads and
-contacts in a solved field.
+``tracker`` runs the stages of the solution; ``stream`` stores a stream's arrays and accepts roots.
+``recover`` retries failed wires, and ``leave_out`` reduces the number of unknowns. ``contacts`` finds loads
+and contacts in a solved field.
 """

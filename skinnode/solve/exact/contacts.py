@@ -1,8 +1,9 @@
 """Estimation of contacts and loads from exact fields.
 
-The field of the exact inverse is modelled as u = G q + slack + e. The loads q ~ N(0, s²) of the elastic prior
-move the electrodes by G q. The error e ~ N(0, ν² Σ) of the inverse has the covariance Σ at rest, scaled by a
-factor ν² from the standard deviations of the field. In the basis U of the singular value decomposition
+The displacement field u from the exact inverse is modelled as u = G q + slack + e. The loads q ~ N(0, s²) of
+the elastic prior move the electrodes by G q. The inverse's error is e ~ N(0, ν² Σ). Here Σ is the error
+covariance at rest, and the factor ν² is computed from the field's standard deviations. In the basis U of the
+singular value decomposition
 
     Σ^(−1/2) [G, ε I] = U S Vᵀ,   z = Uᵀ Σ^(−1/2) u,   B = Uᵀ Σ^(−1/2) G
 
@@ -11,7 +12,7 @@ per patch. A frame then requires only two matrix-vector products, one for z and 
 q = s² Bᵀ (s² S² + ν²)⁻¹ z. The scale s maximises the evidence.
 
 Wires without a position, or with a much larger standard deviation than the others, are left out: their rows
-are projected out of z and B. The projection of B takes a few milliseconds and is cached.
+are projected out of z and B. Projecting B takes a few milliseconds, so the result is cached.
 """
 
 from __future__ import annotations
@@ -39,14 +40,16 @@ from skinnode.solve.posterior.elastic_prior import SLACK, ElasticPrior
 from skinnode.solve.wires.problem import PatchProblem
 
 UNTOUCHED: Final = 4.0
-"""Maximum displacement of an untouched patch, in standard deviations. Noise exceeds this limit in 2 % of
-frames, which are then searched for contacts."""
+"""Displacement, in standard deviations, up to which a patch is considered untouched.
+
+Noise alone exceeds this limit in 2 % of frames; those frames are searched for contacts.
+"""
 WILD: Final = 16.0
-"""Ratio of a wire's variances to the other wires' variances above which the wire is left out."""
+"""Maximum ratio of a wire's variances to the other wires' variances; a wire above this limit is left out."""
 SCALE_STEPS: Final = 30
 """Maximum number of iterations for the scale s²."""
 SCALE_CLOSE: Final = 0.01
-"""Relative change in s² at which the iteration ends; the loads change by a smaller fraction."""
+"""Relative change in s² below which the iteration stops; the relative change in the loads is smaller."""
 SCALE_LEAST: Final = 1e-12
 """Smallest s², pitch²."""
 
@@ -59,13 +62,13 @@ class LoadFactors:
     whitening: Float
     """(n, n) transpose of Uᵀ Σ^(−1/2) for the free coordinates, 1/pitch."""
     rows: Float
-    """(n, 3Q) matrix B of the module's docstring."""
+    """(n, 3Q) matrix B, as defined in the module's docstring."""
     gain: Float
     """(n,) squared singular values, the diagonal of S²."""
     rest_std: Float
     """(n,) standard deviations of the exact inverse at rest, pitches."""
     free: Index
-    """(n,) indices of the free coordinates (the unknowns)."""
+    """(n,) indices of the free coordinates, i.e. the unknowns."""
 
 
 class ExactContacts:
@@ -127,10 +130,10 @@ class ExactContacts:
         self._without: tuple[bytes, float, float, Float] | None = None
 
     def add(self, field: FieldFrame) -> FieldFrame:
-        """Return the field with its contacts and, unless the paper's law determines them, its forces.
+        """Return the field with its contacts, and with its forces unless the paper's law determines them.
 
-        Wires with an infinite standard deviation are ignored. If all wires are ignored, the field has no
-        contacts, and its forces are zero.
+        Wires with an infinite standard deviation are ignored. A field without other wires has no contacts,
+        and zero forces.
 
         Args:
             field: Exact field, after the checks of its roots and data.
@@ -233,7 +236,7 @@ def _cached_factors(
 
 
 def _factors(layout: PatchLayout, rubber: Rubber | None, noise: Float, normal_only: bool) -> LoadFactors:
-    """Return the matrices of a patch whose relative noise is ``noise`` (U, K)."""
+    """Return a patch's matrices for a relative noise of ``noise`` (U, K)."""
     problem, prior, pitch = PatchProblem.of(layout), ElasticPrior.of(layout, rubber), layout.pitch_m
     wires, electrodes = layout.upper_m.shape[:2]
     slopes = jacobian(layout, layout.upper_m) * pitch**2 * problem.a_rest[..., None, None]
@@ -242,7 +245,7 @@ def _factors(layout: PatchLayout, rubber: Rubber | None, noise: Float, normal_on
     every = np.arange(3 * wires * electrodes)
     free = every[2::3] if normal_only else every
     n = weighted.shape[2]
-    least = 1.0 / float(problem.clearance.min())  # no electrode moves farther than the clearance
+    least = 1.0 / float(problem.clearance.min())  # because no electrode moves farther than the clearance
     root, std = np.zeros((free.size, free.size)), np.empty((wires, n))
     for u in range(wires):
         _, singular, turn = np.linalg.svd(weighted[u])

@@ -1,20 +1,20 @@
-"""Options of the exact tracker that omit coordinates from the unknowns, with a standard deviation for each.
+"""Options ``normal_only`` and ``active_only`` of the exact tracker, which reduce the number of unknowns.
 
-With ``normal_only``, x and y of every electrode stay at their rest values. With ``active_only``, electrodes
-that no contact moves stay at rest. A wire starts with all electrodes at rest. While χ² rejects the fit, the
-electrode that explains most of the residual becomes an unknown, together with its neighbours. If more than
-half of the electrodes have become unknowns, all electrodes become unknowns. All electrodes return to rest
-when the rest position explains the frame. The standard deviation of an omitted coordinate is the smallest
-movement that χ² would detect if no other electrode moved. To first order at rest, this movement is √(quantile
-− degrees of freedom) σ / ‖component of the coordinate's column of J outside the range of the unknowns and of
-the electrode's other columns‖.
+If ``normal_only`` is set, the x and y coordinates of all electrodes are fixed at their rest values. If
+``active_only`` is set, electrodes that no contact moves are fixed at rest. Initially, all electrodes of a
+wire are fixed. While χ² rejects the fit, the electrode that explains most of the residual becomes an unknown,
+together with its neighbours. If more than half of the electrodes have become unknowns, all electrodes become
+unknowns. As soon as the rest position explains a frame, all electrodes are fixed at rest again. The standard
+deviation of an omitted coordinate is the smallest movement that χ² would detect if no other electrode moved.
+To first order at rest, this movement is √(quantile − degrees of freedom) σ / ‖component of the coordinate's
+column of J outside the range of the unknowns and of the electrode's other columns‖.
 
 Each option rests on an assumption about the skin, and the standard deviations of the unknowns are valid only
 if the assumption holds. A χ² test detects violations of the assumption of active_only reliably. The test is
 less sensitive for normal_only, because smooth shear resembles a gradient of z. On the staggered layout, h =
 0.5, noise 1e-5, the test rejects a strong Hertzian press whose shear is 30 % of its depth. The test accepts a
-weaker press, with errors in z of up to 16 standard deviations (only 0.2 % of h). Standard deviations that
-allowed for these errors would lose more accuracy than solving for the shear.
+weaker press, with errors in z of up to 16 standard deviations (only 0.2 % of h). Increasing the standard
+deviations to cover these errors would cost more accuracy than solving for the shear.
 """
 
 from __future__ import annotations
@@ -37,10 +37,12 @@ from skinnode.solve.wires.hold import Z_HOLD, chi2_quantile
 from skinnode.solve.wires.stages import DEADLINE, STALE
 
 Z_WIDEN: Final = 3.719
-"""Normal quantile of 1 − 1e-4, the χ² probability above which electrodes become unknowns. At 100 frames/s,
-chance adds one electrode to a long press every 100 s."""
+"""Normal quantile of the χ² probability 1 − 1e-4, above which an electrode becomes an unknown.
+
+At 100 frames/s, chance adds an electrode to a long press about once every 100 s.
+"""
 TINY: Final = 1e-200
-"""Smallest squared slope used as a divisor: far below real slopes, yet large enough to avoid overflow."""
+"""Minimum squared slope used as a divisor: far below real slopes, yet large enough to avoid overflow."""
 
 
 class LeftOut:
@@ -57,7 +59,7 @@ class LeftOut:
         # (U, 3N) undetectable movement of each coordinate, pitches per unit of σ, and its weights (U, K)
         self._unnoticed = np.zeros((layout.shape[0], layout.unknowns))
         self._unnoticed_weight = np.zeros(layout.shape)
-        # limits of χ², indexed by degrees of freedom
+        # maximum χ², indexed by degrees of freedom
         self._chi2_hold, self._chi2_widen, self._chi2_refuse = (
             np.array([chi2_quantile(max(dof, 1), z) for dof in range(layout.shape[1] + 1)])
             for z in (Z_HOLD, Z_WIDEN, Z_REFUSE)
@@ -71,12 +73,12 @@ class LeftOut:
                 self._set_electrodes(u, np.arange(0))
 
     def take_in(self, wires_: NDArray[np.bool_]) -> None:
-        """Make every electrode of these wires (U,) an unknown."""
+        """Make all electrodes of the wires in the mask (U,) unknowns."""
         for u in np.flatnonzero(wires_).tolist():
             self._set_electrodes(u, np.arange(self._layout.unknowns // 3))
 
     def leave_out(self, sigma: float) -> None:
-        """Return wires to rest if the rest position explains the frame; write omitted coordinates' std."""
+        """Fix wires at rest if the rest position explains the frame; write the std of omitted coordinates."""
         solver, arrays = self._stream.solver, self._stream.arrays
         if self._active_only:
             a_rest = self._stream.problem.a_rest
@@ -95,7 +97,7 @@ class LeftOut:
             solver.still_std[:] = sigma * self._unnoticed
 
     def widen(self, frame: Frame, turns: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """Add unknowns to the processed wires with an unexplained residual; return these wires (U,).
+        """Add unknowns to processed wires whose residual is unexplained; return a mask (U,) of these wires.
 
         Sets ``turns`` (U,) to False for wires not processed before the deadline.
         """
@@ -106,11 +108,11 @@ class LeftOut:
         return unexplained
 
     def _set_electrodes(self, u: int, electrodes: Index) -> None:
-        """Make exactly these electrodes of wire u unknowns."""
+        """Make the given electrodes of wire u its only unknowns."""
         solver, arrays, problem = self._stream.solver, self._stream.arrays, self._stream.problem
         solver.set_electrodes(u, electrodes)
         arrays.predictable[u] = len(electrodes) == 0
-        if arrays.predictable[u]:  # no unknowns: the solution is the rest position, without noise
+        if arrays.predictable[u]:  # a wire without unknowns is at rest, and has no noise
             arrays.x[u], arrays.a_solved[u] = problem.rest[u], problem.a_rest[u]
             solver.a_solved[u], solver.noise[u] = arrays.a_solved[u], 0.0
 
@@ -134,11 +136,11 @@ class LeftOut:
             if most:
                 seen = _outside(slopes[group, :most].reshape(-1, lower), unknown).reshape(-1, most, lower)
                 power, direction = np.linalg.eigh(seen @ seen.transpose(0, 2, 1))
-                power = np.maximum(power, op.EPS * power[:, -1:] + TINY)  # smaller values are rounding errors
+                power = np.maximum(power, op.EPS * power[:, -1:] + TINY)  # smaller: rounding
                 unnoticed[group, :most] = least * np.sqrt((direction**2 / power[:, None]).sum(axis=2))
 
     def _explained(self) -> NDArray[np.bool_]:
-        """Return the wires (U,) whose residual is within noise or that have no more electrodes to add."""
+        """Return a mask (U,) of wires whose residual is noise, or whose electrodes are all unknowns."""
         solver = self._stream.solver
         spare = solver.report[:, wires.SPARE]
         limit = np.where(solver.free > 0, self._chi2_widen[spare], self._chi2_hold[spare])
@@ -158,7 +160,7 @@ class LeftOut:
             near = not stream.problem.out_of_reach(solver.x)[u]
             if (
                 near and solver.measure[u, wires.CHI2] < np.inf
-            ):  # the solve reached a minimum with too large a χ²
+            ):  # the solve found a minimum, but its χ² is too large
                 joined = np.union1d(solver.electrodes(u), self._most_explaining(u))
                 electrodes = electrodes if 2 * len(joined) > most else joined
             self._set_electrodes(u, electrodes)
@@ -174,7 +176,7 @@ class LeftOut:
             solver.std[u, left_out] = frame.sigma * self._unnoticed[u, left_out]
 
     def _most_explaining(self, u: int) -> Index:
-        """Return the resting electrode that explains most of the residual of wire u, and its neighbours."""
+        """Return the fixed electrode that explains most of wire u's residual, and its neighbours."""
         solver, arrays = self._stream.solver, self._stream.arrays
         each, (_, lower), most = solver.each, self._layout.shape, self._layout.unknowns // 3
         slopes = (self._slopes[u] * arrays.used[u]).reshape(most, 3, lower)[:, 3 - each :]
@@ -189,7 +191,7 @@ class LeftOut:
 
 
 def _changed(weight: Float, before: Float) -> NDArray[np.bool_]:
-    """Return the wires (U,) on which a weight changed by more than a factor of ``STALE``."""
+    """Return a mask (U,) of the wires on which a weight changed by more than a factor of ``STALE``."""
     return np.asarray(((weight > STALE * before) | (before > STALE * weight)).any(axis=1))
 
 

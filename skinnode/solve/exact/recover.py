@@ -1,4 +1,4 @@
-"""Recovery of wires for which no solve in a frame found an acceptable root.
+"""Recovery of wires for which all solves in a frame failed to find an acceptable root.
 
 The recovery consists of three steps:
 
@@ -28,13 +28,15 @@ BRIDGES: Final = (3, 5, 10)
 wires. Adaptive steps restricted to the trusted branch solve fewer wires, because the straight line in R
 crosses singular points that the press avoids."""
 BRIDGE_TOLERANCE: Final = 1e-6
-"""Tolerance of bridge substeps: the paper's intermediate tolerance."""
+"""Tolerance for the substeps of a bridge, equal to the paper's intermediate tolerance."""
 BRIDGE_STEPS: Final = 20
 """Maximum steps per substep."""
 RECOVERY_STEPS: Final = 300
-"""Maximum total number of steps of all bridges in a frame, about 15 ms; prevents a corrupt frame from
-stalling the stream."""
-# Bridges always use Levenberg-Marquardt, which crosses large gaps most reliably, not the stream's operator.
+"""Maximum total number of solver steps (about 15 ms) in all bridges of a frame.
+
+This limit prevents a corrupt frame from stalling the stream.
+"""
+# Regardless of the stream's operator, bridges use Levenberg-Marquardt: it crosses large gaps most reliably.
 _ACROSS: Final = solve_options(op.LEVENBERG_MARQUARDT, 0, BRIDGE_TOLERANCE, BRIDGE_TOLERANCE, BRIDGE_STEPS)
 _LAST: Final = solve_options(op.LEVENBERG_MARQUARDT, TASKS, TOLERANCE, TOLERANCE, BRIDGE_STEPS)
 
@@ -42,10 +44,10 @@ _LAST: Final = solve_options(op.LEVENBERG_MARQUARDT, TASKS, TOLERANCE, TOLERANCE
 def recover_lost(
     stream: StreamState, frame: Frame, turns: NDArray[np.bool_], exhausted: NDArray[np.bool_]
 ) -> None:
-    """Recover the wires that are not at a root; write ``good`` and ``status`` of the stream's arrays.
+    """Recover the wires that are not at a root; write ``good`` and ``status`` in the stream's arrays.
 
-    Gives up on wires that fail, and on ``exhausted`` wires (U,), for which all attempts have been made. Sets
-    ``turns`` (U,) to False for wires not processed before the deadline.
+    Gives up on wires that fail again, and on the wires in the mask ``exhausted`` (U,), which have no attempts
+    left. Sets ``turns`` (U,) to False for wires not processed before the deadline.
     """
     solver, arrays = stream.solver, stream.arrays
     good, status = arrays.good, arrays.status
@@ -89,9 +91,9 @@ def _bridge(  # noqa: PLR0913 - both ends of the bridge
 ) -> bool:
     """Solve wire u along a straight line from the resistances ``a_from`` (K,) to the frame's resistances.
 
-    Only the last point is checked: the line does not follow a deformation of rubber, so intermediate points
-    may be on any branch. The solver's report on the wire contains the outcome. Returns False if the deadline
-    interrupts the bridge.
+    Only the last point's branch is checked: the line in R is not a deformation of rubber, so intermediate
+    points may be on any branch. The outcome is in the solver's report on the wire. Returns False if the
+    deadline interrupts the bridge.
     """
     todo, a_to = stream.only(u), stream.arrays.a[u]
     between = stream.arrays.a.copy()

@@ -26,13 +26,15 @@ from skinnode.solve.wires.patch_solver import PatchSolver
 from skinnode.solve.wires.problem import PatchProblem
 
 TOLERANCE: Final = 1e-9
-"""Tolerance of r and, in pitches, of x. The value is four orders of magnitude below the noise of a 24-bit
-converter; a single Newton step leads from an error of 1e-5 to this tolerance."""
+"""Tolerance for r, and for x in pitches.
+
+The tolerance is four orders of magnitude below the noise of a 24-bit converter. A single Newton step reduces
+an error of 1e-5 to less than this tolerance.
+"""
 FRAME_STEPS: Final = 12
-"""Maximum number of steps per solve; quadratic convergence from within the trust region takes 3 to 6
-steps."""
+"""Maximum number of steps per solve; Newton's method takes 3 to 6 steps within the trust region."""
 TASKS: Final = wires.COVARIANCE | wires.REUSE
-"""Additional tasks of each solve whose result may become the result of the frame."""
+"""Additional tasks for solves whose result can become the frame's result."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -42,13 +44,13 @@ class Frame:
     sigma: float
     """Smallest relative standard deviation of the resistances."""
     order: Index
-    """(U,) wires in processing order."""
+    """(U,) indices of the wires, in processing order."""
     until: float
     """Deadline on the ``perf_counter`` clock, s; inf if there is none."""
 
     @property
     def expired(self) -> bool:
-        """Whether the deadline has passed."""
+        """True once the deadline has passed."""
         return self.until < math.inf and perf_counter() >= self.until
 
 
@@ -124,7 +126,7 @@ class StreamState:
         return todo
 
     def roots(self) -> NDArray[np.bool_]:
-        """Return the wires (U,) at a root that is within reach and on the branch of the rest position."""
+        """Return a mask (U,) of wires at a root that is within reach and on the rest position's branch."""
         solver = self.solver
         report, out_of_reach = solver.report, self.problem.out_of_reach(solver.x)
         return on_rest_branch(
@@ -132,7 +134,7 @@ class StreamState:
         )
 
     def solvable(self) -> NDArray[np.bool_]:
-        """Return the wires (U,) with enough usable resistances in the frame for their unknowns."""
+        """Return a mask (U,) of wires with at least as many usable resistances as unknowns."""
         count = np.count_nonzero(self.arrays.used, axis=1)
         return np.asarray((count > 0) & (count >= self.unknowns))
 

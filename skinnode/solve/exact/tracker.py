@@ -3,7 +3,7 @@
 Each wire passes through these stages until one of them yields a root:
 
 - hold: keep the position of a wire whose resistances changed no more than their noise (see ``hold``);
-- predict: move the wire by (∂x/∂R) ΔR with the J⁻¹ that an earlier frame computed for its covariance;
+- predict: move the wire by (∂x/∂R) ΔR, using the J⁻¹ stored with an earlier frame's covariance;
 - follow: take simplified Newton steps with the same J⁻¹ while it is accurate enough;
 - correct: iterate the operator to a tolerance far below any noise;
 - widen: add an omitted electrode to the unknowns if it seems to move (see ``leave_out``);
@@ -39,9 +39,11 @@ from skinnode.solve.wires.solve_wires import COVARIANCE_UNITS
 from skinnode.solve.wires.stages import DEADLINE
 
 UNIT_S: Final = 10e-6
-"""Maximum time for one evaluation of F and J and the step that follows, s. Each call includes all wires that
-are certain to be solved in the remaining time, because ten calls instead of one take as much extra time as
-solving ten wires."""
+"""Upper bound on the time for one evaluation of F and J and one step, s.
+
+Each call includes all wires that are certain to finish in the remaining time: splitting one call into ten
+costs as much extra time as solving ten wires.
+"""
 WIRE_UNITS: Final = FRAME_STEPS + 1 + COVARIANCE_UNITS
 """Maximum cost of a wire per frame, in evaluations of F and J."""
 
@@ -59,8 +61,8 @@ class ExactTracker:
         stiffness_n_per_m: Stiffness k of the paper's law F = k Δs, N/m; if given, fields contain forces.
         hold: Whether to keep the position of a wire whose resistances changed no more than their noise.
         deadline_us: Time limit of an update, µs; the update may exceed it by one solve of a wire. Wires not
-            processed by the deadline have the status DEADLINE and an infinite standard deviation; they are
-            processed first in the next frame.
+            processed by the deadline have the status DEADLINE and an infinite standard deviation; the next
+            frame starts with these wires.
         normal_only: Whether only z is unknown.
         active_only: Whether to solve only for electrodes that contacts move.
         codes: Mapping from the codes passed to :meth:`update_codes` to resistances.
@@ -117,10 +119,10 @@ class ExactTracker:
         if codes is not None:
             self.arrays.set_codes(codes)
             self._code_noise[:] = codes.relative_noise
-        self._code_factor = 1.0  # noise factor in the code map
+        self._code_factor = 1.0  # noise factor already included in the code map
         self._noise_estimate: NoiseEstimate | None = None
         self.invalid_codes = 0
-        """Number of invalid codes in the latest scan."""
+        """Number of invalid codes in the last scan."""
         self.reset()
         self.update(problem.a_rest / problem.gain)  # compiles the kernels before a stream starts
         self.reset()
@@ -157,7 +159,7 @@ class ExactTracker:
         """
         start = perf_counter()
         arrays = self.arrays
-        # copied because the kernel uses the addresses of these arrays
+        # copy into existing arrays, because the kernel stores their addresses
         arrays.ohm[:] = require_array("frame_ohm", frame_ohm, self.layout.shape, finite=False)
         arrays.noise[:] = (
             self._noise if relative_noise is None else broadcast_noise(relative_noise, self.layout)
@@ -173,9 +175,9 @@ class ExactTracker:
         return self._advance(stage.SCALE, start)
 
     def update_codes(self, codes: NDArray[np.uint32]) -> FieldFrame:
-        """Return the field of a scan, given as codes (U, K); see :meth:`update`.
+        """Return the field of a scan whose readings are given as codes (U, K); see :meth:`update`.
 
-        Afterwards :attr:`arrays` contains the resistances and :attr:`invalid_codes` the number of invalid
+        On return, :attr:`arrays` contains the resistances, and :attr:`invalid_codes` is the number of invalid
         codes. Raises ValueError if ``codes`` has the wrong shape or is not uint32.
         """
         start = perf_counter()
@@ -259,7 +261,7 @@ class ExactTracker:
         """
         solver, arrays = self._stream.solver, self.arrays
         turns = solver.report[:, wires.TURN] == 1
-        exhausted = np.zeros_like(turns)  # wires for which all attempts have been made
+        exhausted = np.zeros_like(turns)  # these wires have no attempts left
         if self._active_only:
             exhausted = self._left_out.widen(frame, turns)
         recover_lost(self._stream, frame, turns, exhausted)
@@ -267,14 +269,14 @@ class ExactTracker:
         for u in np.flatnonzero(~arrays.good).tolist():
             known = arrays.status[u] != DEADLINE and not frame.expired
             residual[u] = self._held_residual(u) if known else math.inf
-        # unprocessed wires come first, in their previous order
+        # the next frame starts with the unprocessed wires, in their previous order
         self._waiting = not turns.all()
         order = arrays.order
         order[:] = order[np.argsort(turns[order], kind="stable")] if self._waiting else self._in_order
         return residual
 
     def _complete(self) -> None:
-        """Write the values that ``a`` would have in the missing equations of solved wires."""
+        """Write ``a`` for the missing equations of solved wires, as computed from the solution."""
         stream, arrays = self._stream, self.arrays
         solved = arrays.good & (stream.solver.report[:, wires.HELD] == 0)
         for u in np.flatnonzero(solved & (arrays.used == 0).any(axis=1)).tolist():
@@ -282,7 +284,7 @@ class ExactTracker:
             arrays.a_solved[u, missing] = stream.a_at(arrays.x[u])[missing]
 
     def adopt(self, wires_: NDArray[np.bool_], displacement_m: Float) -> None:
-        """Continue from these displacements (U, N, 3) of the wires (U,), as if they were solutions."""
+        """Replace the displacements (U, N, 3) of the given wires (U,), as if these were solutions."""
         stream, arrays = self._stream, self.arrays
         moved = (displacement_m / self.layout.pitch_m).reshape(arrays.x.shape)
         if self._active_only:  # make every electrode an unknown again
@@ -293,7 +295,7 @@ class ExactTracker:
             arrays.predictable[u] = False
 
     def distrust(self, wires_: NDArray[np.bool_]) -> None:
-        """Solve these wires (U,) from rest in the next frame, regardless of the outcome in this frame."""
+        """Solve the given wires (U,) from rest in the next frame, regardless of this frame's outcome."""
         problem, arrays = self._stream.problem, self.arrays
         arrays.x[wires_], arrays.a_solved[wires_] = problem.rest[wires_], problem.a_rest[wires_]
         arrays.predictable[wires_] = False

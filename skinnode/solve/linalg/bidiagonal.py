@@ -22,9 +22,9 @@ def bidiagonalise(  # noqa: C901, PLR0913 - four rows at a time; every result of
     ``a`` (n + 3, whole lanes of m) contains A padded with zeros, so that loops over four rows and whole
     vectors need no special cases. Writes B to ``diagonal`` (n,) and ``upper`` (n,), whose last element is 0.
     Writes the reflectors I − β v vᵀ of Q to the rows of ``a``, with β in ``across`` (n,). Writes the
-    reflectors of P to the rows of ``left`` (n, whole lanes of n + 3), with β in ``down`` (n,). ``w`` is
-    scratch with the length of a row of ``a``. Squares of the elements must not overflow (Golub & Van Loan,
-    5.4.8, with rows and columns swapped).
+    reflectors of P to the rows of ``left`` (n, whole lanes of n + 3), with β in ``down`` (n,). ``w`` is a
+    scratch array as long as a row of ``a``. The squares of A's elements must not overflow (algorithm: Golub &
+    Van Loan, 5.4.8, rows and columns swapped).
     """
     n, end = diagonal.size, a.shape[1]
     for k in range(n):
@@ -48,7 +48,7 @@ def bidiagonalise(  # noqa: C901, PLR0913 - four rows at a time; every result of
         for j in range(0, column.size, LANES):
             store(column, j, LANES, splat(0.0))
         square = 0.0
-        for i in range(k + 1, n, 4):  # reflects the rows and accumulates the column's reflector
+        for i in range(k + 1, n, 4):  # reflects the rows, and accumulates the reflector of the column
             t0, t1, t2, t3 = a[i], a[i + 1], a[i + 2], a[i + 3]
             s0, s1, s2, s3 = splat(0.0), splat(0.0), splat(0.0), splat(0.0)
             for j in range(first, end, LANES):
@@ -118,7 +118,7 @@ def damped_solve(  # noqa: PLR0913 - every result of the decomposition
         c, t = diagonal[i] * inverse[i], root * inverse[i]
         ru[i] = c * upper[i]
         x[i] = c * b[i] + t * rest
-        filled = -t * upper[i]  # fill-in, to be rotated into the next damping row
+        filled = -t * upper[i]  # fill-in, which is rotated into the next damping row
         below = lam + below * radius * (upper[i] * upper[i])
         rest = (c * rest - t * b[i]) * (filled / math.sqrt(below))
     bidiagonal_solve(inverse, ru, x)

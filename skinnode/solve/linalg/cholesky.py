@@ -22,8 +22,10 @@ from skinnode.compiled.simd import LANES, fma, load, splat, store, total
 from skinnode.model.layout import Float
 
 ROWS: Final = 6
-"""Number of rows in a tile. With 2 vectors per row, the 12 sums, 2 loads and one factor fit into the 16
-registers of AVX2."""
+"""Number of rows in a tile.
+
+The 12 sums (2 vectors per row), 2 loads and one factor of a tile fit into the 16 registers of AVX2.
+"""
 TILE: Final = 2 * LANES
 """Number of columns in a tile."""
 
@@ -116,7 +118,7 @@ def cholesky(a: Float, n: int) -> int:
 
     Reads only the diagonal and the upper triangle. Returns 1, or 0 if ``a`` is not positive definite.
     """
-    first: Any = np.int64(0)  # a literal 0 would make numba compile the callee a second time
+    first: Any = np.int64(0)  # with a literal 0, numba would compile the callee a second time
     for r in range(0, n, ROWS):
         rows = min(ROWS, n - r)
         end = r + rows

@@ -24,7 +24,7 @@ def padded(rows: int, size: int) -> Float:
 
 @njit_part
 def dot(a: Float, b: Float) -> float:
-    """Return a·b, summed in four partial sums to reduce the latency to a quarter."""
+    """Return a·b, computed as four partial sums, which reduces the latency to a quarter."""
     s0, s1, s2, s3 = 0.0, 0.0, 0.0, 0.0
     whole = a.size - a.size % 4
     for i in range(0, whole, 4):
@@ -50,9 +50,9 @@ def largest(a: Float) -> float:
 
 @njit
 def orthonormalise(rows: Float) -> None:
-    """Make linearly independent ``rows`` (r, n) orthonormal, by modified Gram-Schmidt done twice.
+    """Orthonormalise linearly independent ``rows`` (r, n) by two passes of modified Gram-Schmidt.
 
-    Two passes are enough for orthogonality to working accuracy (Giraud et al., 2005).
+    Two passes achieve orthogonality to machine precision (Giraud et al., 2005).
     """
     for i in range(len(rows)):
         row = rows[i]

@@ -1,7 +1,7 @@
 """One attempt of ``solve_system``: an operator and its trust region, run until a point can be classified.
 
-The compiled loop stops at roots and near stationary points of ‖r‖. For a loop that ends as CONVERGED, this
-module decides whether the equations determine x, and whether a stationary point with r ≠ 0 is a minimum.
+The compiled loop stops at roots and near stationary points of ‖r‖. If the loop reports CONVERGED, this module
+decides whether the equations determine x, and whether a stationary point with r ≠ 0 is a minimum.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ from skinnode.solve.operators.result import PointKind
 from skinnode.solve.operators.work import LIMIT, NORM, workspace
 
 NEAR: Final = 1e-2
-"""Maximum cosine between r and a column of J at which Newton's method is tried before the operator has
-converged to a minimum. If r is large, the operators' own steps converge only linearly (454 steps on the
-problem of Brown & Dennis)."""
+"""Maximum cosine between r and a column of J for trying Newton's method before the operator has converged
+to a minimum. If r is large, the operators' own steps converge only linearly (454 steps on the problem of
+Brown & Dennis)."""
 
 
 class System:
@@ -41,7 +41,7 @@ class System:
         first = residual(x0.copy())
         shape: tuple[int | str, ...] = ("m",)
         if type(first) is np.ndarray and first.ndim == 1 and first.size > 0:
-            shape = first.shape  # with an exact shape, the check takes its fast path
+            shape = first.shape  # an array of the exact shape is checked on a fast path
         self.first = require_array("residual(x0)", first, shape, finite=False).copy()
         self.m = self.first.size
 
@@ -55,7 +55,7 @@ class System:
         self.jacobians += 1
         j, shape = self._jacobian(x.copy()), (self.m, self.n)
         if type(j) is np.ndarray and j.dtype == np.float64 and j.shape == shape:
-            return j  # J may have any memory order: it is copied
+            return j  # J is copied, so its memory order does not matter
         return require_array("jacobian(x)", j, shape, finite=False)
 
     @property
@@ -65,7 +65,7 @@ class System:
 
 
 class Attempt:
-    """Attempt to solve a system, which can pause after any number of steps.
+    """One attempt to solve a system; an attempt can be paused after any number of steps.
 
     ``limit`` is the initial trust radius: 0 for Moré's column scaling and radius, −radius for D = I.
     """
@@ -82,7 +82,7 @@ class Attempt:
 
     @property
     def at(self) -> Point:
-        """Best iterate; its arrays change when the attempt continues."""
+        """Best iterate, whose arrays are overwritten when the attempt continues."""
         return self._settled or Point(self._w.x, self._w.r, self._w.jt.T)
 
     @property
@@ -97,11 +97,11 @@ class Attempt:
 
     @property
     def decided(self) -> bool:
-        """Whether no other attempt is needed, because x is a root or minimum or is not determined."""
+        """True if no other attempt is needed, because x is a root, a minimum, or undetermined."""
         return self.went in (op.CONVERGED, op.INVALID_START) or self.kind in (PointKind.ROOT, PointKind.FLAT)
 
     def run(self, steps: int, tol_f: float, tol_x: float) -> None:
-        """Take at most this many steps; classify the point at the end of the solve or near a minimum."""
+        """Take at most ``steps`` steps; classify the point at the end of the solve or near a minimum."""
         code, w, system, went, left = self._code, self._w, self._system, self.went, steps
         while went < 0:
             if went == op.TRY:
@@ -133,7 +133,7 @@ class Attempt:
         return self.ended and float(np.abs(w.r).max()) <= tol_f
 
     def settle(self, tol_x: float, steps: int) -> None:
-        """Move to a nearby minimum of ‖r‖ by Newton's method; classify minima, flats and saddles."""
+        """Move to a nearby minimum of ‖r‖ by Newton's method; classify the stationary point."""
         at, system, converged = self.at, self._system, self.went == op.CONVERGED
         if converged:
             self.went = op.ILL_CONDITIONED

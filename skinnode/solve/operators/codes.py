@@ -12,7 +12,7 @@ OPERATORS: Final = {"gauss_newton": 0, "levenberg_marquardt": 1, "dogleg": 2}
 GAUSS_NEWTON: Final = OPERATORS["gauss_newton"]
 LEVENBERG_MARQUARDT: Final = OPERATORS["levenberg_marquardt"]
 
-# Results of a step that does not end the solve; a terminal Status is ≥ 0 instead
+# Negative results of a step, after which the solve continues; a Status that ends the solve is ≥ 0
 TRY: Final = -1
 ACCEPTED: Final = -2
 REJECTED: Final = -3
@@ -34,7 +34,7 @@ MINIMUM_SHARE: Final = EPS ** (1 / 3)
 """Maximum error estimate of a minimum, relative to max(1, ‖x‖∞). The limit is larger than for a root, because
 ‖r‖² determines x only to √eps."""
 STATIONARY: Final = 1e-6
-"""Maximum gradient, relative to ‖J_j‖ ‖r‖, that counts as zero. Below this limit, ‖r‖² is flat to within
-rounding, about √eps."""
+"""Maximum gradient, relative to ‖J_j‖ ‖r‖, that is treated as zero. Below this limit, ‖r‖² is flat to
+within rounding, about √eps."""
 STALL_LIMIT: Final = 30
-"""Maximum number of steps that a tall system may take to settle x while ‖r‖² changes only by rounding."""
+"""Maximum number of steps for refining x in a tall system while ‖r‖² changes only by rounding."""

@@ -1,4 +1,4 @@
-"""Newton step −J⁺ r: taken in full by Gauss-Newton, as in the paper, and shortened by the other operators.
+"""Newton step −J⁺ r, which Gauss-Newton takes in full, as in the paper, and other operators shorten.
 
 The correction −J⁺ r₊ with the current factors is also the error estimate (Deuflhard, Newton methods for
 nonlinear problems, 2004). Source: Xu et al. 2018, eq. 8.
@@ -63,7 +63,7 @@ def finite_jacobian(w: Work) -> bool:
 
 @njit_part
 def settled(w: Work, tol_f: float, tol_x: float) -> bool:
-    """Return whether x is a root or minimum according to the current factors; set ANGLE for a tall system."""
+    """Return whether x is a root or minimum, based on the current factors; set ANGLE for a tall system."""
     s = w.s
     small = largest(w.r) <= tol_f
     if w.r.size != w.x.size:
@@ -108,10 +108,10 @@ def rounding(w: Work, x: Float) -> float:
 
 @njit_part
 def estimate_error(w: Work, inverse: Float) -> float:
-    """Write J⁺ from the last factors into ``inverse`` (n, m); return the error estimate of a converged solve.
+    """Write J⁺ into ``inverse`` (n, m), using the last factors; return a converged solve's error estimate.
 
-    The estimate is the remaining correction plus the effect of rounding x, amplified by the condition
-    number of J, relative to max(1, ‖x‖∞); inf if J is singular.
+    The estimate is relative to max(1, ‖x‖∞). It is the sum of the remaining correction and the effect of
+    rounding x, amplified by the condition number of J; inf if J is singular.
     """
     n, m = w.jt.shape
     if w.flag[SINGULAR] == 1:

@@ -1,20 +1,20 @@
-"""Iteration loop of all operators, with reverse communication: the caller evaluates the functions.
+"""Iteration loop shared by all operators. It uses reverse communication: the caller evaluates r and J.
 
 - ``begin`` starts from x, r and J in the workspace.
 - ``propose`` factors J and, unless x is a root, makes the Newton step the next ``trial``.
 - ``shorten`` replaces a trial outside the trust region with a trial inside it.
 - ``assess`` accepts or rejects the step, given r at ``trial`` in ``r_trial``, and updates the radius.
 
-The compiled solver for a skin wire and a solve with any pair of Python callables therefore execute the same
+Solves of skin wires in compiled code, and solves with arbitrary Python functions, therefore run the same
 compiled steps. Gauss-Newton accepts every step in full; Levenberg-Marquardt and dogleg accept a step only if
 it reduces r.
 
 For a square system, CONVERGED means a root: max|r| ≤ tol_f *and* a simplified Newton correction
-‖J⁻¹ r₊‖∞ ≤ tol_x · max(1, ‖x‖∞) with the current factors. If rounding keeps r above tol_f, an r within the
-rounding error of J·x counts as zero. For a tall system, CONVERGED means a minimum: ‖P r‖ ≤ tol_f ‖r‖, with P
-the projection onto the range of J, and the same condition on the correction. The module ``minimum``
-distinguishes minima from saddles. A stationary point of a square system with r ≠ 0 is ILL_CONDITIONED,
-because J is singular there.
+‖J⁻¹ r₊‖∞ ≤ tol_x · max(1, ‖x‖∞) with the current factors. If rounding keeps r above tol_f, any r within the
+rounding error of J·x is treated as zero. For a tall system, CONVERGED means a minimum: ‖P r‖ ≤ tol_f ‖r‖,
+where P projects onto the range of J, and the correction meets the same condition as for a root. The module
+``minimum`` distinguishes minima from saddles. A stationary point of a square system with r ≠ 0 is
+ILL_CONDITIONED, because J is singular there.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ def begin(w: Work) -> int:
     s, flag = w.s, w.flag
     for k in range(flag.size):
         flag[k] = 0
-    s[RADIUS] = -1.0  # set by the first call of propose, once D is known
+    s[RADIUS] = -1.0  # the first call of propose sets the radius, once D is known
     s[LAM] = 0.0
     s[ERROR] = math.inf
     s[ANGLE] = 1.0
@@ -175,7 +175,7 @@ def assess(operator: int, w: Work, tol_f: float, tol_x: float) -> int:
 
 @njit
 def start(w: Work) -> int:
-    """Provide :func:`begin` to Python callers."""
+    """Call :func:`begin` from Python."""
     return begin(w)
 
 
@@ -183,8 +183,8 @@ def start(w: Work) -> int:
 def advance(operator: int, w: Work, went: int, tol_f: float, tol_x: float) -> int:
     """Call :func:`assess` for the last trial, then :func:`propose`, for a Python caller.
 
-    ``went`` is the result of the last call, initially ``REJECTED``. Returns TRY (evaluate r at ``trial`` into
-    ``r_trial``), ACCEPTED (evaluate J at ``x`` into ``jt``) or a Status.
+    ``went`` is the previous call's return value, or ``REJECTED`` for the first call. Returns TRY (evaluate r
+    at ``trial`` into ``r_trial``), ACCEPTED (evaluate J at ``x`` into ``jt``) or a Status.
     """
     if went == TRY:
         went = assess(operator, w, tol_f, tol_x)
@@ -196,5 +196,5 @@ def advance(operator: int, w: Work, went: int, tol_f: float, tol_x: float) -> in
 
 @njit
 def final_error(w: Work, inverse: Float) -> float:
-    """Provide :func:`estimate_error` to Python callers."""
+    """Call :func:`estimate_error` from Python."""
     return estimate_error(w, inverse)

@@ -1,10 +1,10 @@
 """Second-order test of a stationary point of ‖r‖, and Newton's method for a minimum with r ≠ 0.
 
-The Hessian of ½ ‖r‖² is JᵀJ + S, S = Σ_k r_k ∇²r_k, with S from central differences of Jᵀr at constant r.
-With D the column norms of J and J D⁻¹ = U Σ Vᵀ, the Hessian is D V (Σ² + C) Vᵀ D, C = Vᵀ D⁻¹ S D⁻¹ V, so JᵀJ
-is never formed. Row and column k of Σ² + C are divided by √(σ_k² + ν), with ν the rounding error of C. The
-smallest eigenvalue that remains is 1 at a minimum with r = 0, and at most about 0 at a saddle or in a flat
-direction.
+The Hessian of ½ ‖r‖² is JᵀJ + S, where S = Σ_k r_k ∇²r_k is computed from central differences of Jᵀr at
+constant r. With D the column norms of J and J D⁻¹ = U Σ Vᵀ, the Hessian is D V (Σ² + C) Vᵀ D, C = Vᵀ D⁻¹ S
+D⁻¹ V, so JᵀJ is never formed. Row and column k of Σ² + C are divided by √(σ_k² + ν), with ν the rounding
+error of C. The smallest eigenvalue of the resulting matrix is 1 at a minimum with r = 0, and about 0 or
+negative at a flat point or saddle.
 """
 
 from __future__ import annotations
@@ -20,19 +20,17 @@ from skinnode.model.layout import Float
 from skinnode.solve.operators.codes import EPS, STATIONARY
 
 DIFFERENCE: Final = EPS ** (1 / 3)
-"""Step of a central difference, relative to the coordinate, at which truncation and rounding errors are
-equal."""
+"""Step of a central difference, relative to the coordinate; balances truncation and rounding errors."""
 NOISE: Final = EPS ** (2 / 3)
 """Relative rounding error of a central difference with the step :data:`DIFFERENCE`."""
 CURVED: Final = 0.05
-"""Smallest scaled eigenvalue of the Hessian that counts as positive. On the problems of Moré, Garbow &
-Hillstrom, this eigenvalue is at most 2e-6 at flat points and at least 0.38 at isolated minima. The exception
-is 0.003 on Watson's problem with n = 12, where rounding hides the curvature."""
+"""Smallest scaled eigenvalue of the Hessian that is treated as positive. On the problems of Moré, Garbow &
+Hillstrom, this eigenvalue is at most 2e-6 at flat points and at least 0.38 at isolated minima. The
+exception is 0.003 on Watson's problem with n = 12, where rounding hides the curvature."""
 CONTRACTION: Final = 0.5
-"""Largest ratio of successive Newton steps that counts as convergence."""
+"""Maximum ratio of successive Newton steps during convergence."""
 NEWTON_STEPS: Final = 8
-"""Maximum number of Newton steps to a minimum, twice the number for quadratic convergence from a 1 %
-error."""
+"""Maximum number of Newton steps to a minimum; quadratic convergence from a 1 % error takes half as many."""
 
 
 @dataclass(frozen=True)
@@ -68,7 +66,7 @@ class Point:
 
 @dataclass(frozen=True)
 class Curvature:
-    """Smallest eigenvalue, Newton step and error estimate from the Hessian at a point."""
+    """Curvature at a point: smallest eigenvalue of the Hessian, Newton step and error estimate."""
 
     lowest: float
     """Smallest scaled eigenvalue; about 0 if a direction is flat, NaN if a number overflowed."""
@@ -89,7 +87,7 @@ def column_norms(j: Float) -> Float:
 
 
 def curvature(jacobian: Callable[[Float], Float], at: Point) -> Curvature:
-    """Return the curvature at a point, from a Hessian computed with 2n Jacobians."""
+    """Return the curvature at a point; evaluates 2n Jacobians to compute the Hessian."""
     n = at.x.size
     d = column_norms(at.j)
     d[d == 0.0] = 1.0
@@ -138,7 +136,7 @@ def settle(
     tol_x: float,
     max_steps: int,
 ) -> Settled:
-    """Take Newton steps for Jᵀr = 0 while they contract and ‖r‖ does not grow; assess the last point."""
+    """Take Newton steps for Jᵀr = 0 until they stop contracting or ‖r‖ grows; assess the last point."""
     before = math.inf
     for left in range(min(NEWTON_STEPS, max_steps), -1, -1):
         bent = curvature(jacobian, at)

@@ -1,4 +1,4 @@
-"""Result of ``solve_system``, with the same statuses as a field of the skin."""
+"""Result of ``solve_system``, which uses the same statuses as a skin's displacement field."""
 
 from __future__ import annotations
 
@@ -29,13 +29,14 @@ class PointKind(enum.Enum):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Solution:
-    """Outcome of ``solve_system``, with the best iterate found, whatever the status."""
+    """Outcome of ``solve_system``: the best iterate found, regardless of the status."""
 
     x: Float
     """(n,) best iterate."""
     status: Status
-    """CONVERGED at a root and, if there are more equations than unknowns, at a minimum. ILL_CONDITIONED at a
-    minimum of a square system that is not a root, and at any point that the equations do not determine."""
+    """Status of the solve. CONVERGED at a root and, if there are more equations than unknowns, at a
+    minimum. ILL_CONDITIONED at a minimum of a square system that is not a root, and at any point that the
+    equations do not determine."""
     kind: PointKind
     """Kind of the point: root, minimum or neither."""
     residual_norm: float
@@ -43,6 +44,9 @@ class Solution:
     optimality: float
     """First-order optimality ‖Jᵀr‖∞ at ``x``."""
     error_estimate: float
-    """Estimate of max |x − x*|: the remaining Newton correction plus the effect of rounding x, amplified by
-    the condition number of J or, at a minimum, of the Hessian; inf unless CONVERGED."""
+    """Estimate of max |x − x*|; inf unless CONVERGED.
+
+    Sum of the remaining Newton correction and the effect of rounding x, amplified by the condition number of
+    J or, at a minimum, of the Hessian.
+    """
     stats: SolveStats

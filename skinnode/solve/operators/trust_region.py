@@ -79,7 +79,7 @@ def measure_newton(w: Work) -> None:
 
 @njit_part
 def _gain_noise(w: Work) -> float:
-    """Return the rounding error in the relative decrease of ‖r‖² for a step that predicts little change."""
+    """Return the rounding error of the relative decrease in ‖r‖² for a step with little predicted change."""
     noise, before = 4.0 * EPS, w.s[NORM]
     rounding(w, w.x)
     for k in range(w.r.size):
@@ -107,7 +107,7 @@ def _resize(w: Work, norm: float, gain: float, slope: float, ratio: float) -> No
         shrink = 0.1
         if gain >= 0.0:
             shrink = 0.5
-        elif norm < 10.0 * s[NORM]:  # minimiser of the parabola through both residuals
+        elif norm < 10.0 * s[NORM]:  # step length that minimises the parabola through both residuals
             shrink = 0.5 * slope / (slope + 0.5 * gain)
             shrink = 0.1 if shrink < 0.1 else (0.5 if shrink > 0.5 else shrink)
         reach = 10.0 * s[LENGTH]
@@ -122,7 +122,7 @@ def _resize(w: Work, norm: float, gain: float, slope: float, ratio: float) -> No
 
 @njit_part
 def assess_decrease(w: Work, norm: float) -> int:
-    """Compare the decrease in ‖r‖ (to ``norm`` at the trial) with its prediction; update the radius.
+    """Compare the actual decrease in ‖r‖, to ``norm``, with the predicted decrease; update the radius.
 
     Returns ACCEPTED, REJECTED or a Status.
     """

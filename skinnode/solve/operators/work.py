@@ -1,8 +1,8 @@
-"""Workspace for the steps of a solve, and products with the Jacobian that it contains.
+"""Workspace for the steps of a solve, and products with the workspace's Jacobian.
 
 The symbols are those of the paper: r is the residual (m,), J its Jacobian (m, n), stored transposed, and lam
 the Levenberg-Marquardt parameter. The trust region is ‖D s‖ ≤ radius. D is the running maximum of the column
-norms of J (Moré 1978), so that the units of the unknowns do not matter. For later attempts of
+norms of J (Moré 1978), so that the units of the unknowns do not matter. After the first attempt of
 ``solve_system``, D is the identity.
 """
 
@@ -43,7 +43,7 @@ class Work(NamedTuple):
     bu: Annotated[Float, "n"]
     across: Annotated[Float, "n"]
     down: Annotated[Float, "n"]
-    """Factors β of the left reflectors of the bidiagonal form; ``across`` contains those of the right."""
+    """Factors β of the bidiagonal form's left reflectors; for the right reflectors, see ``across``."""
     inverse: Annotated[Float, "n"]
     """Reciprocal diagonal of the damped bidiagonal form; its superdiagonal is ``ru``."""
     ru: Annotated[Float, "n"]

@@ -1,8 +1,9 @@
 """Corrector for a path tracker: solves wires at positions on a path and logs the cost of each call.
 
-Positions count samples from 0; the rest position is −1. Between two samples, ``a`` is interpolated linearly.
-Interpolating 1/a or log a instead makes no significant difference: with layers 0.3 to 1 pitch apart and
-presses of up to 70 %, the numbers of lost wires differ by no more than their statistical scatter.
+A path position is a sample number, counted from 0; the rest position is −1. Between two samples, ``a`` is
+interpolated linearly. Interpolating 1/a or log a instead makes no significant difference: for layers 0.3 to 1
+pitch apart and presses of up to 70 %, the differences in the number of lost wires are within the statistical
+scatter.
 """
 
 from __future__ import annotations
@@ -39,7 +40,7 @@ class Accuracy:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PathLog:
-    """Cost of each of S calls to a corrector; NaN or 0 for a wire that the call skipped."""
+    """Cost of each of S corrector calls; NaN or 0 for wires that a call skipped."""
 
     position: Float
     """(S, U) position on the path."""
@@ -73,7 +74,7 @@ class Corrector:
 
     @property
     def last(self) -> float:
-        """Position of the last sample on the path."""
+        """Path position of the last sample."""
         return self.samples - 1.0
 
     @property
@@ -91,12 +92,12 @@ class Corrector:
         return np.asarray(self._knots[sample + 1])
 
     def log_start(self, wires_: NDArray[np.bool_], evaluations: Index) -> None:
-        """Log the ``evaluations`` (U,) used to find starting points for these wires (U,)."""
+        """Log the ``evaluations`` (U,) spent on starting points for the given wires (U,)."""
         nothing = np.full(len(evaluations), math.nan)
         self._rows.append((np.where(wires_, self.last, nothing), evaluations, evaluations, nothing))
 
     def a_at(self, position: Float | float) -> Float:
-        """Return R · gain (U, K) of each wire at its own position (U,), or of all wires at one sample."""
+        """Return R · gain (U, K), with each wire at its own position (U,) or all wires at one sample."""
         if isinstance(position, float):
             return np.asarray(self._knots[int(position) + 1].copy())
         before = np.clip(np.floor(position).astype(np.int64), -1, self.samples - 2)
@@ -114,7 +115,7 @@ class Corrector:
         tasks: int = 0,
         operator: int | None = None,
     ) -> None:
-        """Solve wires from their current positions, leave the result in ``solver`` and log the cost.
+        """Solve wires from their current positions; store the result in ``solver``, and log the cost.
 
         Args:
             todo: (U,) LEAVE, SOLVE or PREDICT per wire (:mod:`skinnode.solve.wires.arrays`).

@@ -1,4 +1,4 @@
-"""Path following as in the paper: solves the last sample of a press via the earlier samples.
+"""Path following as in the paper: solves a press's last sample by way of the earlier samples.
 
 The path is the solution of H(X, t) = F(X) − ρ / R(t) = 0, where X(0) is the grid at rest. Each sample is
 solved from the solution of the previous sample (Lahaye; Xu et al. 2018, section 3.2). Step control
@@ -36,11 +36,16 @@ from skinnode.solve.posterior.frame_estimator import FrameEstimator
 from skinnode.solve.wires.problem import PatchProblem
 
 SELECTION: Final = Accuracy(tolerance=1e-12, max_steps=100)
-"""Accuracy of a solve that starts from the posterior: the paper's final tolerance, with the paper's maximum
-number of steps for intermediate samples."""
+"""Accuracy of a solve that starts from the posterior.
+
+The tolerance is the paper's final tolerance; the maximum number of steps is the paper's limit for
+intermediate samples.
+"""
 STARTS: Final = 12
-"""Number of random starting points in the search for other roots on a layout with folds. The points are
-random samples of the posterior, with a fixed seed."""
+"""Number of random starting points for finding other roots on a layout with folds.
+
+The points are drawn from the posterior with a fixed random seed.
+"""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -48,8 +53,8 @@ class PathResult:
     """Solution at the end of a path, and cost of each point on the path.
 
     Row s of ``position``, ``steps``, ``evaluations`` and ``optimality`` describes solver call s. If the call
-    skipped a wire, the wire's position and optimality are NaN. Rows after the first row at the last sample
-    describe second attempts and checks.
+    skipped a wire, the wire's position and optimality are NaN. After the first row for the last sample,
+    further rows describe second attempts and checks.
     """
 
     upper_m: Float
@@ -59,18 +64,20 @@ class PathResult:
     status: tuple[Status, ...]
     """Status of each upper wire."""
     error_estimate_m: Float
-    """(U,) largest coordinate error due to tolerance and rounding if the samples are exact, metres; inf if
-    unknown."""
+    """(U,) largest coordinate error due to tolerance and rounding, in metres; inf if unknown.
+
+    Assumes exact samples.
+    """
     residual: Float
     """(U,) RMS of F/b − 1 at the end."""
     cycle: int | None
     """Number of samples from one solve to the next; None if step control uses no cycle."""
     searched: int
-    """Number of leading rows that describe the search for the cycle; the rows of the path follow."""
+    """Number of rows at the start that describe the search for the cycle; the path's rows follow."""
     position: Float
     """(S, U) sample solved, from 0; 1.5 is halfway between samples 1 and 2, and −1 is the rest position."""
     steps: NDArray[np.int64]
-    """(S, U) operator steps; 0 if the sample was skipped."""
+    """(S, U) number of operator steps; 0 if the sample was skipped."""
     evaluations: NDArray[np.int64]
     """(S, U) evaluations of F and J."""
     optimality: Float
@@ -92,9 +99,9 @@ def solve_path(
     A wire is ILL_CONDITIONED instead of CONVERGED if it may have ended on a branch of F = b other than the
     skin's. There are four possible reasons: the determinant of its Jacobian changed sign on the way; its
     electrodes crossed to the other side of the lower layer; an equally smooth root is across a nearby fold;
-    or the samples led smoothly to another root. In the last case, the wire stays at that other root. Since
-    the skin itself can cross a fold, a root across a fold is accepted if the path led there and the posterior
-    of the patch finds the same root.
+    or the samples led smoothly to another root. If the samples led smoothly to another root, the wire is left
+    at that root. Since the skin itself can cross a fold, a root across a fold is accepted if the path led
+    there and the posterior of the patch finds the same root.
 
     Args:
         layout: The patch, with at least as many lower wires as unknowns per wire (K ≥ 3N).
@@ -154,7 +161,7 @@ def solve_path(
 def _ask_posterior(
     tracker: PathTracker, layout: PatchLayout, last_ohm: Float, baseline_ohm: ArrayLike | None
 ) -> PatchEstimate | None:
-    """Select the roots at the last sample with the posterior; return its estimate, or None if untrusted."""
+    """Select the last sample's roots using the posterior; return its estimate, or None if untrusted."""
     options = PosteriorOptions(
         relative_noise=roots.REFEREE_NOISE, baseline_ohm=baseline_ohm, hold=False, contacts=False,
         follow_noise=False,

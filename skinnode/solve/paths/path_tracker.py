@@ -44,7 +44,7 @@ class PathEnd:
 
     @property
     def converged(self) -> Mask:
-        """(U,) wires that are CONVERGED."""
+        """(U,) mask of the wires whose status is CONVERGED."""
         return np.asarray(self.status == op.CONVERGED)
 
     def copy(self) -> PathEnd:
@@ -55,12 +55,12 @@ class PathEnd:
         )  # fmt: skip
 
     def restore(self, wires_: Mask, earlier: PathEnd) -> None:
-        """Restore the outcome of these wires (U,) from an earlier copy."""
+        """Restore the outcome of the given wires (U,) from an earlier copy."""
         for name in ("status", "residual", "error_estimate", "inverse", "side"):
             getattr(self, name)[wires_] = getattr(earlier, name)[wires_]
 
     def doubt(self, wires_: Mask) -> None:
-        """Change the status of these wires (U,) from CONVERGED to ILL_CONDITIONED."""
+        """Change the status of the given wires (U,) from CONVERGED to ILL_CONDITIONED."""
         self.status[wires_ & (self.status == op.CONVERGED)] = op.ILL_CONDITIONED
 
 
@@ -108,7 +108,7 @@ class PathTracker:
 
     @property
     def smoothness(self) -> Smoothness:
-        """Smoothness of the patch, built on first use because most paths do not need it."""
+        """Smoothness model of the patch, created on first use because most paths do not need it."""
         if self._smoothness is None:
             self._smoothness = Smoothness(self.problem)
         return self._smoothness
@@ -128,10 +128,10 @@ class PathTracker:
         self._points = self._at_rest()
 
     def _at_rest(self) -> list[tuple[Float, Float]]:
-        """Return the first two points of a path: both are the rest position, so their secant is zero."""
+        """Return the first two points of a path; both are the rest position, so that the secant is zero."""
         return [(self.problem.rest.copy(), self.problem.a_rest)] * 2
 
-    # -- sample by sample, as the paper does -----------------------------------------------------------
+    # -- sample by sample, as in the paper -------------------------------------------------------------
 
     def extrapolate(self, sample: int) -> None:
         """Move every wire along the secant towards a sample, by at most the trust radius."""
@@ -140,10 +140,10 @@ class PathTracker:
         secant(x_before, a_before, x, a, a_next, self.problem.step_limit, self.solver.x)
 
     def solve(self, sample: int, accuracy: Accuracy) -> Index:
-        """Solve a sample from the current positions of the wires.
+        """Solve a sample, starting from the wires' current positions.
 
         Returns:
-            (U,) steps; 0 if the first-order optimality was already below the tolerance.
+            (U,) numbers of steps; 0 if the first-order optimality was already below the tolerance.
         """
         self.corrector.correct(self._everywhere, float(sample), accuracy, tasks=wires.SKIP)
         self._points.append((self.solver.x.copy(), self.corrector.sample_a(sample)))
@@ -161,7 +161,7 @@ class PathTracker:
         self.end.doubt(self._crossed)
 
     def walk(self, todo: Mask, samples: list[int], accuracy: Accuracy) -> None:
-        """Follow these wires (U,) from rest along ``samples``, only to find the end of their path.
+        """Follow the given wires (U,) from rest along ``samples``, only to find where their paths end.
 
         The samples are in time order and include the last sample of the press. The method does not change the
         positions of the wires or :attr:`end`.
@@ -179,7 +179,7 @@ class PathTracker:
         self.solver.x[:] = x
 
     def _arrive(self, todo: Mask) -> None:
-        """Store the path end of the wires in ``todo`` (U,), after their solve of the last sample."""
+        """Store the end of the path for the wires in ``todo`` (U,), after the last sample has been solved."""
         self._path_end[todo] = self.solver.x[todo]
         residual = self.solver.measure[:, wires.RESIDUAL]
         self.reached[todo] = (residual <= roots.ROOT_RESIDUAL)[todo]
@@ -192,10 +192,11 @@ class PathTracker:
         return euler(solver.x, solver.inverse, solver.a_solved, self.corrector.a_at(position))
 
     def step(self, todo: Mask, position: Float, accuracy: Accuracy) -> Mask:
-        """Predict and correct the wires in ``todo`` (U,) to their ``position`` (U,).
+        """Advance the wires in ``todo`` (U,) to their ``position`` (U,): predict, then correct.
 
         Returns:
-            (U,) wires that reached a root on the branch of the rest position. The other wires do not move.
+            (U,) mask of the wires that reached a root on the rest position's branch. All other wires are left
+            unchanged.
         """
         solver = self.solver
         before = solver.x.copy(), solver.inverse.copy(), solver.a_solved.copy()
@@ -219,7 +220,7 @@ class PathTracker:
     ) -> None:
         """Solve the last sample for the wires in ``todo`` (U,), and store the outcome in :attr:`end`.
 
-        A root across a fold is ILL_CONDITIONED unless ``also`` returns True for its wire.
+        A wire at a root across a fold is ILL_CONDITIONED unless ``also`` returns True for the wire.
         """
         call = np.where(todo, wires.SOLVE, wires.LEAVE).astype(np.uint8)
         self.corrector.correct(call, self.corrector.last, accuracy, tasks=wires.COVARIANCE, operator=operator)
@@ -238,20 +239,20 @@ class PathTracker:
         self.corrector.correct(call, self.corrector.last, accuracy, operator=op.LEVENBERG_MARQUARDT)
 
     def on_branch(self) -> Mask:
-        """Return the wires (U,) whose last solve reached a root on the branch of the rest position."""
+        """Return a mask (U,) of the wires whose last solve reached a root on the rest position's branch."""
         report = self.solver.report
         return roots.on_rest_branch(
             report[:, wires.STATUS], report[:, wires.BRANCH], self._rest_branch, self.out_of_reach()
         )
 
     def at_path_end(self) -> Mask:
-        """Return the wires (U,) that are at the end of their path and within reach."""
+        """Return a mask (U,) of the wires that are at the end of their path and within reach."""
         apart = roots.distance(self.solver.x, self._path_end)
         size = roots.distance(self._path_end, self.problem.rest)
         return np.asarray((apart <= roots.SAME_ROOT * size) & ~self.out_of_reach())
 
     def led_elsewhere(self) -> Mask:
-        """Return the wires (U,) that are not at the root to which the samples led along a smooth path.
+        """Return a mask (U,) of the wires that left the root at the end of a smooth path.
 
         On a smooth path, the secant through two solutions predicts the next solution, and the first solution
         is close to rest (:data:`skinnode.solve.roots.SMOOTH_PATH`). On a long path, only the second half must
@@ -273,11 +274,11 @@ class PathTracker:
         return elsewhere
 
     def return_to_path_end(self, todo: Mask, accuracy: Accuracy) -> None:
-        """Move these wires (U,) back to the end of their path; none of them is CONVERGED afterwards."""
+        """Move the given wires (U,) back to the end of their path, with a status other than CONVERGED."""
         self.solver.x[todo] = self._path_end[todo]
         self.take(todo, accuracy)
         self.end.doubt(todo)
 
     def out_of_reach(self) -> NDArray[np.bool_]:
-        """Return the wires (U,) with an electrode farther from rest than its clearance."""
+        """Return a mask (U,) of the wires with an electrode farther from rest than its clearance."""
         return self.problem.out_of_reach(self.solver.x)

@@ -26,8 +26,10 @@ GUIDED_STEPS: Final = 100
 """Maximum number of steps from a guided start. A solve that starts near a root takes 1 to 20 steps; a solve
 that starts elsewhere never converges."""
 TWIN: Final = Accuracy(tolerance=1e-9, max_steps=30)
-"""Accuracy of a root that is only compared with another root; distinct roots differ by far more than this
-tolerance."""
+"""Accuracy of roots that are only compared with other roots.
+
+Distinct roots differ by much more than the tolerance.
+"""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -40,20 +42,20 @@ class PatchEstimate:
     """(U, n) standard deviations, pitches."""
 
     def agrees(self, x: Float) -> Mask:
-        """Return the wires (U,) whose position (U, n) in pitches is confirmed by the estimate."""
+        """Return a mask (U,) of the wires whose position (U, n), in pitches, is confirmed by the estimate."""
         return roots.agrees(np.abs(x - self.x), roots.AGREE * self.std)
 
 
 def doubtful(tracker: PathTracker) -> Mask:
-    """Return the wires (U,) that have no root, a root too rough to be a press, or a step that was undone."""
+    """Return a mask (U,) of wires with no root, a root too rough to be a press, or an undone step."""
     return np.asarray(~tracker.end.converged | _rough(tracker) | tracker.stumbled)
 
 
 def guide(tracker: PathTracker, todo: Mask, accuracy: Accuracy) -> None:
-    """Solve the last sample again from the smoothest displacement that explains it; keep the smoother root.
+    """Solve the last sample again, from the smoothest displacement that explains it; keep the smoother root.
 
-    If the new root is across a fold, the function also solves for its twin on the near side. A wire for which
-    neither solve finds a root is not CONVERGED afterwards.
+    If the new root is across a fold, also solves for the twin root on the near side. If neither solve finds a
+    root for a wire, the wire's status is not CONVERGED.
 
     Args:
         tracker: Tracker at the end of its path.
@@ -196,15 +198,15 @@ def doubt_twins(tracker: PathTracker, estimate: PatchEstimate | None) -> None:
 
 
 def heed_samples(tracker: PathTracker, accuracy: Accuracy) -> None:
-    """Reject each root to which the samples do not lead, and return its wire to the end of its path.
+    """Reject roots to which the samples do not lead; return their wires to the end of their paths.
 
     If the skin itself crosses a fold, the root on the branch of the rest position can be wrong although it is
     smoother and likelier than the true root. A start from the smoothest displacement and the posterior then
     both find the wrong root, and only the samples contradict it. If the samples refute the patch estimate on
-    one wire, the roots that other wires took from the estimate are rejected too.
+    one wire, other wires' roots that came from the estimate are rejected too.
     """
     if not tracker.second_tries:
-        return  # a plain path moves no wire away from its end
+        return  # on a plain path, every wire is already at the end of its path
     todo = tracker.led_elsewhere()
     if todo.any():
         moved = ~tracker.at_path_end()

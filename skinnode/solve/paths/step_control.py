@@ -22,21 +22,26 @@ from skinnode.solve.paths.root_selection import doubt_rough, doubtful, guide
 from skinnode.solve.roots import Mask
 
 RELAXED_TOLERANCES: Final = (1e-6, 1e-5, 1e-4, 1e-3)
-"""Intermediate tolerances of the paper's figure 10, from tight to loose."""
+"""Intermediate tolerances in the paper's figure 10, from tight to loose."""
 MISS: Final = 0.2
-"""Target distance between the corrected and the predicted point, in initial trust radii."""
+"""Target distance between predicted and corrected point, as a multiple of the initial trust radius."""
 SHRINK: Final = 0.5
 GROW: Final = 4.0
 """Largest growth factor of the step length per step (Allgower & Georg 1990, section 6.1, use 2 to 4)."""
 SHORTEST: Final = 1 / 64
-"""Minimum step as a fraction of the path; without a minimum, the halving at a fold would never end."""
+"""Minimum step as a fraction of the path; without a minimum, steps at a fold would be halved forever."""
 ADAPTIVE_POINT: Final = Accuracy(tolerance=1e-9, max_steps=6)
-"""Accuracy of an intermediate point. With a tolerance below √eps, a root is accurate enough for its ∂X/∂R to
-be kept. From a contraction ratio of 1/2, Newton's method takes 5 steps to 1e-9."""
+"""Accuracy of an intermediate point.
+
+A root with a tolerance below √eps is accurate enough to keep its ∂X/∂R. Starting at a contraction ratio of
+1/2, Newton's method reaches 1e-9 in 5 steps.
+"""
 
 ADAPTIVE_WALK: Final = Accuracy(tolerance=1e-9, max_steps=100)
-"""Accuracy of a sample that is solved only to find the root to which the samples lead. The maximum number of
-steps equals that in the paper."""
+"""Accuracy of samples that are solved only to find the root to which they lead.
+
+The maximum number of steps is the same as in the paper.
+"""
 
 
 class Schedule(Protocol):
@@ -96,7 +101,7 @@ class Uniform:
 
 @dataclass(frozen=True)
 class Periodic:
-    """Schedule that solves one sample per cycle T (section 5.2 of the paper).
+    """Schedule that solves one sample per cycle of T samples (section 5.2 of the paper).
 
     Between two solves, the tracked point stays within the relaxed tolerance, so the skipped samples add no
     information.
@@ -105,8 +110,8 @@ class Periodic:
     a tolerance of 1e-6, 1e-5, …, skipping each sample whose first-order optimality is below the tolerance. If
     the solves have a period, T is the median number of samples from one solve to the next, on the wire that
     needs the most solves. The path then restarts from rest and solves every T-th sample with this tolerance.
-    The last sample is always solved. If no tolerance shows a cycle of at least two samples that occurs at
-    least twice, every sample is solved with a tolerance of 1e-6.
+    The last sample is always solved. A cycle must have at least two samples and occur at least twice. If no
+    tolerance yields a cycle, every sample is solved with a tolerance of 1e-6.
 
     The paper's tolerance applies to MATLAB's unscaled problem, in which ‖Jᵀr‖∞ is F² times its value in this
     project, where r = a F − 1 and lengths are in pitches. The value of F depends on the unit of length, which
@@ -161,7 +166,7 @@ class Periodic:
             solved = [tracker.solve(sample, accuracy) > 0 for sample in range(tracker.samples - 1)]
             cycle = shortest_cycle(np.array(solved).reshape(-1, tracker.wires))
             if cycle is None:
-                break  # looser tolerances would not reveal a second cycle either
+                break  # a looser tolerance would not yield a second cycle either
             if cycle > 1:
                 return cycle, tolerance
         return None, RELAXED_TOLERANCES[0]
@@ -171,7 +176,7 @@ def shortest_cycle(solved: NDArray[np.bool_]) -> int | None:
     """Return the median number of samples between solves of the wire that is solved most often.
 
     Args:
-        solved: (T, U) whether a wire was solved at a sample.
+        solved: (T, U) bool, True where a wire was solved at a sample.
 
     Returns:
         The cycle, in samples; None if no wire has two cycles.
@@ -184,7 +189,7 @@ def shortest_cycle(solved: NDArray[np.bool_]) -> int | None:
 
 @dataclass(frozen=True)
 class Adaptive:
-    """Schedule that solves as few points per wire as possible, interpolating R between samples.
+    """Schedule that minimises the number of points solved per wire; interpolates R between samples.
 
     Each wire has its own step length. From each point, the wire takes an Euler step along ∂X/∂R, computed
     from the factors of the last Jacobian, and then operator steps. The next step length is chosen to maintain
@@ -220,7 +225,7 @@ class Adaptive:
         _require(self, "final_tolerance", "final_steps")
 
     def follow(self, tracker: PathTracker) -> None:
-        """Predict, correct and choose step lengths; then finish arrived wires and guide doubtful wires."""
+        """Step all wires to the last sample; then solve the last sample, and guide doubtful wires."""
         end = tracker.samples - 1.0
         reach = tracker.problem.step_limit
         position = np.full(tracker.wires, REST)
@@ -251,7 +256,7 @@ class Adaptive:
 
 
 def _finish(tracker: PathTracker, how: Uniform | Periodic) -> None:
-    """Solve the last sample, and check doubtful roots."""
+    """Solve the last sample, then check doubtful roots."""
     accuracy = Accuracy(how.final_tolerance, how.final_steps)
     if not how.plain:
         tracker.extrapolate(tracker.samples - 1)
@@ -264,7 +269,7 @@ def _finish(tracker: PathTracker, how: Uniform | Periodic) -> None:
 
 
 def _far_and_folded(tracker: PathTracker) -> Mask:
-    """Return the wires (U,) of a folded layout that moved far enough from rest to have crossed a fold."""
+    """Return a mask (U,) of wires on folded layouts that moved far enough to have crossed a fold."""
     problem = tracker.problem
     moved = roots.distance(tracker.solver.x, problem.rest)
     far = np.asarray(moved > roots.JUMP * problem.clearance.min())
@@ -277,7 +282,7 @@ def _require_count(name: str, value: int) -> None:
 
 
 def _require(options: object, *names: str) -> None:
-    """Raise ValueError unless the tolerances are positive and the numbers of steps are at least 1."""
+    """Raise ValueError if a tolerance is not positive, or a number of steps is less than 1."""
     for name in names:
         value = getattr(options, name)
         if name.endswith("steps"):

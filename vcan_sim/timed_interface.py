@@ -7,6 +7,9 @@ Endpoints that open the same channel under the same virtual clock are stations o
 from __future__ import annotations
 
 import queue
+import threading
+import time
+from collections import Counter
 from collections.abc import Callable
 from typing import Any, Final, cast
 
@@ -80,6 +83,8 @@ class Segment:
         self._leaving: set[int] = set()
         self._connected: set[int] = set()
         self._due_ns: int | None = None
+        self.cpu_ns: Counter[str] = Counter()
+        """CPU time spent on simulating the bus, by name of the thread that did so, ns."""
 
     def join(self) -> int:
         """Connect a new station and return its number."""
@@ -113,6 +118,11 @@ class Segment:
             self.clock.call_at(due_ns, self._advance)
 
     def _advance(self) -> None:
+        start_ns = time.thread_time_ns()
+        self._deliver()
+        self.cpu_ns[threading.current_thread().name] += time.thread_time_ns() - start_ns
+
+    def _deliver(self) -> None:
         self._due_ns = None
         wall_to_monotonic_ns = self.clock.time_ns() - self.clock.now_ns
         for event in self.bus.advance(self.clock.now_ns):

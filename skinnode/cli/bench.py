@@ -214,6 +214,45 @@ def path(
 
 
 @app.command()
+def scale(
+    json: JsonFile = None,
+    plot: PlotFile = None,
+    patches: Annotated[
+        list[int] | None,
+        typer.Option(min=1, max=1000, help="Number of patches, of which one is touched. Can be repeated."),
+    ] = None,
+    scans: Annotated[int, typer.Option(min=1, max=10_000, help="Number of scans per measurement.")] = 20,
+) -> None:
+    """Measure the CPU time of simulator and host against skin area and against contact.
+
+    Hands run in virtual time. Each patch takes about 20 MB of memory.
+    """
+    from skinnode.bench import scale as bench
+
+    _prepare(json, plot)
+    figures = bench.run(patches or bench.PATCHES, scans)
+    _print_machine(figures)
+    typer.echo("CPU time per patch and scan, ms")
+    typer.echo(
+        f"{'patches':>8}{'touched':>9}{'nodes':>8}{'bus':>8}{'host':>8}{'virtual/real time':>19}{'MB':>7}"
+    )
+    for row in figures["area"] + figures["contact"]:
+        times = "".join(f"{row[key]:8.2f}" for key in ("nodes_ms", "bus_ms", "host_ms"))
+        typer.echo(f"{row['patches']:8}{row['touched']:9}{times}{row['faster']:19.2f}{row['memory_mb']:7.0f}")
+    reading = figures["physics"]
+    share = 100 * reading["untouched_us"] / reading["touched_us"]
+    typer.echo(
+        f"physics of one reading, without frames: touched {reading['touched_us']:.0f} µs, "
+        f"untouched {reading['untouched_us']:.1f} µs ({share:.1f} %)"
+    )
+    _write(json, figures)
+    if plot is not None:
+        from skinnode.bench.plots.scale import draw
+
+        draw(plot, figures)
+
+
+@app.command()
 def node(
     json: JsonFile = None,
     seconds: Annotated[

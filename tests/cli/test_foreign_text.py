@@ -165,7 +165,18 @@ COMMANDS: dict[str, Callable[[Place], list[list[str]]]] = {
     ],
     **{
         f"bench {name}": lambda place: [["--json", place.missing + "/x"], [WORSE]]
-        for name in ("kernel", "solve", "path", "accuracy", "node", "pipeline", "soak", "stability", "trust")
+        for name in (
+            "kernel",
+            "solve",
+            "path",
+            "accuracy",
+            "node",
+            "pipeline",
+            "scale",
+            "soak",
+            "stability",
+            "trust",
+        )
     },
     "vcan-sim": lambda place: [
         *[[place.missing], [place.broken_hand()], [place.hand(), "--fault", WORSE]],

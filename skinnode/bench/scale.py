@@ -1,0 +1,179 @@
+"""Measures how the cost of the simulator and of the host grows with skin area and with contact.
+
+Hands of several patches, four per bus, run in virtual time on timed buses. Bodies press on some of the
+patches. The CPU time of each thread is read from the thread's own clock: the threads of the nodes belong to
+the simulator, all other threads to the host. The thread that waits last simulates the timed bus, so the CPU
+time of the bus is measured separately and subtracted from that thread. Virtual time makes the load exact:
+each patch sends every scan, however slow the machine is.
+"""
+
+from __future__ import annotations
+
+import resource
+import threading
+import time
+from collections import Counter
+from collections.abc import Sequence
+from typing import Any, Final
+
+from skinnode.bench.timing import machine, take_turns
+from skinnode.config import HandConfig, parse_hand
+from skinnode.host import Host
+from vcan_sim.fleet import Fleet
+from vcan_sim.scenes import PatchScene, SceneConfig, bind_scene, parse_scene
+from vcan_sim.sensor import SimulatedPatch
+from vcan_sim.timed_bus import BitRates
+from vcan_sim.timed_interface import Segment, segment
+from vcan_sim.virtual_time import VirtualClock
+
+PATCHES: Final = (1, 4, 16, 64)
+"""Default numbers of patches, of which one is touched."""
+FIXED: Final = 16
+"""Number of patches of the hand in which more and more patches are touched."""
+TOUCHED: Final = (0, 1, 4, 16)
+"""Numbers of touched patches in this hand."""
+PATCHES_PER_BUS: Final = 4
+PERIOD_MS: Final = 100
+_SETTLED_S: Final = 1.0
+"""Time between the end of the bring-up and the start of the measurement, s; the presses have reached their
+depth."""
+
+Row = dict[str, Any]
+
+
+def run(patches: Sequence[int] = PATCHES, scans: int = 20) -> dict[str, Any]:
+    """Measure the cost against area and against contact.
+
+    Args:
+        patches: Numbers of patches of the hands with one touched patch.
+        scans: Number of scans of each measurement.
+
+    Returns:
+        ``machine``; ``area`` and ``contact``, lists of rows with ``patches``, ``touched``, CPU time per patch
+        and scan in ms (``nodes_ms``, ``bus_ms``, ``host_ms``), ``fields`` solved, ``faster``, the ratio of
+        virtual to real time, and ``memory_mb`` of the process; and ``physics``, the time of one reading
+        of a simulated patch in µs, untouched and touched.
+    """
+    return {
+        "machine": machine(),
+        "area": [measure(count, 1, scans) for count in patches],
+        "contact": [measure(FIXED, count, scans) for count in TOUCHED],
+        "physics": physics(),
+    }
+
+
+def measure(patches: int, touched: int, scans: int) -> Row:
+    """Measure a hand of which some patches are touched.
+
+    Args:
+        patches: Number of patches.
+        touched: Number of touched patches.
+        scans: Number of scans to measure.
+
+    Returns:
+        A row as in :func:`run`.
+    """
+    hand = hand_of(patches)
+    with VirtualClock() as clock:
+        rates = BitRates(hand.buses[0].bitrate_bps)
+        segments = [segment(bus.channel, clock, rates) for bus in hand.buses]
+        with Fleet(hand, scene=scene_of(touched)) as fleet, Host.from_config(hand) as host:
+            clock.sleep(_SETTLED_S)
+            solved, before = _solved(host), _cpu_ns(segments)
+            start = time.perf_counter()
+            clock.sleep(scans * PERIOD_MS * 1e-3)
+            real_s = time.perf_counter() - start
+            spent = _cpu_ns(segments) - before
+            fields = _solved(host) - solved
+            assert not fleet.failed
+    each = 1e-6 / (patches * scans)
+    return {
+        "patches": patches,
+        "touched": touched,
+        "nodes_ms": spent["nodes"] * each,
+        "bus_ms": spent["bus"] * each,
+        "host_ms": spent["host"] * each,
+        "fields": fields,
+        "faster": scans * PERIOD_MS * 1e-3 / real_s,
+        "memory_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
+    }
+
+
+def physics() -> dict[str, float]:
+    """Time one reading of a simulated patch, without frames: untouched, and under a press.
+
+    Returns:
+        ``untouched_us`` and ``touched_us``, µs.
+    """
+    scene = scene_of(1)
+    assert scene is not None
+    scenes = bind_scene(scene, hand_of(2))
+    timed = take_turns({"touched": _Reading(scenes["patch0"]), "untouched": _Reading(scenes["patch1"])})
+    return {f"{name}_us": timing.call_us for name, timing in timed.items()}
+
+
+class _Reading:
+    """Readings of a patch, each at a new time."""
+
+    def __init__(self, scene: PatchScene) -> None:
+        self._patch, self._t_ns = SimulatedPatch(scene), 1_500_000_000
+        self._patch.start(0)
+
+    def __call__(self) -> None:
+        self._t_ns += 1_000_000
+        self._patch.read(self._t_ns)
+
+
+def hand_of(patches: int) -> HandConfig:
+    """Return a hand of reference patches, :data:`PATCHES_PER_BUS` per bus."""
+    return parse_hand(
+        {
+            "buses": [
+                {"name": f"can{i}", "interface": "timed", "channel": f"can{i}"}
+                for i in range(-(-patches // PATCHES_PER_BUS))
+            ],
+            "sync": {"period_ms": PERIOD_MS},
+            "patches": [
+                {
+                    "name": f"patch{i}",
+                    "node_id": i % PATCHES_PER_BUS + 1,
+                    "bus": f"can{i // PATCHES_PER_BUS}",
+                    "tolerances": "exact",
+                }
+                for i in range(patches)
+            ],
+        }
+    )
+
+
+def scene_of(touched: int) -> SceneConfig | None:
+    """Return a scene in which a sphere presses with 1 N on each of the first ``touched`` patches."""
+    if not touched:
+        return None
+    sphere = {"shape": "sphere", "radius_m": 0.01}
+    touch = {"at_m": [0.016, 0.016], "force_n": 1.0, "from_s": 0.1, "to_s": 3600.0}
+    return parse_scene(
+        {
+            "bodies": [{"name": f"ball{i}", **sphere} for i in range(touched)],
+            "touches": [{"body": f"ball{i}", "patch": f"patch{i}", **touch} for i in range(touched)],
+        }
+    )
+
+
+def _solved(host: Host) -> int:
+    return sum(patch.solved for patch in host.stats().patches.values())
+
+
+def _cpu_ns(segments: Sequence[Segment]) -> Counter[str]:
+    """Return the CPU time of the nodes, the buses and the host so far, ns."""
+    by_bus: Counter[str] = Counter()
+    for each in segments:
+        by_bus.update(each.cpu_ns)
+    spent: Counter[str] = Counter(bus=by_bus.total())
+    for thread in threading.enumerate():
+        if thread is threading.main_thread() or thread.ident is None:
+            continue
+        owner = "nodes" if thread.name.startswith("nodes ") else "host"
+        clock = time.pthread_getcpuclockid(thread.ident)
+        spent[owner] += time.clock_gettime_ns(clock) - by_bus[thread.name]
+    return spent

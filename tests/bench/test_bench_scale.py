@@ -1,0 +1,35 @@
+"""``bench scale``: every scan is solved, and the parts of the cost are there."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from skinnode.bench import scale
+from skinnode.bench.plots.scale import draw
+from skinnode.cli.main import main
+
+
+def test_each_scan_of_each_patch_is_solved() -> None:
+    row = scale.measure(patches=5, touched=2, scans=4)  # on two buses
+    assert row["fields"] == 5 * 4
+    assert all(row[part] > 0.0 for part in ("nodes_ms", "bus_ms", "host_ms", "faster", "memory_mb"))
+
+
+def test_the_command_prints_writes_and_plots(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(scale, "FIXED", 2)
+    monkeypatch.setattr(scale, "TOUCHED", (0, 2))
+    file, image = tmp_path / "scale.json", tmp_path / "scale.png"
+    with pytest.raises(SystemExit) as done:
+        main(f"bench scale --patches 1 --patches 2 --scans 2 --json {file} --plot {image}".split())
+    assert done.value.code == 0
+    assert "CPU time per patch and scan" in capsys.readouterr().out
+    figures = json.loads(file.read_text())
+    assert [row["patches"] for row in figures["area"]] == [1, 2]
+    assert [row["touched"] for row in figures["contact"]] == [0, 2]
+    assert image.read_bytes().startswith(b"\x89PNG")
+    draw(image, figures)

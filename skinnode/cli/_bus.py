@@ -1,4 +1,4 @@
-"""Finds the bus and node of a command from options that name an interface, or a bus in a hand file."""
+"""Finds the bus and node that a command's options specify, with or without a hand file."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def find_buses(
     hand: Path | None,
     bus: str | None,
 ) -> list[Place]:
-    """Return the bus that the options name, or every bus of the hand if ``--bus`` is not given.
+    """Return the bus that the options specify, or every bus of the hand if ``--bus`` is not given.
 
     Args:
         interface: Value of ``--interface``.
@@ -81,7 +81,7 @@ def find_bus(
     hand: Path | None,
     bus: str | None,
 ) -> Place:
-    """Return the single bus that the options name. The arguments are those of :func:`find_buses`.
+    """Return the single bus that the options specify. The arguments are those of :func:`find_buses`.
 
     Raises:
         ConfigError: The options are not valid, or they match several buses.
@@ -143,7 +143,7 @@ def node_among(node: str, places: list[Place], key: str) -> tuple[Place, int]:
     Args:
         node: A node-ID or the name of a patch.
         places: Buses to search.
-        key: Name of the command-line argument that holds ``node``, for error messages.
+        key: Name of the command-line argument that contains the node, for error messages.
 
     Raises:
         ConfigError: No patch has this name, or the bus of the node-ID is ambiguous.

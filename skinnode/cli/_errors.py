@@ -12,7 +12,7 @@ from skinnode.cli._exit_status import COULD_NOT_RUN, FINE, closed_pipe
 from skinnode.errors import ConfigError, SkinError
 from skinnode.text.printable import PrintableStream
 
-_UsageError: type[Exception] = typer.BadParameter.__mro__[1]  # typer uses click or its own copy of click
+_UsageError: type[Exception] = typer.BadParameter.__mro__[1]  # from click, or from typer's own copy of click
 
 
 def run(app: typer.Typer, argv: Sequence[str] | None = None) -> int:
@@ -64,7 +64,7 @@ def _wants_help(error: Any) -> bool:
     """Return True if a command group was called without a command, after printing the group's help."""
     if type(error).__name__ != "NoArgsIsHelpError":
         return False
-    text = error.ctx.get_help()  # rich prints the help and returns no text
+    text = error.ctx.get_help()  # if rich is in use, get_help() prints the help and returns no text
     if text:
         typer.echo(text, err=True)
     return True

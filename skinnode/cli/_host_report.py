@@ -272,7 +272,7 @@ def _patch_text(name: str, facts: Mapping[str, object]) -> str:
     worst = "".join(f"  {facts[key]} {key}" for key in ("torn", "corrupt", "missed", "skipped") if facts[key])
     trust = f"  untrusted: {facts['distrust']}" if facts["trusted"] is False else _doubts(facts)
     if facts["noise_factor"] not in (None, 1.0):
-        trust += f"  noise {facts['noise_factor']:.2g} times as stated"
+        trust += f"  noise {facts['noise_factor']:.2g} times the stated value"
     why = f" ({facts['reason']})" if facts["reason"] else ""
     return (
         f"{name} {facts['condition']}{why}  {facts['solved']} fields{deepest}{trust}"

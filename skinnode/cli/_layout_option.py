@@ -49,5 +49,7 @@ def find_layout(text: str) -> PatchLayout:
             OPTION, text, f"a function that returns a layout ({type(error).__name__}: {what})"
         ) from error
     if not isinstance(layout, PatchLayout):
-        raise ConfigError(OPTION, text, f"a PatchLayout, or a function that returns one, not {layout!r:.80}")
+        raise ConfigError(
+            OPTION, text, f"a PatchLayout, or a function that returns a PatchLayout, not {layout!r:.80}"
+        )
     return layout

@@ -46,7 +46,7 @@ def host(
     report = JsonReport() if as_json else TextReport()
     if is_cold():
         report.note("compiling the kernels once; this takes a few seconds")
-    for patch in plan.patches:  # no resource is open yet, so Ctrl-C can end the program
+    for patch in plan.patches:  # no resource is open yet, so Ctrl-C may end the program immediately
         check_solvable(patch, plan.solver)
     with stop_on_signal() as stop:
         status = _run(plan, seconds, report, stop)

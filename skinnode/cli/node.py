@@ -32,7 +32,12 @@ def node(
     ],
     node_id: Annotated[
         int | None,
-        typer.Option(min=1, max=127, help="Node-ID, unless LSS has stored another in --store.", metavar="N"),
+        typer.Option(
+            min=1,
+            max=127,
+            help="Node-ID, unless the --store file contains a node-ID set by LSS.",
+            metavar="N",
+        ),
     ] = None,
     layout: Annotated[str, typer.Option(help=LAYOUT_HELP, metavar="LAYOUT")] = "staggered",
     interface: Annotated[str, typer.Option(help="python-can interface.", metavar="NAME")] = "socketcan",

@@ -99,7 +99,7 @@ def od(
 def _require_combination(
     where: tuple[int, int | None] | None, write: str | None, dcf: Path | None, diff: Path | None
 ) -> None:
-    """Raise ConfigError if the options exclude each other."""
+    """Raise ConfigError if mutually exclusive options are given."""
     from skinnode.errors import ConfigError
 
     if write is not None and where is None:
@@ -164,7 +164,7 @@ def _sheet_if_any(remote: RemoteOd, eds: Path | None) -> DataSheet:
     """Return the EDS of the node.
 
     The EDS has no entries if a third-party device has no EDS file, or if the node refuses to identify itself.
-    The objects then have only their CiA 301 names.
+    Without EDS entries, the objects have only their CiA 301 names.
     """
     from skinnode.conformance.eds_reader import Eds
     from skinnode.diagnose.data_sheet import DataSheet, data_sheet_of

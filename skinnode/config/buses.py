@@ -11,7 +11,7 @@ from skinnode.config.table import Allowed, Name, NodeId, Table, one_of
 from skinnode.errors import ConfigError
 
 MAX_BUS_LOAD: Final = 0.70
-"""Default load limit of a bus, as a fraction. Above this limit, the response times of low-priority frames
+"""Default load limit of a bus, as a fraction. At higher bus loads, the response times of low-priority frames
 grow steeply (Davis, Burns, Bril, Lukkien: Controller Area Network (CAN) schedulability analysis, Real-Time
 Systems 35, 2007), and too little capacity remains to repeat frames after errors."""
 
@@ -25,7 +25,7 @@ _KEYS_OF_TABLE: Final = ("interface", "channel", "bitrate", "data_bitrate", "fd"
 class OtherFrame(Table):
     """Frame that another device, such as a drive, sends on the bus.
 
-    The frame adds to the bus load and delays the frames of the hand.
+    The frame adds to the bus load and delays the hand's frames.
     """
 
     can_id: Annotated[int, Field(ge=0, le=0x7FF), Allowed("an integer from 0 to 0x7FF")]
@@ -67,7 +67,7 @@ class BusConfig(Table):
     """Frames that the host may send as a guest: ``nothing``, or ``sdo`` requests that identify and configure
     the patches and read their data."""
     heartbeat_node_id: Annotated[NodeId | None, Allowed("an integer from 1 to 127 that no node uses")] = None
-    """Node-ID in the heartbeat that the host sends as master. The patches monitor this heartbeat and go
+    """Node-ID in the heartbeat that the host sends as master. The patches monitor the host's heartbeat and go
     pre-operational when it stops. If the node-ID is None, the host sends no heartbeat."""
     max_load: Annotated[
         float, Field(gt=0, le=1, allow_inf_nan=False), Allowed("a number above 0 and up to 1")
@@ -124,9 +124,9 @@ class BringUpConfig(Table):
     """Action if a patch does not answer at start-up: ``refuse`` does not start the hand; ``wait`` starts the
     other patches and waits for the missing patch."""
     heartbeat_ms: Annotated[int, Field(ge=20, le=10_000), Allowed("an integer from 20 to 10000")] = 250
-    """Heartbeat period of the nodes, milliseconds. The host sets this period in the nodes. A guest that sends
-    nothing cannot set the period, and assumes that the nodes use it. At a period of 250 ms, a lost node is
-    detected within a second, and the heartbeats of four nodes use 0.1 % of the bandwidth."""
+    """Heartbeat period of the nodes, milliseconds. The host sets the heartbeat period in the nodes. A guest
+    that sends nothing cannot set the period, and assumes that the nodes use it. At a period of 250 ms, a lost
+    node is detected within a second, and the heartbeats of four nodes use 0.1 % of the bandwidth."""
 
     @property
     def heartbeat_s(self) -> float:

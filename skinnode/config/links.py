@@ -39,7 +39,7 @@ class PoseConfig(Table):
         Field(strict=False),
         Allowed("three numbers [roll, pitch, yaw], radians"),
     ] = None
-    """Orientation as roll, pitch, yaw about the fixed axes x, y, z, radians, as in URDF."""
+    """Roll, pitch and yaw (radians) about the fixed axes x, y and z, as in URDF."""
 
     @model_validator(mode="after")
     def _one_unit_orientation(self) -> PoseConfig:

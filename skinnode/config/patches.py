@@ -50,8 +50,8 @@ class LayoutConfig(Table):
 
     file: Annotated[Path | None, Field(strict=False), Allowed("the path of a layout file")] = None
     """NPZ or TOML file with the electrodes (``upper_m``, ``lower_m``, metres), or TOML file with the other
-    keys of this table. With a file, ``coordinates`` is the only other key allowed here. The path is relative
-    to the hand file."""
+    keys of this table. If a file is given, the only other key allowed in the table is ``coordinates``. The
+    path is relative to the hand file."""
     preset: Annotated[Preset, one_of(Preset)] = "staggered"
     """Named arrangement of the electrodes."""
     pitch_m: Length = 4e-3
@@ -214,7 +214,7 @@ class PatchConfig(Table):
         Path | None, Field(strict=False), Allowed("the path of a file of resistances in ohm")
     ] = None
     """File with the resistances at rest, ohm: one line per upper wire, one number per lower wire.
-    None: the host reads these resistances from the node."""
+    None: the host reads the resistances at rest from the node."""
     calibration: CalibrationConfig = CalibrationConfig()
     tolerances: Annotated[TolerancesConfig, Field(json_schema_extra=_or_named), Allowed(_TOLERANCES)] = (
         TolerancesConfig()

@@ -23,7 +23,7 @@ class SolverConfig(Table):
     operator: Annotated[Operator, one_of(Operator)] = "dogleg"
     """Operator (type of solver step) of the exact inverse."""
     stiffness_n_per_m: Stiffness | None = None
-    """Stiffness of the rubber under one electrode, N/m, from which the exact inverse computes forces. The
+    """Stiffness of the rubber under one electrode, N/m; the exact inverse uses it to compute forces. The
     calibration of a patch can override this stiffness."""
     deadline_us: Annotated[
         int | None, Field(ge=100, le=10_000_000), Allowed("an integer from 100 to 10000000")

@@ -1,8 +1,8 @@
 """Reads TOML files and returns the value of each key with its line and column.
 
-tomllib parses the file and checks its syntax, but does not record positions. Files that tomllib accepts are
-therefore scanned again for the positions of keys. The scanner is hand-written because no maintained TOML
-reader with positions is as strict as tomllib.
+tomllib parses the file and checks its syntax, but does not record positions. Each file that tomllib accepts
+is therefore scanned again to find the positions of its keys. The scanner is hand-written because no
+maintained TOML reader with positions is as strict as tomllib.
 """
 
 from __future__ import annotations
@@ -78,7 +78,7 @@ def read_toml(path: Path, what: str) -> Document:
         raise ConfigError(
             f"byte {error.start}", error.object[error.start : error.end], "UTF-8", where=str(path)
         ) from None
-    if _LONG_KEY.search(text):  # tomllib would take minutes to parse such a key
+    if _LONG_KEY.search(text):  # tomllib would take minutes to parse a key this long
         raise ConfigError(what, Shown("deeper nesting"), _TOO_DEEP, where=str(path))
     try:
         table = tomllib.loads(text)

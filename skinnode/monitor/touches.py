@@ -41,7 +41,7 @@ def touches_of(field: FieldFrame, rest_m: Float) -> tuple[Touch, ...]:
     """Return the contacts on a patch, strongest first.
 
     If the exact inverse computed the field and the field contains no contacts (for example, an old
-    recording), each connected region of pressed skin is returned as a contact. Forces of such regions are
+    recording), each connected region of pressed skin is returned as a contact. The forces of a region are
     known only if a stiffness was specified.
 
     Args:

@@ -183,7 +183,7 @@ class CanPort:
         return self._reader is not None
 
     def fileno(self) -> int:
-        """Return the socket's file descriptor if the port :attr:`reads_batches`; -1 otherwise."""
+        """Return the socket's file descriptor; -1 if the port does not read batches of frames."""
         return -1 if self._reader is None else self._reader.fileno()
 
     @property

@@ -38,8 +38,8 @@ LONG_NS: Final = 5_000_000
 frame may remain in the kernel for up to 1.5 times this pause."""
 
 _BEFORE_NS: Final = 800_000
-"""Time before a predicted arrival at which frames that have already arrived are fetched, ns, so that little
-work remains when the predicted frame arrives."""
+"""Lead time of an extra fetch before each predicted arrival, ns. The extra fetch leaves little work for the
+moment when the predicted frame arrives."""
 _SHORT_NS: Final = 300_000
 """Minimum pause between two fetches, ns; used while a predicted frame is imminent or slightly overdue."""
 _LATE_NS: Final = 600_000
@@ -75,7 +75,7 @@ class Intake:
             raise ValueError(f"capacity: got {capacity}, must be at least 1")
         self.port = port
         self.seen_ns = 0
-        """Monotonic time up to which all arrived frames have been queued or dropped, ns."""
+        """Monotonic time, ns; all frames that arrived earlier have been queued or dropped."""
         self.due_ns = 0
         """Monotonic time of the next :meth:`fetch`, ns. Used only by the receiver."""
         self._capacity = capacity
@@ -239,12 +239,15 @@ class Receiver:
             self.resume(intake)
 
     def wait(self, timeout_s: float) -> None:
-        """Wait up to ``timeout_s`` for frames or an error in any intake. Only one thread may wait."""
+        """Wait up to ``timeout_s`` for frames or an error in any intake.
+
+        Only one thread may call this method.
+        """
         with contextlib.suppress(queue.Empty):
             self._news.get(timeout=timeout_s)
 
     def resume(self, intake: Intake) -> None:
-        """Resume reception on a port that has failed and been reopened. Any thread."""
+        """Resume reception on a port that has failed and been reopened. Any thread may call this method."""
         if intake.port.reads_batches:
             intake.resume()
             self._joining.append(intake)

@@ -107,7 +107,7 @@ class SocketReader:
         earliest_ns, latest_ns = now_ns - _OLDEST_NS, now_ns + _NEWEST_NS
         second = second_ns = 0
         frames: list[Frame] = []
-        new = tuple.__new__  # a NamedTuple's own __new__ takes twice as long
+        new = tuple.__new__  # Frame.__new__ would take twice as long
         for (control, length), record in zip(batch.used(), _RECORD.iter_unpack(batch.taken()), strict=True):
             word, size, data, seconds, nanoseconds, hardware_s = record
             if control == _STAMPED_BYTES and not hardware_s:

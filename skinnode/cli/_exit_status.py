@@ -65,7 +65,7 @@ def main_of(module: str, argv: Sequence[str] | None = None) -> NoReturn:
     except Stopped as stopped:
         status = int(stopped.code or 0)
         _flush(status)
-    _handle(_exit_at_once)  # while Python waits for threads, a signal would print a traceback
+    _handle(_exit_at_once)  # a signal during Python's final wait for threads would print a traceback
     sys.exit(status)
 
 

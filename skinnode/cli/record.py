@@ -125,8 +125,7 @@ def _follow(
     as_json: bool,
     check: Callable[[], object] = lambda: None,
 ) -> None:
-    """Print a line every second until stopped or the duration elapses; exceptions from ``check``
-    propagate."""
+    """Print a line every second until stopped or the duration elapses; propagate errors of ``check``."""
     start_s = time.monotonic()
     end_s = float("inf") if seconds is None else start_s + seconds
     due_s = start_s + 1.0

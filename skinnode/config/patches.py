@@ -145,7 +145,7 @@ class CalibrationConfig(Table):
 
 
 class TolerancesConfig(Table):
-    """Manufacturing tolerances of a patch, which the reported standard deviations include.
+    """Manufacturing tolerances of a patch, which are included in the reported standard deviations.
 
     The text `"ordinary"` selects the defaults below; `"exact"` selects a patch without deviations from its
     layout, such as a simulated patch. Only the posterior can include tolerances. If a patch has tolerances,

@@ -46,7 +46,7 @@ class FrameLog:
 
     Raises:
         ConfigError: if the file exists already, or cannot be created.
-        OSError: if writing to the disk fails; raised by the other methods.
+        OSError: raised by the other methods if writing to the disk fails.
     """
 
     def __init__(self, path: Path, channels: tuple[str, ...]) -> None:

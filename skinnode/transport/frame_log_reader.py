@@ -56,7 +56,7 @@ class _Container(NamedTuple):
 
 
 class FrameLogReader:
-    """Reader of a log file; iterate over the reader, once only, to get the frames. Owned by one thread.
+    """Reader of a log file; iterating over the reader yields the frames, once only. Owned by one thread.
 
     Raises:
         ConfigError: if the file cannot be opened, or its name does not end in ``.log`` or ``.blf``.

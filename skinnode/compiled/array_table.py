@@ -1,8 +1,8 @@
 """Tables that pass many arrays and numbers to a kernel in one argument, with access by name.
 
 Numba checks and unpacks every argument of every call. For the fifty arrays of a patch, this overhead is 4 µs
-with warm caches and 40 µs with cold caches, as much as for solving four wires. An :class:`ArrayTable` is one
-array of addresses and shapes. A subclass declares the fields once, for Python and for kernels:
+with warm caches and 40 µs with cold caches, about the time needed to solve four wires. An :class:`ArrayTable`
+is one array of addresses and shapes. A subclass declares the fields once, for Python and for kernels:
 
     class Scan(ArrayTable):
         ohm: Annotated[NDArray[np.float64], "U K"]     # element type and axes
@@ -92,7 +92,7 @@ class _Field:
                 )
 
     def _wanted(self) -> str:
-        """Return the requirements on the array as text for an error message."""
+        """Return the part of an error message that states the requirements on the array."""
         return f"must be a contiguous, writable {self.dtype} array with axes ({', '.join(self.axes or ())})"
 
 
@@ -180,7 +180,7 @@ class ArrayTable:
         vars(self).update(values, table=table)  # keeps the arrays alive
 
     def __setattr__(self, name: str, value: object) -> None:
-        if name in self._names and value is not getattr(self, name):  # x += 1 assigns the same object
+        if name in self._names and value is not getattr(self, name):  # allows ``table.x += 1``
             raise AttributeError(
                 f"{type(self).__name__}.{name}: kernels use its address; write to it in place"
             )

@@ -42,7 +42,7 @@ _KERNEL_FILES = (
 def _writable(folder: Path) -> bool:
     try:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-        if folder.stat().st_uid != os.getuid():  # code from another user's folder must never be loaded
+        if folder.stat().st_uid != os.getuid():  # never load another user's compiled code
             return False
         with tempfile.TemporaryFile(dir=folder):
             return True
@@ -107,8 +107,8 @@ def njit(function: _F) -> _F:
 def njit_brief(function: _F) -> _F:
     """Compile ``function`` as :func:`njit` does, but hold the interpreter lock while it runs.
 
-    Use this decorator for kernels that take about a microsecond. If such a kernel released the lock, another
-    thread could hold the lock for longer than the rest of the field's computation takes.
+    Use this decorator for kernels that take about a microsecond. If such a short kernel released the lock,
+    reacquiring the lock from another thread could take longer than all other computations of a field.
     """
     return _kept(function, nogil=False)
 

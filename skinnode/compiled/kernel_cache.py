@@ -91,7 +91,7 @@ class KernelCache:
 
     def save_overload(self, signature: Any, compiled: Any) -> None:
         """Write ``compiled`` to the cache if possible."""
-        if compiled.lifted or compiled.library.has_dynamic_globals:  # numba's own cache skips such code too
+        if compiled.lifted or compiled.library.has_dynamic_globals:  # numba's cache skips it too
             return
         path = self._path(signature, compiled.codegen)
         try:
@@ -125,7 +125,7 @@ def _file_digest(file: str) -> str:
 
 def _read(path: Path) -> bytes:
     """Return the payload of a file. Raises OSError if the file is unreadable, ValueError if it is damaged."""
-    if not stat.S_ISREG(path.stat().st_mode):  # reading a pipe would block until its writer writes
+    if not stat.S_ISREG(path.stat().st_mode):  # reading a named pipe could block forever
         raise ValueError("not a file")
     data = path.read_bytes()
     payload = data[_HEAD_BYTES:]
@@ -190,7 +190,7 @@ def _locked(folder: Path) -> Iterator[None]:
 
 
 def _report(folder: Path, what: str) -> None:
-    """Log ``what`` once per process and folder, so that forty kernels on a full disk produce one line."""
+    """Log ``what`` once per process and folder, so that a full disk produces a single line."""
     kind = f"{folder} {what[:1].isdigit()}"
     if kind not in _reported:
         _reported.add(kind)

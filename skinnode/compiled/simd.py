@@ -1,10 +1,10 @@
 """Explicit vectors of doubles for kernels in which automatic vectorisation is not good enough.
 
-LLVM prefers 256-bit vectors even if 512-bit vectors are twice as fast. It does not vectorise unless it can
-prove that rows do not overlap, and it may keep sums in memory instead of registers. A kernel that calls
-``load``, ``fma`` and ``store`` gets exactly these instructions, and each lane accumulates its own sum in the
-order written. The result is therefore the same for any number of threads and any split of the columns. On
-processors with narrower vectors, each operation is split.
+LLVM prefers 256-bit vectors even if 512-bit vectors are twice as fast. LLVM vectorises only code whose rows
+provably do not overlap, and it may keep sums in memory instead of registers. ``load``, ``fma`` and ``store``
+compile to exactly these instructions, and each lane accumulates its own sum in the order written. The result
+is therefore the same for any number of threads and any split of the columns. On processors with narrower
+vectors, each operation is split.
 
 Vectors support +, − and *; a double in such an expression is broadcast to a vector.
 """
@@ -203,7 +203,7 @@ def drop(_typing: Any, value: Any, count: Any) -> Any:
 
 @extending.intrinsic  # type: ignore[untyped-decorator]
 def total(_typing: Any, value: Any) -> Any:
-    """Return the sum of the lanes, adding halves pairwise."""
+    """Return the sum of the lanes, computed by repeatedly adding one half of the vector to the other."""
 
     def generate(_context: Any, builder: Any, _sig: Any, arguments: Any) -> Any:
         value, width = arguments[0], LANES
@@ -219,7 +219,7 @@ def total(_typing: Any, value: Any) -> Any:
 
 @extending.intrinsic  # type: ignore[untyped-decorator]
 def rough_inverse_root(_typing: Any, value: Any) -> Any:
-    """Return 1 / √value to within 3.5 % by bit manipulation; inf below the smallest normal number.
+    """Return 1 / √value to within 3.5 % by bit manipulation; inf for values below the smallest normal number.
 
     Source: Lomont, Fast inverse square root, 2003, for doubles.
     """

@@ -1,14 +1,15 @@
 """Surface displacement of an incompressible elastic layer bonded to a rigid base, under normal loads.
 
 In the Fourier domain, with the wave number k, the thickness h, x = k h and the shear modulus G, a normal
-pressure of amplitude 1 displaces the surface by
+pressure of amplitude 1 displaces the surface by the amplitudes
 
     normal      (sinh 2x − 2x) / (2 G k (cosh 2x + 1 + 2x²))
     outwards            x²     / (  G k (cosh 2x + 1 + 2x²))
 
-in the direction of the load, and away from it along the surface, 90° out of phase. (The biharmonic stream
-function of an incompressible layer with no displacement at z = −h and no shear traction at z = 0.) For x → ∞
-the normal displacement is that of a half-space, 1 / (2 G k), and the surface does not move outwards.
+The normal displacement is in the direction of the load. The outward displacement is along the surface, away
+from the load, and 90° out of phase. Both formulas follow from the biharmonic stream function of an
+incompressible layer, with no displacement at z = −h and no shear traction at z = 0. For x → ∞ the normal
+displacement is that of a half-space, 1 / (2 G k), and the outward displacement vanishes.
 """
 
 from __future__ import annotations
@@ -26,7 +27,8 @@ BLUR: Final = 0.1
 """Standard deviation of the Gaussian that blurs the rim of the load, relative to its radius. The blur limits
 the wave numbers that contribute."""
 _END: Final = 6.0
-"""Largest wave number times the standard deviation of the blur; the transform of the load is 1e-8 there."""
+"""Largest wave number in the integral, times the standard deviation of the blur; at this wave number, the
+blur has reduced the transform of the load to 1e-8."""
 _NODES_PER_WAVE: Final = 8
 """Number of quadrature nodes per period of the Bessel functions at the largest distance."""
 
@@ -40,12 +42,12 @@ def bonded_layer_compliance(
         rubber: The material; its Poisson's ratio is taken as 0.5.
         thickness_m: Thickness h of the layer, m.
         distance_m: Distance of each surface point from the centre of the load, m; any shape.
-        radius_m: Radius of the disc, m; the pressure is uniform but for :data:`BLUR`.
+        radius_m: Radius of the disc, m; the pressure is uniform except for the blurred rim (:data:`BLUR`).
 
     Returns:
-        Displacement along the force, and away from it along the surface for a force that presses on the
-        layer, m/N, each with the shape of ``distance_m``. The second one has the opposite sign for a force
-        along +z, the outward normal.
+        Two displacements per unit force, m/N, each with the shape of ``distance_m``: along the force, and
+        along the surface away from a force that presses on the layer. For a force along +z, the outward
+        normal, reverse the sign of the second displacement.
 
     Raises:
         ValueError: If the thickness or the radius is not positive and finite.

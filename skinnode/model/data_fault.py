@@ -1,4 +1,4 @@
-"""Faults in the data of a patch: which readings failed a test and were left out of a field."""
+"""Faults in the data of a patch: readings that failed a test and were left out of a field."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 
 class FaultyPart(enum.StrEnum):
-    """Part of a patch whose readings are at fault."""
+    """Part of a patch whose readings are faulty."""
 
     CROSSING = "crossing"
     """One pair of an upper and a lower wire."""
@@ -35,15 +35,15 @@ class DataFault:
     part: FaultyPart
     kind: FaultKind
     upper: int | None = None
-    """Upper wire; None if all upper wires are concerned."""
+    """Number of the upper wire; None if the fault affects all upper wires."""
     lower: int | None = None
-    """Lower wire; None if all lower wires are concerned."""
+    """Number of the lower wire; None if the fault affects all lower wires."""
     since: int = 0
-    """Scan in which the fault was first found: the host's scan number, or, without a host, the number of
+    """Scan in which the fault was first found: the host's scan number or, without a host, the number of
     frames since the tracker was reset."""
     deviations: float = 0.0
-    """Size of the test's statistic, as the number of standard deviations at which a normal variable is
-    equally unlikely; inf if the fault is certain."""
+    """Significance of the fault, in standard deviations of a normal variable with the same tail probability;
+    inf if the fault is certain."""
 
     @property
     def place(self) -> str:

@@ -1,4 +1,4 @@
-"""Text that explains why a field is not trusted."""
+"""Explanation, as text, of why a field is not trusted."""
 
 from __future__ import annotations
 

@@ -67,9 +67,9 @@ def point_compliance(rubber: Rubber, offset_m: ArrayLike, *, softening_m: float 
     Args:
         rubber: The material.
         offset_m: (P, 2) offset of each point from the load, metres.
-        softening_m: Softening length ε, metres; r is replaced with √(r² + ε²). This spreads the load over a
-            spot of about the radius ε, so that the displacement at the load stays finite. A value of 0 means
-            an ideal point load.
+        softening_m: Softening length ε, metres; r is replaced with √(r² + ε²). The softening spreads the load
+            over a spot of about the radius ε, so that the displacement at the load stays finite. A value of 0
+            means an ideal point load.
 
     Returns:
         (P, 3, 3) compliance, m/N. The last axis is the component of the load; the second-to-last axis is the
@@ -93,7 +93,7 @@ def rectangle_compliance(rubber: Rubber, offset_m: ArrayLike, size_m: tuple[floa
     """Return the displacement of surface points per unit traction on a rectangle; finite everywhere.
 
     The result is the closed form for a uniform load on a rectangle (Love, Philosophical Transactions A 228,
-    1929, for the normal part; Johnson eq. 3.25): each entry of the compliance matrix has an elementary
+    1929, for the normal part; Johnson eq. 3.25). Each entry of the compliance matrix has an elementary
     antiderivative in x and y, which is evaluated at the corners.
 
     Args:
@@ -155,7 +155,7 @@ def _compliance(  # noqa: PLR0913 - the six functions in the matrix
 
 @dataclass(frozen=True)
 class HertzContact:
-    """Hertzian contact with a rigid sphere that presses on the rubber and slides over it.
+    """Hertzian contact between the rubber and a rigid sphere that presses on the rubber and slides over it.
 
     The traction on the rubber is p (t_x, t_y, −1) with p = p₀ √(1 − r²/a²) inside the contact circle. The
     surface displacement has a closed form everywhere. Since p is radially symmetric, all integrals follow
@@ -166,11 +166,11 @@ class HertzContact:
     Args:
         rubber: The material.
         radius_m: Radius of the sphere, metres.
-        indentation_m: Approach δ of the sphere, metres. This approach is the normal displacement at the
-            centre of a contact without shear or, if ν = 0.5, of any contact. 0 means no contact.
+        indentation_m: Approach δ of the sphere, metres; 0 means no contact. Without shear, or if ν = 0.5, δ
+            equals the normal displacement at the centre of the contact.
         center_m: Centre (x, y) of the contact circle, metres.
-        traction_ratio: (t_x, t_y) ratio of the shear on the rubber to the pressure: the coefficient of
-            friction in the sliding direction of the sphere.
+        traction_ratio: (t_x, t_y) ratio of the shear traction on the rubber to the pressure: a vector in the
+            sliding direction of the sphere whose length is the coefficient of friction.
 
     Raises:
         ValueError: If a value is not finite, the radius is not positive, or the indentation is negative.
@@ -222,7 +222,7 @@ class HertzContact:
         return np.asarray(pressure[:, None] * np.array([*self.traction_ratio, -1.0]))
 
     def displacement_m(self, points_m: ArrayLike) -> Float:
-        """Return the displacement (P, 3) in m of surface points (P, 2) in m; exactly 0 without a contact.
+        """Return the displacement (P, 3) in m of surface points (P, 2) in m; exactly 0 without contact.
 
         Raises:
             ValueError: If the array has the wrong shape or contains NaN.
@@ -258,13 +258,13 @@ def _hertz_integrals(offset: Float, a: float, peak: float) -> tuple[Float, Float
     phi = c * a * a * (2 - s2)
     isotropic = c * a * a * (1 - 0.75 * s2)
     radial = np.full_like(r2, 0.5 * c)
-    # (1 − (1 − s²)^{3/2}) / s² without cancellation at the centre
+    # computes (1 − (1 − s²)^{3/2}) / s² without cancellation at the centre
     root = np.sqrt(1 - s2)
     enclosed = 2 / 3 * math.pi * peak * (1 + root + (1 - s2)) / (1 + root)
     far = ~near
     q2 = r2[far]
     w = np.sqrt(q2 - a * a)
-    angle = np.arctan2(a, w)  # arcsin(a/r) without loss of digits near the edge
+    angle = np.arctan2(a, w)  # arcsin(a/r), accurate near the edge
     c = math.pi * peak / (2 * a)
     outside = c * ((2 * a * a - q2) * angle + a * w)
     mean = c * ((a * a - 0.25 * q2) * angle + (0.75 * a * a + 0.25 * w * w) * a * w / q2)

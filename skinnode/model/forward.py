@@ -2,8 +2,8 @@
 
 The rubber between two electrodes at distance d is a resistor ρ d. The N·M paths between an upper and a lower
 wire are in parallel, so  ρ / R_k = F_k(X) = Σ_j Σ_i 1 / |x_i − x̄_jk|  (Xu et al. 2018, eq. 2). F is the
-potential of the lower wire's M unit charges summed over the N electrodes of the upper wire, and
-∂F_k/∂x_i = − Σ_j (x_i − x̄_jk) / |x_i − x̄_jk|³.
+potential of M unit charges at the lower wire's electrodes, summed over the N electrodes of the upper wire,
+and ∂F_k/∂x_i = − Σ_j (x_i − x̄_jk) / |x_i − x̄_jk|³.
 
 These functions are the readable reference for the compiled versions in ``kernels``.
 """
@@ -23,7 +23,7 @@ def _offsets(layout: PatchLayout, upper_m: ArrayLike) -> Float:
 
 
 def potential_per_m(layout: PatchLayout, upper_m: ArrayLike) -> Float:
-    """Return F (U, K) in 1/m for electrodes at ``upper_m`` (U, N, 3) in metres; inf if two coincide.
+    """Return F (U, K) in 1/m for electrodes at ``upper_m`` (U, N, 3) in metres; inf if electrodes coincide.
 
     Raises:
         ValueError: If the array has the wrong shape or contains NaN.

@@ -18,7 +18,7 @@ Z_95_TWO_SIDED: Final = 1.959964
 
 @dataclass(frozen=True, slots=True)
 class ScanStamp:
-    """Identity and times of a scan; times are from the host's monotonic clock unless stated otherwise."""
+    """Scan number and times of a scan; the clock is the host's monotonic clock unless stated otherwise."""
 
     patch: str
     """Name of the patch."""
@@ -28,9 +28,9 @@ class ScanStamp:
     """Scan number in the CAN frames, u8; equal to the SYNC counter if SYNC frames contain a counter."""
     device_time_us: int
     """Time on the node's own clock at the SYNC of the scan, µs, 0 to 2³² − 1 with wrap-around; 0 if the
-    summary was lost. The resolution is 64 µs; the host derives the upper 10 bits (for the first scan, from
-    its own clock). The node's full 32-bit time with a resolution of 1 µs can be read from 0x2011:4; patches
-    of revision 1.0 send it with each scan."""
+    summary was lost. The resolution is 64 µs. The host derives the upper 10 bits; for the first scan, it uses
+    its own clock. The node's full 32-bit time with a resolution of 1 µs can be read from 0x2011:4; patches of
+    revision 1.0 send it with each scan."""
     t_sync_ns: int
     """Time at which the SYNC of this scan was sent or received; 0 if unknown."""
     t_receive_ns: int
@@ -39,7 +39,7 @@ class ScanStamp:
     """Time at which the field was ready; 0 if it is not ready yet."""
 
     def solved_at(self, t_ns: int) -> ScanStamp:
-        """Return the stamp of a field that was ready at ``t_ns``."""
+        """Return a copy of the stamp for a field that was ready at ``t_ns``."""
         return ScanStamp(
             self.patch, self.scan, self.counter, self.device_time_us, self.t_sync_ns, self.t_receive_ns, t_ns
         )
@@ -65,7 +65,7 @@ class SolveStats:
     jacobians: int
     """Number of evaluations of J, each of which also yields F."""
     steps: int
-    """Number of operator steps or, for a posterior, of factorisations."""
+    """Number of operator steps or, in a posterior solve, number of factorisations."""
     time_s: float
     """Elapsed time, s."""
 
@@ -95,9 +95,10 @@ class Contact:
     """(2,) standard deviation of the shear force, N."""
     force_calibrated: bool = False
     """Whether the forces are based on a calibration of this patch (``force_calibrated`` of Tracker or of
-    ``[patches.calibration]``). Without a calibration, five standard deviations of the normal force cover the
-    range from a half-space's force to the force of a bonded layer as thick as the clearance. This range is a
-    bound on the model error, not noise. The standard deviation of the shear force includes no such bound."""
+    ``[patches.calibration]``). Without a calibration, the standard deviation of the normal force is a bound
+    on the model error: five standard deviations cover both the force computed for a half-space and the force
+    computed for a bonded layer as thick as the clearance. The standard deviation of the shear force includes
+    no such bound."""
     axes: Float = field(default_factory=lambda: _FLAT)
     """(3, 3) unit vectors as rows, in the frame of the layout, at the centre of the contact: along the wire,
     across the wires and out of the skin. On a flat patch, these vectors are the x, y and z axes."""
@@ -111,49 +112,52 @@ class FieldFrame:
     """(U, N, 3) displacement from the rest position, metres."""
     displacement_std_m: Float
     """(U, N, 3) standard deviation due to noise in the resistances, metres; inf if the displacement is
-    unknown. The part due to a prior includes an allowance for the tail of the prior's errors, so an error
-    above five standard deviations indicates a fault."""
+    unknown. If a prior contributes to the displacement, the standard deviation is enlarged to cover rare
+    large errors of the prior, so an error above five standard deviations indicates a fault."""
     status: tuple[Status, ...]
     """Status of each upper wire."""
     residual: Float
     """(U,) RMS of the relative residual F/b − 1 over the valid resistances of a wire."""
     stats: SolveStats
     force_n: Float | None = None
-    """(U, N, 3) loads on the skin in newtons, computed from the displacement of an elastic half-space; in an
-    exact field with a given stiffness, the paper's law F = k Δs. None if ``contacts`` was switched off."""
+    """(U, N, 3) loads on the skin, in newtons; None if ``contacts`` was switched off. The loads follow from
+    the displacement of an elastic half-space or, in an exact field with a given stiffness, from the paper's
+    law F = k Δs."""
     stamp: ScanStamp | None = None
     """Scan from which the field was computed; None outside a host."""
     method: str = "exact"
     """``exact`` if each wire was inverted; ``posterior`` if the patch was estimated as a whole."""
     by_prior: NDArray[np.bool_] | None = None
-    """(U,) wires whose own equations were not sufficient: in an exact field, wires estimated with the prior;
-    in a posterior field, wires without equations. For these wires, ``trusted`` may be based on the prior
-    alone."""
+    """(U,) mask of the wires whose own equations were not sufficient: in an exact field, the wires estimated
+    with the prior; in a posterior field, the wires without equations. Trust in these wires may be based on
+    the prior alone."""
     contacts: tuple[Contact, ...] = ()
     """Contacts, strongest first; empty if nothing touches, if no wire could be solved, or if ``contacts`` was
-    switched off. The number of contacts depends on the previous frame too, so that noise does not split or
-    drop a contact."""
+    switched off. The number of contacts also depends on the previous frame, so that noise does not split or
+    remove a contact."""
     gain: Float | None = None
     """(U,) estimated gain error of each wire's resistances, as a fraction; None if no drift is estimated."""
     noise_factor: float = 1.0
     """Ratio of the estimated noise to the configured noise; exactly 1 while the stream agrees with the
-    configured noise. If the resistances come from codes, the factor applies to the noise before the
-    converter."""
+    configured noise. If the resistances were computed from codes, the ratio refers to the noise at the input
+    of the converter."""
     held: NDArray[np.bool_] | None = None
-    """(U,) wires that were not solved because their movement did not exceed the noise of the frame."""
+    """(U,) mask of the wires that were not solved because their movement did not exceed the noise of the
+    frame."""
     core_std_m: Float | None = None
-    """(U, N, 3) standard deviation of the bulk of the errors, without the allowance for the tail, metres;
-    None if equal to ``displacement_std_m``."""
+    """(U, N, 3) standard deviation of typical errors, not enlarged for rare large errors of the prior,
+    metres; None if equal to ``displacement_std_m``."""
 
     distrust: str | None = None
     """Reason why the field is not trusted, as text; empty if the field is trusted; None if not assessed."""
     wires_trusted: NDArray[np.bool_] | None = None
-    """(U,) wires whose own readings passed every test and are complete enough; None if not assessed."""
+    """(U,) mask of the wires whose readings passed every test and are sufficiently complete; None if not
+    assessed."""
     precise: bool = True
     """Whether the standard deviations are within the limits that the user set (``max_std_m`` and
     ``max_force_std_n`` of Tracker), or within their defaults."""
     data_share: Float | None = None
-    """(U, N, 3) share of each displacement that comes from the data of this frame, not from the prior: 1
+    """(U, N, 3) share of each displacement that comes from the data of this frame rather than the prior: 1
     minus the ratio of the posterior's variance to the prior's. None if all shares are 1, as in an exact
     field."""
     faults: tuple[DataFault, ...] = ()
@@ -166,7 +170,7 @@ class FieldFrame:
 
     @property
     def trusted(self) -> bool:
-        """Whether data and solution pass every test, the data are complete enough, and the patch is alive.
+        """Whether all tests are passed, the data are sufficiently complete, and the patch is alive.
 
         ``distrust`` contains the reason if the field is not trusted. A field that has not been assessed is
         trusted if every wire converged.
@@ -180,11 +184,11 @@ _Record = TypeVar("_Record", Contact, FieldFrame)
 
 
 def sealed(record: _Record, **changes: Any) -> _Record:
-    """Return a copy with ``changes`` and read-only arrays, because many receivers share the copy.
+    """Return a copy with ``changes`` and read-only arrays, which several receivers can share.
 
     The arrays are read-only views of the originals, which stay writable.
     """
-    twin = object.__new__(type(record))  # runs once per field; ``replace`` takes five times as long
+    twin = object.__new__(type(record))  # avoids ``dataclasses.replace``, which takes five times as long
     for name in _NAMES[type(record)]:
         value = changes[name] if name in changes else getattr(record, name)
         if isinstance(value, np.ndarray) and value.flags.writeable:
@@ -195,7 +199,7 @@ def sealed(record: _Record, **changes: Any) -> _Record:
 
 
 def amended(field: FieldFrame, **changes: Any) -> FieldFrame:
-    """Return a copy with ``changes``, like ``dataclasses.replace``, in a fifth of the time."""
+    """Return a copy with ``changes``; equivalent to ``dataclasses.replace``, but five times as fast."""
     twin = object.__new__(FieldFrame)
     for name in _NAMES[FieldFrame]:
         object.__setattr__(twin, name, changes[name] if name in changes else getattr(field, name))

@@ -1,6 +1,6 @@
 """Contacts and wrenches in the frame of a link or of the hand, with their covariances.
 
-A contact on a patch acts with the force f on the skin at the point r. In the frame of a link, the contact's
+A contact on a patch exerts the force f on the skin at the point r. In the frame of a link, the contact's
 wrench is the force f and the torque r × f about the origin of the link's frame. To first order, the
 covariance of the wrench follows from the covariances of f and r, whose errors are assumed to be independent
 of each other.
@@ -20,7 +20,7 @@ from skinnode.model.layout import Float
 from skinnode.model.pose import Pose
 
 HAND: Final = "hand"
-"""Name of the hand's own frame; also the link name of patches that are fixed to the hand itself."""
+"""Name of the hand's own frame, and link name of the patches that are mounted on the hand itself."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,7 +28,7 @@ class Mount:
     """Place of a patch on the robot."""
 
     link: str = HAND
-    """Link that carries the patch."""
+    """Name of the link on which the patch is mounted."""
     pose: Pose = field(default_factory=Pose)
     """Pose of the patch's frame in the frame of its link."""
 
@@ -40,16 +40,16 @@ class HandContact:
     patch: str
     """Name of the patch."""
     link: str
-    """Link that carries the patch; :data:`HAND` for a patch that is fixed to the hand itself."""
+    """Name of the link on which the patch is mounted; :data:`HAND` for a patch on the hand itself."""
     frame: str
-    """Frame of the vectors of this contact: :data:`HAND` or the link."""
+    """Name of the frame in which the contact's vectors are expressed: :data:`HAND` or the link."""
     position_m: Float
     """(3,) centre of the normal load on the skin at rest, metres."""
     position_covariance_m2: Float
     """(3, 3) covariance of the position, m²."""
     normal: Float
-    """(3,) unit vector out of the skin at the contact. A pressing object exerts its normal force in the
-    opposite direction."""
+    """(3,) unit normal at the contact, pointing out of the skin. A pressing object exerts its normal force in
+    the opposite direction."""
     normal_force_n: float
     """Normal force, N; positive for a press."""
     normal_force_std_n: float
@@ -128,14 +128,14 @@ class HandContact:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Wrench:
-    """Force and torque that all contacts on a link, or on the hand, exert on the skin.
+    """Total force and torque that the contacts on a link, or on the hand, exert on the skin.
 
-    Forces that are too weak to be found as contacts, and the torque of each contact about its own normal, are
-    not included.
+    Forces too weak to be detected as contacts are not included, nor is the torque of each contact about its
+    own normal.
     """
 
     frame: str
-    """Name of the frame of all vectors; the torque is about the origin of this frame."""
+    """Name of the frame in which all vectors are expressed; the torque is about the origin of this frame."""
     force_n: Float
     """(3,) force on the skin, N."""
     torque_nm: Float
@@ -147,7 +147,7 @@ class Wrench:
     force_calibrated: bool
     """Whether every force is based on a calibration of its patch; True if there are no contacts."""
     trusted: bool
-    """Whether the fields of all patches that the wrench covers are present and trusted."""
+    """Whether every patch included in the wrench has a field, and all these fields are trusted."""
 
     @property
     def force_std_n(self) -> Float:
@@ -181,12 +181,12 @@ class Wrench:
 
 
 def wrench_of(contacts: Iterable[HandContact], frame: str, *, trusted: bool) -> Wrench:
-    """Return the wrench of contacts that are given in the same frame.
+    """Return the total wrench of contacts whose vectors are all in the same frame.
 
-    Contacts on different patches have independent errors. The errors of contacts on one patch may be
+    Errors on different patches are independent. On one patch, the errors of different contacts may be
     correlated in any way: noise shifts load between neighbouring contacts, and an error in the layer's
-    stiffness scales all forces. The covariances of these contacts are therefore combined into a bound that is
-    valid for any correlation.
+    stiffness scales all forces. The covariances of contacts on one patch are therefore combined into a bound
+    that is valid for any correlation.
 
     Args:
         contacts: The contacts, all in ``frame``.
@@ -212,7 +212,7 @@ def wrench_of(contacts: Iterable[HandContact], frame: str, *, trusted: bool) -> 
 
 
 def _covariance(contact: HandContact) -> Float:
-    """Return the covariance (6, 6) of one contact's wrench, to first order."""
+    """Return the first-order covariance (6, 6) of one contact's wrench."""
     by_force = np.vstack([np.eye(3), _cross(contact.position_m)])
     by_position = np.vstack([np.zeros((3, 3)), -_cross(contact.force_n)])
     return np.asarray(
@@ -222,6 +222,6 @@ def _covariance(contact: HandContact) -> Float:
 
 
 def _cross(vector: Float) -> Float:
-    """Return the matrix (3, 3) of the cross product with ``vector`` (3,) from the left."""
+    """Return the (3, 3) matrix that maps w to the cross product ``vector`` × w."""
     x, y, z = vector
     return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])

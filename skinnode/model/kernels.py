@@ -2,7 +2,7 @@
 
 Lower electrodes are stored as (3, M, K) and the Jacobian as its transpose (3N, K). Vectors of neighbouring
 lower wires k are therefore contiguous in memory, and their sums stay in registers. Most of the time is spent
-on distances: a square root and a division per pair would saturate one slow execution unit of the processor,
+on distances. A square root and a division per pair would saturate one slow execution unit of the processor,
 so 1/√ is computed by multiplications instead. Lengths may be in any unit; F has the inverse unit.
 """
 
@@ -25,12 +25,12 @@ def lower_rows(lower: Float) -> Float:
 
 
 def relative_residual(a: _T, f: _T) -> _T:
-    """Return a F − 1 for numbers or arrays: the relative deviation of a resistance from its prediction."""
+    """Return a F − 1, the relative deviation of a resistance from its prediction, for numbers or arrays."""
     return a * f - 1.0
 
 
 relative_residual_part = njit_body(relative_residual)
-"""Version of ``relative_residual`` for kernels."""
+"""Version of ``relative_residual`` that kernels can call."""
 
 
 @njit_part
@@ -52,7 +52,7 @@ def _inverse_root(square: Lanes) -> Lanes:
 def potential(x: Float, lower: Float, f: Float) -> None:
     """Write F of one wire into ``f`` (K,).
 
-    ``x`` (3N,) contains the electrodes of the wire as x₁ y₁ z₁ x₂ …; ``lower`` (3, M, K), the lower
+    ``x`` (3N,) contains the wire's electrodes as x₁ y₁ z₁ x₂ …, and ``lower`` (3, M, K) contains the lower
     electrodes.
     """
     charges, wires = lower.shape[1], lower.shape[2]

@@ -1,4 +1,4 @@
-"""Geometry of a patch: positions of its electrodes at rest, from which all matrix sizes are derived.
+"""Geometry of a patch: the positions of its electrodes at rest, which also determine all matrix sizes.
 
 The x axis is along an upper wire, y across the upper wires and z out of the skin; the lower layer is at
 z = 0.
@@ -25,11 +25,11 @@ MOST_ELECTRODES: Final = 1024
 takes 75 MB, and the posterior stores several of these matrices."""
 
 MOST_PAIRS: Final = 1 << 22
-"""Maximum number of pairs of an upper and a lower electrode. Storing the distances of all pairs takes 100 MB,
-and each evaluation of all wires computes every distance."""
+"""Maximum number of pairs that consist of an upper and a lower electrode. Storing the distances of all pairs
+takes 100 MB, and each evaluation of all wires computes every distance."""
 
 _HASH_RESOLUTION_M: Final = 1e-9
-"""Resolution of coordinates in the hash, m; layouts that agree to within a nanometre count as equal."""
+"""Resolution of coordinates in the hash, m; differences below a nanometre are ignored."""
 
 
 def require_array(name: str, value: ArrayLike, shape: tuple[int | str, ...], *, finite: bool = True) -> Float:
@@ -42,10 +42,10 @@ def require_array(name: str, value: ArrayLike, shape: tuple[int | str, ...], *, 
         finite: Whether every number must be finite.
 
     Raises:
-        ValueError: If the value cannot be converted. The message contains the argument's name, its value and
-            the requirement.
+        ValueError: If the value cannot be converted. The error message contains the argument's name, its
+            value and the requirement.
     """
-    if (  # fast path: a host passes such an array with every frame
+    if (  # fast path for the arrays that a host passes with every frame
         type(value) is np.ndarray
         and value.dtype == np.float64
         and value.shape == shape
@@ -127,7 +127,7 @@ class PatchLayout:
         object.__setattr__(self, "resistivity_ohm_per_m", float(self.resistivity_ohm_per_m))
 
     def __repr__(self) -> str:
-        """Return a one-line summary without the electrodes."""
+        """Return a one-line summary that omits the electrode coordinates."""
         (wires, electrodes), (lower, charges) = self.upper_m.shape[:2], self.lower_m.shape[:2]
         return (
             f"PatchLayout({self.name!r}, {wires} upper wires of {electrodes}, {lower} lower of {charges}, "
@@ -151,7 +151,8 @@ class PatchLayout:
 
         - ``aligned``: The lower wires run straight along y and are evenly spaced in x. Their electrodes are
           offset from the upper wires by a quarter pitch, as in a literal reading of the paper's figure.
-        - ``symmetric``: The layout equals ``aligned`` without the offset. The Jacobian is close to singular.
+        - ``symmetric``: The layout is the same as ``aligned``, except that there is no offset. The
+          Jacobian is close to singular.
         - ``staggered``: The lower layer is half a pitch wider than the patch, its electrodes are 1.2 pitches
           apart, and lower wire k is shifted in y by 0.43 (k mod 3 − 1) pitches. In measurements, this layout
           was up to a thousand times better conditioned than the others.
@@ -233,7 +234,7 @@ class PatchLayout:
 
     @functools.cached_property
     def layout_hash(self) -> int:
-        """CRC-32 of the sizes and of all coordinates in nm; object 0x2000 of the nodes, checked by hosts."""
+        """CRC-32 of the sizes and of all coordinates in nm; hosts compare it with object 0x2000 of nodes."""
         sizes = np.array([*self.upper_m.shape, *self.lower_m.shape], dtype="<i8")
         parts = [np.rint(a / _HASH_RESOLUTION_M).astype("<i8") for a in (self.upper_m, self.lower_m)]
         return zlib.crc32(b"".join(a.tobytes() for a in (sizes, *parts)))

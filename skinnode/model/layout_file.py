@@ -21,10 +21,11 @@ _MOST_NPZ_BYTES: Final = 16 << 20
 _MOST_VALUES: Final = {"upper_m": 3 * MOST_ELECTRODES, "lower_m": 3 * MOST_PAIRS, "resistivity_ohm_per_m": 1}
 """Maximum number of values in each array of a layout file."""
 _MOST_ITEM_BYTES: Final = 32
-"""Maximum size of one value: a complex long double, which is rejected later because of its type."""
+"""Maximum size of one value, in bytes: the size of a complex long double, which is rejected later because of
+its type."""
 _LONGEST_KEY: Final = 40
 _MOST_HEADER_BYTES: Final = 10_240
-"""Maximum size of the data that precedes the values; NumPy reads headers of up to 10,000 characters."""
+"""Maximum size of an array's header, in bytes; NumPy reads headers of up to 10,000 characters."""
 
 
 def read_npz(path: Path) -> PatchLayout:
@@ -69,7 +70,7 @@ def _require_sizes(data: io.BytesIO, path: Path) -> None:
             if member.compress_type not in (
                 zipfile.ZIP_STORED,
                 zipfile.ZIP_DEFLATED,
-            ):  # other compression methods unpack whole members at once
+            ):  # other compression methods would unpack a whole member at once
                 got = Shown(f"compression method {member.compress_type}")
                 raise ConfigError(key, got, "stored or deflated, as NumPy writes it", where=str(path))
             most_bytes = _MOST_VALUES[key] * _MOST_ITEM_BYTES
@@ -90,12 +91,12 @@ def _require_size(key: str, got: str, size: int, most: int, path: Path) -> None:
 
 
 def has_electrodes(table: Mapping[str, Any]) -> bool:
-    """Return whether the table of a TOML layout file has electrodes rather than the keys of a preset."""
+    """Return whether the table of a TOML layout file contains electrodes rather than the keys of a preset."""
     return any(key in table for key in _ARRAYS)
 
 
 def from_electrodes(table: Mapping[str, Any], path: Path) -> PatchLayout:
-    """Return the layout given by a table with the keys that :func:`read_npz` expects.
+    """Return the layout defined by ``table``, whose keys must be those that :func:`read_npz` expects.
 
     Raises:
         ConfigError: If a key is missing or unknown, or a value is invalid; the error names ``path``.

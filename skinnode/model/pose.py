@@ -13,7 +13,7 @@ from skinnode.model.frames import FieldFrame
 from skinnode.model.layout import Float, PatchLayout
 
 UNIT_TOLERANCE: Final = 1e-3
-"""Largest deviation of a quaternion's length from 1 that is attributed to rounding."""
+"""Maximum deviation of a quaternion's length from 1 that is accepted as a rounding error."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,7 +42,7 @@ class Pose:
 
     @classmethod
     def from_rpy(cls, position_m: tuple[float, float, float], rpy_rad: tuple[float, float, float]) -> Self:
-        """Return the pose for roll, pitch and yaw about the fixed axes x, y, z of the parent, in this order.
+        """Return the pose after rotations about the parent's axes x (roll), y (pitch), z (yaw), in this order.
 
         URDF uses the same convention.
 
@@ -86,7 +86,7 @@ class Pose:
         return points
 
     def __matmul__(self, inner: Pose) -> Pose:
-        """Return ``inner``, a pose in this frame, as a pose in this frame's parent."""
+        """Convert ``inner``, a pose in this frame, to a pose in the parent frame."""
         x, y, z, w = self._unit()
         a, b, c, d = inner._unit()
         x_m, y_m, z_m = self.points_m(inner.position_m).tolist()
@@ -101,7 +101,7 @@ class Pose:
         )
 
     def inverse(self) -> Pose:
-        """Return the pose of the parent in this frame."""
+        """Return the inverse pose: the parent's pose in this frame."""
         x, y, z, w = self._unit()
         back = Pose((0.0, 0.0, 0.0), (-x, -y, -z, w))
         x_m, y_m, z_m = (-back.vectors(self.position_m)).tolist()

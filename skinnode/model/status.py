@@ -7,7 +7,7 @@ from collections.abc import Iterable
 
 
 class Status(enum.IntEnum):
-    """Outcome of a solve. With any status other than CONVERGED, the result is the best iterate found."""
+    """Outcome of a solve. If the status is not CONVERGED, the result is the best iterate found."""
 
     CONVERGED = 0
     """The result is a root that passed all checks."""
@@ -24,7 +24,7 @@ class Status(enum.IntEnum):
     NON_FINITE = 6
     """A value overflowed, or resistances were unusable."""
     INVALID_START = 7
-    """F or J is not finite at the starting point, which is returned unchanged (`solve_system`)."""
+    """F or J is not finite at the starting point; `solve_system` returns the starting point unchanged."""
     INCONSISTENT = 8
     """No deformation explains the resistances: χ² is far above what their noise allows."""
 

@@ -1,4 +1,4 @@
-"""Manufacturing tolerances of a patch: how far its geometry may differ from its layout."""
+"""Manufacturing tolerances of a patch: allowed differences between its geometry and its layout."""
 
 from __future__ import annotations
 
@@ -37,6 +37,6 @@ class Tolerances:
 
 
 EXACT: Final = Tolerances()
-"""Tolerances of a patch that equals its layout exactly, such as a simulated patch."""
+"""Tolerances of a patch that matches its layout exactly, such as a simulated patch."""
 ORDINARY: Final = Tolerances(placement=0.02, thickness=0.05, electrode_radius=0.05, gain=0.02)
-"""Tolerances of a patch that was made in a good workshop."""
+"""Tolerances that a good workshop achieves."""

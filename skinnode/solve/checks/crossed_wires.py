@@ -1,9 +1,10 @@
 """Crossed wires: two wires of the same layer whose readings are exchanged.
 
 If two wires were already crossed when the readings at rest were measured, the error stays invisible until the
-skin moves. The displacements of each wire are then attributed to the other wire. Exchanging the readings of
-two wires changes the log evidence of a frame by −αᵀδ − ½ δᵀPδ, with the precision P, α = P z and the change δ
-of the readings z. The test has no fitted parameters, so a difference of a few nats is significant.
+skin moves. After the exchange, the displacements of each wire are attributed to the other wire. Exchanging
+the readings of two wires changes the log evidence of a frame by −αᵀδ − ½ δᵀPδ. Here P is the precision of the
+readings z, α = P z, and δ is the change of z due to the exchange. The test has no fitted parameters, so a
+difference of a few nats is significant.
 
 In 108 healthy frames with six kinds of presses (staggered layout, h = 0.5, noise 1e-4), the log evidence
 changed by at most 2.8 nats. The median change was 125 nats with two upper wires crossed, and 43 nats with two
@@ -35,7 +36,7 @@ class WirePair:
 
 
 def exchanged(z: Float, present: Mask, pair: WirePair) -> tuple[Float, Mask]:
-    """Return copies of the readings and of the mask of available readings, with two wires exchanged."""
+    """Return copies of the readings and their mask in which two wires are exchanged."""
     here, there = [pair.one, pair.other], [pair.other, pair.one]
     z, present = z.copy(), present.copy()
     for values in (z, present):
@@ -49,13 +50,13 @@ def exchanged(z: Float, present: Mask, pair: WirePair) -> tuple[Float, Mask]:
 def likeliest(
     p: Float, alpha: Float, z: Float, present: Mask, *, far: bool = False
 ) -> tuple[float, WirePair]:
-    """Return the largest gain in log evidence from exchanging two wires, in nats, and the two wires.
+    """Return the largest gain in log evidence (nats) from exchanging two wires, and these two wires.
 
     Args:
         p: (m, m) precision of the readings.
         alpha: (m,) P z.
         z: (U, K) changes of the readings since rest, in units of their noise.
-        present: (U, K) bool, the available readings; other readings are not exchanged.
+        present: (U, K) mask of the available readings; unavailable readings are not exchanged.
         far: Whether to compare all pairs of wires; by default, only neighbours are compared. Comparing all
             pairs takes ten times as long.
     """
@@ -72,10 +73,10 @@ def likeliest(
 def best_exchange(  # noqa: PLR0913 - a kernel: arrays by name
     p: Float, alpha: Float, z: Float, present: Mask, upper: int, lower: int, reach: int, delta: Float
 ) -> tuple[float, bool, int, int]:
-    """Return the largest gain from exchanging two wires, whether these are upper wires, and their numbers.
+    """Return the largest gain from an exchange, whether the wires are upper wires, and the wire numbers.
 
-    The gain in log evidence is in nats. The search covers wires whose numbers differ by up to ``reach``. The
-    choice among n pairs reduces the gain by ln n. ``delta`` (max(U, K),) is a work array.
+    The gain in log evidence is in nats. The search covers wires whose numbers differ by up to ``reach``.
+    Because n pairs are compared, ln n is subtracted from the gain. ``delta`` (max(U, K),) is a work array.
     """
     best, is_upper, one, other, pairs = -math.inf, True, 0, 0, 0
     for apart in range(1, reach + 1):
@@ -107,9 +108,9 @@ def _gain(  # noqa: PLR0913 - a kernel: arrays by name
 ) -> float:
     """Return the gain in log evidence from exchanging the ``count`` readings of two wires.
 
-    The readings of the first wire have the indices ``start``, ``start + step``, …; the indices of the second
-    wire are larger by ``across``. The upper bound −αᵀδ is computed first. If the bound does not exceed
-    ``enough``, it is returned instead of the gain.
+    The first wire's readings have the indices ``start``, ``start + step``, …; add ``across`` to obtain the
+    indices of the second wire's readings. The upper bound −αᵀδ is computed first. If the bound does not
+    exceed ``enough``, it is returned instead of the gain.
     """
     linear, both = 0.0, 0
     for i in range(count):

@@ -1,8 +1,8 @@
 """Data check: find readings of a frame that contradict the others, solve without them, and assess trust.
 
 Each frame is first solved with all readings except those with confirmed faults. The field is converted to
-readings linearised at rest, which are tested by the model in :mod:`skinnode.solve.checks.reading_model`. If a
-reading or a wire contradicts the others, it is left out and the frame is solved again, until :data:`ROUNDS`
+readings linearised at rest, and the model in :mod:`skinnode.solve.checks.reading_model` tests these readings.
+If a reading or a wire contradicts the others, the frame is solved again without it; at most :data:`ROUNDS`
 groups of readings are left out.
 """
 
@@ -34,50 +34,52 @@ from skinnode.solve.linalg.cholesky import multiply_vector, solve_positive
 from skinnode.solve.wires.problem import PatchProblem
 
 ROUNDS: Final = 3
-"""Number of groups of readings left out of a frame at which the check stops solving the frame again."""
+"""Maximum number of groups of readings left out of a frame; after that, the frame is not solved again."""
 WRONG: Final = 0.1
-"""Expected relative error of a wrong reading. Not tuned: with a value of 0.01, the cost of a wrong reading
-would change by only 2 nats."""
+"""Expected relative error of a wrong reading. This value is not tuned; a value of 0.01 would change the cost
+of a wrong reading by only 2 nats."""
 SUSPICIOUS: Final = 5.0
-"""Gain in log evidence from a fault above which a frame is suspicious and explanations are sought, nats."""
+"""Threshold (nats) for the gain in log evidence from a fault; above the threshold, a frame is suspicious, and
+the check looks for explanations."""
 OFFSETS: Final = (0, 1, 3, 5)
-"""Offsets below the best-fitting κ index at which single readings are tested."""
+"""Values subtracted from the index of the best-fitting κ; single readings are tested at each resulting κ."""
 CLEAR: Final = -30.0
-"""Difference between the log evidence of faults and that of loads, nats, below which loads clearly explain a
-frame. The next frames are then not examined if they resemble this frame."""
+"""Threshold (nats) for the log evidence of faults minus that of loads; below the threshold, loads clearly
+explain the frame, and subsequent similar frames are not examined."""
 EXCUSED: Final = 10.0
-"""Increase of the gain after an examined frame that makes a similar frame suspicious again, nats."""
+"""Increase of the gain (nats) since the last examination that makes a similar frame suspicious again."""
 EXCUSED_FRAMES: Final = 8
-"""Number of frames after an examined frame in which similar frames need no new examination; an examination
+"""Number of frames after an examination during which similar frames are not examined again; an examination
 takes 9 ms."""
 PATIENCE: Final = 4
-"""Interval, in suspicious frames without time for an examination, at which a frame is examined despite its
-deadline. A fault makes all following frames suspicious; a press seldom does."""
+"""Number of suspicious frames without time for an examination after which one is examined despite its
+deadline. A fault makes all subsequent frames suspicious; a press rarely does."""
 EXAMINATION_S: Final = 3e-3
 """Expected duration of the first examination, s. Later examinations use measured durations."""
 CROSSED_FRAMES: Final = 5
-"""Number of frames after the detection of two crossed wires in which detecting one of them counts as
-detecting both."""
+"""Number of frames after the detection of two crossed wires during which the detection of one of them is
+reported as a detection of both."""
 NOISE_RATIOS: Final = (2.0, 4.0, 8.0, 16.0)
-"""Ratios of actual to stated noise that are tested as explanations of a suspicious frame."""
+"""Ratios of actual to stated noise that are tried as explanations of a suspicious frame."""
 COARSE: Final = 0.1
 """Assumed error of the linearised readings if several upper wires have no solution, relative to the readings'
 largest change since rest."""
 COARSE_GROUPS: Final = 3
 """Maximum number of groups of readings that are left out at once if several upper wires have no solution. If
-more groups are found, only the first is left out."""
+the search finds more groups, only the first is left out."""
 UNSOLVED: Final = 1
-"""Maximum number of upper wires without a solution for which these wires are reported as faulty. If more
-upper wires have no solution, a lower wire may be the cause."""
+"""Maximum number of upper wires without a solution that are reported as faulty. If more upper wires have no
+solution, none is reported, because a lower wire may be the cause."""
 SPARED: Final = 3
-"""Maximum number of upper wires left out by the solver for which these wires are reported as faulty."""
+"""Maximum number of upper wires left out by the solver that are reported as faulty; if the solver left out
+more, none is reported."""
 
 Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Solved:
-    """A field and the readings from which it was computed."""
+    """A field, and the readings from which the field was computed."""
 
     field: FieldFrame
     a: Float
@@ -85,7 +87,7 @@ class Solved:
     noise: Float
     """(U, K) relative standard deviation of the resistances R."""
     used: Mask
-    """(U, K) bool, the readings used."""
+    """(U, K) mask of the readings used."""
 
 
 class DataCheck:
@@ -99,8 +101,8 @@ class DataCheck:
         drift: Gain errors that are expected and not reported as faults: ``none``, ``patch`` or ``wire``.
 
     Attributes:
-        scan: Scan number of the next frame, used in its faults; if None, the number of checked frames is
-            used.
+        scan: Scan number of the next frame, for its reported faults; if None, the number of checked frames is
+            reported.
     """
 
     def __init__(
@@ -128,18 +130,18 @@ class DataCheck:
         self._explainer.wrong_readings(self._z, every, self._evidence, 0, 1.0, 1.0)  # compiles the kernels
         self._largest_gains(every, self._evidences(every), 1.0, 1.0)
         every[0, 0] = False
-        self._evidences(every)  # compiles the kernels for missing readings
+        self._evidences(every)  # also compile the kernels for missing readings
         self.reset()
 
     def prepare(self) -> None:
-        """Compute tables in advance, so that the first suspicious frames of a stream are not delayed."""
+        """Precompute tables, so that the first suspicious frames of a stream are not delayed."""
         self._model.prepare(self._sigma)
 
     def reset(self) -> None:
         """Discard the state of the stream, including all faults."""
         self._list.reset()
         self._frame, self._doubtful, self._noisy = 0, False, False
-        self._lead = 0.0  # gain in log evidence from more noise if the last frame was noisy, else 0
+        self._lead = 0.0  # if the last frame was noisy: gain in log evidence from more noise; else 0
         self._excused, self._excused_where, self._excused_until = -math.inf, -1, 0
         self._where = -1
         self._crossed: tuple[Group, ...] = ()
@@ -150,22 +152,22 @@ class DataCheck:
 
     @property
     def left_out(self) -> Mask | None:
-        """(U, K) bool, the readings to leave out of the next frame; None if all readings are used."""
+        """(U, K) mask of the readings to leave out of the next frame; None if all readings are used."""
         return self._list.mask
 
     def check(
         self, solved: Solved, solve_without: Callable[[Mask], Solved], until: float = math.inf
     ) -> FieldFrame:
-        """Check the readings of a frame, and return its field with faults and trust added.
+        """Check the readings of a frame, and return its field with its faults and trust filled in.
 
         Args:
-            solved: The frame, solved without the readings :attr:`left_out`.
+            solved: The frame, solved without the readings in :attr:`left_out`.
             solve_without: Function that solves the frame without the given readings (U, K) and without those
                 in :attr:`left_out`.
-            until: Deadline as a value of :func:`skinnode.process.clock.perf_counter`, s; −inf if some wires
-                were not solved for lack of time, which is no sign of a fault. A suspicious frame that cannot
-                be examined before the deadline is not trusted. Every :data:`PATIENCE`-th such frame is
-                examined despite its deadline.
+            until: Deadline as a value of :func:`skinnode.process.clock.perf_counter`, s; −inf if the solver
+                ran out of time before all wires were solved, which does not indicate a fault. A suspicious
+                frame that cannot be examined before the deadline is not trusted. Every :data:`PATIENCE`-th
+                suspicious frame without time for an examination is examined despite its deadline.
         """
         self._frame += 1
         last = self._last
@@ -237,11 +239,11 @@ class DataCheck:
         return self._needs_no_explanation(max(self._largest_gains(self._present, best, cost, sigma)))
 
     def _needs_no_explanation(self, gain: float) -> bool:
-        """Return whether a frame with this gain in log evidence from a fault needs no explanation.
+        """Return whether a frame with this gain from a fault is accepted without further examination.
 
-        No explanation is needed if the gain is small, or if loads clearly explained a recent frame with a
-        similar gain and the same suspected reading. A different suspected reading needs an explanation,
-        because a reading may be wrong under a press. After a noisy frame, every frame needs an explanation.
+        A frame is accepted if the gain is small, or if loads clearly explained a recent frame with a similar
+        gain and the same suspected reading. A frame with a different suspected reading is not accepted,
+        because a reading may become wrong during a press. After a noisy frame, no frame is accepted.
         """
         excused = (
             self._frame < self._excused_until
@@ -298,8 +300,8 @@ class DataCheck:
     def _may_examine(self, gain: float, until: float) -> bool:
         """Return whether there is time to examine a suspicious frame.
 
-        If there is no time, the frame is marked as unexamined, unless it resembles a frame that was recently
-        examined and found without fault.
+        If there is no time, the frame is marked as unexamined, unless a similar frame was recently examined
+        and had no fault.
         """
         if self._overdue or perf_counter() + self._examination_s <= until:
             return True
@@ -307,15 +309,15 @@ class DataCheck:
         if where == self._where and gain < last + EXCUSED:
             if self._frame - frame < EXCUSED_FRAMES:
                 return False
-            self._waiting = PATIENCE  # the last examination of a similar frame is too old
+            self._waiting = PATIENCE  # no similar frame was examined recently enough
         self._unexamined = not self._in_time(self._examination_s, until)
         return not self._unexamined
 
     def _in_time(self, seconds: float, until: float) -> bool:
-        """Return whether a suspicious frame may take ``seconds``.
+        """Return whether the check may spend ``seconds`` on a suspicious frame.
 
-        The frame may take this time if the deadline permits, or if it is the :data:`PATIENCE`-th suspicious
-        frame without time for an examination.
+        The check may spend this time if the deadline permits, or if the frame is the :data:`PATIENCE`-th
+        suspicious frame without time for an examination.
         """
         if self._overdue or perf_counter() + seconds <= until:
             return True
@@ -326,10 +328,10 @@ class DataCheck:
         return self._overdue
 
     def _noisier(self) -> float:
-        """Return the log evidence of the frame, assuming that all its readings are noisier than stated.
+        """Return the log evidence of the frame if all its readings are noisier than stated.
 
-        For each ratio of actual to stated noise, the result is the log evidence of z / ratio, minus ln(ratio)
-        for each reading.
+        If the noise is ``ratio`` times the stated noise, the log evidence is that of z / ratio, minus
+        ln(ratio) for each reading.
         """
         model, z = self._model, self._z.ravel()
         most = -math.inf
@@ -342,7 +344,7 @@ class DataCheck:
         return most - math.log(len(NOISE_RATIOS))
 
     def _with_both_crossed(self, found: tuple[Group, ...]) -> tuple[Group, ...]:
-        """Return ``found``, or both recently crossed wires if ``found`` contains only one of them."""
+        """Replace ``found`` with both recently crossed wires if ``found`` contains only one of them."""
         if any(group.kind is FaultKind.CROSSED for group in found):
             self._crossed, self._crossed_until = found, self._frame + CROSSED_FRAMES
         elif self._frame <= self._crossed_until:
@@ -352,7 +354,7 @@ class DataCheck:
         return found
 
     def _linearised(self, solved: Solved, present: Mask) -> float:
-        """Write the readings' changes since rest, linearised, into ``_z``; return their relative noise."""
+        """Write the linearised changes since rest into ``_z``, and return the readings' relative noise."""
         field, layout = solved.field, self._problem.layout
         sigma = float(np.median(solved.noise[present]))
         moved = field.displacement_m.reshape(layout.shape[0], -1) / layout.pitch_m
@@ -371,9 +373,9 @@ class DataCheck:
         return sigma
 
     def _remove_gain(self, present: Mask, std: float) -> None:
-        """Subtract the remaining gain errors, each with the prior N(0, ``std``²), from ``_z``.
+        """Estimate the remaining gain errors with the prior N(0, ``std``²), and subtract them from ``_z``.
 
-        The solver's gain estimate is too small because its prior attributes part of a gain error to a
+        The solver underestimates gain errors, because its prior attributes part of each gain error to a
         displacement of the wire.
         """
         upper, lower = self._z.shape
@@ -388,7 +390,7 @@ class DataCheck:
         self._z[~present] = 0.0
 
     def _residuals(self, moved: Float, a: Float, wires: Mask) -> Float:
-        """Return the residuals a F − 1 of the n upper wires in ``wires``, (n, K)."""
+        """Return the residuals a F − 1 (n, K) of the n upper wires selected by ``wires``."""
         for u in np.flatnonzero(wires).tolist():
             potential(self._problem.rest[u] + moved[u], self._problem.lower, self._f[u])
         return np.asarray(a[wires] * self._f[wires] - 1.0)
@@ -409,7 +411,7 @@ class DataCheck:
         return best
 
     def _largest_gains(self, present: Mask, best: int, cost: float, sigma: float) -> tuple[float, float]:
-        """Return the largest gain from a wrong reading or crossed wires, and that from a faulty wire."""
+        """Return the largest gains: from a wrong reading or crossed wires, and from a faulty wire."""
         most, of_wires, z = -math.inf, -math.inf, self._z.ravel()
         for offset in OFFSETS:
             number = best - offset
@@ -430,8 +432,8 @@ class DataCheck:
     def _find_coarsely(self, solved: Solved) -> tuple[Group, ...]:
         """Return the most likely wrong readings if several upper wires have no solution.
 
-        Loads cannot explain such a frame, so the search includes no loads. Before :meth:`check` reports these
-        readings, it compares them with the field solved without them.
+        If several upper wires have no solution, loads cannot explain the frame, so the search omits loads.
+        :meth:`check` compares the wrong readings with the field solved without them before it reports them.
         """
         with np.errstate(divide="ignore", invalid="ignore"):
             np.log(self._problem.a_rest / solved.a, out=self._z)
@@ -466,7 +468,7 @@ class DataCheck:
         return np.where(known, deviation, np.inf), known
 
     def _contradicting(self, groups: list[Group], solved: Solved) -> list[Group]:
-        """Return the groups without those that were found by the coarse search but agree with the field."""
+        """Return the groups, except those found by the coarse search that agree with the field."""
         if not self._coarse:
             return groups
         deviation, known = self._deviations(solved)
@@ -480,7 +482,7 @@ class DataCheck:
 
 
 def _spared(solved: Solved) -> tuple[Solved, list[Group]]:
-    """Return the frame without the readings of upper wires that its solver left out, and these wires."""
+    """Return the frame without the upper wires that its solver left out, and a list of these wires."""
     field = solved.field
     status = np.array(field.status)
     out = (status != Status.CONVERGED) & (solved.used.mean(axis=1) >= OF_WIRE)
@@ -492,6 +494,6 @@ def _spared(solved: Solved) -> tuple[Solved, list[Group]]:
 
 
 def _still(solved: Solved, last: FieldFrame) -> bool:
-    """Return whether all wires were held in this frame and have the same status as in the last field."""
+    """Return whether every wire was held in this frame and its status is the same as in the last field."""
     held = solved.field.held
     return held is not None and bool(held.all()) and solved.field.status == last.status

@@ -1,12 +1,11 @@
 """Explanations of a frame: loads on the skin, wrong readings, or two crossed wires.
 
-If a frame is unlikely under the elastic prior, it has one of three causes: loads where the prior does not
-expect them, for example under a contact much narrower than the patch; wrong readings; or two crossed wires. A
-greedy search, as in orthogonal matching pursuit, adds one load or one group of wrong readings at a time, in
-each step the one with the largest gain in log evidence. Readings are reported as wrong only if the log
-evidence of the best explanation with faults exceeds that of the best explanation by loads alone by
-:data:`MARGIN`. The same margin applies to crossed wires, where loads alone explain the readings after the
-exchange.
+A frame that is unlikely under the elastic prior has one of three causes: wrong readings, two crossed wires,
+or loads that the prior does not expect, such as a contact much narrower than the patch. A greedy search, as
+in orthogonal matching pursuit, adds one load or one group of wrong readings at a time: the candidate with the
+largest gain in log evidence. Readings are reported as wrong only if the best explanation with faults exceeds
+the best explanation by loads alone by more than :data:`MARGIN` in log evidence. The same margin applies to
+crossed wires: after the two wires are exchanged, the readings are explained by loads alone.
 """
 
 from __future__ import annotations
@@ -28,26 +27,25 @@ from skinnode.solve.checks.wire_tests import GAIN_STD, LEAST, WireFinding, least
 from skinnode.solve.linalg.cholesky import multiply_vector
 
 MARGIN: Final = 20.0
-"""Log evidence by which faults must explain a frame better than loads alone to be reported, nats. With this
-margin, no fault was falsely reported in 6,800 frames of deep slides at a noise of 3e-6, nor in 270 frames
-with six kinds of presses at a noise of 1e-5."""
+"""Margin in log evidence (nats) by which an explanation with faults must beat loads alone before the faults
+are reported. With this margin, no fault was falsely reported in 6,800 frames of deep slides at a noise of
+3e-6, nor in 270 frames with six kinds of presses at a noise of 1e-5."""
 MARGIN_OF_READING: Final = 50.0
-"""Log evidence by which a single wrong reading must explain a frame better than loads alone to be reported,
-nats. The reading is tested at every prior scale. Under a narrow load at the edge of a patch, the difference
-for a correct reading reached 29 nats in 36,000 frames (``bench trust --seed 1 --only hours``)."""
+"""Margin in log evidence (nats) by which an explanation with a single wrong reading must beat loads alone
+before the reading is reported. Single readings are tested at every prior scale. Under a narrow load at the
+edge of a patch, a correct reading reached a margin of 29 nats in 36,000 frames (``bench trust --seed 1 --only
+hours``)."""
 DOUBT: Final = 5.0
-"""Log evidence by which faults must explain a frame better than loads alone for the frame to be doubtful,
-nats. In 144 healthy frames, the difference was at most 0 nats, with up to 8 loads in the explanation by
-loads."""
+"""Margin in log evidence (nats) by which an explanation with faults must beat loads alone before a frame is
+marked doubtful. In 144 healthy frames, explanations with faults never beat explanations by up to 8 loads."""
 SCALES: Final = 4
-"""Number of prior scales at which explanations are sought: the best-fitting scale and smaller scales. A wrong
-reading inflates the best-fitting scale by up to 2⁴, a narrow contact by up to 2³."""
+"""Number of prior scales searched for explanations: the best-fitting scale and smaller scales. A wrong
+reading can inflate the best-fitting scale by a factor of up to 2⁴, and a narrow contact by up to 2³."""
 STRIDE: Final = 2
-"""Step in log2 κ between the prior scales at which explanations are sought."""
+"""Step in log2 κ between the prior scales that are searched for explanations."""
 HOPELESS: Final = 150.0
-"""Log evidence by which loads alone must explain a frame better than faults at one prior scale, nats, for the
-search for faults to stop at this scale. In 163 frames with a fault, the log evidence of loads exceeded that
-of faults by at most 114 nats."""
+"""Margin in log evidence (nats) by which loads alone must beat faults at one prior scale before the search
+for faults at that scale stops. In 163 frames with a fault, loads beat faults by at most 114 nats."""
 
 _PARTS: Final = {CROSSING: FaultyPart.CROSSING, LOWER: FaultyPart.LOWER, UPPER: FaultyPart.UPPER}
 
@@ -56,7 +54,7 @@ Mask = NDArray[np.bool_]
 
 @dataclass(frozen=True, slots=True)
 class Group:
-    """Group of wrong readings: a crossing, or all crossings of a wire."""
+    """Group of wrong readings: the reading of one crossing, or all readings of a wire."""
 
     part: FaultyPart
     upper: int | None
@@ -77,7 +75,7 @@ class Explainer:
     """Search for the most likely explanation of a frame. Do not share an instance between owners.
 
     Args:
-        model: Distribution of the readings.
+        model: Joint distribution of the readings.
     """
 
     def __init__(self, model: ReadingModel) -> None:
@@ -85,10 +83,9 @@ class Explainer:
         self._search = GreedySearch(model)
         self._alpha, self._row = np.empty(len(model.response)), np.empty(max(model.shape) + 1)
         self.margin = -math.inf
-        """Log evidence by which faults explained the last frame better than loads alone or noise alone,
-        nats."""
+        """Margin (nats) by which the evidence of faults beat that of loads or noise in the last frame."""
         self.is_noisier = False
-        """Whether noise above the stated level explained the last frame better than loads."""
+        """Whether the last frame was explained better by noise above the stated level than by loads."""
 
     def wrong_readings(  # noqa: PLR0913 - the frame, and what is known of it
         self,
@@ -106,14 +103,15 @@ class Explainer:
         Args:
             z: (U, K) changes of the readings since rest, in units of their noise.
             present: (U, K) bool, the readings to use.
-            evidence: (L,) log evidence of the frame at every κ.
+            evidence: (L,) log evidence of the frame at each κ.
             best: Index of the κ with the largest log evidence.
-            cost: Log evidence subtracted for each wrong reading: ln of the ratio between its expected error
-                and the noise.
+            cost: Log evidence subtracted for each wrong reading: the logarithm of the reading's expected
+                error divided by the noise.
             sigma: Relative noise of the readings.
-            noisier: Log evidence of the frame without loads or faults, but with noise above the stated level.
-            whole_wires_only: Whether to search only for a wire that is inconsistent with the others, and not
-                for single wrong readings or crossed wires.
+            noisier: Log evidence of the frame under the assumption of noise above the stated level, without
+                loads or faults.
+            whole_wires_only: Whether to search only for inconsistent wires, and to skip single wrong readings
+                and crossed wires.
         """
         by_loads, by_faults = -math.inf, -math.inf
         groups: tuple[Group, ...] = ()
@@ -154,7 +152,7 @@ class Explainer:
     def wrong_without_loads(
         self, z: Float, present: Mask, evidence: Float, best: int, cost: float
     ) -> tuple[Group, ...]:
-        """Return the groups of wrong readings in a frame that no load explains.
+        """Return the groups of wrong readings in a frame that loads cannot explain.
 
         The arguments are those of :meth:`wrong_readings`.
         """
@@ -172,8 +170,8 @@ class Explainer:
     ) -> tuple[float, int]:
         """Return the log evidence of the best explanation by loads and one wrong reading, and the reading.
 
-        This case needs its own search: at small prior scales, the greedy search would first leave out the
-        whole wire of the reading.
+        A single wrong reading needs its own search, because at small prior scales the greedy search would
+        first leave out the whole wire.
         """
         level = self._model.level(best)
         multiply_vector(level.precision, z.ravel(), self._alpha)
@@ -199,7 +197,7 @@ class Explainer:
     def _by_exchange(
         self, z: Float, present: Mask, cost: float, alpha: Float, level: Level
     ) -> tuple[float, WirePair]:
-        """Return the log evidence of the best explanation by loads with two wires exchanged, and the pair."""
+        """Return the log evidence of the best explanation by exchanged wires and loads, and the wires."""
         gain, pair = likeliest(level.precision, alpha, z, present, far=True)
         if gain < DOUBT:
             return -math.inf, pair
@@ -210,7 +208,7 @@ class Explainer:
     def _by_wire(  # noqa: PLR0913 - the frame, and what was found in it
         self, z: Float, present: Mask, cost: float, finding: WireFinding, alpha: Float, best: int, tau: float
     ) -> float:
-        """Return the log evidence of the best explanation by loads if the found wire is faulty."""
+        """Return the log evidence of the best explanation by loads and a faulty wire."""
         upper, lower = self._model.shape
         wire, choice = finding.wire, math.log(2.0 * (upper + lower))
         rows = (slice(wire, wire + 1), slice(None)) if wire < upper else (slice(None), wire - upper)
@@ -228,7 +226,7 @@ class Explainer:
         tables = self._model.level(best).wires
         of_p = tables.upper_p[wire] if wire < upper else tables.lower_p[wire - upper]
         error = np.linalg.solve(of_p @ of_p.T, alpha.reshape(z.shape)[rows].ravel())
-        z[rows] = (own - error).reshape(z[rows].shape)  # prediction by the other wires
+        z[rows] = (own - error).reshape(z[rows].shape)  # prediction from the other wires
         present[rows] = False
 
         def alone(level: Level) -> float:
@@ -278,7 +276,7 @@ class Explainer:
 
 
 def _scales(best: int) -> range:
-    """Return the indices of κ at which explanations are sought: ``best`` and smaller indices."""
+    """Return the indices of κ to search for explanations: ``best`` and smaller indices."""
     return range(best, max(best - STRIDE * SCALES, -1), -STRIDE)
 
 

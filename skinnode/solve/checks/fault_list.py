@@ -18,21 +18,22 @@ from skinnode.model.layout import Float
 from skinnode.solve.checks.explanations import Group
 
 FRAMES: Final = 3
-"""Number of frames, out of :data:`WITHIN` successive frames, in which readings must contradict the others
-before their fault is confirmed. Not tuned."""
+"""Number of frames, out of :data:`WITHIN` successive frames, in which a fault must be found before it is
+confirmed. Not tuned."""
 WITHIN: Final = 10
-"""Number of successive frames within which contradictions are counted to confirm a fault."""
+"""Number of successive frames over which detections are counted to confirm a fault."""
 ADMIT: Final = 64
 """Number of consecutive frames in which readings with a confirmed fault must agree with the field before they
-are used again. It doubles after each relapse. Not tuned."""
+are used again. The number doubles each time the fault returns. Not tuned."""
 AGREE: Final = 3.0
-"""Maximum RMS difference, in standard deviations, at which readings count as agreeing with the field."""
+"""Maximum RMS difference between readings and a field, in standard deviations, for the readings to agree with
+the field."""
 
 Mask = NDArray[np.bool_]
 
 
 def agree(deviation: Float) -> bool:
-    """Return whether readings with these deviations from a field, in standard deviations, agree with it."""
+    """Return whether readings agree with a field, given their deviations in standard deviations."""
     return float(np.mean(deviation**2)) <= AGREE**2
 
 
@@ -68,7 +69,7 @@ class FaultList:
 
     @property
     def mask(self) -> Mask | None:
-        """(U, K) bool, the readings of all confirmed faults; None if there are no confirmed faults."""
+        """(U, K) mask of the readings with a confirmed fault; None if there are no confirmed faults."""
         if not self._named:
             return None
         found = np.zeros(self._shape, bool)
@@ -77,7 +78,7 @@ class FaultList:
         return found
 
     def add(self, groups: Sequence[Group], frame: int, scan: int) -> tuple[DataFault, ...]:
-        """Record the groups of readings that are wrong in a frame; return the faults not yet confirmed.
+        """Record a frame's groups of wrong readings, and return the faults that are not yet confirmed.
 
         Args:
             groups: Groups of wrong readings.
@@ -99,11 +100,11 @@ class FaultList:
         return tuple(passing)
 
     def follow(self, deviation: Float, known: Mask) -> None:
-        """Remove the faults whose readings have agreed with the field for enough successive frames.
+        """Remove each fault whose readings agreed with the field in enough successive frames.
 
         Args:
             deviation: (U, K) differences between the readings and the field, in standard deviations.
-            known: (U, K) bool, the readings that were received.
+            known: (U, K) mask of the readings that were received.
         """
         for key, named in list(self._named.items()):
             here = named.mask & known

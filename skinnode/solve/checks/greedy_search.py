@@ -3,8 +3,8 @@
 The matrix A = [I B] has one column for each of the m readings and one for the response to each of the 4Q
 loads. The search needs Aᵀ P z and the diagonal of the Gram matrix E = Aᵀ P A. Adding a load or leaving out a
 reading is a rank-one update of the precision, P' = P − share · v vᵀ. Each such step stores one vector Aᵀ v,
-from which Aᵀ P z and the diagonal are updated, as in batch orthogonal matching pursuit. Of P', only the
-wires' blocks are computed; they are needed to test whether all readings of a wire are wrong.
+from which Aᵀ P z and the diagonal are updated, as in batch orthogonal matching pursuit. Only the blocks of P'
+that belong to a single wire are computed, in order to test whether all readings of the wire are wrong.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ from skinnode.solve.linalg.vectors import Index
 STEPS: Final = 8
 """Maximum total number of loads and groups of wrong readings in an explanation with faults."""
 LOADS: Final = 60
-"""Maximum number of loads in an explanation by loads alone: a contact covers up to twenty cells, with three
-loads each. With a maximum of 8 loads and a noise of 3e-6, faults were falsely reported in half of all healthy
-frames of a deep slide."""
+"""Maximum number of loads in an explanation by loads alone. A contact covers up to twenty cells, and each
+cell has three loads. With a maximum of 8 loads, at a noise of 3e-6, faults were falsely reported in half of
+all healthy frames of a deep slide."""
 ENOUGH: Final = 1.0
-"""Minimum gain in log evidence, nats, for which the search adds a load or a fault."""
+"""Minimum gain in log evidence (nats) from a load or fault that the search adds to an explanation."""
 LOAD, CROSSING, LOWER, UPPER = range(4)
 """Kinds of a search step: add a load, leave out the reading of a crossing, or leave out all readings of a
 lower or an upper wire."""
@@ -44,7 +44,7 @@ class GreedySearch:
         model: Distribution of the readings.
 
     Attributes:
-        kinds: (LOADS,) kind of each step of the last search; −1 after its last step.
+        kinds: (LOADS,) kind of each step of the last search; −1 marks unused entries.
         numbers: (LOADS,) number of the load, reading or wire of each step.
         gains: (LOADS,) gain of each step in log evidence, nats.
     """
@@ -69,7 +69,7 @@ class GreedySearch:
         Args:
             number: Index of κ.
             z: (U, K) changes of the readings since rest, in units of their noise.
-            present: (U, K) bool, the readings to use.
+            present: (U, K) mask of the readings to use.
             cost: Log evidence subtracted for each wrong reading, nats.
             faults: Whether the explanation may contain wrong readings.
             loads: Whether the explanation may contain loads.
@@ -91,7 +91,7 @@ class GreedySearch:
 def crossing_gain(d: Float, alpha: Float, present: Mask, cost: float) -> tuple[float, int]:
     """Return the largest gain in log evidence from treating a reading as wrong, and that reading's number.
 
-    ``d`` is the diagonal of P. The choice among m readings reduces the gain by ln m.
+    ``d`` is the diagonal of P. Because m readings are compared, ln m is subtracted from the gain.
     """
     best, where = -math.inf, -1
     for i in range(present.size):
@@ -145,8 +145,8 @@ def _best_group(  # noqa: PLR0913 - a kernel: arrays by name
 ) -> tuple[float, int, int]:
     """Return the largest gain from treating a group of readings as wrong, and the group's kind and number.
 
-    A group is a single reading or all readings of a wire. The choice among n groups of a kind reduces the
-    gain by ln n. ``block`` and ``right`` are work arrays.
+    A group is a single reading or all readings of a wire. Because n groups of each kind are compared, ln n is
+    subtracted from the gain. ``block`` and ``right`` are work arrays.
     """
     upper, lower = len(of_upper), len(of_lower)
     gain, number = crossing_gain(d, alpha, present, cost)
@@ -166,7 +166,7 @@ def _best_group(  # noqa: PLR0913 - a kernel: arrays by name
 def _gram_row(  # noqa: PLR0913 - a kernel: arrays by name
     item: int, p: Float, moved: Float, gram: Float, response_t: Float, row: Float
 ) -> None:
-    """Write row ``item`` of E into ``row`` (m + 4Q,); use ``moved`` and ``gram`` unless they are empty."""
+    """Write row ``item`` of E into ``row`` (m + 4Q,), from ``moved`` and ``gram`` unless these are empty."""
     m = len(p)
     if item < m:
         for j in range(m):
@@ -200,7 +200,8 @@ def _update(  # noqa: PLR0913 - a kernel: arrays by name
 ) -> None:
     """Update the search vectors for step ``count``, which leaves out a reading or adds a load.
 
-    A load is added with its most likely variance, (b² − h) / h². Elements before ``first`` are not updated.
+    An added load is assigned its most likely variance, (b² − h) / h². Elements before ``first`` are not
+    updated.
     """
     row = vectors[count]
     _gram_row(item, p, moved, gram, response_t, row)
@@ -258,7 +259,7 @@ def _update_blocks(share: float, row: Float, of_upper: Float, of_lower: Float) -
 
 @njit
 def _best_load(weighted: Float, diagonal: Float, m: int, least: float) -> tuple[float, int]:
-    """Return the largest gain from adding a load, and the load's number, or −1 if no load has a gain."""
+    """Return the largest gain from adding a load, and the load's number; −1 if no load has a gain."""
     most, number = 1.0, -1
     for j in range(m, diagonal.size):
         if diagonal[j] > least:
@@ -323,7 +324,7 @@ def _search(  # noqa: PLR0913, C901 - a kernel: arrays by name, a greedy search
         total += gain
         kinds[step], numbers[step], gains[step] = kind, number, gain
         if kind == LOAD:
-            first = 0 if faults else m  # explanations by loads alone do not use the first m elements
+            first = 0 if faults else m  # a search for loads alone does not use the first m elements
             _update(m + number, count, first, p, moved, gram, response_t, weighted, diagonal, vectors, share)
             if faults:
                 _update_blocks(share[count], vectors[count], of_upper, of_lower)

@@ -8,10 +8,10 @@ others is α_Gᵀ P_GG⁻¹ α_G (Rasmussen and Williams, Gaussian Processes for
 5.4.2).
 
 The loads act on two supports of the rubber: a half-space, as in the elastic prior (three loads per cell), and
-a thin bonded layer (a normal load per cell). With the half-space alone, the readings of a sound patch on a
-thin layer seemed to contradict each other: in ``tests/solve/test_trust_on_a_thin_layer.py``, 91 of 210 fields
-were not trusted, and 88 faults were reported. With both supports, 1 field is not trusted, and no fault is
-reported.
+a thin bonded layer (one normal load per cell). With the half-space alone, readings of a healthy patch with a
+thin layer were reported as contradictory: in ``tests/solve/test_trust_on_a_thin_layer.py``, 91 of 210 fields
+were not trusted, and 88 faults were reported. With both supports, only 1 of the 210 fields was not trusted,
+and no faults were reported.
 """
 
 from __future__ import annotations
@@ -30,21 +30,21 @@ from skinnode.solve.linalg.cholesky import multiply, multiply_vector
 from skinnode.solve.posterior.elastic_prior import SLACK, ElasticPrior, bonded_response
 
 USUAL: Final = (-17, -3)
-"""Range of log2 s, with the prior scale s in pitches, for which load tables are computed in advance."""
+"""Range of log2 s for which load tables are precomputed; s is the prior scale in pitches."""
 MOST_USUAL: Final = 9
-"""Number of prior scales whose tables are computed in advance for a large patch. These are the largest scales
-within :data:`USUAL`."""
+"""Number of prior scales, counted from the largest in :data:`USUAL`, whose tables are precomputed for a large
+patch."""
 STORED: Final = 125_000_000
-"""Maximum size of tables computed in advance, in bytes. Computing the tables during the stream would delay
-the first touch by up to 0.1 s. The tables of the reference patch take 122 MB. For larger patches, products
-with loads are computed when they are needed."""
+"""Maximum size of precomputed tables, in bytes. Computing the tables during the stream would delay the first
+touch by up to 0.1 s. The tables of the reference patch take 122 MB. For larger patches, the products with the
+loads are computed when they are needed."""
 OCTAVES: Final = (-7, 21)
-"""Range of log2 κ, which covers noise from 1e-6 to 1e-2 and prior scales from 1e-4 to 1 pitch."""
+"""Range of log2 κ; it covers noise from 1e-6 to 1e-2 and prior scales from 1e-4 to 1 pitch."""
 
 
 @dataclass(frozen=True, eq=False)
 class Level:
-    """Distribution of the readings at one κ, with m = U K readings and Q cells of loads."""
+    """Distribution of the m = U K readings at one κ, for Q cells that may be loaded."""
 
     precision: Float
     """(m, m) precision P of the readings."""
@@ -76,7 +76,7 @@ class ReadingModel:
 
     Attributes:
         jacobian: (U, K, 3N) ∂(ln F)/∂x at rest, 1/pitch.
-        response: (m, 4Q) matrix B, the changes of the readings per load.
+        response: (m, 4Q) matrix B of the readings' responses to unit loads.
         response_t: (4Q, m) Bᵀ.
         kappa: (L,) values of κ.
         log_det: (L,) ln det S.
@@ -96,7 +96,7 @@ class ReadingModel:
         self.response_t = np.ascontiguousarray(self.response.T)
         covariance = np.empty((upper * lower, upper * lower))
         multiply(self.response, self.response_t, covariance)
-        for u in range(upper):  # the slack of the elastic prior
+        for u in range(upper):  # the slack term of the elastic prior
             rows = slice(u * lower, (u + 1) * lower)
             covariance[rows, rows] += SLACK**2 * (self.jacobian[u] @ self.jacobian[u].T)
         values, vectors = np.linalg.eigh(0.5 * (covariance + covariance.T))
@@ -114,7 +114,7 @@ class ReadingModel:
 
     @classmethod
     def of(cls, layout: PatchLayout) -> ReadingModel:
-        """Return the model of ``layout`` from a cache."""
+        """Return the cached model of ``layout``, and create the model on first use."""
         return _model(layout)
 
     def level(self, number: int) -> Level:
@@ -132,7 +132,7 @@ class ReadingModel:
         return found
 
     def prepare(self, sigma: float) -> None:
-        """Compute the tables that a stream with the relative noise ``sigma`` usually needs.
+        """Precompute the tables that a stream with the relative noise ``sigma`` usually needs.
 
         Other tables are computed on first use. The computation takes 0.25 s for the reference patch.
         """
@@ -189,7 +189,7 @@ def changes(jacobian_: Float, moved: Float, sigma: float, z: Float) -> None:
 def evidences(  # noqa: PLR0913 - a kernel: arrays by name
     vectors_t: Float, shrink: Float, log_det: Float, z: Float, c: Float, out: Float
 ) -> int:
-    """Write the log evidence of ``z`` (m,) at every κ into ``out`` (L,); return the index of the largest.
+    """Write the log evidence of ``z`` (m,) at every κ into ``out`` (L,); return the index of the maximum.
 
     The constant −½ m ln 2π is omitted. ``c`` (m,) is a work array.
     """

@@ -1,7 +1,7 @@
-"""Trust in a field: decide whether a field is trusted, and state the reason if not.
+"""Trust in a field: decide whether the field is trusted and, if it is not, state the reason.
 
-A field is trusted if every upper wire that was not left out converged, if enough readings and upper wires
-remain, and if the readings do not contradict each other. The host also requires that the patch is alive.
+A field is trusted if all used upper wires converged, if the readings and upper wires used are sufficiently
+many, and if the readings do not contradict each other. The host additionally requires the patch to be alive.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from skinnode.model.data_fault import DataFault
 from skinnode.model.status import Status
 
 OF_PATCH: Final = 0.75
-"""Minimum share of usable readings, and minimum share of trusted upper wires, for a field to be trusted. On
-the reference patch, two upper wires and one lower wire may be missing (share 0.77), but not three upper wires
-(0.7)."""
+"""Minimum share of usable readings, and minimum share of trusted upper wires, for a field to be trusted. The
+field of the reference patch is still trusted if two upper wires and one lower wire are missing (share 0.77),
+but not if three upper wires are missing (0.7)."""
 OF_WIRE: Final = 0.8
 """Minimum share of usable readings for an upper wire to be trusted."""
 CONTRADICTION: Final = (
@@ -40,13 +40,13 @@ def assess(
 
     Args:
         status: Status of each of the U wires.
-        used: (U, K) bool, the readings used.
+        used: (U, K) mask of the readings used.
         faults: Faults whose readings were left out.
         contradiction: Description of a contradiction that remains among the used readings; empty if there is
             none.
 
     Returns:
-        The reason as text, empty if the field is trusted; and (U,) bool, the trusted upper wires.
+        The reason as text (empty if the field is trusted), and the (U,) mask of the trusted upper wires.
     """
     share = used.mean(axis=1)
     converged = np.array([each is Status.CONVERGED for each in status])

@@ -1,16 +1,16 @@
 """Tests of whole wires: whether a wire's readings fit the other wires, and whether its gain is correct.
 
-If the readings of a wire lag behind or belong to another wire, each of them deviates only slightly from the
-prediction by the other wires. A test of single readings does not detect such a fault. Let G be the readings
-of a wire, P the precision, S = P⁻¹ the covariance and α = P z. Two hypotheses are compared with the
-hypothesis of a healthy wire:
+If a wire's readings are delayed or belong to another wire, each reading deviates only slightly from the
+prediction by the other wires. A test of single readings does not detect these small deviations. Let G be the
+readings of a wire, P the precision, S = P⁻¹ the covariance and α = P z. Two fault hypotheses are compared
+with the hypothesis that the wire is healthy:
 
 - Unrelated: z_G has its own distribution N(0, S_GG), independent of the other wires. The log evidence changes
   by ½ α_Gᵀ P_GG⁻¹ α_G − ½ z_Gᵀ S_GG⁻¹ z_G − ½ ln det P_GG S_GG.
 - Gain: all readings of the wire are wrong by the same factor 1 + c, c ~ N(0, τ²). The log evidence changes by
   ½ (1ᵀα_G)² / (q + τ⁻²) − ½ ln(1 + τ² q) with q = 1ᵀ P_GG 1.
 
-Both changes follow from the rules for conditioning a normal distribution.
+The changes of the log evidence follow from the rules for conditioning a normal distribution.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from skinnode.compiled.jit import njit, njit_part
 from skinnode.model.layout import Float
 
 GAIN_STD: Final = 0.02
-"""Standard deviation of a wire's relative gain error, equal to the value assumed for gain drift. Not
+"""Assumed standard deviation of a wire's relative gain error; the same value is used for gain drift. Not
 tuned."""
 LEAST: Final = 1e-9
 """Minimum precision of a reading, in units of 1 / noise²; smaller values are rounding errors."""
@@ -95,7 +95,8 @@ def least_fitting(  # noqa: PLR0913 - the frame, its tables and scratch
         tables: Cholesky factors of the wires' blocks of P and S.
         z: (U, K) changes of the readings since rest, in units of their noise.
         alpha: (m,) P z.
-        present: (U, K) bool, the available readings; a wire without at least half of its readings is skipped.
+        present: (U, K) mask of the available readings; a wire is skipped if fewer than half of its readings
+            are available.
         sigma: Relative noise of the readings.
         work: (max(U, K),) work array.
     """
@@ -148,7 +149,7 @@ def _least_fitting(  # noqa: PLR0913 - a kernel: arrays by name
 
 @njit_part
 def _square(factor: Float, values: Float, first: int, step: int, work: Float) -> float:
-    """Return xᵀ (L Lᵀ)⁻¹ x with the Cholesky factor L, for the values at ``first``, ``first + step``, …."""
+    """Return xᵀ (L Lᵀ)⁻¹ x for the Cholesky factor L and the elements x at ``first``, ``first + step``, …."""
     square = 0.0
     for i in range(factor.shape[0]):
         value = values[first + i * step]

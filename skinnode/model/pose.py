@@ -42,7 +42,7 @@ class Pose:
 
     @classmethod
     def from_rpy(cls, position_m: tuple[float, float, float], rpy_rad: tuple[float, float, float]) -> Self:
-        """Return the pose after rotations about the parent's axes x (roll), y (pitch), z (yaw), in this order.
+        """Return the pose after rotations about the parent's axes x (roll), y (pitch) and z (yaw), in order.
 
         URDF uses the same convention.
 

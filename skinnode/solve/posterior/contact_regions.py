@@ -7,14 +7,14 @@ and the difference is significant (topological persistence).
 
 A peak is a contact if one of three tests is significant: the load sum of its 3 × 3 cells, the χ² of the loads
 of these cells, or the sum of the loads over its area. The strongest peak is also a contact if the skin under
-it is significantly pressed in. In this case, the patch is touched even though the loads cannot be located.
+it is significantly pressed in. A significantly indented skin is touched even if the loads cannot be located.
 
 Only cells with an electrode are tested: beyond the outermost electrodes, loads of different sizes at
-different distances cause nearly the same displacement. Cells beyond these electrodes are added to the
+different distances cause nearly the same displacement. Cells beyond the outermost electrodes are added to the
 adjacent contact.
 
 The thresholds depend on the last frame, so that noise does not switch a contact on and off. The loads between
-two peaks must change by a third before one contact becomes two or two contacts become one.
+two peaks must change by a third before one contact is split or two contacts are merged.
 """
 
 from __future__ import annotations
@@ -30,18 +30,18 @@ from skinnode.model.layout import Float
 from skinnode.solve.linalg.vectors import Index
 
 SIGNIFICANT: Final = 5.0
-"""Significance, in standard deviations, above which a load is a contact. With 100 load sums per frame, noise
-exceeds this threshold about once in ten thousand frames."""
+"""Minimum significance of a load, in standard deviations, for the load to be a contact. With 100 load sums
+per frame, noise exceeds this threshold about once in ten thousand frames."""
 SIGNIFICANT_STILL: Final = 4.0
-"""Significance, in standard deviations, above which a contact of the last frame remains a contact."""
+"""Minimum significance, in standard deviations, for a contact of the last frame to be kept."""
 BLOCK_EXTRA: Final = 22.0
-"""Amount by which the χ² of the nine loads around a peak must exceed the squared significance threshold. With
-nine degrees of freedom, χ² exceeds 47 as rarely as a normal variable exceeds five standard deviations."""
+"""Minimum difference between the χ² of the nine loads around a peak and the squared significance threshold.
+With nine degrees of freedom, χ² exceeds 47 as rarely as a normal variable exceeds five standard
+deviations."""
 PRESSED: Final = 6.0
-"""Indentation of the skin, in standard deviations, above which the strongest peak is a contact."""
+"""Minimum indentation of the skin, in standard deviations, for the strongest peak to be a contact."""
 PRESSED_STILL: Final = 5.0
-"""Indentation of the skin, in standard deviations, above which a contact of the last frame remains a
-contact."""
+"""Minimum indentation of the skin, in standard deviations, for a contact of the last frame to be kept."""
 RELEVANT: Final = 0.2
 """Minimum ratio of a peak's load sum to that of the strongest contact for the peak to be another contact.
 Ringing next to a contact reaches a tenth of the contact's load sum."""
@@ -54,11 +54,11 @@ PART_SIGNIFICANT: Final = 3.0
 """Minimum load sum for a cell to belong to a contact, in standard deviations of the peak's load sum. Without
 this limit, noise around a touch near the detection limit would shift the centre by a pitch."""
 PART_MOST: Final = 0.6
-"""Ratio of a cell's load sum to the peak's load sum above which the cell belongs to the contact even if its
-load sum is not significant."""
+"""Minimum ratio of a cell's load sum to the peak's load sum for the cell to belong to the contact even if the
+cell's load sum is not significant."""
 GAP: Final = 0.5
-"""Ratio of the load sum between two peaks to that of the smaller peak, below which the peaks are two
-contacts. Measured on ten families of loads (spheres inside, on the edge and half off the patch, punches,
+"""Maximum ratio of the load sum between two peaks to the load sum of the smaller peak, for the peaks to be
+two contacts. Measured on ten families of loads (spheres inside, on the edge and half off the patch, punches,
 plates, ridges, dents, large areas; ``tests/solve/test_contact_number.py``): with 0.4, 0.5 and 0.6, no single
 body was split. With 0.75, plates at the edge were split because of ringing. Two spheres are separated if they
 are at least 5 pitches apart."""
@@ -67,8 +67,8 @@ GAP_ONE: Final = 0.4
 GAP_TWO: Final = 0.6
 """Value of :data:`GAP` for two peaks that were two contacts in the last frame."""
 GAP_SIGNIFICANT: Final = 3.0
-"""Minimum difference between the load sum of the smaller peak and the load sum between two peaks for the
-peaks to be two contacts, in standard deviations."""
+"""Minimum difference, in standard deviations, between the load sum of the smaller peak and the load sum
+between two peaks, for the peaks to be two contacts."""
 
 
 RegionScratch = tuple[
@@ -151,7 +151,7 @@ def _block_chi2(  # noqa: PLR0913, C901 - a kernel: loads and their posterior by
 
 @njit_part
 def _box(cell: int, near: Index, own: NDArray[np.bool_], out: Index) -> int:
-    """Write a cell and its neighbours, if they have an electrode, into ``out``; return their number."""
+    """Write those of a cell and its neighbours that have an electrode into ``out``; return their number."""
     count = 0
     for i in near[cell]:
         if i >= 0 and own[i]:
@@ -246,7 +246,7 @@ def _grow_areas(  # noqa: PLR0913, C901 - a kernel: loads, their posterior and s
     signs: Float,
     split: NDArray[np.bool_],
 ) -> None:
-    """Write each cell's peak into ``area`` (Q,), or −1 for cells with a small load sum."""
+    """Write the peak to which each cell belongs into ``area`` (Q,); −1 for cells with a small load sum."""
     cells, top = total.size, total[order[0]]
     for cell in range(cells):
         area[cell], parent[cell] = -1, cell

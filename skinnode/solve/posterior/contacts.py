@@ -1,8 +1,8 @@
 """Contacts on the skin, measured from the posterior of the loads.
 
-In the prior, the loads q ~ N(0, s² D) move the electrodes by u = G q + slack. The posterior mean of q for a
-displacement u is D Gᵀ C⁻¹ u. The posterior variance of a sum wᵀ q is s² wᵀ D w − ‖L⁻¹ J G s² D w‖², in the
-notation of :mod:`skinnode.solve.posterior.measurement_update`.
+According to the prior, the loads q ~ N(0, s² D) displace the electrodes by u = G q plus a small slack. The
+posterior mean of q for a displacement u is D Gᵀ C⁻¹ u. The posterior variance of a sum wᵀ q is s² wᵀ D w −
+‖L⁻¹ J G s² D w‖², in the notation of :mod:`skinnode.solve.posterior.measurement_update`.
 
 :mod:`skinnode.solve.posterior.contact_regions` assigns the cells to contacts. This module measures the force,
 centre, area and shear of each contact, with standard deviations.
@@ -29,13 +29,13 @@ from skinnode.solve.posterior.map_estimate import PRIOR_DOUBT
 HERTZ_SPREAD: Final = 2.5
 """Ratio of the squared contact radius a² to the mean of r² weighted by the Hertz pressure √(1 − r²/a²)."""
 PULLING: Final = 0.25
-"""Ratio of the sum of all loads of a contact to the sum of its pressing loads, below which pulling loads are
-left out. Nothing pulls on the skin, but the half-space model reproduces the displacement of a layer on a
-support only with pulling loads at the rim of the contact. The ratio is 0.5 for 16 mm of rubber bonded to
-metal, 0.15 for 8 mm, and about 0 for 4 mm or less. On a half-space, the ratio is 0.8 to 1, or at least 0.33
-if the contact is much smaller than a cell."""
+"""Threshold for the ratio of the sum of all loads of a contact to the sum of its pressing loads; below the
+threshold, pulling loads are left out. Real objects do not pull on the skin, but the half-space model needs
+pulling loads at the rim of the contact to reproduce the displacement of a supported layer. The ratio is 0.5
+for 16 mm of rubber bonded to metal, 0.15 for 8 mm, and about 0 for 4 mm or less. On a half-space, the ratio
+is 0.8 to 1, or at least 0.33 if the contact is much smaller than a cell."""
 PULLED_OFF: Final = 0.1
-"""Standard deviation of a contact's centre along the surface if pulling loads were left out, in cell widths.
+"""Standard deviation, in cell widths, of a contact's centre along the surface if pulling loads were left out.
 Measured RMS errors on layers of 2, 4 and 8 mm were 0.11, 0.08 and 0.05; the maximum was 0.25. If pulling
 loads are left out, the standard deviation of the contact's area is at least as large as the area."""
 BEYOND: Final = 1.0
@@ -70,12 +70,12 @@ class ContactFinder:
         prior: Elasticity of the patch.
         layout: The patch.
         rubber: Material of the skin.
-        calibrated: Whether the forces are calibrated. If not, the standard deviation of a normal force
-            includes the difference from a layer that is as thick as the clearance and bonded to a rigid
-            support.
+        calibrated: Whether the forces are calibrated. Without calibration, the standard deviation of a normal
+            force covers the difference between a half-space and a layer that is as thick as the clearance and
+            bonded to a rigid support.
         thickness: Tolerance of the thickness, as a fraction of the clearance.
         outermost: Whether to add the loads of the outermost ring of cells to an adjacent contact. Use False
-            if the prior expects equal loads everywhere, because it spreads the loads too far.
+            if the prior expects equal loads everywhere, because such a prior spreads the loads too far.
     """
 
     def __init__(  # noqa: PLR0913 - what the patch is
@@ -239,11 +239,11 @@ def _measure(  # noqa: PLR0913, C901 - a kernel: cells, loads and outputs by nam
 ) -> tuple[int, bool, float]:
     """Measure the force in N, centre (3) in m, mean r² in m² and shear (2) in N of one contact.
 
-    Writes the seven values into ``mean``, and their standard deviations, by the delta method, into ``std``.
-    Returns the cell closest to the centre, whether pulling loads were left out, and the sum of the pressing
-    loads in N. The variances are multiplied by ``PRIOR_DOUBT``, because mainly the prior determines how a
-    contact's load is distributed over its cells. ``cells`` (Q,), ``r2`` (Q,) and ``slopes`` (Q, 5) are work
-    arrays.
+    Writes the seven values into ``mean``, and their standard deviations (computed by the delta method) into
+    ``std``. Returns the cell closest to the centre, whether pulling loads were left out, and the sum of the
+    pressing loads in N. The variances are multiplied by ``PRIOR_DOUBT``, because mainly the prior determines
+    how a contact's load is distributed over its cells. ``cells`` (Q,), ``r2`` (Q,) and ``slopes`` (Q, 5) are
+    work arrays.
     """
     size, every, pressing = 0, 0.0, 0.0
     for cell in range(number.size):

@@ -28,14 +28,14 @@ from skinnode.solve.posterior.load_cells import MARGIN, LoadCells
 
 SHEAR_SHARE: Final = 0.4
 """Ratio of the standard deviations of shear and normal loads; a contact that slides with a friction
-coefficient of 0.6 has a shear load of 1.5 standard deviations. The evidence changes by 2 % between ratios of
-0.25 and 0.4. With smaller ratios, the standard deviations are too small on layouts that are insensitive to
+coefficient of 0.6 has a shear load of 1.5 standard deviations. The evidence varies by 2 % for ratios from
+0.25 to 0.4. With smaller ratios, the standard deviations are too small on layouts that are insensitive to
 shear (`aligned`)."""
 LAYER_SHARE: Final = 0.25
-"""Ratio of the displacement expected from loads on a bonded layer to that from loads on a half-space, for the
-data check. Values from 0.25 to 1 explain all presses on thin layers; with 0.1, a dent that no half-space
-forms is taken for a faulty wire. With 0.5 or more, an upper wire that lags by four scans goes unnoticed,
-because loads on the layer explain its readings."""
+"""Ratio, in the data check, of the expected displacement by loads on a bonded layer to that by loads on a
+half-space. Values from 0.25 to 1 explain all presses on thin layers; with 0.1, a dent that cannot form on a
+half-space was mistaken for a faulty wire. With 0.5 or more, an upper wire whose readings are delayed by four
+scans is not detected, because loads on the layer explain these readings."""
 SLACK: Final = 0.005
 """Ratio of ε to the standard deviation of the normal displacement. It keeps C regular. Values from 0.001 to
 0.02 give the same results."""
@@ -93,10 +93,10 @@ class ElasticPrior:
 def bonded_response(layout: PatchLayout) -> Float:
     """Return the response (3UN, Q) of a bonded layer to normal loads, pitches per unit load.
 
-    The layer is as thick as the electrodes are high, and incompressible: of all supports of the rubber, this
-    one differs most from the half-space. Under a press, its surface moves outwards around the contact and
-    hardly sinks there. The median standard deviation of the normal displacement is :data:`LAYER_SHARE`
-    pitches if the loads have a standard deviation of 1.
+    The layer is incompressible, and its thickness equals the height of the electrodes. This support of the
+    rubber differs most from the half-space. Around a contact, the surface of the layer moves outwards and
+    hardly downwards. The median standard deviation of the normal displacement is :data:`LAYER_SHARE` pitches
+    if the loads have a standard deviation of 1.
     """
     cells = LoadCells.of(layout)
     radius_m = math.sqrt(cells.size_m[0] * cells.size_m[1] / math.pi)  # a disc as large as a cell

@@ -39,15 +39,16 @@ from skinnode.solve.wires.decode import A_MAX, A_MIN
 from skinnode.solve.wires.problem import PatchProblem
 
 NOISE_LEAST: Final = 1e-6
-"""Minimum relative noise, equal to a fifth of a 16-bit code; the forward model is not more accurate. Lower
+"""Minimum relative noise: a fifth of a 16-bit code, which is also the accuracy of the forward model. Lower
 noise would force the field onto a root of F = b, which can be a wrong root. On layouts with folds, wrong
-roots occur even at ten times this noise."""
+roots occur even at ten times the minimum noise."""
 LEFT_OUT: Final = 3
-"""Maximum number of wires left out of a frame, one at a time, before the whole frame is INCONSISTENT."""
+"""Maximum number of wires left out of a frame, one at a time; if that is not sufficient, the whole frame is
+INCONSISTENT."""
 LEAST_STEPS: Final = 3.0
 """Minimum duration of a solve from rest, as a multiple of the time to factorise all wires and compute their
-standard deviations. In measurements, solves of presses on 1 to 10 wires took 11 to 20 times this
-time."""
+standard deviations. Measured solves of presses on 1 to 10 wires took 11 to 20 times as long as this basic
+computation."""
 
 Mask = NDArray[np.bool_]
 
@@ -129,7 +130,7 @@ class FrameEstimator:
         a = 1.0 / (potential * self._problem.gain)
         self.estimate(a, np.ones(self.layout.shape, bool), 1e-4)
         self._seconds = seconds
-        self._estimator.gamma()  # compile gamma now, not in the first untouched frame
+        self._estimator.gamma()  # compile gamma before the first untouched frame
         if self._contacts is not None:
             self._contacts.warm_up(self._hyper.loads.estimate())
         self._forget()
@@ -231,7 +232,7 @@ class FrameEstimator:
     def energy(self, moved: Float) -> float:
         """Return uᵀ (s² C)⁻¹ u: −2 log of the prior density of a displacement, up to a constant.
 
-        The prior is that of the last frame.
+        The method uses the prior of the last frame.
 
         Args:
             moved: (U, 3N) displacement, pitches.
@@ -253,7 +254,7 @@ class FrameEstimator:
         estimate = self.noise_estimate
         if estimate is not None:
             if estimate.see(frame, noise, rounding_ohm, mask):
-                self._seen = np.zeros_like(self._seen)  # the trusted field has the previous noise
+                self._seen = np.zeros_like(self._seen)  # the trusted field assumed the previous noise
             if estimate.factor != 1.0:
                 noise = estimate.factor * noise
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
@@ -278,8 +279,8 @@ class FrameEstimator:
     def _is_quiet(self, observation: Observation) -> bool:
         """Return whether the last field explains the frame within noise.
 
-        The residual of a wire used for the last field contains noise from two sources: this frame and the
-        last field.
+        If a wire was used for the last field, its residual contains the noise of this frame and the noise of
+        the last field.
         """
         seen_before = self._known and np.array_equal(observation.weight > 0, self._seen)
         if not (self.options.hold and seen_before):
@@ -331,7 +332,7 @@ class FrameEstimator:
         return self._give_up(Status.INCONSISTENT)
 
     def _joining(self, fit: Fit, observation: Observation, wanted: Index) -> Index:
-        """Return the wires outside ``wanted`` that contradict the current field, and keep them in use."""
+        """Return the wires outside ``wanted`` that contradict the current field, and mark them as kept."""
         moved = self._gate.moved(fit, observation.count)
         moved[wanted] = False
         joining = np.flatnonzero(moved)
@@ -341,7 +342,7 @@ class FrameEstimator:
     def _accept(
         self, status: NDArray[np.int64], members: Index, seen: Mask
     ) -> tuple[NDArray[np.int64], Mask]:
-        """Accept the current field as the trusted field, unless an electrode is out of reach."""
+        """Accept the current field as the trusted field, unless an electrode moved impossibly far."""
         estimator = self._estimator
         if self._problem.out_of_reach(self._problem.rest + estimator.moved).any():
             return self._give_up(Status.ILL_CONDITIONED)
@@ -380,7 +381,7 @@ class FrameEstimator:
     def _anneal_and_compare(self, observation: Observation, members: Index) -> bool:
         """Anneal from rest, and keep the more likely of the tracked and the annealed field.
 
-        A field far from the last compared field may be a wrong maximum found by tracking.
+        If the field is far from the last compared field, tracking may have reached a wrong maximum.
         """
         estimator = self._estimator
         self._compared[:] = estimator.moved
@@ -400,9 +401,9 @@ class FrameEstimator:
     ) -> Observation:
         """Adapt the hyperparameters and, if the layout has folds, select the more likely of two maxima.
 
-        A prior that expects loads everywhere may have led to a wrong maximum. The field is therefore annealed
-        again with loads expected where they were found. The new field replaces the old field if its −2 log
-        posterior is lower by at least :data:`skinnode.solve.roots.LIKELIER`.
+        A prior that expects loads everywhere can lead to a wrong maximum. The field is therefore annealed
+        again with a prior that expects loads at the locations found. The new field replaces the old field if
+        its −2 log posterior is lower by at least :data:`skinnode.solve.roots.LIKELIER`.
         """
 
         def observe(noise_factor: float) -> Observation:
@@ -436,7 +437,7 @@ class FrameEstimator:
         displacement = problem.displacement_m(problem.rest + self._trusted)
         std, core = np.zeros_like(self._trusted), np.zeros_like(self._trusted)
         std[:, self._free], core[:, self._free] = estimator.std, estimator.core
-        if held.all():  # include half of the displacement that the gate may have missed
+        if held.all():  # include half of any displacement that the gate may have missed
             for each in (std, core):
                 each[:, self._free] = np.maximum(each[:, self._free], 0.5 * self._overlooked)
         if self._contacts is not None and self._known and not held.all():

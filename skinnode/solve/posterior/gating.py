@@ -18,11 +18,11 @@ from skinnode.solve.roots import IMPOSSIBLE_CHANCE
 QUIET_CHANCE: Final = 0.005
 """Probability per frame that the χ² test reports an unmoved wire as moved."""
 QUIET_DEVIATIONS: Final = 3.7
-"""Apparent movement of a single coordinate, in standard deviations, above which its wire counts as moved.
+"""Maximum apparent movement of a coordinate, in standard deviations, for its wire to be considered unmoved.
 With 300 coordinates at rest, noise alone exceeds this limit in one frame in 15."""
 KEPT: Final = 50
-"""Number of frames for which a wire's equations remain in use after the wire moved although the field
-computed from the other wires did not predict the movement."""
+"""Number of frames for which a wire's equations are used after the wire moved in a way that the other wires
+did not predict."""
 
 
 class Fit(NamedTuple):
@@ -33,7 +33,7 @@ class Fit(NamedTuple):
     sharpest: Float
     """(U,) largest apparent error of a single coordinate, in standard deviations."""
     move: Float
-    """(U, f) size of the movement that fits the wire best if only this coordinate moves, pitches."""
+    """(U, f) best-fitting movement of each coordinate, assuming that no other coordinate moved, pitches."""
 
 
 class Gate:
@@ -48,7 +48,7 @@ class Gate:
         self._quiet, self._impossible = (
             chi_squared_limits(equations, chance) for chance in (QUIET_CHANCE, IMPOSSIBLE_CHANCE)
         )
-        self._kept = np.zeros(wires, np.int64)  # remaining frames of each kept wire
+        self._kept = np.zeros(wires, np.int64)  # number of frames for which each wire is still kept
 
     def reset(self) -> None:
         """Remove all wires from the list of kept wires."""
@@ -63,7 +63,7 @@ class Gate:
         self._kept[wires] = KEPT
 
     def moved(self, fit: Fit, count: Index, noises: float | Float = 1.0) -> NDArray[np.bool_]:
-        """Return a (U,) bool mask of the wires whose residuals exceed their noise.
+        """Return a (U,) mask of the wires whose residuals exceed their noise.
 
         Args:
             fit: Misfit of the tested displacement.
@@ -81,7 +81,7 @@ class Gate:
         Args:
             fit: Misfit of the rest position.
             count: (U,) usable resistances of each wire.
-            members: Wires in the last estimate; a lower threshold applies to them.
+            members: Wires in the last estimate, to which a lower threshold applies.
         """
         touched = self.moved(fit, count)
         stay = np.zeros(len(touched), bool)
@@ -92,12 +92,12 @@ class Gate:
         return np.flatnonzero(touched)
 
     def excess(self, fit: Fit, count: Index) -> Float:
-        """Return the ratio of each wire's χ² to the limit above which the model is rejected, (U,)."""
+        """Return the ratios (U,) of each wire's χ² to the limit above which the model is rejected."""
         return np.asarray(fit.chi_squared / self._impossible[count])
 
 
 def chi_squared_limits(most: int, chance: float) -> Float:
-    """Return the χ² (most + 1,) exceeded with probability ``chance`` for 0, 1, … degrees of freedom."""
+    """Return the χ² limits (most + 1,) with tail probability ``chance`` for 0, 1, … degrees of freedom."""
     from scipy.special import chdtri
 
     return np.concatenate([[1e-300], chdtri(np.arange(1.0, most + 1.0), chance)])

@@ -1,12 +1,12 @@
-"""Geometry errors: nuisances that model a patch's manufacturing errors, and their effects on residuals.
+"""Geometry errors: nuisance parameters for a patch's manufacturing errors, and their effects on residuals.
 
 The resistances at rest (R₀) are measured, so a geometry error θ does not affect the residuals at rest. Away
-from rest, the effect is θ times the difference between ∂ ln F/∂θ at the displacement and at rest. This effect
-grows with the press. The errors are nuisances with a variance of 1, in units of their tolerance.
+from rest, the effect is θ times the change of ∂ ln F/∂θ since rest. The effect of a geometry error increases
+with the depth of the press. The errors are nuisances with a variance of 1, in units of their tolerance.
 
 - Thickness: all upper electrodes are shifted along their normals, in proportion to the clearance.
-- Radius: the mean of F over the rims of electrodes of radius ρ is F + (ρ²/2) ∇²F within the surface, with
-  ρ²/4 from each layer. The nuisance is ρ² in units of the squared tolerance.
+- Radius: the mean of F over the rims of electrodes of radius ρ is F + (ρ²/2) ∇²F, with the Laplacian within
+the surface; each layer contributes ρ²/4. The nuisance is ρ² in units of the squared tolerance.
 - Gain: the change in each resistance is multiplied by e^γ. Half of the variance of γ is common to the patch;
   the other half is independent in each upper wire.
 - Placement: each upper and each lower wire is shifted along x, y and z.
@@ -35,7 +35,8 @@ THICKNESS: Final = 0
 RADIUS: Final = 1
 GAIN: Final = 2
 COMMON: Final = 3
-"""Number of nuisances common to the whole patch, which come first: thickness, radius and gain."""
+"""Number of nuisances common to the whole patch (thickness, radius and gain); these are the first elements of
+g."""
 UPPER: Final = 4
 """Number of nuisances of each upper wire: shifts along x, y and z, and gain."""
 LOWER: Final = 3
@@ -43,8 +44,8 @@ LOWER: Final = 3
 EFFECTS: Final = COMMON + UPPER + LOWER
 """Number of geometry nuisances on which each residual depends."""
 GAIN_SHARE: Final = math.sqrt(0.5)
-"""Standard deviation of the gain error common to all wires, and of the additional gain error of each upper
-wire, in tolerances. A converter shared by all wires causes the common error; a converter per wire causes the
+"""Standard deviation, in tolerances, of the gain error common to all wires, and of the additional gain error
+of each upper wire. A converter shared by all wires causes the common error; a converter per wire causes the
 additional error."""
 
 
@@ -108,8 +109,8 @@ class GeometryError:
     ) -> float:
         """Write the residuals of the wires ``members`` into ``r`` (U, K), and return their sum of squares.
 
-        The residuals are r − H g, where ``h`` (U, K, p) and ``own`` (p,) contain the nuisances other than
-        those of the geometry.
+        The residuals are r − H g, where ``h`` (U, K, p) and ``own`` (p,) contain all nuisances except the
+        geometry errors.
         """
         shift, lower = self._shifts(g)
         problem = self._problem
@@ -168,7 +169,7 @@ def _linearise(  # noqa: PLR0913 - a kernel: arrays by name
             h_u[k, GAIN] = w * gain * change * own / before
             h_u[k, COMMON + 3] = h_u[k, GAIN]
             r_u[k] = scale * own - w + rim * g[RADIUS]
-            # the work arrays now receive factors of the derivatives of F and of the rims, here and at rest
+            # reuse the work arrays for factors of the derivatives of F and of the rims, at ``x`` and at rest
             rims[k] = w * square * g[RADIUS] / own
             bend[k] = scale - rims[k] * bend[k] / own
             at_rest = w * square * g[RADIUS] / before
@@ -273,8 +274,8 @@ def _product(first: Float, second: Float, start: int, stop: int) -> float:
 def add_covariance(members: Index, effect: Float, g: Float, y: Float, s: Float) -> None:
     """Add H Hᵀ of the wires ``members`` to the upper triangle of ``s``, and −H g to ``y``.
 
-    ``g`` contains only the nuisances of the geometry. Two residuals of the same upper wire share its
-    nuisances, as do two residuals of the same lower wire. All residuals share the common nuisances.
+    ``g`` contains only the geometry nuisances. Two residuals of the same upper wire share its nuisances, as
+    do two residuals of the same lower wire. All residuals share the common nuisances.
     """
     wires, equations = effect.shape[0], effect.shape[1]
     for j in range(members.size):
@@ -293,7 +294,7 @@ def add_covariance(members: Index, effect: Float, g: Float, y: Float, s: Float) 
 
 @njit
 def estimate(members: Index, effect: Float, v: Float, g: Float) -> None:
-    """Write −Hᵀ v with v = S⁻¹ y into ``g``, the nuisances of the geometry."""
+    """Write −Hᵀ v with v = S⁻¹ y into the geometry nuisances ``g``."""
     wires, equations = effect.shape[0], effect.shape[1]
     for q in range(g.size):
         g[q] = 0.0

@@ -18,9 +18,11 @@ from skinnode.solve.posterior.map_estimate import MapEstimator
 from skinnode.solve.posterior.observation import Observation
 
 SCALE_WORTH: Final = 2.0
-"""Weight of the prior on s², as a number of directions in data space; the data determine 100 to 200."""
+"""Weight of the prior on s², as a number of directions in data space; the data typically determine 100 to 200
+directions."""
 SCALE_REST: Final = 0.005
-"""Expected value of the prior scale s, in clearances; typical of presses that indent the layer by a tenth."""
+"""Expected value of the prior scale s, in clearances; typical of presses that indent the layer by a tenth of
+its thickness."""
 SCALE_MOST: Final = 1.0
 """Maximum prior scale s, in clearances; with a larger scale, the surface could be below the lower layer."""
 SCALE_STEP: Final = math.log(1.25)
@@ -28,8 +30,8 @@ SCALE_STEP: Final = math.log(1.25)
 by a smaller factor than the scale."""
 SCALE_LEAST: Final = 1.0
 """Minimum prior scale, relative to the scale of a field whose mean change of the resistances equals their
-noise. A smaller field cannot be detected, so the standard deviations of an untouched patch must allow for
-such a field."""
+noise. Smaller fields cannot be detected, so the standard deviations of an untouched patch must allow for
+undetected fields."""
 ADAPTIONS: Final = 5
 """Maximum number of updates of the prior or the noise per frame."""
 REFINEMENTS: Final = 3
@@ -90,20 +92,20 @@ class Hyperparameters:
             self._prior.scale2 = self._bounded(self._estimator.guess_scale(observation, members))
 
     def spread_as_seen(self, observation: Observation, members: Index) -> None:
-        """Reset the prior to equal loads, with the scale guessed from the frame and the old prior."""
+        """Reset the prior to equal loads, and estimate its initial scale from the frame and the old prior."""
         guess = self._fixed or self._bounded(self._estimator.guess_scale(observation, members))
         self._prior.spread(guess)
 
     def adapt(
         self, observation: Observation, observe: Observe, members: Index, *, local: bool
     ) -> Observation:
-        """Set the hyperparameters from the current field, and solve again until they stop changing.
+        """Set the hyperparameters from the field, and solve again until the hyperparameters stop changing.
 
         Args:
             observation: The frame.
             observe: Function that returns the observation of the frame for another noise factor.
             members: Wires whose equations are used.
-            local: Whether to set the expected load locations too.
+            local: Whether to set the expected load locations as well.
 
         Returns:
             The observation with the estimated noise.
@@ -138,7 +140,7 @@ class Hyperparameters:
         return observation
 
     def _set_scale(self, *, local: bool, refine: bool) -> bool:
-        """Set the scale and the load locations from the evidence; return whether they changed."""
+        """Set the scale and the load locations from the evidence; return whether the prior changed."""
         prior, changed = self._prior, False
         if local:
             variance = np.minimum(self.loads.expected(self._least), self._most)

@@ -1,4 +1,4 @@
-"""Cells on which surface loads act: one around each electrode site, and rings of cells beyond the outermost.
+"""Cells on which surface loads act: one cell around each electrode, and rings of cells beyond the edge.
 
 Curved skin is unrolled: distances are chords, and the response to a load is expressed in the tangent frame
 of each electrode.
@@ -83,13 +83,13 @@ def _lattice(layout: PatchLayout) -> tuple[Float, Float, Float, Float]:
     lower = layout.lower_m.reshape(-1, 3)
     up = (site - lower[_nearest(site, lower)]).mean(axis=(0, 1))
     wires, electrodes = site.shape[:2]
-    if min(wires, electrodes) == 1:  # a single row of electrodes defines no surface, so use the lower layer
+    if min(wires, electrodes) == 1:  # one row defines no surface, so use the lower layer
         flat = np.linalg.svd(lower - lower.mean(axis=0))[2][-1]
         up = flat * np.sign(flat @ up) if len(lower) > 2 and flat @ up != 0 else up
     up = up / np.linalg.norm(up)
     if electrodes > 1:
         along = np.gradient(site, axis=1)
-    else:  # a wire with one electrode has no direction of its own, so derive one
+    else:  # a wire with one electrode does not define a direction, so derive a direction
         axis = np.diff(site[:, 0], axis=0).mean(axis=0) if wires > 1 else np.eye(3)[np.argmin(np.abs(up))]
         along = np.broadcast_to(_sized(np.cross(axis, up), layout.pitch_m), site.shape)
     if wires > 1:

@@ -16,12 +16,12 @@ from skinnode.solve.posterior.contacts import LoadEstimate
 from skinnode.solve.posterior.map_estimate import MapEstimator
 
 LOCAL_SIGNIFICANT: Final = 4.0
-"""Squared significance above which a load counts as found, in squared standard deviations."""
+"""Minimum squared significance, in squared standard deviations, for a load to be considered detected."""
 LOCAL_CERTAIN: Final = 100.0
-"""Squared significance above which a press is certain, in squared standard deviations. With a value of 25 and
-high noise, the first load locations are unreliable and errors are 1 % larger. With values of 1000 and above,
-on layouts with low sensitivity (`aligned`), half of the expected load is still spread over the whole patch,
-which increases errors by 14 %."""
+"""Minimum squared significance, in squared standard deviations, for a press to be considered certain. With a
+value of 25 and high noise, the first load locations are unreliable and errors are 1 % larger. With values of
+1000 and above, on layouts with low sensitivity (`aligned`), half of the expected load is still spread over
+the whole patch, which increases errors by 14 %."""
 
 
 class LoadPosterior:
@@ -37,7 +37,7 @@ class LoadPosterior:
         self._whitened = np.empty((estimator.equations, loads))
         self._ones = np.ones(estimator.equations)
         self._stiffness = np.empty(loads)
-        self._factors = -1  # serial number of the factors used for the last two arrays
+        self._factors = -1  # serial number of the factors from which the cached arrays were computed
 
     def estimate(self) -> LoadEstimate:
         """Return the loads and their covariance; the arrays are valid until the next frame."""
@@ -76,9 +76,9 @@ class LoadPosterior:
 def _found(q: Float, own: Float, stiffness: Float, significant: float, found: Float) -> float:
     """Write the largest squared load of each cell, estimated without its own prior, into ``found`` (Q,).
 
-    Loads below the significance threshold count as 0. ``q`` (Q, 3) contains the loads, ``own`` (Q,) their
-    prior variances and ``stiffness`` (3Q,) their k. Returns the largest ratio of a squared load to its noise
-    variance.
+    For loads below the significance threshold, 0 is written. ``q`` (Q, 3) contains the loads, ``own`` (Q,)
+    their prior variances and ``stiffness`` (3Q,) their k. Returns the largest ratio of a squared load to its
+    noise variance.
     """
     most = 0.0
     for cell in range(found.size):

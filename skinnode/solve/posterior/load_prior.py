@@ -1,8 +1,8 @@
 """Prior of the loads on a patch, and of the displacement that the loads cause.
 
-Initially, equal loads are expected over the whole patch, with one scale s². After loads have been found, the
-prior expects loads at these locations and hardly any elsewhere (:meth:`LoadPrior.localise`). The skin next to
-a contact then moves only as far as the contact's loads require. Compared with one scale for the whole patch,
+Initially, the prior expects equal loads over the whole patch, with one scale s². After loads have been found,
+the prior expects loads mainly where they were found (:meth:`LoadPrior.localise`). The skin next to a contact
+then moves only as far as the contact's loads require. Compared with one scale for the whole patch,
 localisation reduces the error by a factor of two to three, and the error of a narrow contact no longer
 exceeds the reported standard deviation.
 """
@@ -26,20 +26,19 @@ from skinnode.solve.posterior.elastic_prior import SLACK, ElasticPrior
 
 LOCAL_SPREAD: Final = 0.7
 """Standard deviation, in cells, of the Gaussian that spreads the squared loads over neighbouring cells. A
-smaller value relies on single cells; the estimate is then better if the rubber matches the prior, but
-overconfident if it does not. With a value of 1, a quarter of the improvement is lost."""
+smaller value improves the estimate if the rubber matches the prior, but makes the estimate overconfident if
+the rubber differs from the prior. With a value of 1, a quarter of the improvement is lost."""
 LOCAL_FLOOR: Final = 0.05
 """Mean square load expected in cells without a found load, relative to the mean over the patch. This minimum
 allows for light touches near a press."""
 LOCAL_CHANGE: Final = 0.35
-"""Fraction of the expected loads that must move elsewhere before the prior is rebuilt. With a value of
-0.5, errors in a slow press reach 6 standard deviations; with 0.25, twice as many frames need a rebuild."""
+"""Minimum fraction of the expected loads that must change location before the prior is rebuilt. With a value
+of 0.5, errors in a slow press reach 6 standard deviations; with 0.25, twice as many frames need a rebuild."""
 LOCAL_SURPRISE: Final = 16.0
-"""Ratio of the squared load of a cell to its expected square above which the prior is rebuilt even if little
-of the expected load moved elsewhere. Without this limit, the error of a press twice as deep as in the
-previous frame was 7 standard deviations after an unusual motion that left small expected loads. A value of 16
-costs no time: in slow presses, the number of frames that need a factorisation is the same as without the
-limit."""
+"""Ratio of a cell's squared load to its expected squared load above which the prior is rebuilt even if the
+load locations hardly changed. Without this limit, the error of a press twice as deep as in the previous frame
+was 7 standard deviations after an unusual motion that left small expected loads. A value of 16 costs no time:
+in slow presses, the number of frames that need a factorisation is the same as without the limit."""
 
 
 class LoadPrior:
@@ -67,7 +66,7 @@ class LoadPrior:
         self.scale2 = 1.0
         self.share = np.ones(len(self._blur))
         self.version = 0
-        self._loads: tuple[Float, Float] | None = None  # last displacement and its mean loads
+        self._loads: tuple[Float, Float] | None = None  # last displacement, and its mean loads
 
     def spread(self, scale2: float) -> None:
         """Reset the prior to equal loads over the whole patch, at scale s²."""
@@ -83,7 +82,7 @@ class LoadPrior:
             variance: (Q,) variance of the loads of each cell, pitch².
 
         Returns:
-            Whether the prior was rebuilt; False if hardly any of the expected load moved elsewhere.
+            Whether the prior was rebuilt; False if the expected load locations hardly changed.
         """
         mean = float(variance.mean())
         share = variance / mean
@@ -101,8 +100,8 @@ class LoadPrior:
         """Return the load variances (Q,) in pitch² that the found loads imply, at least ``least``.
 
         The variances move halfway from their current values to the implied values, because full steps would
-        make neighbouring cells alternate. A full step is taken if a press is certain and equal loads were
-        expected over the whole patch.
+        make the variances of neighbouring cells oscillate. A full step is taken if a press is certain and
+        equal loads were expected over the whole patch.
 
         Args:
             found: (Q,) squared loads found in the frame, pitch².
@@ -138,7 +137,7 @@ class LoadPrior:
     def roughness(self, displacement: Float) -> float:
         """Return uᵀ C⁻¹ u in pitch² for a displacement (U f,), which is overwritten.
 
-        The result is the number of unknowns times the squared scale s² that fits the displacement best.
+        The result is the number of unknowns times the best-fitting squared scale s².
         """
         solve_lower_vector(self._root, displacement, displacement.size)
         return float(displacement @ displacement)

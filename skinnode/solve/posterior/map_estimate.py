@@ -5,9 +5,9 @@
 - Newton: refactorise at the current field, then take chord steps.
 - Anneal: start at the rest position with an assumed noise of 3 %, which is divided by four until it reaches
   the true noise. At high noise, the posterior has a single maximum, close to the maximum of the prior.
-  Tracking this maximum while the noise decreases leads to the correct maximum. Annealing solves presses of
-  70 % of the layer between two frames, even on layouts where the exact inverse fails when it tracks the press
-  sample by sample.
+  Tracking this maximum while the noise decreases leads to the correct maximum. Annealing solves presses that
+  indent the layer by 70 % between two frames, even on layouts where the exact inverse fails when it tracks
+  the press sample by sample.
 """
 
 from __future__ import annotations
@@ -36,32 +36,33 @@ ANNEAL_NOISE: Final = 0.03
 """Initial relative noise for annealing; at this noise, one Gauss-Newton step from rest ends near the
 maximum."""
 ANNEAL_RATIO: Final = 4.0
-"""Ratio of the noise of one annealing step to that of the next. In 80 presses of up to 70 % from rest on the
-staggered and aligned layouts, h = 0.5 and 1, a ratio of 3 leads to the correct maximum in 80 cases, a ratio
-of 5 in 79."""
+"""Ratio of the noise in one annealing step to the noise in the next step. In 80 presses of up to 70 % from
+rest on the staggered and aligned layouts, h = 0.5 and 1, a ratio of 3 leads to the correct maximum in 80
+cases, a ratio of 5 in 79."""
 SETTLED: Final = 0.02
-"""RMS of a chord step, relative to the RMS standard deviation, below which chord steps stop."""
+"""Tolerance of the chord steps: the RMS of the last step, relative to the RMS standard deviation."""
 CHORDS: Final = 4
 """Maximum number of chord steps per factorisation."""
 CHORD_RATE: Final = 0.35
-"""Ratio of the sizes of successive chord steps above which refactorising is cheaper. A factorisation costs as
-much as ten chord steps."""
+"""Ratio of successive chord step sizes above which a new factorisation is cheaper than further chord steps. A
+factorisation costs as much as ten chord steps."""
 NEWTONS: Final = 12
-"""Maximum number of factorisations in a solve that starts near the maximum. Such a solve typically needs one
-or two factorisations, but more if full steps would cycle."""
+"""Maximum number of factorisations in a solve that starts near the maximum. A solve that starts near the
+maximum typically needs one or two factorisations, or more if full steps would oscillate."""
 NEWTONS_MADE: Final = 40
-"""Maximum number of factorisations in a solve with geometry errors, whose maximum is at the end of a curved
-ridge. On the aligned layout, h = 0.5, with ordinary tolerances, 12 factorisations were too few for one in
-three presses of 30 %."""
+"""Limit on the factorisations in a solve that includes geometry errors; the posterior then peaks at the end
+of a curved ridge. On the aligned layout, h = 0.5, with ordinary tolerances, 12 factorisations were
+insufficient for one in three presses of 30 %."""
 FLAT: Final = 0.1
-"""Decrease in −2 log posterior over :data:`FLAT_STEPS` factorisations below which a solve with geometry
-errors counts as converged."""
+"""Convergence threshold of a solve with geometry errors: the decrease in −2 log posterior over
+:data:`FLAT_STEPS` factorisations."""
 FLAT_STEPS: Final = 4
-"""Number of factorisations over which the decrease in −2 log posterior is compared with :data:`FLAT`."""
+"""Number of factorisations over which the decrease in −2 log posterior is measured; the decrease is compared
+with :data:`FLAT`."""
 EFFECT_STEP: Final = 0.2
-"""Relative change in the effects of the geometry errors, as a root sum of squares, above which the factors
-and standard deviations are computed again. Smaller changes of the effects change the standard deviations by
-less than this ratio."""
+"""Relative change (root sum of squares) in the effects of the geometry errors above which the factors and
+standard deviations are recomputed. Smaller changes of the effects change the standard deviations by less than
+this ratio."""
 HALVINGS: Final = 6
 """Maximum number of halvings of a Gauss-Newton step."""
 PRIOR_DOUBT: Final = 3.0
@@ -70,10 +71,10 @@ location is known only roughly. With a factor of 1, the errors on one wire in 20
 deviations at a first touch and in dents that a half-space cannot form. With a factor of 2, the error was 5.6
 standard deviations on one coordinate in 12 000 in such dents, and at most 5 in the hard cases."""
 SMOOTH_SHARE: Final = 0.25
-"""Factor applied, for the 95 % interval, to the part of the variance that only the prior determines.
-Independent loads on cells are rougher than the loads of real bodies. The measured errors contain a fraction
-of 0.0 to 0.13 of this variance for spheres, and 0.02 to 0.5 for Gaussian dents. The standard deviation covers
-the tail of the error distribution; the 95 % interval covers its centre."""
+"""Factor that the 95 % interval applies to the part of the variance that only the prior determines.
+Independent loads on cells are rougher than the loads of real bodies. In measurements, the fraction of the
+prior's variance that appeared in the errors was 0.0 to 0.13 for spheres, and 0.02 to 0.5 for Gaussian dents.
+The standard deviation covers the tail of the error distribution; the 95 % interval covers its centre."""
 
 
 class MapEstimator:
@@ -85,7 +86,7 @@ class MapEstimator:
         problem: The patch.
         elastic: Elastic prior of the patch.
         free: (f,) indices of the free coordinates of a wire.
-        nuisances: Number p of nuisances, excluding those of the geometry errors.
+        nuisances: Number p of nuisances, not counting the geometry errors.
         tolerances: Manufacturing tolerances of the patch.
 
     Attributes:
@@ -121,7 +122,7 @@ class MapEstimator:
         self._b = kernels.make_buffers(wires, equations, coordinates, free.size, nuisances, effects)
         self._rows = len(self._b.v) // wires
         self._reach = roots.NEAR * float(problem.clearance.min())
-        self._enough = math.inf  # RMS of a chord step below which chord steps stop
+        self._enough = math.inf  # tolerance for the RMS of a chord step
         self._at_rest = np.zeros((wires, equations)), np.zeros((wires, coordinates, equations))
         kernels.potentials(np.arange(wires), problem.rest.copy(), problem.lower, *self._at_rest)
         self.g = np.zeros(nuisances + (geometry_error.nuisances(wires, equations) if effects else 0))
@@ -333,7 +334,7 @@ class MapEstimator:
         return bool((np.abs(new - old) <= 0.1 * old).all())  # False if a resistance was lost or regained
 
     def _effects_fit(self) -> bool:
-        """Return whether the effects of the geometry errors are still similar to those in the factors."""
+        """Return whether the geometry errors' effects are still close to their values in the factors."""
         if self._geometry is None:
             return True
         now, then = self._b.effect[self.members], self._b.factored_effect[self.members]
@@ -439,7 +440,7 @@ class MapEstimator:
         return False
 
     def _chord(self, observation: Observation) -> bool:
-        """Take chord steps until one is small relative to the standard deviation; return whether one was."""
+        """Take chord steps until a step is small relative to the standard deviation; return False on failure."""
         b, wires, prior, step = self._b, len(self.moved), self.load_prior, self._correction
         before = math.inf
         for _ in range(CHORDS):

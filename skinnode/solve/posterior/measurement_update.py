@@ -22,13 +22,13 @@ correction is
 
     δ = e − (s² C Jᵀ; −d Hᵀ) S⁻¹ (J e_x − H e_g)
 
-This correction is called a chord step; it costs two triangular solves.
+The Newton correction with old factors is called a chord step; it requires two triangular solves.
 
 If a wire has more equations than unknowns, a QR decomposition of [J H] first reduces them to one equation per
 unknown without loss of information. This reduction is not possible with geometry errors
 (:mod:`skinnode.solve.posterior.geometry_error`), because each lower wire has its own nuisances. In g, the
-geometry errors follow the other p nuisances. Their H is sparse; only the non-zero effects on each residual
-are stored.
+geometry errors follow the other p nuisances. For the geometry errors, H is sparse, and only the non-zero
+effects on each residual are stored.
 """
 
 from __future__ import annotations
@@ -78,7 +78,7 @@ class Buffers(NamedTuple):
     whitened: Float
     """(U R, U f) whitened cross-covariance V = L⁻¹ (s² J C)."""
     kalman_gain_t: Float
-    """(U R, U f) transposed Kalman gain Kᵀ, effect of a unit of noise in each equation on the estimate."""
+    """(U R, U f) transposed Kalman gain Kᵀ: the effect of unit noise in each equation on the estimate."""
     work: Float
     """(U R, U R) work array."""
     gradient: Float
@@ -178,9 +178,9 @@ def measure_fit(  # noqa: PLR0913 - a kernel: arrays by name
 ) -> None:
     """Measure the misfit of the residuals ``r`` (U, K), and replace ``r`` with r − H g.
 
-    Writes χ² of each wire into ``square_sum`` (U,). Writes the error |Jᵢᵀ r| / ‖Jᵢ‖² of each coordinate, if
-    only this coordinate moves, into ``move`` (U, f). Writes the largest error of each wire in standard
-    deviations, |Jᵢᵀ r| / ‖Jᵢ‖, into ``top`` (U,).
+    Writes χ² of each wire into ``square_sum`` (U,). Writes the error |Jᵢᵀ r| / ‖Jᵢ‖² of each coordinate i,
+    assuming that no other coordinate moves, into ``move`` (U, f). Writes the largest error of each wire in
+    standard deviations, |Jᵢᵀ r| / ‖Jᵢ‖, into ``top`` (U,).
     """
     for u in range(jt.shape[0]):
         r_u = r[u]
@@ -388,7 +388,7 @@ def chord_step(  # noqa: PLR0913, C901 - a kernel: arrays by name, sums as loops
     wires, equations = b.r.shape
     rows = b.jacobian.shape[0] // wires
     m, n = members.size * rows, b.gradient.size
-    made = b.effect.shape[2] > 0  # whether the geometry has errors
+    made = b.effect.shape[2] > 0  # True if geometry errors are modelled
     for j in range(n):
         b.gradient[j] = 0.0
     for q in range(g.size):

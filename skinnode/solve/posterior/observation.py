@@ -3,7 +3,7 @@
 A wire's residual is r = w (a F(x) − 1) with w = 1/σ. In the model, r(x) − H g is noise of variance 1, where H
 is the effect of the nuisances g ~ N(0, diag(d)). The nuisances are a gain error of the patch or of each wire
 (drift), an error of the forward model proportional to the change in each resistance, and errors of the
-geometry. H of the geometry errors depends on the displacement
+geometry. For the geometry errors, H depends on the displacement
 (:mod:`skinnode.solve.posterior.geometry_error`).
 """
 
@@ -32,7 +32,7 @@ class Readings:
     noise: Float
     """(U, K) relative standard deviation of the resistances R."""
     usable: NDArray[np.bool_]
-    """(U, K) bool, whether the resistance is usable."""
+    """(U, K) mask of the usable resistances."""
 
     def without(self, wires: list[int]) -> Readings:
         """Return a copy in which the readings of ``wires`` are marked as unusable."""
@@ -102,7 +102,7 @@ class ObservationModel:
             self.variance = np.concatenate([self.variance, np.ones(geometry)])
 
     def observe(self, readings: Readings, noise_factor: float) -> Observation:
-        """Return the observation of a frame with ``noise_factor`` times the noise of its readings."""
+        """Return the observation of a frame, with the readings' noise multiplied by ``noise_factor``."""
         a = readings.a
         change = a / self._problem.a_rest - 1.0
         variance = (noise_factor * readings.noise) ** 2 + 0.5 * (self._model_error * change) ** 2

@@ -21,7 +21,7 @@ from skinnode.solve.options import PosteriorArguments, PosteriorOptions, merged
 from skinnode.solve.posterior.frame_estimator import FrameEstimator, Mask
 
 PLACED: Final = 2.0
-"""Assumed error of a reading, relative to the readings' largest change, per pitch of placement error."""
+"""Assumed error of a reading per pitch of placement error, relative to the readings' largest change."""
 
 
 class Posterior(FrameEstimator):
@@ -72,11 +72,11 @@ class Posterior(FrameEstimator):
     ) -> FieldFrame:
         """Estimate the displacement field, loads and contacts of one frame.
 
-        No resistance value raises an exception. A wire without usable resistances is estimated from its
-        neighbours, with a larger standard deviation. A wire whose resistances no deformation explains is
-        INCONSISTENT and left out of the estimate. A wire that does not converge even on its own gets the
-        status MAX_STEPS and is also left out. If the whole frame cannot be solved, the last trusted field is
-        held with an infinite standard deviation.
+        This method never raises an exception because of a resistance value. A wire without usable resistances
+        is estimated from its neighbours, with a larger standard deviation. A wire whose resistances no
+        deformation explains is INCONSISTENT and left out of the estimate. A wire that does not converge even
+        when solved alone gets the status MAX_STEPS and is also left out. If the whole frame cannot be solved,
+        the last trusted field is returned with an infinite standard deviation.
 
         Args:
             frame_ohm: (U, K) resistances, ohm; values that are not positive and finite are ignored.

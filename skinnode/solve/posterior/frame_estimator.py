@@ -332,7 +332,7 @@ class FrameEstimator:
         return self._give_up(Status.INCONSISTENT)
 
     def _joining(self, fit: Fit, observation: Observation, wanted: Index) -> Index:
-        """Return the wires outside ``wanted`` that contradict the current field, and mark them as kept."""
+        """Return the wires outside ``wanted`` that contradict the current field, and keep using them."""
         moved = self._gate.moved(fit, observation.count)
         moved[wanted] = False
         joining = np.flatnonzero(moved)

@@ -6,7 +6,7 @@ with the depth of the press. The errors are nuisances with a variance of 1, in u
 
 - Thickness: all upper electrodes are shifted along their normals, in proportion to the clearance.
 - Radius: the mean of F over the rims of electrodes of radius ρ is F + (ρ²/2) ∇²F, with the Laplacian within
-the surface; each layer contributes ρ²/4. The nuisance is ρ² in units of the squared tolerance.
+  the surface; each layer contributes ρ²/4. The nuisance is ρ² in units of the squared tolerance.
 - Gain: the change in each resistance is multiplied by e^γ. Half of the variance of γ is common to the patch;
   the other half is independent in each upper wire.
 - Placement: each upper and each lower wire is shifted along x, y and z.

@@ -72,8 +72,8 @@ deviations at a first touch and in dents that a half-space cannot form. With a f
 standard deviations on one coordinate in 12 000 in such dents, and at most 5 in the hard cases."""
 SMOOTH_SHARE: Final = 0.25
 """Factor that the 95 % interval applies to the part of the variance that only the prior determines.
-Independent loads on cells are rougher than the loads of real bodies. In measurements, the fraction of the
-prior's variance that appeared in the errors was 0.0 to 0.13 for spheres, and 0.02 to 0.5 for Gaussian dents.
+Independent loads on cells are rougher than the loads of real bodies. In measurements, the fraction of this
+variance that appeared in the errors was 0.0 to 0.13 for spheres, and 0.02 to 0.5 for Gaussian dents.
 The standard deviation covers the tail of the error distribution; the 95 % interval covers its centre."""
 
 
@@ -440,7 +440,7 @@ class MapEstimator:
         return False
 
     def _chord(self, observation: Observation) -> bool:
-        """Take chord steps until a step is small relative to the standard deviation; return False on failure."""
+        """Take chord steps until a step is small compared with the standard deviation; return success."""
         b, wires, prior, step = self._b, len(self.moved), self.load_prior, self._correction
         before = math.inf
         for _ in range(CHORDS):

@@ -1,11 +1,12 @@
-"""Conformance suite for CANopen nodes: 127 cases that test any node on any interface with raw frames.
+"""Conformance suite for CANopen nodes: 127 cases that test any node with raw frames on any CAN interface.
 
-``eds_reader`` parses the device's EDS, and ``tester`` sends and receives frames. ``sdo`` and ``dut`` (the
-device under test) build on both, and the cases use ``sdo`` and ``dut``. ``run`` resets the device before each
-case and restores its configuration; ``report`` and ``html_report`` write the results.
+``eds_reader`` parses the device's EDS, and ``tester`` sends and receives frames. ``sdo`` (the SDO
+client) and ``dut`` (the device under test) build on these two modules, and the cases build on ``sdo`` and
+``dut``. ``run`` resets the device before each case and restores its configuration; ``report`` and
+``html_report`` write the results.
 
-The suite relies only on a node's EDS and its frames. It has its own tester, SDO client, EDS reader
-and constants, because an error in code that the suite shared with the node would go unnoticed.
+The suite relies only on a node's EDS and on the frames that the node sends. The suite has its own tester,
+SDO client, EDS reader and constants: it could not detect an error in code that it shared with the node.
 """
 
 from skinnode.conformance.case import Case, NotApplicable, Result, Verdict

@@ -18,7 +18,7 @@ class Verdict(StrEnum):
 
     PASSED = "passed"
     WARNING = "warning"
-    """The device passes, but its behaviour is discouraged by CiA or cannot be handled by some tools."""
+    """The device passes, but CiA discourages its behaviour or some tools cannot handle it."""
     FAILED = "failed"
     NOT_APPLICABLE = "not applicable"
 
@@ -26,7 +26,7 @@ class Verdict(StrEnum):
 class NotApplicable(Exception):
     """Raised if the device does not offer the feature that the case checks.
 
-    The exception text names the object, EDS entry or response that shows that the feature is absent.
+    The exception text gives the evidence: a missing object, a missing EDS entry or the device's response.
     """
 
 
@@ -38,14 +38,15 @@ class Warned(Exception):
 class Case:
     """One conformance case.
 
-    ``run`` returns if the device passes; otherwise it raises Failed, NotApplicable or Warned.
+    ``run`` returns if the device passes, and otherwise raises Failed, NotApplicable or Warned (a pass with a
+    warning).
     """
 
     id: str
-    """Area and number, such as "SDO-07"."""
+    """Identifier of the case: its area and number, such as "SDO-07"."""
     title: str
     clause: str
-    """Clause that the case checks, in CiA 301 v4.2.0 unless another document is named."""
+    """Clause that the case checks. It is a clause of CiA 301 v4.2.0 unless another document is named."""
     run: Callable[[Dut], None]
 
     @property
@@ -56,13 +57,15 @@ class Case:
 
 @dataclass(frozen=True, slots=True)
 class Result:
-    """A case and its result."""
+    """Result of one conformance case."""
 
     case: Case
     verdict: Verdict
     why: str = ""
-    """Reason for the verdict: expected and received data, the doubt, or why the case does not apply; empty
-    if the device passed without a doubt."""
+    """Reason for the verdict; empty if the device passed without a warning.
+
+    States the expected and received data, the cause of the warning, or why the case does not apply.
+    """
     seconds: float = 0.0
     trace: tuple[TraceLine, ...] = field(default=(), repr=False)
     """Frames sent and received during the case."""

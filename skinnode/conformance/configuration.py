@@ -16,13 +16,13 @@ _PDO_PARAMETERS: Final = (*range(0x1400, 0x1600), *range(0x1800, 0x1A00))
 _MAPPINGS: Final = (*range(0x1600, 0x1800), *range(0x1A00, 0x1C00))
 _INVALID: Final = 1 << 31
 _LAST: Final = {_SYNC_COUNTER: 1, _PERIOD: 2, _SYNC: 3, _VERIFY: 4}
-"""Write order of these objects, after all others. The SYNC counter overflow value can be written only while
+"""Objects to write after all others, in this order. The SYNC counter overflow value can be written only while
 the period is 0, and the producer starts after both. 0x1020 is last, because writing any other object clears
 it."""
 
 
 def read_configuration(dut: Dut) -> dict[tuple[int, int], bytes]:
-    """Read all values that are readable and writable, except commands and values of variable length."""
+    """Read all readable and writable objects, except commands and objects of variable length."""
     values: dict[tuple[int, int], bytes] = {}
     for entry in dut.eds.between(0x1000, 0x9FFF):
         if entry.index in _COMMANDS or not entry.size or not (entry.readable and entry.writable):

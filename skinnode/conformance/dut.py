@@ -40,7 +40,7 @@ class Dut:
         self.stored = False
         """Whether a case has stored or restored parameters since the configuration was last restored."""
         self.up = False
-        """Whether the node came up after the last reset."""
+        """Whether the node responded after the last reset."""
 
     @property
     def error_control_id(self) -> int:
@@ -59,7 +59,7 @@ class Dut:
         self.bus.send(0x000, bytes((command, self.node_id)))
 
     def reset(self, command: int = RESET_NODE) -> None:
-        """Reset the node and await its boot-up message. Raises Failed if the message is missing or wrong."""
+        """Reset the node and await its boot-up message. Raises Failed if it is missing or wrong."""
         self.bus.clear()
         self.nmt(command)
         frame = self.bus.expect(
@@ -119,7 +119,7 @@ class Dut:
             self.need(GUARD_TIME)
 
     def state(self, what: str) -> int:
-        """Return the NMT state from a heartbeat, or from guarding if the node has no heartbeat.
+        """Return the NMT state from a heartbeat, or from node guarding if the node has no heartbeat.
 
         Uses the second heartbeat received, because the first may have been sent before the call. Call
         :meth:`start_heartbeat` first.
@@ -140,7 +140,7 @@ class Dut:
             raise Failed(f"{STATES[state]} {what}", STATES.get(got, f"state {got}"))
 
     def guard(self, what: str) -> int | None:
-        """Request the state with a remote frame and return the response byte; None if none arrives."""
+        """Request the state with a remote frame and return the response byte; None without a response."""
         self.bus.pending(self.error_control_id)
         self.bus.send(self.error_control_id, remote=True)
         frame = self.bus.take(self.error_control_id, 4 * QUIET_S)
@@ -160,7 +160,7 @@ class Dut:
     def need_storage(self, index: int, subindex: int) -> None:
         """Raise NotApplicable if the device cannot store (0x1010) or restore (0x1011) parameters on command.
 
-        Bit 0 of the value indicates the capability (CiA 301, 7.5.2.13 and 7.5.2.14).
+        Bit 0 of the object's value indicates this capability (CiA 301, 7.5.2.13 and 7.5.2.14).
         """
         self.need(index, subindex)
         try:

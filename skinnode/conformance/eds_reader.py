@@ -25,7 +25,7 @@ SIZES: Final = {
     0x01: 1, 0x02: 1, 0x03: 2, 0x04: 4, 0x05: 1, 0x06: 2, 0x07: 4, 0x08: 4, 0x0C: 6, 0x0D: 6,
     0x10: 3, 0x11: 8, 0x12: 5, 0x13: 6, 0x14: 7, 0x15: 8, 0x16: 3, 0x18: 5, 0x19: 6, 0x1A: 7, 0x1B: 8,
 }  # fmt: skip
-"""Size of a value in bytes by data type (CiA 301 v4.2.0, table 44); types not listed have variable length."""
+"""Sizes in bytes of the data types that have a fixed length (CiA 301 v4.2.0, table 44)."""
 
 _MOST_ENTRIES: Final = 1 << 16
 SIGNED: Final = (0x02, 0x03, 0x04, 0x10, 0x12, 0x13, 0x14, 0x15)
@@ -52,14 +52,14 @@ class EdsEntry:
     data_type: int
     access: str
     default: str
-    """Default as written in the file; empty if there is none."""
+    """Default value as written in the file; empty if the file specifies no default."""
     low: int | None
     high: int | None
     mappable: bool
     flags: int
     """ObjFlags: bit 0 is "refuse write on download", bit 1 is "refuse read on scan"."""
     given: bytes | None = None
-    """Default as raw bytes if the file specifies bytes; :attr:`default` is then empty."""
+    """Default value as raw bytes, if the file specifies bytes; :attr:`default` is then empty."""
 
     @property
     def size(self) -> int:
@@ -78,12 +78,12 @@ class EdsEntry:
 
     @property
     def into_rpdo(self) -> bool:
-        """Whether an RPDO may map the entry, which must be writable and not declared as process input."""
+        """Whether an RPDO may map the entry: mappable, writable and not declared as process input."""
         return self.mappable and self.access in ("wo", "rww", "rw")
 
     @property
     def into_tpdo(self) -> bool:
-        """Whether a TPDO may map the entry, which must be readable and not declared as process output."""
+        """Whether a TPDO may map the entry: mappable, readable and not declared as process output."""
         return self.mappable and self.access in ("ro", "rwr", "rw", "const")
 
     @property
@@ -92,7 +92,7 @@ class EdsEntry:
         return self.index << 16 | self.subindex << 8 | 8 * self.size
 
     def default_bytes(self, node_id: int) -> bytes | None:
-        """Return the entry's default as the bytes of an SDO transfer.
+        """Return the entry's default value in the byte order of an SDO transfer.
 
         Args:
             node_id: Replaces $NODEID.
@@ -130,7 +130,7 @@ class Eds:
     source: str
     """Origin of the EDS, for use in messages."""
     device: Mapping[str, str]
-    """Section DeviceInfo, with keys in lower case."""
+    """Entries of section DeviceInfo; the keys are in lower case."""
     dummies: frozenset[int]
     """Data types that may be mapped as dummy entries."""
     entries: Mapping[tuple[int, int], EdsEntry]
@@ -176,7 +176,7 @@ def _hex(text: str) -> bytes | None:
 
 
 def parse_eds_file(path: Path, key: str = "EDS") -> tuple[Eds, EdsText]:
-    """Read an EDS or DCF in any encoding; ``source`` in the result names the encoding unless it is ASCII.
+    """Read an EDS or DCF in any encoding; the result's ``source`` names an encoding other than ASCII.
 
     Args:
         path: The file.
@@ -245,7 +245,7 @@ def parse_eds(text: str, source: str, codec: str = "utf-8") -> Eds:
 def _entries(
     sections: Mapping[str, Mapping[str, str]], source: str
 ) -> tuple[dict[tuple[int, int], EdsEntry], list[str]]:
-    """Return the entries of all sections, and one line for each section that contradicts itself."""
+    """Return the entries of all sections, and one line for each inconsistent section."""
     found: list[str] = []
     entries: dict[tuple[int, int], EdsEntry] = {}
     for title in sorted(sections, key=_order):
@@ -260,8 +260,8 @@ def _entries(
                 _object(entries, index, sections[title], found)
         except (ValueError, KeyError) as error:
             found.append(f"[{title}]: {error}")
-        if len(entries) > _MOST_ENTRIES:  # a compact array expands 60 characters to 255 entries
-            got = Shown(f"more than {_MOST_ENTRIES} values, up to section {title}")
+        if len(entries) > _MOST_ENTRIES:  # 60 characters can declare a compact array of 255 entries
+            got = Shown(f"more than {_MOST_ENTRIES} values in the sections up to {title}")
             raise ProfileError("EDS", got, f"at most {_MOST_ENTRIES}", where=source)
     return entries, found
 
@@ -311,7 +311,7 @@ def _add(
 
 
 def _listed(sections: Mapping[str, Mapping[str, str]], described: set[int]) -> Iterator[str]:
-    """Yield a line for each object that is either listed or described but not both, and each wrong count."""
+    """Yield a line for each object that is only listed or only described, and for each wrong count."""
     listed: set[int] = set()
     for name in ("mandatoryobjects", "optionalobjects", "manufacturerobjects"):
         options = sections.get(name, {})

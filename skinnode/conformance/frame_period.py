@@ -1,7 +1,7 @@
 """Checks whether frames arrive with an expected period.
 
 A busy machine delays individual frames, so both mean and median are checked. A delayed frame lengthens one
-interval and shortens the next, which hardly changes the mean; a few late frames do not change the median.
+interval and shortens the next, so the mean hardly changes. A few late frames do not change the median.
 """
 
 from __future__ import annotations

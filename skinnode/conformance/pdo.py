@@ -1,4 +1,4 @@
-"""Lists the PDOs of the device under test, sets them up and waits for their frames."""
+"""Lists the PDOs of the device under test, configures them and waits for their frames."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def tpdos(dut: Dut) -> list[Pdo]:
 
 
 def sync(dut: Dut, counter: int | None = None) -> int:
-    """Send a SYNC and return its transmission time, ns."""
+    """Send a SYNC and return the timestamp (ns) of its transmission."""
     return dut.bus.send(SYNC_ID, b"" if counter is None else bytes((counter,)))
 
 
@@ -100,7 +100,7 @@ class PdoSetup:
 def set_up(dut: Dut, pdo: Pdo, parameters: PdoSetup) -> int:
     """Disable the PDO, write its parameters and enable it.
 
-    Discards frames of this PDO that have already arrived, for example because the node starts by itself.
+    Discards frames of this PDO that have already arrived, for example from a self-starting node.
 
     Args:
         dut: The device.
@@ -175,7 +175,7 @@ def each_tpdo(dut: Dut, trial: Trial) -> None:
 
 
 def expect_pdo(dut: Dut, can_id: int, length: int, what: str) -> Frame:
-    """Return the next frame of a PDO. Raises Failed if its length does not match the mapping."""
+    """Return the next frame of a PDO. Raises Failed if the frame's length does not match the mapping."""
     frame = dut.bus.expect(can_id, what)
     if len(frame.data) != length:
         raise Failed(f"{counted(length, 'byte')} as mapped, {what}", describe(frame))
@@ -183,7 +183,7 @@ def expect_pdo(dut: Dut, can_id: int, length: int, what: str) -> Frame:
 
 
 def drain(dut: Dut, can_id: int) -> None:
-    """Discard frames with ``can_id`` until none arrives for 20 ms, but for at most half a second."""
+    """Discard frames with ``can_id`` until none arrives for 20 ms; stop after at most half a second."""
     end_s = time.monotonic() + 0.5
     while time.monotonic() < end_s and dut.bus.take(can_id, _PAUSE_S) is not None:
         pass

@@ -36,7 +36,7 @@ def expect_no_emcy(dut: Dut, code: int, what: str) -> None:
 
 
 def short_pdo(dut: Dut) -> Frame:
-    """Send an RPDO without data in OPERATIONAL and return the emergency message that follows."""
+    """Send an RPDO without data in OPERATIONAL and return the device's emergency message."""
     for pdo in rpdos(dut):
         cob_id = dut.sdo.integer(pdo.parameter, 1)
         if cob_id & INVALID or not mapped(dut, pdo):
@@ -54,13 +54,13 @@ def foreign_id(dut: Dut) -> int:
 
 
 def consume(dut: Dut, node_id: int, within_ms: int, subindex: int = 1) -> None:
-    """Make the device expect heartbeats from ``node_id``."""
+    """Configure the device to monitor the heartbeats of node ``node_id``."""
     dut.need(CONSUMER, subindex)
     dut.sdo.write_integer(CONSUMER, subindex, node_id << 16 | within_ms, 4)
 
 
 def beat(dut: Dut, node_id: int, times: int = 1, each_s: float = 0.0, state: int = 5) -> int:
-    """Send heartbeats as another node; return the time of the last heartbeat, ns."""
+    """Send heartbeats as another node; return the timestamp (ns) of the last heartbeat."""
     sent_ns = 0
     for number in range(times):
         if number:
@@ -90,7 +90,7 @@ def lose_partner(dut: Dut, within_ms: int = 100) -> None:
 
 
 def not_before(frame: Frame, since_ns: int, least_ms: int, what: str) -> None:
-    """Raise Failed if ``frame`` arrived less than ``least_ms`` after ``since_ns``."""
+    """Raise Failed if ``frame`` arrived earlier than ``least_ms`` milliseconds after ``since_ns``."""
     elapsed_ms = (frame.t_ns - since_ns) * 1e-6
     if elapsed_ms < least_ms - 1:  # 1 ms tolerance, because the two timestamps come from different clocks
         raise Failed(f"{what} not before {least_ms} ms", f"after {elapsed_ms:.1f} ms")

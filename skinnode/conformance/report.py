@@ -43,7 +43,8 @@ def summary_line(report: Report) -> str:
 def as_json(report: Report) -> dict[str, Any]:
     """Return the run as JSON-compatible data.
 
-    Frames are strings: seconds since the case began, Tx (sent by the tester) or Rx, COB-ID, length, data.
+    Each frame is a string: seconds since the start of the case, Tx (sent by the tester) or Rx, COB-ID, length
+    and data.
     """
     return {
         "eds": report.eds,
@@ -70,8 +71,8 @@ def as_json(report: Report) -> dict[str, Any]:
 def as_junit(report: Report) -> str:
     """Return JUnit XML with one suite per area.
 
-    A failure contains the frames of the failed case. A case that does not apply counts as skipped. A warning
-    appears as the output of a passed test.
+    A failure contains the frames of the failed case. A case that does not apply is reported as skipped. A
+    warning appears as the output of a passed test.
     """
     root = ElementTree.Element("testsuites", name="CANopen conformance")
     areas: dict[str, list[Result]] = {}

@@ -1,4 +1,4 @@
-"""Runs each case after a reset and in bounded time, and restores the node's configuration."""
+"""Runs each case after a reset and within a bounded time, and restores the node's configuration."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from skinnode.protocol.profile import BusType, PatchProfile
 from skinnode.transport import CanPort
 
 SILENT_CASES: Final = 3
-"""Number of consecutive cases with a silent node after which the remaining cases are skipped."""
+"""Number of consecutive cases without any response before the remaining cases are skipped."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,7 +43,7 @@ class Report:
 
 
 def connect(port: CanPort, node_id: int, eds: Eds | None = None) -> Dut:
-    """Reset the node and return it as a device under test.
+    """Reset a node and return the device under test.
 
     Args:
         port: The bus.
@@ -92,7 +92,7 @@ def _own_eds(sdo: SdoClient) -> Eds:
 def run_cases(dut: Dut, cases: Iterable[Case], say: Callable[[Result], None] = lambda _: None) -> Report:
     """Run ``cases`` one after another.
 
-    Every case yields a result, however the node behaves. At the end, the node is reset and its original
+    Every case produces a result, even if the node misbehaves. At the end, the node is reset and its original
     configuration is restored.
 
     Args:
@@ -110,7 +110,7 @@ def run_cases(dut: Dut, cases: Iterable[Case], say: Callable[[Result], None] = l
     try:
         for case in cases:
             if silent == SILENT_CASES:
-                why = f"not run: the node did not come up in {SILENT_CASES} consecutive cases"
+                why = f"not run: the node did not respond to resets in {SILENT_CASES} consecutive cases"
                 result = Result(case, Verdict.FAILED, why)
             else:
                 result = run_case(dut, case)
@@ -141,7 +141,7 @@ def run_case(dut: Dut, case: Case) -> Result:
         verdict, why = Verdict.FAILED, str(failure)
     except BusError:
         raise
-    except Exception as error:  # an unexpected response fails this case and does not abort the run
+    except Exception as error:  # an unexpected response fails the case but does not abort the run
         verdict, why = Verdict.FAILED, f"unexpected response ({type(error).__name__}: {error})"
     return Result(case, verdict, why, time.monotonic() - begun_s, dut.bus.trace)
 

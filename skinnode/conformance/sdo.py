@@ -1,7 +1,7 @@
 """SDO client built on raw frames (CiA 301 v4.2.0, 7.2.4.3): expedited, segmented and block transfer.
 
 The client is designed for tests: it checks every response byte by byte and can violate the protocol on
-request. It shares no code with this project's server.
+request. The client shares no code with this project's SDO server.
 """
 
 from __future__ import annotations
@@ -53,12 +53,12 @@ MEANINGS: Final = {
 """Meanings of the SDO abort codes (CiA 301 v4.2.0, table 22)."""
 
 _SEGMENT: Final = 7
-_MOST_BYTES: Final = 1 << 20  # ends an upload that never sends its last segment
+_MOST_BYTES: Final = 1 << 20  # maximum length of an upload, in case the last segment never arrives
 _BLOCK_SIZE: Final = 20
 
 
 class Aborted(Failed):
-    """Raised if the device aborts a transfer that it should serve; ``code`` is the abort code."""
+    """Raised if the device aborts a transfer that should succeed; ``code`` is the abort code."""
 
     def __init__(self, what: str, code: int) -> None:
         self.code = code
@@ -66,12 +66,12 @@ class Aborted(Failed):
 
 
 def name(code: int) -> str:
-    """Return an abort code as text, in hexadecimal and in words."""
+    """Return an abort code in hexadecimal, followed by its meaning."""
     return f"0x{code:08X} ({MEANINGS.get(code, 'not a code of CiA 301')})"
 
 
 def crc16(data: bytes) -> int:
-    """Return the CRC of a block transfer: x¹⁶ + x¹² + x⁵ + 1, initial value 0 (7.2.4.3.16)."""
+    """Return the CRC of a block transfer: x¹⁶ + x¹² + x⁵ + 1, initial value 0 (CiA 301, 7.2.4.3.16)."""
     crc = 0
     for byte in data:
         crc ^= byte << 8
@@ -81,7 +81,7 @@ def crc16(data: bytes) -> int:
 
 
 def mux(index: int, subindex: int) -> bytes:
-    """Return the multiplexor: index and sub-index in transfer order."""
+    """Return the multiplexor: index and sub-index as sent on the bus."""
     return struct.pack("<HB", index, subindex)
 
 
@@ -99,7 +99,7 @@ class SdoClient:
         self._bus.send(self.request_id, request.ljust(8, b"\0"))
 
     def answer(self, what: str) -> bytes:
-        """Return the next response. Raises Failed if none arrives or its length is not eight bytes."""
+        """Return the next response. Raises Failed if no response of eight bytes arrives."""
         return self._checked(self._bus.take(self.answer_id, ANSWER_S), what)
 
     def ask(self, request: bytes, what: str) -> bytes:
@@ -109,7 +109,7 @@ class SdoClient:
         return self.answer(what)
 
     def served(self, request: bytes, what: str) -> bytes:
-        """Send a request as :meth:`ask` does. Raises Aborted if the response is an abort."""
+        """Send a request as :meth:`ask` does and return the response. Raises Aborted if it is an abort."""
         return _not_aborted(self.ask(request, what), what)
 
     def _checked(self, frame: Frame | None, what: str) -> bytes:
@@ -120,7 +120,7 @@ class SdoClient:
         return frame.data
 
     def abort(self, index: int, subindex: int, code: int = GENERAL_ERROR) -> None:
-        """Abort a transfer; the device does not answer."""
+        """Send an abort, to which the device sends no response."""
         self.send(b"\x80" + mux(index, subindex) + struct.pack("<I", code))
 
     def aborts(self, request: bytes, index: int, subindex: int, codes: Collection[int], what: str) -> int:
@@ -150,7 +150,7 @@ class SdoClient:
     # --- upload
 
     def read(self, index: int, subindex: int = 0) -> bytes:
-        """Upload a value by expedited or segmented transfer, as the device chooses."""
+        """Upload a value by expedited or segmented transfer, whichever the device selects."""
         what = f"read of 0x{index:04X}:{subindex:02X}"
         answer = self.served(b"\x40" + mux(index, subindex), what)
         if answer[0] & 0xE0 != 0x40 or answer[1:4] != mux(index, subindex):
@@ -196,7 +196,9 @@ class SdoClient:
         start = bytes((0xA0 | crc << 2,)) + mux(index, subindex) + bytes((size, 0))
         answer = self.served(start, what)
         if answer[0] & 0xF9 != 0xC0 or answer[1:4] != mux(index, subindex):
-            raise Failed(f"C0, C2, C4 or C6 and the object to {what}", answer.hex(" ").upper())
+            raise Failed(
+                f"a response with C0, C2, C4 or C6 and the object to {what}", answer.hex(" ").upper()
+            )
         announced = int.from_bytes(answer[4:8], "little") if answer[0] & 2 else None
         checked = crc and bool(answer[0] & 4)
         self.send(b"\xa3")
@@ -217,7 +219,7 @@ class SdoClient:
         return data
 
     def _read_sub_block(self, size: int, what: str) -> tuple[bytes, int, bool]:
-        """Read a sub-block; return its bytes, its number of segments, and whether it ends the transfer."""
+        """Read a sub-block; return its bytes, its number of segments, and whether it is the last."""
         data = b""
         for number in range(1, size + 1):
             segment = _not_aborted(self.answer(f"segment {number}, {what}"), what)
@@ -260,12 +262,14 @@ class SdoClient:
     def write_block(
         self, index: int, subindex: int, data: bytes, *, crc: bool = False, wrong_crc: bool = False
     ) -> None:
-        """Download at most one sub-block by block transfer; ``wrong_crc`` sends a wrong CRC."""
+        """Download at most one sub-block by block transfer, with a wrong CRC if ``wrong_crc`` is true."""
         what = f"block write to 0x{index:04X}:{subindex:02X}"
         start = bytes((0xC2 | crc << 2,)) + mux(index, subindex) + struct.pack("<I", len(data))
         answer = self.served(start, what)
         if answer[0] & 0xFB != 0xA0 or answer[1:4] != mux(index, subindex) or not 1 <= answer[4] <= 127:
-            raise Failed(f"A0 or A4, the object and a block size to {what}", answer.hex(" ").upper())
+            raise Failed(
+                f"a response with A0 or A4, the object and a block size to {what}", answer.hex(" ").upper()
+            )
         parts = [data[at : at + _SEGMENT] for at in range(0, len(data), _SEGMENT)]
         if len(parts) > answer[4]:
             raise Failed(f"a block size of at least {len(parts)}, {what}", str(answer[4]))
@@ -282,7 +286,7 @@ class SdoClient:
 
 
 def expedited(index: int, subindex: int, data: bytes) -> bytes:
-    """Return the request for an expedited download of one to four bytes, with the size indicated."""
+    """Return the request for an expedited download of one to four bytes that indicates its size."""
     return bytes((0x23 | (4 - len(data)) << 2,)) + mux(index, subindex) + data.ljust(4, b"\0")
 
 

@@ -1,7 +1,7 @@
 """Sends and receives raw frames on a bus, and keeps a trace of them.
 
-Received frames wait in an inbox, in order of arrival, until a case asks for them. A PDO that arrives before
-the SDO response is therefore not lost. Every wait is bounded.
+Received frames are kept in an inbox, in order of arrival, until a case requests them. A PDO that arrives
+before an expected SDO response is therefore not lost. Every wait is bounded.
 """
 
 from __future__ import annotations
@@ -14,17 +14,20 @@ from typing import Final, NamedTuple
 from skinnode.transport import CanPort, Frame
 
 ANSWER_S: Final = 1.0
-"""Maximum wait for a response, s; far longer than a device needs, so that no case fails on a busy machine."""
+"""Maximum wait for a response, s.
+
+The limit is far longer than a device needs, so that a busy machine does not cause failures.
+"""
 
 QUIET_S: Final = 0.06
-"""Time without frames that counts as silence, s."""
+"""Time without frames after which the bus is considered silent, s."""
 
 _INBOX_FRAMES: Final = 20_000
 _TRACE_FRAMES: Final = 400
 
 
 class Failed(Exception):
-    """Raised if the device does not do what the standard requires."""
+    """Raised if the device violates the standard."""
 
     def __init__(self, expected: str, got: str) -> None:
         self.expected, self.got = expected, got
@@ -66,18 +69,18 @@ class Tester:
         self._begun_ns = time.monotonic_ns()
 
     def begin(self) -> None:
-        """Begin a case: discard all frames received so far and clear the trace."""
+        """Start a case: discard all frames received so far and clear the trace."""
         self.clear()
         self._trace.clear()
         self._begun_ns = time.monotonic_ns()
 
     @property
     def trace(self) -> tuple[TraceLine, ...]:
-        """Newest frames sent or received since :meth:`begin`."""
+        """Newest frames sent or received since the last :meth:`begin`."""
         return tuple(self._trace)
 
     def send(self, can_id: int, data: bytes = b"", *, remote: bool = False) -> int:
-        """Send a frame and return its transmission time on the monotonic clock, ns."""
+        """Send a frame and return the timestamp (ns, monotonic clock) of its transmission."""
         now_ns = time.monotonic_ns()
         self._note(now_ns, True, can_id, data, remote)
         self._port.send(can_id, data, remote=remote)
@@ -95,7 +98,7 @@ class Tester:
     def take(
         self, can_id: int, within_s: float = ANSWER_S, match: Callable[[Frame], bool] | None = None
     ) -> Frame | None:
-        """Return the first matching frame with ``can_id`` from the inbox or, failing that, from the bus.
+        """Return the first matching frame with ``can_id``, from the inbox if possible, otherwise from the bus.
 
         Args:
             can_id: CAN-ID of a data frame.
@@ -103,7 +106,7 @@ class Tester:
             match: Additional condition on the frame.
 
         Returns:
-            The frame; None if none arrives within ``within_s``.
+            The frame; None if no matching frame arrives within ``within_s``.
         """
 
         def wanted(frame: Frame) -> bool:
@@ -126,20 +129,20 @@ class Tester:
         within_s: float = ANSWER_S,
         match: Callable[[Frame], bool] | None = None,
     ) -> Frame:
-        """Take a frame as :meth:`take` does. Raises Failed, naming ``what``, if none arrives."""
+        """Return a frame as :meth:`take` does. Raises Failed with ``what`` if no frame arrives."""
         frame = self.take(can_id, within_s, match)
         if frame is None:
             raise Failed(f"{what} (0x{can_id:03X}) within {within_s:g} s", "nothing")
         return frame
 
     def listen(self, can_id: int, for_s: float) -> list[Frame]:
-        """Return all frames with ``can_id`` that arrive within ``for_s`` from now."""
+        """Return all frames with ``can_id`` that arrive within the next ``for_s`` seconds."""
         self.pending(can_id)
         self.wait(for_s)
         return self.pending(can_id)
 
     def wait(self, for_s: float) -> None:
-        """Wait ``for_s`` seconds, keeping frames that arrive in the inbox."""
+        """Wait ``for_s`` seconds and store the frames that arrive in the inbox."""
         end_s = time.monotonic() + for_s
         while (left_s := end_s - time.monotonic()) > 0:
             self._receive(left_s)
@@ -153,7 +156,7 @@ class Tester:
         return found
 
     def expect_silence(self, can_id: int, what: str, for_s: float = QUIET_S) -> None:
-        """Raise Failed if a frame with ``can_id`` is in the inbox or arrives within ``for_s``."""
+        """Raise Failed if a frame with ``can_id`` is in the inbox or arrives within ``for_s`` seconds."""
         frame = self.take(can_id, for_s)
         if frame is not None:
             raise Failed(f"no {what}", describe(frame))

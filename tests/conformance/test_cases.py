@@ -16,7 +16,7 @@ NOT_APPLICABLE = {
     "SDO-29": "no SDO server beyond the default one",
     "SDO-30": "no SDO client",
     "OD-04": "no object with access wo",
-    "OD-05": "no object answers at sub-index 0xFF",
+    "OD-05": "no object has the optional sub-index 0xFF",
 }
 """What a patch does not have, and the words it is said with. Everything else has to pass."""
 

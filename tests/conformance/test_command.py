@@ -78,11 +78,11 @@ def test_a_warning_is_status_0_and_in_every_report(
     assert (suite.get("failures"), suite.get("errors"), suite.get("skipped")) == ("0", "0", "0")
     (case,) = suite.iter("testcase")
     assert [(child.tag, child.text) for child in case] == [
-        ("system-out", "warning: NrOfTXPDO=5, but 4 are described")
+        ("system-out", "warning: NrOfTXPDO=5, but the EDS describes 4")
     ]
     page = Balance()
     page.feed(files["html"].read_text())
-    assert "NrOfTXPDO=5, but 4 are described" in page.text
+    assert "NrOfTXPDO=5, but the EDS describes 4" in page.text
     assert 'class="verdict warned"' in files["html"].read_text()
     report = json.loads(files["json"].read_text())
     assert (report["passed"], report["warnings"], report["failed"]) == (1, 1, 0)

@@ -166,8 +166,8 @@ def test_a_sheet_that_contradicts_itself_or_the_device(
 @pytest.mark.parametrize(
     ("wrong", "told"),
     [
-        (("NrOfTXPDO=0", "NrOfTXPDO=4"), "NrOfTXPDO=4, but 0 are described"),
-        (("NrOfRXPDO=0", "NrOfRXPDO=many"), "NrOfRXPDO=many, but 0 are described"),
+        (("NrOfTXPDO=0", "NrOfTXPDO=4"), "NrOfTXPDO=4, but the EDS describes 0"),
+        (("NrOfRXPDO=0", "NrOfRXPDO=many"), "NrOfRXPDO=many, but the EDS describes 0"),
         (
             (
                 "AccessType=const\nDefaultValue=somebody",

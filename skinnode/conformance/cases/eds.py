@@ -18,7 +18,7 @@ _IDENTITY = ((1, "vendornumber"), (2, "productnumber"), (3, "revisionnumber"))
 
 @case(
     "EDS-01",
-    "The EDS does not contradict itself, CiA 301 or the identity of the device",
+    "The EDS contradicts neither itself nor CiA 301 nor the device's identity",
     "CiA 306-1; 7.5.2.21",
 )
 def sheet(dut: Dut) -> None:
@@ -48,7 +48,7 @@ def _missing(eds: Eds) -> Iterator[str]:
 
 
 def _miscounted(eds: Eds) -> Iterator[str]:
-    """Yield each PDO count in DeviceInfo that differs from the number of PDOs described."""
+    """Yield a line for each PDO count in section DeviceInfo that differs from the PDOs in the EDS."""
     for key, name, first in (("nrofrxpdo", "NrOfRXPDO", 0x1400), ("nroftxpdo", "NrOfTXPDO", 0x1800)):
         stated, count = eds.device.get(key) or "", len(eds.indices(first, first + 0x1FF))
         try:
@@ -56,7 +56,7 @@ def _miscounted(eds: Eds) -> Iterator[str]:
         except ValueError:
             right = False
         if not right:
-            yield f"{name}={stated}, but {count} are described"
+            yield f"{name}={stated}, but the EDS describes {count}"
 
 
 def _identity(dut: Dut) -> Iterator[str]:
@@ -69,7 +69,7 @@ def _identity(dut: Dut) -> Iterator[str]:
             except ValueError:
                 same = False
             if not same:
-                yield f"{key}={stated}, the device reports 0x{value:08X}"
+                yield f"{key}={stated}, but the device reports 0x{value:08X}"
 
 
 def _entry(entry: EdsEntry, node_id: int) -> Iterator[str]:
@@ -79,25 +79,25 @@ def _entry(entry: EdsEntry, node_id: int) -> Iterator[str]:
         yield f"{entry}: data type 0x{entry.data_type:04X} is not defined"
         return
     if entry.mappable and not (entry.into_rpdo or entry.into_tpdo):
-        yield f"{entry}: mappable, but its access type permits neither RPDOs nor TPDOs"
+        yield f"{entry}: mappable, but its access type forbids both RPDOs and TPDOs"
     if entry.mappable and entry.data_type == _DOMAIN:
         yield f"{entry}: mappable, although it is a DOMAIN"
     try:
         entry.default_bytes(node_id)
         value = _default(entry, node_id)
     except (ValueError, OverflowError):
-        yield f"{entry}: default {entry.default!r} does not fit its type"
+        yield f"{entry}: default {entry.default!r} does not fit the data type"
         return
     if value is not None and value >= 1 << 8 * entry.size:
-        yield f"{entry}: default {entry.default} exceeds the range of its type"
+        yield f"{entry}: default {entry.default} exceeds the range of its data type"
 
 
 def _doubtful(entry: EdsEntry, node_id: int) -> Iterator[str]:
-    """Yield each property of an EDS entry that the standard permits but some tools cannot handle."""
+    """Yield a line for each property of an EDS entry that is permitted but that some tools cannot handle."""
     if entry.mappable and not entry.size and entry.data_type in _TEXTS and entry.data_type != _DOMAIN:
         yield f"{entry}: mappable, but of variable length"
     if entry.low is not None and entry.high is not None and entry.low > entry.high:
-        yield f"{entry}: low limit {entry.low} above high limit {entry.high}"
+        yield f"{entry}: low limit {entry.low} is above high limit {entry.high}"
     try:
         value = _default(entry, node_id)
     except ValueError:
@@ -105,11 +105,11 @@ def _doubtful(entry: EdsEntry, node_id: int) -> Iterator[str]:
     if value is None:
         return
     if (entry.low is not None and value < entry.low) or (entry.high is not None and value > entry.high):
-        yield f"{entry}: default {entry.default} outside its limits"
+        yield f"{entry}: default {entry.default} is outside the limits"
 
 
 def _default(entry: EdsEntry, node_id: int) -> int | None:
-    """Return the default of a numeric entry; None if the entry has no default or is not numeric.
+    """Return the default value of a numeric EDS entry; None if the entry has no default or is not numeric.
 
     Raises ValueError if the default is not a number.
     """

@@ -38,7 +38,13 @@ def history(dut: Dut) -> None:
     count = dut.sdo.integer(_HISTORY)
     if count:
         raise Failed("0x1003:00 = 0", str(count))
-    dut.sdo.aborts(b"\x40" + mux(_HISTORY, 1), _HISTORY, 1, (_NO_DATA,), "read of 0x1003:01 without an error")
+    dut.sdo.aborts(
+        b"\x40" + mux(_HISTORY, 1),
+        _HISTORY,
+        1,
+        (_NO_DATA,),
+        "read of 0x1003:01 while the error history is empty",
+    )
 
 
 @case("EMCY-04", "An RPDO that is too short triggers EMCY 0x8210 with the generic error bit set",
@@ -47,7 +53,7 @@ def forced(dut: Dut) -> None:
     dut.need(_COB_ID)
     frame = short_pdo(dut)
     if not frame.data[2] & _GENERIC:
-        raise Failed("bit 0 of the error register set in the EMCY", describe(frame))
+        raise Failed("an emergency message with bit 0 of the error register set", describe(frame))
     dut.bus.expect_silence(dut.emcy_id, "second emergency message for the same error")
 
 
@@ -59,17 +65,21 @@ def register_after(dut: Dut) -> None:
         frame = later
     got = dut.sdo.integer(_REGISTER)
     if got != frame.data[2]:
-        raise Failed(f"0x1001:00 = 0x{frame.data[2]:02X} as in {describe(frame)}", f"0x{got:02X}")
+        raise Failed(
+            f"0x1001:00 = 0x{frame.data[2]:02X} as in the emergency message {describe(frame)}", f"0x{got:02X}"
+        )
 
 
-@case("EMCY-06", "0x1003:01 holds the last error; only writing 0 clears the history", "7.5.2.4")
+@case(
+    "EMCY-06", "0x1003:01 contains the last error; only writing 0 to 0x1003:00 clears the history", "7.5.2.4"
+)
 def history_after(dut: Dut) -> None:
     dut.need(_HISTORY, 1)
     frame = short_pdo(dut)
     dut.nmt(PRE_OPERATIONAL)
     count, newest = dut.sdo.integer(_HISTORY), dut.sdo.integer(_HISTORY, 1)
     if count != 1 or newest & 0xFFFF != emcy_code(frame):
-        raise Failed(f"one error, 0x{emcy_code(frame):04X}", f"{count} errors, the last 0x{newest:08X}")
+        raise Failed(f"one error, 0x{emcy_code(frame):04X}", f"{count} errors; the last is 0x{newest:08X}")
     request = expedited(_HISTORY, 0, b"\x01")
     dut.sdo.aborts(request, _HISTORY, 0, (0x0609_0030, 0x0609_0031), "write of 1 to 0x1003:00")
     dut.sdo.write_integer(_HISTORY, 0, 0, 1)

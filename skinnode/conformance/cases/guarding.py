@@ -12,9 +12,9 @@ _GUARD_MS, _FACTOR = 100, 3
 
 
 def guarded(dut: Dut, state: int, toggle: int | None, what: str) -> None:
-    """Raise Failed unless the node answers a remote frame with ``state`` and ``toggle``.
+    """Raise Failed unless the node answers a remote frame with NMT state ``state`` and toggle bit ``toggle``.
 
-    ``toggle`` is the expected toggle bit; None accepts either value.
+    If ``toggle`` is None, either toggle bit is accepted.
     """
     got = dut.guard(what)
     toggle_text = "any toggle bit" if toggle is None else f"toggle bit {toggle}"
@@ -32,10 +32,10 @@ def defaults(dut: Dut) -> None:
         default = dut.need(index).default_bytes(dut.node_id)
         value = dut.sdo.read(index)
         if value != default:
-            raise Failed(f"0x{index:04X}:00 as in the EDS", value.hex(" ").upper())
+            raise Failed(f"0x{index:04X}:00 to equal the default in the EDS", value.hex(" ").upper())
 
 
-@case("GUARD-02", "A remote frame is answered with the NMT state", "7.2.8.3.2.1")
+@case("GUARD-02", "The device answers a remote frame with its NMT state", "7.2.8.3.2.1")
 def answered(dut: Dut) -> None:
     dut.need(GUARD_TIME)
     guarded(dut, 127, None, "after a reset")
@@ -51,10 +51,10 @@ def toggle(dut: Dut) -> None:
     for number in range(5):
         guarded(dut, 127, number % 2, f"answer {number + 1}")
     dut.reset(RESET_COMMUNICATION)
-    guarded(dut, 127, 0, "the first after a communication reset")
+    guarded(dut, 127, 0, "first remote frame after a communication reset")
 
 
-@case("GUARD-04", "Remote frames for other node-IDs are not answered", "7.2.8.3.2.1; 7.3.3")
+@case("GUARD-04", "The device does not answer remote frames for other node-IDs", "7.2.8.3.2.1; 7.3.3")
 def others(dut: Dut) -> None:
     dut.need(GUARD_TIME)
     for node_id in range(1, 128):
@@ -72,10 +72,10 @@ def written(dut: Dut) -> None:
     dut.sdo.write_integer(LIFE_TIME_FACTOR, 0, 3, 1)
     got = dut.sdo.integer(GUARD_TIME), dut.sdo.integer(LIFE_TIME_FACTOR)
     if got != (0x1234, 3):
-        raise Failed("0x1234 and 3 read back", f"0x{got[0]:04X} and {got[1]}")
+        raise Failed("the written values 0x1234 and 3", f"0x{got[0]:04X} and {got[1]}")
 
 
-@case("GUARD-06", "Remote frames start life guarding; EMCY 0x8130 follows when they stop",
+@case("GUARD-06", "Remote frames start life guarding; when they stop, the device sends EMCY 0x8130",
       "7.2.8.2.2.1, 7.5.2.12")  # fmt: skip
 def life_guarding(dut: Dut) -> None:
     dut.need(GUARD_TIME)
@@ -93,4 +93,4 @@ def life_guarding(dut: Dut) -> None:
     frame = expect_emcy(dut, COMMUNICATION_LOST, "when remote frames stop")
     not_before(frame, sent_ns, _GUARD_MS * _FACTOR, "EMCY 0x8130")
     if dut.eds.find(0x1029, 1) is None or dut.sdo.integer(0x1029, 1) == 0:
-        guarded(dut, 127, None, "after life guarding failed in OPERATIONAL")
+        guarded(dut, 127, None, "after a life guarding event in OPERATIONAL")

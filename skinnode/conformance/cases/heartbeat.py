@@ -31,7 +31,7 @@ def written(dut: Dut) -> None:
             raise Failed(f"0x1017:00 = {value}", str(dut.sdo.integer(HEARTBEAT)))
 
 
-@case("HB-02", f"Heartbeats arrive every {_PERIOD_MS} ms and carry the state", "7.2.8.3.2.2")
+@case("HB-02", f"Heartbeats arrive every {_PERIOD_MS} ms and contain the NMT state", "7.2.8.3.2.2")
 def counted(dut: Dut) -> None:
     dut.need(HEARTBEAT)
     dut.start_heartbeat(_PERIOD_MS)
@@ -67,7 +67,7 @@ def twice(dut: Dut) -> None:
 
 @case(
     "HB-05",
-    "Heartbeats that arrive in time cause neither an emergency message nor a change of state",
+    "Heartbeats within the consumer time cause neither an emergency message nor a change of state",
     "7.2.8.2.2.2",
 )
 def in_time(dut: Dut) -> None:
@@ -76,8 +76,8 @@ def in_time(dut: Dut) -> None:
     dut.start_heartbeat(_PERIOD_MS)
     dut.operational()
     beat(dut, partner, times=7, each_s=0.1)
-    expect_no_emcy(dut, COMMUNICATION_LOST, "while heartbeats arrive in time")
-    dut.expect_state(5, "while heartbeats arrive in time")
+    expect_no_emcy(dut, COMMUNICATION_LOST, "while heartbeats arrive within the consumer time")
+    dut.expect_state(5, "while heartbeats arrive within the consumer time")
 
 
 @case(
@@ -87,7 +87,7 @@ def too_late(dut: Dut) -> None:
     partner = foreign_id(dut)
     consume(dut, partner, 100)
     dut.operational()
-    for _ in range(2):  # after a late heartbeat, monitoring resumes with the next heartbeat
+    for _ in range(2):  # the next heartbeat restarts monitoring
         sent_ns = beat(dut, partner)
         frame = expect_emcy(dut, COMMUNICATION_LOST, "when a heartbeat is late")
         not_before(frame, sent_ns, 100, "EMCY 0x8130")
@@ -95,7 +95,7 @@ def too_late(dut: Dut) -> None:
 
 @case(
     "HB-07",
-    "After a node reset, the first heartbeat starts monitoring; 0x1029 applies if heartbeats stop",
+    "After a reset, the first heartbeat starts monitoring; 0x1029 sets the reaction when heartbeats stop",
     "7.2.8.2.2.2, 7.5.2.32",
 )
 def after_reset(dut: Dut) -> None:

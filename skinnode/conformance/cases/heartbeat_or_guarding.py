@@ -1,4 +1,4 @@
-"""Conformance cases HBVG-01 to HBVG-07: a device uses either heartbeat or guarding (7.2.8.2.2).
+"""Conformance cases HBVG-01 to HBVG-07: a device uses either heartbeat or guarding (CiA 301, 7.2.8.2.2).
 
 If both are enabled, heartbeat has priority.
 """
@@ -30,7 +30,10 @@ def _both(dut: Dut, heartbeat_ms: int, guard_ms: int) -> None:
 
 
 def _heartbeats(dut: Dut, *, remote: bool) -> None:
-    """Check that only heartbeats arrive, at the set period; ``remote`` sends a remote frame after each."""
+    """Check that heartbeats arrive with the configured period and no other error-control frames arrive.
+
+    If ``remote`` is true, a remote frame is sent after each heartbeat.
+    """
     frames = []
     for _ in range(8):
         frames.append(dut.bus.expect(dut.error_control_id, "a heartbeat"))
@@ -38,7 +41,7 @@ def _heartbeats(dut: Dut, *, remote: bool) -> None:
             dut.bus.send(dut.error_control_id, remote=True)
     for frame in frames:
         if frame.data != b"\x7f":
-            raise Failed("only heartbeats, 7F without a toggle bit", describe(frame))
+            raise Failed("only heartbeats with data 7F, without a toggle bit", describe(frame))
     check_period(frames, _PERIOD_MS, "one frame")
 
 
@@ -54,7 +57,9 @@ def supported(dut: Dut) -> None:
     running = heartbeat is not None and dut.sdo.integer(HEARTBEAT) > 0
     guarded_too = guarding is not None and dut.sdo.integer(GUARD_TIME) > 0
     if running and guarded_too:
-        raise Failed("heartbeat or guarding on after a reset", "both 0x1017 and 0x100C above 0")
+        raise Failed(
+            "heartbeat or guarding disabled after a reset", "0x1017 and 0x100C are both greater than 0"
+        )
 
 
 @case("HBVG-02", "Heartbeat off, guarding off: the device sends nothing unsolicited", _CLAUSE)

@@ -38,7 +38,7 @@ def _read_all(dut: Dut, entries: Iterable[EdsEntry]) -> None:
                 faults.append(f"{entry}: {abort}")
             continue
         if entry.size and len(value) != entry.size:
-            faults.append(f"{entry}: {counted(len(value), 'byte')}, but its data type has {entry.size}")
+            faults.append(f"{entry}: {counted(len(value), 'byte')} read, but its data type has {entry.size}")
     _none("every object to be readable and to have the length of its data type", faults)
 
 
@@ -51,8 +51,7 @@ def _none(expected: str, faults: list[str]) -> None:
 def _compare_defaults(dut: Dut, entries: Iterable[EdsEntry]) -> None:
     """Compare the device's default values with those in the EDS.
 
-    0x1010 and 0x1011 return the device's capabilities rather than defaults, so a difference in these objects
-    causes only a warning.
+    0x1010 and 0x1011 return capabilities instead of defaults, so a different value causes only a warning.
     """
     faults: list[str] = []
     doubts: list[str] = []
@@ -86,7 +85,7 @@ def communication_defaults(dut: Dut) -> None:
     _compare_defaults(dut, dut.eds.between(*_COMMUNICATION))
 
 
-@case("OD-03", "Writing any ro or const object is refused", "7.4.5, 7.2.4.3.17")
+@case("OD-03", "Writes to ro and const objects are refused", "7.4.5, 7.2.4.3.17")
 def read_only(dut: Dut) -> None:
     for entry in dut.eds.entries.values():
         if entry.access in ("ro", "const"):
@@ -96,7 +95,7 @@ def read_only(dut: Dut) -> None:
             dut.sdo.aborts(request, entry.index, entry.subindex, READ_ONLY, f"write to {entry}")
 
 
-@case("OD-04", "Reading any wo object is refused", "7.4.5, 7.2.4.3.17")
+@case("OD-04", "Reads of wo objects are refused", "7.4.5, 7.2.4.3.17")
 def write_only(dut: Dut) -> None:
     entries = [entry for entry in dut.eds.entries.values() if entry.access == "wo"]
     if not entries:
@@ -106,7 +105,9 @@ def write_only(dut: Dut) -> None:
         dut.sdo.aborts(request, entry.index, entry.subindex, WRITE_ONLY, f"read of {entry}")
 
 
-@case("OD-05", "Sub-index 0xFF, if it exists, holds the object code and data type given in the EDS", "7.4.3")
+@case(
+    "OD-05", "Sub-index 0xFF, if it exists, contains the object code and data type given in the EDS", "7.4.3"
+)
 def structure(dut: Dut) -> None:
     known = {0x5: 0x05, 0x6: 0x06, 0x7: 0x07}
     found = False
@@ -124,14 +125,14 @@ def structure(dut: Dut) -> None:
         if object_code == 0x8 and known.get(entry.data_type, data_type) != data_type:
             raise Failed(f"data type 0x{entry.data_type:04X} in 0x{index:04X}:FF", f"0x{word:08X}")
     if not found:
-        raise NotApplicable("no object answers at sub-index 0xFF, which is optional")
+        raise NotApplicable("no object has the optional sub-index 0xFF")
 
 
 @case("OD-06", "Values beyond the limits in the EDS are refused", "7.2.4.3.17")
 def limits(dut: Dut) -> None:
     found = False
     for entry in dut.eds.entries.values():
-        # Other rules apply to mappings (PDO-25), the error field (accepts only 0) and signatures.
+        # Other rules apply to mapping counts (case PDO-25), the error field (only 0) and signatures.
         if (entry.index in _PDOS and entry.subindex == 0) or entry.index in (*_COMMANDS, _ERROR_FIELD):
             continue
         for limit, beyond, codes in ((entry.high, 1, TOO_HIGH), (entry.low, -1, TOO_LOW)):
@@ -152,13 +153,13 @@ def limits(dut: Dut) -> None:
 def read_rest(dut: Dut) -> None:
     entries = [entry for entry in dut.eds.between(*_REST) if not entry.flags & _REFUSE_READ]
     if not entries:
-        raise NotApplicable("the EDS has no object from 0x2000 to 0x9FFF that may be scanned")
+        raise NotApplicable("the EDS has no object from 0x2000 to 0x9FFF with ObjFlags bit 1 clear")
     _read_all(dut, entries)
 
 
 @case(
     "OD-08",
-    "Objects from 0x2000 to 0x9FFF have the default values given in the EDS (ObjFlags bit 1 clear)",
+    "Objects from 0x2000 to 0x9FFF have the default values given in the EDS, unless ObjFlags bit 1 is set",
     "CiA 306-1",
 )
 def rest_defaults(dut: Dut) -> None:
@@ -171,7 +172,7 @@ def rest_defaults(dut: Dut) -> None:
 
 @case(
     "OD-09",
-    "Objects from 0x2000 to 0x9FFF with access rw accept the value read from them (ObjFlags bit 0 clear)",
+    "Objects from 0x2000 to 0x9FFF with access rw accept their own value, unless ObjFlags bit 0 is set",
     "CiA 306-1",
 )
 def write_back(dut: Dut) -> None:
@@ -188,4 +189,4 @@ def write_back(dut: Dut) -> None:
                 f"{entry} = {value.hex(' ').upper()} after that value was written", again.hex(" ").upper()
             )
     if not found:
-        raise NotApplicable("the EDS has no rw object from 0x2000 to 0x9FFF that may be scanned")
+        raise NotApplicable("the EDS has no rw object from 0x2000 to 0x9FFF with ObjFlags bits 0 and 1 clear")

@@ -1,4 +1,4 @@
-"""Conformance cases OTHER-01 to OTHER-10: parameter storage, 0x1020 and restricted CAN-IDs."""
+"""Conformance cases OTHER-01 to OTHER-10: storage, verify configuration (0x1020), restricted CAN-IDs."""
 
 from __future__ import annotations
 
@@ -50,15 +50,15 @@ def _wrong_signature(dut: Dut, index: int, subindex: int) -> None:
     """Check that a wrong signature is refused and changes nothing, even after a reset."""
     dut.need_storage(index, subindex)
     before, after = _change(dut)
-    # If the device accepts the signature, its stored parameters must be put back.
+    # If the device accepts a wrong signature, its stored parameters must be restored after the case.
     dut.stored = True
     for signature in (b"wron", b"\0\0\0\0", b"SAVE", b"LOAD"):
         request = expedited(index, subindex, signature)
         what = f"{signature!r} to 0x{index:04X}:{subindex:02X}"
         dut.sdo.aborts(request, index, subindex, _WRONG_SIGNATURE, what)
-    _compare(dut, after, "after the wrong signature")
+    _compare(dut, after, "after a wrong signature")
     dut.reset()
-    _compare(dut, before, "after the wrong signature and a node reset")
+    _compare(dut, before, "after a wrong signature and a node reset")
 
 
 def _store(dut: Dut, subindex: int) -> None:
@@ -66,21 +66,23 @@ def _store(dut: Dut, subindex: int) -> None:
     _, after = _change(dut)
     dut.store(subindex)
     dut.reset()
-    _compare(dut, after, "after it was stored and the node was reset")
+    _compare(dut, after, "after storing the value and resetting the node")
 
 
 def _restore(dut: Dut, subindex: int) -> None:
-    """Check that restored defaults take effect at the next reset and not earlier."""
+    """Check that a command to restore defaults takes effect at the next reset, not before."""
     dut.need_storage(RESTORE, subindex)
     if dut.eds.find(STORE, subindex) is not None:
         _store(dut, subindex)
     _, after = _change(dut)
     dut.restore(subindex)
-    _compare(dut, after, "before the reset at which defaults take effect")
+    _compare(dut, after, "after the command to restore defaults, before the reset")
     dut.reset()
     defaults = {index: dut.need(index).default_bytes(dut.node_id) for index in after}
     _compare(
-        dut, {i: d for i, d in defaults.items() if d is not None}, "after restoring defaults and a node reset"
+        dut,
+        {i: d for i, d in defaults.items() if d is not None},
+        "after restoring defaults and resetting the node",
     )
 
 
@@ -140,13 +142,13 @@ def restore_communication(dut: Dut) -> None:
     _restore(dut, 2)
 
 
-@case("OTHER-09", "0x1020 keeps date and time through a store and reset; a write to another object clears it",
+@case("OTHER-09", "0x1020 retains its values across store and reset; a write to another object clears it",
       "7.5.2.23")  # fmt: skip
 def verify(dut: Dut) -> None:
     dut.need(_VERIFY, 1)
     dut.need(_VERIFY, 2)
     dut.need_storage(STORE, 1)
-    date, time = 15_000, 43_200_000  # days since 1984-01-01; milliseconds since midnight
+    date, time = 15_000, 43_200_000  # date: days since 1984-01-01; time: ms since midnight
     dut.sdo.write_integer(_VERIFY, 1, date, 4)
     dut.sdo.write_integer(_VERIFY, 2, time, 4)
     dut.store(1)
@@ -157,7 +159,7 @@ def verify(dut: Dut) -> None:
     _change(dut)
     got = dut.sdo.integer(_VERIFY, 1), dut.sdo.integer(_VERIFY, 2)
     if got != (0, 0):
-        raise Failed("date and time 0 after another object was written", f"{got[0]} and {got[1]}")
+        raise Failed("date 0 and time 0 after a write to another object", f"{got[0]} and {got[1]}")
 
 
 @case("OTHER-10", "No COB-ID can be set to a restricted CAN-ID", "7.3.5")
@@ -165,7 +167,7 @@ def restricted(dut: Dut) -> None:
     found = False
     for index, subindex in _cob_ids(dut):
         found = True
-        if index == _EMCY or index >= 0x1280:  # CiA 301 forbids changing a valid COB-ID
+        if index == _EMCY or index >= 0x1280:  # CiA 301 forbids changes to a valid COB-ID
             current = dut.sdo.integer(index, subindex)
             dut.sdo.write_integer(index, subindex, current | INVALID, 4)
         for block in RESTRICTED:
@@ -174,7 +176,7 @@ def restricted(dut: Dut) -> None:
                 what = f"CAN-ID 0x{can_id:03X} for 0x{index:04X}:{subindex:02X}"
                 dut.sdo.aborts(request, index, subindex, _RESTRICTED_VALUE, what)
     if not found:
-        raise NotApplicable("the EDS has no COB-ID that can be written")
+        raise NotApplicable("no COB-ID in the EDS is writable")
 
 
 def _cob_ids(dut: Dut) -> Iterator[tuple[int, int]]:

@@ -30,7 +30,10 @@ from skinnode.conformance.tester import ANSWER_S, QUIET_S, Failed
 
 _EVENT_MS = 50
 _FIRST_S = 0.4
-"""Maximum wait after a SYNC for the first TPDO of a cycle, s; a later SYNC may trigger that TPDO instead."""
+"""Maximum time (s) to wait after a SYNC for the first TPDO of a cycle.
+
+If the TPDO does not arrive, a later SYNC of the cycle may trigger it.
+"""
 _SYNC_COUNTER = 0x1019
 _RESERVED_KINDS = range(241, 252)
 
@@ -38,8 +41,8 @@ _RESERVED_KINDS = range(241, 252)
 def _scan(dut: Dut, pdos: list[Pdo], base: int) -> None:
     """Check the COB-IDs and transmission types of PDOs.
 
-    COB-IDs must equal those in the EDS. Those of valid PDOs must be unique, and the first four must match
-    the pre-defined connection set.
+    The COB-IDs must equal those in the EDS. Valid PDOs must have unique CAN-IDs, and the first four PDOs must
+    have the CAN-IDs of the pre-defined connection set.
     """
     valid: dict[int, Pdo] = {}
     for pdo in pdos:
@@ -47,12 +50,15 @@ def _scan(dut: Dut, pdos: list[Pdo], base: int) -> None:
         default = dut.need(pdo.parameter, 1).default_bytes(dut.node_id)
         if default is not None and cob_id != int.from_bytes(default, "little"):
             raise Failed(
-                f"{pdo} COB-ID 0x{int.from_bytes(default, 'little'):08X} given in the EDS", f"0x{cob_id:08X}"
+                f"{pdo} with COB-ID 0x{int.from_bytes(default, 'little'):08X} given in the EDS",
+                f"0x{cob_id:08X}",
             )
         number = pdo.parameter % 0x200
         wanted = base + 0x100 * number + dut.node_id
         if number < 4 and not cob_id & INVALID and cob_id & CAN_ID != wanted:
-            raise Failed(f"{pdo} on 0x{wanted:03X} as in the pre-defined connection set", f"0x{cob_id:08X}")
+            raise Failed(
+                f"{pdo} with CAN-ID 0x{wanted:03X} from the pre-defined connection set", f"0x{cob_id:08X}"
+            )
         if not cob_id & INVALID and (other := valid.setdefault(cob_id & CAN_ID, pdo)) != pdo:
             raise Failed("a different CAN-ID for each PDO", f"0x{cob_id & CAN_ID:03X} for {other} and {pdo}")
         kind = dut.sdo.integer(pdo.parameter, 2)
@@ -62,7 +68,7 @@ def _scan(dut: Dut, pdos: list[Pdo], base: int) -> None:
 
 @case(
     "PDO-01",
-    "RPDOs have the COB-IDs given in the EDS and by the pre-defined connection set",
+    "The COB-IDs of the RPDOs match the EDS and the pre-defined connection set",
     "7.5.2.35; 7.3.3",
 )
 def scan_rpdos(dut: Dut) -> None:
@@ -74,7 +80,7 @@ def scan_rpdos(dut: Dut) -> None:
 
 @case(
     "PDO-02",
-    "TPDOs have the COB-IDs given in the EDS and by the pre-defined connection set",
+    "The COB-IDs of the TPDOs match the EDS and the pre-defined connection set",
     "7.5.2.37; 7.3.3",
 )
 def scan_tpdos(dut: Dut) -> None:
@@ -115,7 +121,7 @@ def _for_remote(dut: Dut, pdo: Pdo) -> tuple[int, int]:
 
 @case(
     "PDO-04",
-    "OPERATIONAL: TPDOs of types 254 and 255 are sent on the event timer, but not before the inhibit time",
+    "OPERATIONAL: the event timer triggers TPDOs of types 254 and 255, but not within the inhibit time",
     "7.2.2.2, 7.5.2.37",
 )
 def event_driven(dut: Dut) -> None:
@@ -163,7 +169,7 @@ def event_timer(dut: Dut) -> None:
     each_tpdo(dut, trial)
 
 
-@case("PDO-06", "OPERATIONAL: a TPDO is sent after every SYNC if of type 1, after every third if of type 3",
+@case("PDO-06", "OPERATIONAL: a TPDO of type 1 follows every SYNC; a TPDO of type 3 follows every third",
       "7.2.2.2, 7.5.2.37")  # fmt: skip
 def cyclic(dut: Dut) -> None:
     def trial(dut: Dut, pdo: Pdo) -> None:
@@ -174,7 +180,7 @@ def cyclic(dut: Dut) -> None:
             dut.bus.expect_silence(can_id, f"{pdo} of type {kind} without SYNC")
             first = _first_of_cycle(dut, can_id, kind, str(pdo))
             for number in range(first + 1, first + 2 * kind + 1):
-                what = f"{pdo} of type {kind} after SYNC {number}; the first came after SYNC {first}"
+                what = f"{pdo} of type {kind} after SYNC {number}; the first {pdo} followed SYNC {first}"
                 _after_sync(dut, can_id, length, (number - first) % kind == 0, what)
             dut.nmt(PRE_OPERATIONAL)
 
@@ -182,7 +188,7 @@ def cyclic(dut: Dut) -> None:
 
 
 def _first_of_cycle(dut: Dut, can_id: int, kind: int, name: str) -> int:
-    """Return the number of the SYNC, counted from 1, that triggered the first TPDO of a cycle."""
+    """Send SYNCs until the first TPDO of a cycle arrives; return the number of SYNCs sent."""
     for number in range(1, kind + 1):
         sync(dut)
         if dut.bus.take(can_id, _FIRST_S if number < kind else ANSWER_S) is not None:
@@ -235,7 +241,9 @@ def sync_start(dut: Dut) -> None:
         dut.operational()
         for counter in range(1, 8):
             due = counter in (3, 5, 7)
-            _after_sync(dut, can_id, length, due, f"{pdo} at SYNC counter {counter}, start value 3", counter)
+            _after_sync(
+                dut, can_id, length, due, f"{pdo} at SYNC counter {counter}, with start value 3", counter
+            )
 
     each_tpdo(dut, trial)
 
@@ -246,11 +254,14 @@ def _for_start(dut: Dut, pdo: Pdo) -> int:
     return set_up(dut, pdo, PdoSetup(2, start=3))
 
 
-# --- STOPPED, and PRE-OPERATIONAL entered from OPERATIONAL: no trigger may send a TPDO
+# --- STOPPED, and PRE-OPERATIONAL entered from OPERATIONAL: no trigger may cause a TPDO
 
 
 def _silent(command: int, kind: int, state: str, *, event_ms: int = 0, start: bool = False) -> Trial:
-    """Return a trial that checks that a triggered PDO is not sent in ``state``, entered from OPERATIONAL."""
+    """Return a trial of a PDO that must not be sent in ``state``.
+
+    The device enters ``state`` from OPERATIONAL, and the trial then triggers the PDO.
+    """
 
     def trial(dut: Dut, pdo: Pdo) -> None:
         if kind == 253:

@@ -1,6 +1,6 @@
-"""Conformance cases PDO-21 to PDO-33: default mapping, and remapping.
+"""Conformance cases PDO-21 to PDO-33: default mapping and remapping of PDOs.
 
-PDOs are remapped by the standard procedure, without it, and to invalid entries.
+The cases follow the standard procedure of remapping, deviate from it, and write invalid mapping entries.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ Fits = Callable[[EdsEntry], bool]
 
 
 def _changeable(dut: Dut, pdos: list[Pdo]) -> list[Pdo]:
-    """Return the PDOs that can be remapped. Raises NotApplicable if there are none."""
+    """Return the PDOs that can be remapped. Raises NotApplicable if no PDO can be remapped."""
     found = []
     for pdo in pdos:
         count, cob_id = dut.eds.find(pdo.mapping, 0), dut.eds.find(pdo.parameter, 1)
@@ -62,7 +62,7 @@ def _any_for(dut: Dut, pdo: Pdo) -> EdsEntry:
 
 
 def _clear(dut: Dut, pdo: Pdo) -> int:
-    """Disable the PDO and its mapping, the first steps of remapping; return the previous COB-ID."""
+    """Disable the PDO and its mapping, as remapping requires; return the previous COB-ID."""
     cob_id = disable(dut, pdo)
     dut.sdo.write_integer(pdo.mapping, 0, 0, 1)
     return cob_id
@@ -74,11 +74,11 @@ def _most_bytes(dut: Dut) -> int:
 
 
 def _slots(dut: Dut, pdo: Pdo) -> int:
-    """Return the maximum number of mapping entries of a PDO."""
+    """Return the highest sub-index of a PDO's mapping in the EDS: the maximum number of entries."""
     return max(entry.subindex for entry in dut.eds.between(pdo.mapping, pdo.mapping))
 
 
-@case("PDO-21", "Default mappings name mappable objects in the EDS with their lengths, and fit into a frame",
+@case("PDO-21", "Default mappings contain mappable objects with their EDS lengths, and fit into a frame",
       "7.5.2.36, 7.5.2.38")  # fmt: skip
 def default_mapping(dut: Dut) -> None:
     pdos = [*rpdos(dut), *tpdos(dut)]
@@ -88,7 +88,8 @@ def default_mapping(dut: Dut) -> None:
         words = mapped(dut, pdo)
         if payload_bytes(words) > _most_bytes(dut):
             raise Failed(
-                f"{pdo} of at most {counted(_most_bytes(dut), 'byte')}", counted(payload_bytes(words), "byte")
+                f"{pdo} with at most {counted(_most_bytes(dut), 'byte')}",
+                counted(payload_bytes(words), "byte"),
             )
         for subindex, word in enumerate(words, 1):
             _check_mapped(dut, pdo, subindex, word)
@@ -96,7 +97,7 @@ def default_mapping(dut: Dut) -> None:
 
 def _check_mapped(dut: Dut, pdo: Pdo, subindex: int, word: int) -> None:
     where = f"0x{pdo.mapping:04X}:{subindex:02X}"
-    if word < 0x0020_0000:  # a dummy entry: a data type instead of an object
+    if word < 0x0020_0000:  # a dummy entry names a data type instead of an object
         if pdo.transmits or word >> 16 not in dut.eds.dummies:
             raise Failed(f"{where} to name an object or an allowed dummy", f"0x{word:08X}")
         return
@@ -124,7 +125,7 @@ def remap(dut: Dut) -> None:
             can_id = set_up(dut, pdo, PdoSetup(1))
             dut.operational()
             sync(dut)
-            expect_pdo(dut, can_id, entry.size, f"{pdo} after SYNC, remapped to {entry}")
+            expect_pdo(dut, can_id, entry.size, f"{pdo}, remapped to {entry}, after SYNC")
         dut.prepare()
 
 
@@ -140,7 +141,7 @@ def entry_without_procedure(dut: Dut) -> None:
         tried = True
         disable(dut, pdo)
         request = expedited(pdo.mapping, 1, words[0].to_bytes(4, "little"))
-        what = f"{pdo}: write of entry 1 while {len(words)} are in use"
+        what = f"{pdo}: write of mapping entry 1 while {len(words)} are in use"
         dut.sdo.aborts(request, pdo.mapping, 1, OUT_OF_ORDER, what)
         _still(dut, pdo, words)
     if not tried:
@@ -156,7 +157,13 @@ def mapping_of_valid(dut: Dut) -> None:
         tried = True
         words = mapped(dut, pdo)
         request = expedited(pdo.mapping, 0, b"\0")
-        dut.sdo.aborts(request, pdo.mapping, 0, OUT_OF_ORDER, f"{pdo}: write to sub-index 0 while valid")
+        dut.sdo.aborts(
+            request,
+            pdo.mapping,
+            0,
+            OUT_OF_ORDER,
+            f"{pdo}: write to the number of entries while the PDO is valid",
+        )
         _still(dut, pdo, words)
     if not tried:
         raise NotApplicable("no PDO is valid by default")
@@ -167,7 +174,7 @@ def _still(dut: Dut, pdo: Pdo, words: list[int]) -> None:
         raise Failed(f"{pdo} with its mapping unchanged", str([f"0x{word:08X}" for word in mapped(dut, pdo)]))
 
 
-@case("PDO-25", "More objects than a PDO can map are refused", "7.5.2.36, 7.5.2.38")
+@case("PDO-25", "A mapping with more objects than the PDO has entries is refused", "7.5.2.36, 7.5.2.38")
 def too_many(dut: Dut) -> None:
     for pdo in _changeable(dut, [*rpdos(dut), *tpdos(dut)]):
         entry = _any_for(dut, pdo)
@@ -177,13 +184,13 @@ def too_many(dut: Dut) -> None:
             dut.sdo.write_integer(pdo.mapping, subindex, entry.mapping, 4)
         request = expedited(pdo.mapping, 0, bytes((slots + 1,)))
         dut.sdo.aborts(
-            request, pdo.mapping, 0, TOO_MUCH, f"{pdo}: {slots + 1} mapping entries, where {slots} fit,"
+            request, pdo.mapping, 0, TOO_MUCH, f"{pdo}: {slots + 1} mapping entries (maximum {slots})"
         )
         if dut.sdo.integer(pdo.mapping, 0):
             raise Failed(f"{pdo} still without entries", str(dut.sdo.integer(pdo.mapping, 0)))
 
 
-@case("PDO-26", "A mapping with more bits than a frame can hold is refused", "7.5.2.36, 7.5.2.38")
+@case("PDO-26", "A mapping with more bits than fit into a frame is refused", "7.5.2.36, 7.5.2.38")
 def too_long(dut: Dut) -> None:
     tried = False
     for pdo in _changeable(dut, [*rpdos(dut), *tpdos(dut)]):
@@ -199,10 +206,10 @@ def too_long(dut: Dut) -> None:
                 dut.sdo.write_integer(pdo.mapping, subindex, entry.mapping, 4)
         except Aborted as abort:
             if abort.code in TOO_MUCH:
-                continue  # a device may refuse the entry that exceeds the frame
+                continue  # a device may refuse the first entry that exceeds the frame
             raise
         request = expedited(pdo.mapping, 0, bytes((count,)))
-        what = f"{pdo}: {count} × {8 * entry.size} bits"
+        what = f"{pdo}: mapping of {count} × {8 * entry.size} bits"
         dut.sdo.aborts(request, pdo.mapping, 0, TOO_MUCH, what)
     if not tried:
         raise NotApplicable("no PDO can map more objects than fit into a frame")
@@ -221,7 +228,10 @@ def _accepts(dut: Dut, pdos: list[Pdo], fits: Fits, lack: str) -> None:
 
 
 def _refuses(dut: Dut, pdos: list[Pdo], fits: Fits, lack: str) -> None:
-    """Check that the device refuses the entry or, if it validates only at the end, the number of entries."""
+    """Check that the device refuses an invalid mapping entry.
+
+    The device may refuse the entry when it is written, or the number of entries, which is written last.
+    """
     for pdo, word in _each(dut, pdos, fits, lack):
         what = f"{pdo}: mapping of 0x{word:08X}"
         request = expedited(pdo.mapping, 1, word.to_bytes(4, "little"))

@@ -26,12 +26,12 @@ _DEVICE_TYPE = 0x1000
 _HARMLESS = (HEARTBEAT, 0x1015, 0x1006, 0x1007, GUARD_TIME)
 """Objects of CiA 301 that accept any value and have no immediate effect."""
 _SPECIAL = (0x1003, 0x1010, 0x1011, 0x1020, 0x1F50, 0x1F51)
-"""Objects that accept only commands or particular values."""
+"""Objects to which only commands or particular values can be written."""
 _STRINGS = (0x1008, 0x1009, 0x100A)
 
 
 def first(entries: Iterable[EdsEntry], fits: Callable[[EdsEntry], bool], lack: str) -> EdsEntry:
-    """Return the first entry that ``fits`` accepts. Raises NotApplicable, naming ``lack``, if none fits."""
+    """Return the first entry that ``fits`` accepts. Raises NotApplicable with ``lack`` if none fits."""
     for entry in entries:
         if fits(entry) and entry.index not in _SPECIAL:
             return entry
@@ -39,7 +39,7 @@ def first(entries: Iterable[EdsEntry], fits: Callable[[EdsEntry], bool], lack: s
 
 
 def long_object(dut: Dut) -> tuple[EdsEntry, bytes]:
-    """Return a readable object of more than four bytes, preferably a name or version, and its value."""
+    """Return a readable object longer than four bytes and its value; prefer a device name or version."""
     texts = [dut.eds.find(index) for index in _STRINGS]
     others = (entry for entry in dut.eds.entries.values() if entry.size not in (1, 2, 3, 4))
     for entry in (*texts, *others):
@@ -51,7 +51,7 @@ def long_object(dut: Dut) -> tuple[EdsEntry, bytes]:
 
 
 def check(dut: Dut, index: int, value: int, size: int) -> None:
-    """Raise Failed unless the value written to ``index`` is read back."""
+    """Raise Failed unless a read of ``index`` returns ``value``."""
     got = dut.sdo.integer(index)
     if got != value:
         raise Failed(f"0x{value:0{2 * size}X} read back from 0x{index:04X}:00", f"0x{got:0{2 * size}X}")
@@ -65,7 +65,7 @@ def read_expedited(dut: Dut) -> None:
     entry = dut.need(_DEVICE_TYPE)
     default = entry.default_bytes(dut.node_id)
     if default is not None and answer[4:] != default:
-        raise Failed(f"{default.hex(' ').upper()} as in the EDS", answer[4:].hex(" ").upper())
+        raise Failed(f"{default.hex(' ').upper()}, the default in the EDS", answer[4:].hex(" ").upper())
 
 
 @case(
@@ -75,7 +75,9 @@ def read_expedited(dut: Dut) -> None:
 )
 def write_expedited(dut: Dut) -> None:
     entries = [found for index in _HARMLESS if (found := dut.eds.find(index)) is not None]
-    entry = first(entries, lambda e: e.readable and e.writable, "plain rw object from 0x1000 to 0x1FFF")
+    entry = first(
+        entries, lambda e: e.readable and e.writable, "rw object from 0x1000 to 0x1FFF without side effects"
+    )
     before = dut.sdo.read(entry.index)
     value = (int.from_bytes(before, "little") ^ 0x2000).to_bytes(entry.size, "little")
     dut.sdo.write(entry.index, 0, value)
@@ -177,7 +179,7 @@ def too_high(dut: Dut) -> None:
     entry = first(
         dut.eds.entries.values(),
         lambda e: e.index not in range(0x1600, 0x1C00) and limited(e, e.high, 1) is not None,
-        "writable object with a high limit below that of its type",
+        "writable object whose high limit is below the maximum of its data type",
     )
     before = dut.sdo.read(entry.index, entry.subindex)
     value = limited(entry, entry.high, 1) or b""
@@ -191,7 +193,7 @@ def too_low(dut: Dut) -> None:
     entry = first(
         dut.eds.entries.values(),
         lambda e: limited(e, e.low, -1) is not None,
-        "writable object with a low limit above that of its type",
+        "writable object whose low limit is above the minimum of its data type",
     )
     before = dut.sdo.read(entry.index, entry.subindex)
     value = limited(entry, entry.low, -1) or b""
@@ -202,7 +204,7 @@ def too_low(dut: Dut) -> None:
 
 @case(
     "SDO-12",
-    "0x1200 holds the COB-IDs of the default SDO: node-ID + 0x600 and node-ID + 0x580",
+    "0x1200 contains the COB-IDs of the default SDO: node-ID + 0x600 and node-ID + 0x580",
     "7.5.2.33; 7.3.3",
 )
 def default_sdo(dut: Dut) -> None:
@@ -215,7 +217,7 @@ def default_sdo(dut: Dut) -> None:
 
 @case(
     "SDO-13",
-    "0x1000 can be read by the transfer that the server chooses and has the announced length",
+    "0x1000 can be read with the transfer type that the server selects; its length is as announced",
     "7.2.4.3.5",
 )
 def read_short(dut: Dut) -> None:
@@ -277,7 +279,7 @@ def read_segments(dut: Dut) -> None:
     entry, value = long_object(dut)
     again = dut.sdo.read(entry.index, entry.subindex)
     if again != value:
-        raise Failed(f"the same value of {entry} twice", f"{value!r} and {again!r}")
+        raise Failed(f"the same value in two reads of {entry}", f"{value!r} and {again!r}")
     for other in dut.eds.entries.values():
         if other.readable and other.size not in (1, 2, 3, 4):
             dut.sdo.read(other.index, other.subindex)

@@ -1,4 +1,4 @@
-"""Conformance cases SDO-19 to SDO-30: block transfer, and SDOs other than the default SDO."""
+"""Conformance cases SDO-19 to SDO-30: block transfer and additional SDOs."""
 
 from __future__ import annotations
 
@@ -108,7 +108,9 @@ def wrong_block_size(dut: Dut) -> None:
             _block(lambda: dut.sdo.read_block(0x1000))
 
 
-@case("SDO-27", "Acknowledging a segment that was never sent (128) is refused", "7.2.4.3.14, 7.2.4.3.17")
+@case(
+    "SDO-27", "An acknowledgement of segment 128, which was never sent, is refused", "7.2.4.3.14, 7.2.4.3.17"
+)
 def wrong_sequence(dut: Dut) -> None:
     _block(lambda: dut.sdo.read_block(0x1000))
     dut.sdo.served(b"\xa0" + mux(0x1000, 0) + b"\x14", "a block read of 0x1000:00")

@@ -1,4 +1,4 @@
-"""Conformance cases STATE-01 to STATE-04: the boot-up message, and the services served in each NMT state."""
+"""Conformance cases STATE-01 to STATE-04: the boot-up message, and the services of each NMT state."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def boot_up(dut: Dut) -> None:
 
 
 def _check_state(dut: Dut, state: int, what: str) -> None:
-    """Check the NMT state by heartbeat and by guarding, if the device supports them."""
+    """Check the NMT state that the device reports by heartbeat and by guarding, if supported."""
     dut.start_heartbeat()
     dut.expect_state(state, what)
     if dut.eds.find(HEARTBEAT) is not None:
@@ -72,9 +72,7 @@ def _check_state(dut: Dut, state: int, what: str) -> None:
         guarded(dut, state, None, what)
 
 
-@case(
-    "STATE-02", "PRE-OPERATIONAL: SDO, EMCY, SYNC and error control are served, but PDOs are not", "7.3.2.2.2"
-)
+@case("STATE-02", "PRE-OPERATIONAL: SDO, EMCY, SYNC and error control work, but PDOs do not", "7.3.2.2.2")
 def pre_operational(dut: Dut) -> None:
     _check_state(dut, 127, "after a reset")
     dut.sdo.read(0x1000)
@@ -87,7 +85,7 @@ def pre_operational(dut: Dut) -> None:
 
 
 def _timed(dut: Dut) -> dict[int, int]:
-    """Set up TPDOs for transmission every 20 ms in OPERATIONAL; return their lengths, keyed by CAN-ID."""
+    """Configure TPDOs to be sent every 20 ms in OPERATIONAL; return their lengths, keyed by CAN-ID."""
     found = {}
     for pdo in tpdos(dut):
         if not mapped(dut, pdo):
@@ -117,7 +115,7 @@ def _emcy(dut: Dut, what: str) -> None:
 
 @case(
     "STATE-03",
-    "OPERATIONAL: SDO, PDO and EMCY are served; 0x1029 applies to a communication error",
+    "OPERATIONAL: SDO, PDO and EMCY work; 0x1029 sets the reaction to a communication error",
     "7.3.2.2.3, 7.5.2.32",
 )
 def operational(dut: Dut) -> None:
@@ -143,7 +141,7 @@ def operational(dut: Dut) -> None:
         dut.expect_state(wanted, f"with 0x1029:01 = {behaviour}")
 
 
-@case("STATE-04", "STOPPED: error control is served; SDO, PDO, SYNC and EMCY are not", "7.3.2.2.4")
+@case("STATE-04", "STOPPED: error control works; SDO, PDO, SYNC and EMCY do not", "7.3.2.2.4")
 def stopped(dut: Dut) -> None:
     can_ids = _timed(dut)
     dut.start_heartbeat()

@@ -26,7 +26,7 @@ def consume_only(dut: Dut) -> None:
 
 
 def produce(dut: Dut, period_ms: int = PERIOD_MS) -> None:
-    """Start the SYNC producer. Raises NotApplicable if the device has no producer."""
+    """Start the SYNC producer. Raises NotApplicable if the device cannot produce SYNC."""
     dut.need(COB_ID)
     dut.need(PERIOD)
     dut.sdo.write_integer(PERIOD, 0, period_ms * 1000, 4)
@@ -34,7 +34,7 @@ def produce(dut: Dut, period_ms: int = PERIOD_MS) -> None:
         dut.sdo.write_integer(COB_ID, 0, SYNC_ID | PRODUCE, 4)
     except Aborted as abort:
         if abort.code in (*_INVALID_VALUE, 0x0800_0000):
-            raise NotApplicable(f"no SYNC producer: bit 30 of 0x1005 is refused, {abort}") from abort
+            raise NotApplicable(f"no SYNC producer: the device refuses bit 30 of 0x1005: {abort}") from abort
         raise
 
 
@@ -43,7 +43,7 @@ def default(dut: Dut) -> None:
     dut.need(COB_ID)
     cob_id = dut.sdo.integer(COB_ID)
     if cob_id & 0x3FFF_FFFF != SYNC_ID:
-        raise Failed("0x1005:00 = 0x00000080, bit 30 ignored", f"0x{cob_id:08X}")
+        raise Failed("0x1005:00 = 0x00000080 (bit 30 is ignored)", f"0x{cob_id:08X}")
 
 
 @case("SYNC-02", f"The producer sends SYNC every {PERIOD_MS} ms and can be stopped", "7.2.5, 7.5.2.6")
@@ -105,7 +105,9 @@ def wrong_overflow(dut: Dut) -> None:
         raise Failed(f"0x1019:00 still {before}", str(dut.sdo.integer(OVERFLOW)))
 
 
-@case("SYNC-06", "With an overflow value of 0 the producer sends SYNC without data", "7.2.5, 7.5.2.22")
+@case(
+    "SYNC-06", "With a counter overflow value of 0, the producer sends SYNC without data", "7.2.5, 7.5.2.22"
+)
 def no_counter(dut: Dut) -> None:
     dut.need(OVERFLOW)
     consume_only(dut)
@@ -124,18 +126,22 @@ def _counted(dut: Dut, values: list[int], what: str) -> None:
             raise Failed(f"SYNC with counter {value} {what}", describe(frame))
 
 
-@case("SYNC-07", "With an overflow value of 5 the producer counts from 1 to 5 repeatedly", "7.2.5, 7.5.2.22")
+@case(
+    "SYNC-07",
+    "With a counter overflow value of 5, the producer counts from 1 to 5 repeatedly",
+    "7.2.5, 7.5.2.22",
+)
 def counter(dut: Dut) -> None:
     dut.need(OVERFLOW)
     consume_only(dut)
     dut.sdo.write_integer(OVERFLOW, 0, 5, 1)
     produce(dut)
-    _counted(dut, [1, 2, 3, 4, 5, 1, 2, 3, 4, 5, 1], "of a cycle of 5")
+    _counted(dut, [1, 2, 3, 4, 5, 1, 2, 3, 4, 5, 1], "in a cycle of 5")
 
 
 @case(
     "SYNC-08",
-    "A producer stored through 0x1010:01 starts after a node reset, counting from 1",
+    "If stored through 0x1010:01, the producer starts after a node reset and counts from 1",
     "7.5.2.13, 7.5.2.22",
 )
 def counter_stored(dut: Dut) -> None:
@@ -149,7 +155,7 @@ def counter_stored(dut: Dut) -> None:
     _counted(dut, [1, 2, 3], "after a node reset")
 
 
-@case("SYNC-09", "The overflow value cannot be written while the period is not 0", "7.5.2.22")
+@case("SYNC-09", "The counter overflow value cannot be written while the period is not 0", "7.5.2.22")
 def overflow_in_use(dut: Dut) -> None:
     dut.need(OVERFLOW)
     dut.need(PERIOD)
@@ -159,7 +165,11 @@ def overflow_in_use(dut: Dut) -> None:
     dut.sdo.aborts(request, OVERFLOW, 0, _BUSY, "write to 0x1019:00 while the period in 0x1006 is not 0")
 
 
-@case("SYNC-10", "The overflow value stored through 0x1010:01 survives a node reset", "7.5.2.13, 7.5.2.22")
+@case(
+    "SYNC-10",
+    "The counter overflow value stored through 0x1010:01 survives a node reset",
+    "7.5.2.13, 7.5.2.22",
+)
 def overflow_stored(dut: Dut) -> None:
     dut.need(OVERFLOW)
     dut.need_storage(STORE, 1)

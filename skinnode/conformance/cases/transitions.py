@@ -22,7 +22,7 @@ _NAMES = {PRE_OPERATIONAL: "enter pre-operational", START: "start", STOP: "stop"
 
 
 def _application_object(dut: Dut) -> tuple[EdsEntry, bytes] | None:
-    """Change an object from 0x2000 to 0x9FFF; return it and its old value, or None if none can be changed."""
+    """Change an object from 0x2000 to 0x9FFF; return the object and its old value, or None."""
     for entry in dut.eds.between(0x2000, 0x9FFF):
         if not (entry.readable and entry.writable and entry.data_type in UNSIGNED and entry.size <= 4):
             continue
@@ -42,7 +42,7 @@ def _application_object(dut: Dut) -> tuple[EdsEntry, bytes] | None:
 
 @case(
     "TRANS-01",
-    "Reset node and reset communication work in every state; the latter keeps application objects",
+    "Reset node and reset communication work in every state; the latter keeps application parameters",
     "7.3.2.2.1",
 )
 def resets(dut: Dut) -> None:
@@ -71,7 +71,7 @@ def resets(dut: Dut) -> None:
 
 
 def _transition(dut: Dut, command: int, *others: int) -> None:
-    """Check that ``command`` works after each of ``others``, addressed to the node or to all nodes (0)."""
+    """Check that ``command``, sent to the node or to all nodes, works after each command in ``others``."""
     state, name = _COMMANDS[command], _NAMES[command]
     dut.start_heartbeat()
     for other in others:
@@ -92,7 +92,7 @@ def _transition(dut: Dut, command: int, *others: int) -> None:
 
 @case(
     "TRANS-02",
-    "Enter pre-operational works in OPERATIONAL and STOPPED, sent to the node-ID or to all nodes",
+    "Enter pre-operational, addressed to the node or to all nodes, works in OPERATIONAL and STOPPED",
     "7.2.8.2.1, 7.3.2.2",
 )
 def enter_pre_operational(dut: Dut) -> None:
@@ -101,7 +101,7 @@ def enter_pre_operational(dut: Dut) -> None:
 
 @case(
     "TRANS-03",
-    "Start works in PRE-OPERATIONAL and STOPPED, sent to the node-ID or to all nodes",
+    "Start, addressed to the node or to all nodes, works in PRE-OPERATIONAL and STOPPED",
     "7.2.8.2.1, 7.3.2.2",
 )
 def start(dut: Dut) -> None:
@@ -110,7 +110,7 @@ def start(dut: Dut) -> None:
 
 @case(
     "TRANS-04",
-    "Stop works in PRE-OPERATIONAL and OPERATIONAL, sent to the node-ID or to all nodes",
+    "Stop, addressed to the node or to all nodes, works in PRE-OPERATIONAL and OPERATIONAL",
     "7.2.8.2.1, 7.3.2.2",
 )
 def stop(dut: Dut) -> None:

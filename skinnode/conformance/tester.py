@@ -98,7 +98,7 @@ class Tester:
     def take(
         self, can_id: int, within_s: float = ANSWER_S, match: Callable[[Frame], bool] | None = None
     ) -> Frame | None:
-        """Return the first matching frame with ``can_id``, from the inbox if possible, otherwise from the bus.
+        """Return the first matching frame with ``can_id`` from the inbox, or else from the bus.
 
         Args:
             can_id: CAN-ID of a data frame.

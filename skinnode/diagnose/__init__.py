@@ -6,7 +6,7 @@
 ``pdo_parameters``, ``nmt_commands``, ``lss_commissioning``, ``tare``. A function writes to a node only if its
 name indicates a write.
 
-``skinnode doctor`` builds on these modules. ``collect_facts`` gathers the facts about a bus with
-``scan_capture``. :mod:`skinnode.diagnose.checks` derives findings from the facts with ``noise``.
+``skinnode doctor`` builds on these modules. ``collect_facts`` uses ``scan_capture`` to gather the
+facts about a bus. :mod:`skinnode.diagnose.checks` uses ``noise`` to derive findings from the facts.
 ``root_causes`` groups findings by cause, and ``html_report`` writes the report as a page.
 """

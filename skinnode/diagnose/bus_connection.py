@@ -19,11 +19,13 @@ from skinnode.host.mainline import Mainline
 from skinnode.host.sdo_client import RemoteOd
 
 LONGEST_HEARTBEAT_S: Final = 2.5
-"""Maximum wait for a heartbeat, s; heartbeats with a longer period are not detected."""
+"""Maximum time (s) to wait for a heartbeat; heartbeats with a longer period are not detected."""
 
 GUARD_ANSWERS_S: Final = (0.15, 0.5)
-"""Maximum waits for a response to the first and to the second remote frame, s; a busy node may miss the
-first."""
+"""Maximum times (s) to wait for a response to the first and to the second remote frame.
+
+A busy node may miss the first remote frame.
+"""
 
 _POLL_S: Final = 0.002
 
@@ -34,7 +36,7 @@ class State(NamedTuple):
     state: int | None
     """NMT state; None if unknown."""
     how: str
-    """``heartbeat``, ``guarding``, or why the state is unknown."""
+    """Source of the state: ``heartbeat`` or ``guarding``; if the state is unknown, the reason."""
 
     def __str__(self) -> str:
         return "unknown" if self.state is None else state_name(self.state)
@@ -47,7 +49,7 @@ def no_answer(wrong: str) -> str:
     """
     if not wrong:
         return "does not answer SDO requests"
-    return f"sends SDO frames that do not respond to the request (newest: {wrong})"
+    return f"sends SDO frames that are not responses to the request (newest: {wrong})"
 
 
 class BusConnection:
@@ -121,7 +123,7 @@ class BusConnection:
 
         Args:
             node_id: The node.
-            more: Returns text to append to the error message.
+            more: Callback that returns text to append to the error message.
 
         Raises:
             NodeError: The node sends no valid response.
@@ -146,7 +148,7 @@ class BusConnection:
         return newest[1].hex(" ") or "no data"
 
     def heartbeat_s(self, node_id: int) -> float | None:
-        """Read the heartbeat period (0x1017) of a node, s; 0 if off, None if the node does not answer."""
+        """Read a node's heartbeat period (0x1017) in s; 0 if disabled, None if the node does not answer."""
         try:
             return float(self.od(node_id).read(od.HEARTBEAT_PRODUCER, 0, "u16")) * 1e-3
         except NodeError:
@@ -155,8 +157,8 @@ class BusConnection:
     def guarded(self, node_id: int) -> bool:
         """Return whether a master guards the node.
 
-        A remote frame from this program would start life guarding in the node, which would later mistake the
-        program's silence for the loss of its master.
+        A remote frame from this program would start life guarding in such a node. When the program then stops
+        sending, the node would report the loss of its master.
         """
         remote = self.od(node_id)
         try:

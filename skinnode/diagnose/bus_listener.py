@@ -15,7 +15,7 @@ from skinnode.canopen.nmt import STATE_MASK, NmtState
 from skinnode.transport import Frame
 
 _KEPT: Final = 256
-"""Maximum number of messages kept per kind and node; covers more than half a minute of heartbeats at 4 Hz."""
+"""Maximum number of messages kept per kind and node: about a minute of heartbeats at 4 Hz."""
 
 
 class Beat(NamedTuple):
@@ -45,8 +45,8 @@ class NodeTraffic:
     sdo_answers: deque[tuple[int, bytes]] = field(default_factory=lambda: deque(maxlen=_KEPT))
     """Reception time in ns and the eight data bytes of each SDO response."""
     newest_sdo: tuple[int, bytes] | None = None
-    """Reception time in ns and data of the newest frame on the COB-ID for SDO responses, whatever its
-    length."""
+    """Reception time in ns and data of the newest frame of any length on the COB-ID for SDO
+    responses."""
 
 
 class BusListener:
@@ -57,8 +57,8 @@ class BusListener:
         self.cob_ids: Counter[int] = Counter()
         """Number of data frames, keyed by 11-bit COB-ID."""
         self.nmt: Counter[bytes] = Counter()
-        """Number of NMT commands, keyed by their two data bytes (command specifier and node-ID); ``b""``
-        counts the commands of any other length."""
+        """Number of NMT commands, keyed by their two data bytes (command specifier and node-ID). Commands
+        of any other length are counted under ``b""``."""
         self.extended = self.remote = self.errors = 0
         """Counts of frames with 29-bit identifiers, remote frames and error frames."""
 
@@ -68,7 +68,7 @@ class BusListener:
         return dict(self._nodes)
 
     def node(self, node_id: int) -> NodeTraffic:
-        """Return the messages received from one node-ID; empty if there are none."""
+        """Return the messages received from one node-ID, which may be none."""
         return self._nodes.get(node_id) or NodeTraffic()
 
     def newest_beat(self, node_id: int, since_ns: int = 0) -> Beat | None:

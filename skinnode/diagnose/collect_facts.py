@@ -36,14 +36,14 @@ SCANS: Final = 50
 """Number of scans needed for a noise estimate accurate to 10 %."""
 
 LONGEST_S: Final = 15.0
-"""Maximum wait for scans, s, regardless of the SYNC period."""
+"""Maximum time (s) to wait for scans, regardless of the SYNC period."""
 
 DEFAULT_NOISE: Final = 3e-6
 """Relative noise assumed for the converter if there is no hand file."""
 
 _PAUSES_S: Final = (0.0, 0.1, 0.3, 0.6)
-"""Pauses before successive attempts to read a node, s; a host reading a baseline keeps the node busy for 0.1
-to 0.3 s."""
+"""Pauses (s) before successive attempts to read a node. A host that reads a baseline occupies the node for
+0.1 to 0.3 s."""
 
 _FIRST_SYNC_S: Final = 0.5
 _KNOWN_TO_ALL: Final = frozenset(
@@ -169,7 +169,7 @@ def _examine(
 
 
 def _asked(question: Callable[[], Answer]) -> tuple[Answer | None, str]:
-    """Call ``question`` until it succeeds; return its answer, or None and the reason for the last failure.
+    """Call ``question`` up to four times; return its answer, or None and the reason for the last failure.
 
     Retries are needed because a running host may access the node at the same time, and an SDO server handles
     only one transfer at a time.
@@ -194,7 +194,7 @@ def _listen(  # noqa: PLR0913 - one call, the state of one examination
     active: bool,
     progress: Callable[[str], None],
 ) -> tuple[bool, float]:
-    """Capture scans of the running patches; with ``active``, start the other patches first.
+    """Capture scans of the running patches; if ``active`` is true, start the other patches first.
 
     Returns:
         Whether this program sent SYNC, and the bus load in the busiest second.
@@ -237,7 +237,7 @@ def _scan_s(patch: PatchFacts, profiles: dict[int, PatchProfile]) -> float:
     """Return the minimum SYNC period in s for a node that no host has configured; 0 for any other node.
 
     With its default inhibit time, a node needs at least this period to finish each scan before the next SYNC.
-    Bring-up later sets an inhibit time that fits the hand's period.
+    At bring-up, the host sets an inhibit time that suits the hand's SYNC period.
     """
     profile = profiles.get(patch.node_id)
     if profile is None or patch.info is None or patch.found is None or patch.found.state == "operational":
@@ -289,10 +289,10 @@ def _commands_of_others(heard: BusListener, node_ids: Collection[int]) -> int:
 def _foreign(heard: BusListener, node_ids: Collection[int], bus: BusConfig) -> dict[int, int]:
     """Return the number of unexplained frames, keyed by COB-ID.
 
-    Services, detected nodes, and the entries of ``others`` in the hand file explain frames.
-    COB-IDs in the pre-defined connection set of a detected node are attributed to that node, whatever the
-    device. Frames with the COB-IDs of a patch that does not answer are attributed to a host that polls the
-    patch.
+    A frame is explained if a CANopen service, a detected node or an entry of ``others`` in the hand file uses
+    its COB-ID. COB-IDs in the pre-defined connection set of a detected node are attributed to that node, even
+    if the node is not a patch. Frames with the COB-IDs of a patch that does not answer are attributed to a
+    host that polls the patch.
     """
     explained = _KNOWN_TO_ALL.union(*map(od.predefined_cob_ids, node_ids))
     explained |= {other.can_id for other in bus.others}

@@ -32,7 +32,7 @@ class DataSheet(NamedTuple):
 def read_profile(remote: RemoteOd) -> PatchProfile | None:
     """Read the sizes of a patch; None if the device is not a patch.
 
-    Raises NodeError if it does not answer.
+    Raises NodeError if the device does not answer.
     """
     try:
         identity = [remote.read(od.IDENTITY, sub, "u32") for sub in (od.IDENTITY_VENDOR, od.IDENTITY_PRODUCT)]

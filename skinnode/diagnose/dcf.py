@@ -1,4 +1,4 @@
-"""Writes and reads the configuration of one device as a file (DCF, CiA 306) without losing a byte.
+"""Writes and reads the configuration of one device as a DCF (CiA 306); every value is preserved byte by byte.
 
 Numbers and printable ASCII text are written to ``ParameterValue`` as CiA 306 specifies. An OCTET_STRING or a
 DOMAIN is written there in hexadecimal. CiA 306 has no notation for text that an INI reader would change, such
@@ -27,7 +27,7 @@ _BYTES_KEY: Final = ";ParameterBytes"
 _BYTES_LINE: Final = re.compile(r"^;(ParameterBytes=)", re.MULTILINE)
 _SECTION: Final = re.compile(r"([0-9A-Fa-f]{4})(?:sub([0-9A-Fa-f]{1,2}))?", re.IGNORECASE)
 _VALUES: Final = ("parametervalue", "parameterbytes", _BYTES_KEY.lower())
-_COMMISSIONING: Final = "DeviceComissioning"  # CiA 306 spells it this way
+_COMMISSIONING: Final = "DeviceComissioning"  # CiA 306 spells the name with one m
 _STRINGS: Final = {"VISIBLE_STRING": "ascii", "UNICODE_STRING": "utf-16-le"}
 _OCTETS: Final = ("OCTET_STRING", "DOMAIN")
 _VISIBLE_STRING: Final = 0x09
@@ -46,10 +46,9 @@ class Dcf(NamedTuple):
 
 
 def as_dcf(sheet: DataSheet, readings: Sequence[Reading], node_id: int, bitrate_bps: int, name: str) -> Dcf:
-    """Return the DCF of a device: its EDS with device commissioning and the value of each writable object.
+    """Return the DCF of a device: its EDS, device commissioning and the values of its writable objects.
 
-    The file is UTF-8, whatever the encoding of the EDS; a string that UTF-8 would change is written byte by
-    byte.
+    The file is in UTF-8, whatever the EDS's encoding. A string that UTF-8 would change is written as bytes.
 
     Args:
         sheet: The EDS.
@@ -111,8 +110,8 @@ def _with_value(entry: EdsEntry, value: str | None, as_bytes: str | None) -> Eds
         try:
             return replace(entry, given=bytes.fromhex(as_bytes))
         except ValueError:
-            return entry  # another tool wrote this text, which is not hexadecimal
-    if value and entry.data_type == _VISIBLE_STRING:  # text with trailing zeros is written as bytes
+            return entry  # Another tool wrote this text.
+    if value and entry.data_type == _VISIBLE_STRING:  # Text with trailing zeros is written as bytes.
         return replace(entry, given=octets(value.strip()))
     return replace(entry, default=value.strip()) if value else entry
 
@@ -125,7 +124,7 @@ def _is_configuration(reading: Reading) -> bool:
 
 
 def _standard_form(reading: Reading, data: bytes) -> str | None:
-    """Return the value in CiA 306 notation; None if no such notation preserves its bytes.
+    """Return the value in CiA 306 notation; None if that notation does not preserve its bytes.
 
     Integers are hexadecimal and reals are bit patterns, as conforming tools expect.
     """

@@ -1,7 +1,7 @@
 """Finds the nodes on a bus, by SDO, by heartbeats and by LSS.
 
 The device type of every node-ID is requested while heartbeats are recorded. LSS finds nodes without a
-node-ID. Nothing is written except LSS mode switches, which affect only nodes without a node-ID.
+node-ID. The only writes are LSS mode switches, which affect only nodes without a node-ID.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ class FoundNode:
     boot_ups: int
     """Boot-up messages received during the search."""
     duplicate: str
-    """Evidence that two nodes have this node-ID; empty if there is none."""
+    """Evidence that two nodes have this node-ID; empty without such evidence."""
     wrong_answer: str = ""
     """Newest frame on the COB-ID for SDO responses, as hexadecimal text, if no response was valid."""
 
@@ -133,7 +133,7 @@ def discover(connection: BusConnection, progress: Callable[[str], None] = lambda
             nodes = [job.result() for job in jobs]
             connection.wait_until(lambda: False, max(0.0, begun_s + LISTEN_S - time.monotonic()))
             unconfigured, more = lss.result()
-        except BaseException:  # the pool's threads must end after Ctrl-C, too
+        except BaseException:  # Ctrl-C must also end the pool's threads
             connection.abandon()
             raise
     heard = connection.listener.nodes
@@ -161,7 +161,7 @@ def _sdo_frames(connection: BusConnection) -> int:
 
 
 def find_unconfigured(connection: BusConnection) -> tuple[tuple[LssAddress, ...], bool]:
-    """Find the nodes without a node-ID; return them, and whether the search ended before all were found.
+    """Find the nodes without a node-ID; return these nodes, and whether the search was incomplete.
 
     The nodes return to LSS waiting mode.
     """
@@ -206,7 +206,9 @@ def _examine(connection: BusConnection, node_id: int, answers: int) -> FoundNode
     if not duplicate and identity[:2] == [od.VENDOR_ID, od.PRODUCT_CODE]:
         strangers = _number(connection, node_id, od.REJECTED_FRAMES, 7)
         if strangers:
-            duplicate = f"another node sent boot-ups or heartbeats with this ID (0x2040:7 = {strangers})"
+            duplicate = (
+                f"another node sent boot-up messages or heartbeats with this node-ID (0x2040:7 = {strangers})"
+            )
     heartbeat_s = connection.heartbeat_s(node_id)
     state = connection.state(node_id, heartbeat_s, guarding=not connection.guarded(node_id))
     return FoundNode(
@@ -257,7 +259,7 @@ def _two_serials(connection: BusConnection, node_id: int) -> str:
         return ""
     serials = sorted({int.from_bytes(data[4:8], "little") for data in answers if data[0] & 0xE0 == 0x40})
     shown = " and ".join(map(str, serials))
-    return f"one request got {len(answers)} responses" + (f": serials {shown}" if shown else "")
+    return f"{len(answers)} responses to one request" + (f": serials {shown}" if shown else "")
 
 
 def _number(connection: BusConnection, node_id: int, index: int, subindex: int) -> int | None:

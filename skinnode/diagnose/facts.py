@@ -28,7 +28,7 @@ class Sure(StrEnum):
     LIKELY = "likely"
     """Hardly any other cause can explain the evidence."""
     POSSIBLE = "possible"
-    """The condition may be intended; a person must decide."""
+    """The condition may be intentional; the user must decide."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -137,8 +137,8 @@ class BusFacts:
     """Counters of the SYNCs received; 0 for a SYNC without a counter."""
     sync_ours: bool = False
     own_period_s: float = 0.0
-    """Period of the SYNC that the doctor sends, s; 0 if another node sends SYNC. Exceeds ``period_s`` if a
-    node that no host has configured needs more time for a scan."""
+    """Period of the SYNC that the doctor sends, s; 0 if another node sends SYNC. The period
+    exceeds ``period_s`` if a node that no host has configured needs more time for a scan."""
     active: bool = False
     """Whether the doctor was allowed to start nodes that were not running."""
     role: str = "master"

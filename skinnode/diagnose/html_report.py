@@ -31,7 +31,7 @@ svg { max-width: 100%; height: auto; margin-top: 1.2rem }
 
 
 def as_html(buses: Sequence[BusFacts], groups: Sequence[Group], title: str) -> str:
-    """Return the report. Needs matplotlib if there are scans.
+    """Return the report. Requires matplotlib if scans were captured.
 
     Args:
         buses: Facts about each bus.

@@ -41,7 +41,7 @@ class Commissioned:
 
 
 def only_unconfigured(connection: BusConnection) -> LssAddress:
-    """Return the only node without a node-ID. Raises ConfigError if there is none or more than one."""
+    """Return the only node without a node-ID. Raises ConfigError unless there is exactly one."""
     found, more = find_unconfigured(connection)
     if len(found) != 1 or more:
         serials = ", ".join(str(address.serial_number) for address in found)
@@ -97,7 +97,7 @@ def commission(
         if not agreed(before):
             return None
         fault = _configure(connection, wanted)
-    finally:  # a node without a node-ID boots when released
+    finally:  # a node without a node-ID boots when LSS releases it
         connection.lss.release()
     faults = [fault] if fault else []
     booted = True

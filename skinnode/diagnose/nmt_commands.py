@@ -92,7 +92,7 @@ def command_nodes(
 
 
 def _watch(connection: BusConnection, node_id: int) -> _Watch:
-    """Read the values that a stopped node would not return."""
+    """Read a node's state and settings before the command; a stopped node would not return them."""
     heartbeat_s = connection.heartbeat_s(node_id)
     guarding = not connection.guarded(node_id)
     before = connection.state(node_id, heartbeat_s, guarding=guarding)
@@ -123,7 +123,7 @@ def _booted(connection: BusConnection, watch: _Watch, sent_ns: int) -> Change:
         after = "silent" if now is None else state_name(now.state)
         return Change(node_id, str(watch.before), after, False, why)
     booted_ns = time.monotonic_ns()
-    heartbeat_s = connection.heartbeat_s(node_id)  # the reset may have changed the period
+    heartbeat_s = connection.heartbeat_s(node_id)  # the reset may have changed the heartbeat period
     guarding = not connection.guarded(node_id)
     now_in = connection.state(node_id, heartbeat_s, guarding=guarding, since_ns=booted_ns)
     how = "boot-up message" + (f", {now_in.how}" if now_in.state is not None else "")

@@ -1,12 +1,13 @@
 """Estimates the noise at each crossing and on each wire, even while the skin is touched.
 
-The functions are pure. There are two noise estimates. Second differences of successive scans (variance 6 σ²)
-are insensitive to slow touches. The part of a crossing's signal that the other wires do not explain is
-insensitive to quick touches. A touch affects the crossings of many wires by combinations of a few functions
-of time, whereas the noise of each crossing is independent. Both estimates are upper bounds on the noise, so
-the smaller of the two is used. A quick, deep and small touch affects both estimates. On touched skin, the
-smallest singular values of a wire, which a touch hardly affects, are therefore compared with those of its
-neighbours. The patch as a whole is judged by its own smallest singular values.
+The functions are pure and compute two estimates of the noise. Second differences of successive scans
+(variance 6 σ²) are insensitive to slow touches. The part of a crossing's signal that the other wires do not
+explain is insensitive to quick touches. A touch affects the crossings of many wires by combinations of a few
+functions of time, whereas the noise of each crossing is independent. Both estimates are upper bounds on the
+noise, so the smaller of the two is used. A quick, deep and small touch affects both estimates. A touch
+hardly affects the smallest singular values of a wire. On touched skin, a wire's smallest singular values are
+therefore compared with those of its neighbours. The patch as a whole is judged by its own smallest singular
+values.
 """
 
 from __future__ import annotations
@@ -22,11 +23,11 @@ from skinnode.diagnose.facts import Counts, ScanFacts
 from skinnode.model.layout import Float
 
 LEAST_SCANS: Final = 20
-"""Minimum number of scans for a noise analysis; with fewer scans, the estimated standard deviation is off by
-more than 25 %."""
+"""Minimum number of scans for a noise analysis; with fewer scans, the error of the estimated standard
+deviation exceeds 25 %."""
 
 _MOST_SCANS: Final = 64
-"""Maximum number of scans used (the newest); computing time grows with the square of this number."""
+"""Maximum number of scans used, from the newest; computing time grows with the square of this number."""
 
 _FLOOR: Final = 8
 """Number of singular values that form a patch's noise floor; they determine the noise level to within 20
@@ -35,19 +36,21 @@ _FLOOR: Final = 8
 _MOVED: Final = 6.0
 """Minimum motion of a touched crossing, in units of the stated noise."""
 _EXPLAINED: Final = 2.0
-"""Minimum ratio of the motion of a touched crossing to its unexplained residual. Noise with 25 degrees of
-freedom exceeds this ratio once in a million crossings."""
+"""Minimum ratio of a touched crossing's motion to the part that other wires do not explain.
+
+Noise with 25 degrees of freedom exceeds this ratio once in a million crossings.
+"""
 _TOUCHED: Final = 2
-"""Minimum number of crossings that move together on touched skin; a loose contact affects only one."""
+"""Minimum number of crossings that move together on touched skin; a loose contact moves one crossing."""
 _STEP: Final = 20.0
 """Minimum height of a jump, in units of the stated noise."""
 _STAYS: Final = 0.3
-"""Maximum difference between a jump and the change of the median, as a fraction of the jump."""
+"""Maximum difference between a jump and the resulting change of the median, as a fraction of the jump."""
 _STILL: Final = 0.1
 """Maximum standard deviation of a crossing after its jump is removed, as a fraction of the jump."""
 _EVEN: Final = 0.2
-"""Maximum noise of a crossing without the common noise, as a fraction of the common noise, if the supply
-counts as noisy."""
+"""Maximum ratio of a crossing's own noise to the noise common to all crossings, if the supply is reported as
+noisy."""
 
 Mask = NDArray[np.bool_]
 
@@ -72,9 +75,9 @@ class NoiseAnalysis:
     """(U,) noise of each upper wire divided by the stated noise; the effect of a touch is removed as far as
     possible."""
     lower: Float
-    """(K,) noise of each lower wire, as for ``upper``."""
+    """(K,) noise of each lower wire, divided by the stated noise as in ``upper``."""
     floor: float
-    """Noise of all crossings together, as for ``upper``."""
+    """Noise of all crossings together, divided by the stated noise as in ``upper``."""
     supply: float
     """Noise common to all crossings divided by the stated noise; 0 unless each
     crossing's own noise is much smaller."""
@@ -123,7 +126,7 @@ def _roughness(series: Float) -> Float:
 
 
 def _unexplained(moved: Float) -> Float:
-    """Return the (U, K) standard deviations of the part of the motion that other wires do not explain.
+    """Return the (U, K) standard deviations of the motion that the other wires do not explain.
 
     For each upper wire, the leading half of the temporal components of all other upper wires is projected
     out. The same is done for each lower wire. At each crossing, the larger of the two residuals is used.
@@ -145,7 +148,7 @@ def _unexplained(moved: Float) -> Float:
 
 
 def _of_wires(moved: Float, noise: Float, known: Mask) -> Float:
-    """Return the smaller of noise floor and median noise for each wire on the first axis; 0 if unknown."""
+    """Return each wire's noise floor or median noise, whichever is smaller; 0 if unknown."""
     levels = np.zeros(moved.shape[1])
     for wire, there in enumerate(known):
         if there.any():
@@ -155,7 +158,7 @@ def _of_wires(moved: Float, noise: Float, known: Mask) -> Float:
 
 
 def _floor(moved: Float, values: int) -> float:
-    """Return the norm of the smallest singular values of (T, n) data, relative to that of unit noise."""
+    """Return the norm of the smallest singular values of (T, n) data, divided by the norm for unit noise."""
     return _smallest(moved, values) / _of_noise(moved.shape, values) if moved.shape[1] else 0.0
 
 
@@ -171,10 +174,10 @@ def _of_noise(shape: tuple[int, int], values: int) -> float:
 
 
 def _steps(safe: Float) -> tuple[Counts, Float, Mask]:
-    """Return scan and height of each crossing's largest jump, and whether the crossing is otherwise constant.
+    """Return the scan and height of each crossing's largest jump, and whether it is otherwise constant.
 
-    A crossing is otherwise constant if its medians before and after the jump differ by the jump's height, and
-    there is little other variation.
+    A crossing is otherwise constant if its medians before and after the jump differ by the jump's height and
+    the remaining variation is small.
     """
     jumps = np.diff(safe, axis=0)
     at = np.abs(jumps).argmax(axis=0)

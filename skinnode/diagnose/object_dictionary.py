@@ -39,8 +39,7 @@ _BOOLEAN, _TEXT = 0x01, 0x09
 _REALS: Final = {0x08: "<f", 0x11: "<d"}
 _STRINGS: Final = ("VISIBLE_STRING", "OCTET_STRING", "UNICODE_STRING", "DOMAIN")
 NOT_CONFIGURATION: Final = (od.ERROR_REGISTER, od.ERROR_FIELD, od.STORE, od.RESTORE)
-"""Objects that hold the state of a node rather than its configuration, even if its EDS specifies a
-default."""
+"""Objects that contain a node's state instead of its configuration, even if the EDS specifies a default."""
 _LONGEST_SHOWN: Final = 16
 _ADDRESS: Final = re.compile(r"(?:0[xX])?([0-9A-Fa-f]{1,4})(?::(0[xX][0-9A-Fa-f]{1,2}|[0-9]{1,3}))?")
 
@@ -59,7 +58,7 @@ class Reading:
     data: bytes | None
     """The bytes transferred; None if the node refused the request."""
     refused: str
-    """Reason for the refusal; empty if there was none."""
+    """Reason for the refusal; empty if the read succeeded."""
     refused_code: int = 0
     """SDO abort code of the refusal; 0 if the read succeeded."""
 
@@ -141,7 +140,7 @@ def encode(entry: EdsEntry, text: str, node_id: int) -> bytes:
         node_id: Replaces $NODEID.
 
     Raises:
-        ConfigError: The text does not fit the type.
+        ConfigError: The text is not a value of the object's type.
     """
     kind = _TYPES.get(entry.data_type, f"data type 0x{entry.data_type:X}")
     try:
@@ -159,7 +158,7 @@ def encode(entry: EdsEntry, text: str, node_id: int) -> bytes:
     where = (
         f"{entry} is {kind}"
         if entry.data_type
-        else f"the type of {entry} is specified only in the EDS of the node (--eds FILE)"
+        else f"the type of {entry} is specified only in the node's EDS (--eds FILE)"
     )
     raise ConfigError("--write", text, f"--hex and bytes in hexadecimal: {where}")
 
@@ -210,7 +209,7 @@ def entries_at(eds: Eds, index: int, subindex: int | None, count: Callable[[], i
 
 
 def dump_standard(remote: RemoteOd, progress: Callable[[str], None] = lambda _: None) -> Iterator[Reading]:
-    """Read every CiA 301 object that the node has, without needing an EDS."""
+    """Read every CiA 301 object that the node has; no EDS is needed."""
     progress("objects of CiA 301")
     for index in SINGLE:
         yield from _standard(remote, index)
@@ -223,7 +222,7 @@ def dump_standard(remote: RemoteOd, progress: Callable[[str], None] = lambda _: 
 
 
 def _standard(remote: RemoteOd, index: int) -> Iterator[Reading]:
-    """Read the values of an object; yields nothing if the node does not have it."""
+    """Read the values of an object; yield nothing if the node lacks the object."""
     try:
         count = remote.read_bytes(index, 0)
     except SdoAbort as abort:
@@ -254,7 +253,7 @@ def compare(
         remote: The node.
         eds: The file. Its readable values are compared, except objects that hold the node's state.
         node_id: Replaces $NODEID.
-        progress: Called from time to time with a description of the progress.
+        progress: Called repeatedly with a description of the progress.
 
     Returns:
         The values that differ.
@@ -294,7 +293,7 @@ def _same(entry: EdsEntry, data: bytes, wanted: bytes) -> bool:
 
 
 def _distinct(got: Reading, expected: Reading) -> tuple[str, str]:
-    """Return two different values as different texts.
+    """Format two different values so that their texts differ.
 
     If the plain texts are equal, the bytes from the first difference onwards are appended.
     """

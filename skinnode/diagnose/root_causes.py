@@ -2,8 +2,8 @@
 
 For example, an overloaded bus causes torn scans, skipped scans and emergencies at every patch on it. All
 these findings are true, but only the overload needs to be corrected. A rule names a cause and its possible
-consequences, at the same patch or at every patch on a bus. If the text of a finding is ambiguous, its
-evidence decides: emergencies follow from an overload only if each of their texts reports an overrun.
+consequences, at the same patch or at every patch on a bus. If a finding's text is ambiguous, the rule also
+tests its evidence: emergencies follow from an overload only if each of their texts reports an overrun.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ _RANK: Final = {sure: rank for rank, sure in enumerate(Sure)}
 
 @dataclass(frozen=True, slots=True)
 class Group:
-    """A finding not caused by any other finding, with its consequences."""
+    """A finding that no other finding causes, and its consequences."""
 
     cause: Finding
     consequences: tuple[Finding, ...] = ()
@@ -39,8 +39,8 @@ class Rule:
     cause: str
     follow: tuple[str, ...]
     evidence: Mapping[str, str]
-    """Evidence pattern for each pattern in ``follow``; a finding counts as a consequence only if every part
-    of its evidence matches."""
+    """Evidence pattern for each pattern in ``follow``; a finding is a consequence only if every part of its
+    evidence matches."""
 
 
 _HOLES: Final = ("incomplete scans", "whole scans are missing")
@@ -56,7 +56,7 @@ _CONFIGURED_BY_OTHERS: Final = (
     "the patch scans on its own timer",
 )
 _UNEXPLAINED: Final = "^error register 0x|^last: none reported$"
-"""Pattern for the evidence of an error report that names no cause."""
+"""Pattern that matches the evidence of an error report without a cause."""
 _OVERRUN: Final = dict.fromkeys(_ERRORS, f"overrun|{_UNEXPLAINED}")
 _WIRE: Final = dict.fromkeys(_ERRORS, f"wire open or shorted|overrun|{_UNEXPLAINED}")
 _RESTARTED: Final = dict.fromkeys(_ERRORS, f"SYNC of unexpected length|heartbeat|overrun|{_UNEXPLAINED}")
@@ -64,8 +64,8 @@ _COLLISION: Final = dict.fromkeys(_ERRORS, f"collision|{_UNEXPLAINED}")
 _CONTROLLER: Final = dict.fromkeys(_ERRORS, f"passive|bus-off|{_UNEXPLAINED}")
 _ANYTHING: Final[Mapping[str, str]] = {}
 
-# The first rule that matches a finding applies. Rules about a patch precede rules about its bus, and a rule
-# precedes any rule whose cause may be a consequence of its own cause.
+# The first rule that matches a finding applies. Rules about a patch precede rules about its bus. If the cause
+# of one rule may be a consequence of another rule's cause, the other rule comes first.
 RULES: Final = (
     Rule(
         "two nodes have the patch's node-ID",

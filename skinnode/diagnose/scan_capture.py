@@ -66,7 +66,7 @@ class ScanCapture:
                 self.note_sync(frame.t_ns, frame.data[0] if frame.data else 0)
             elif (taker := self._takers.get(frame.can_id)) is not None:
                 patch, chunk = taker
-                if not patch.begun:  # the first scan began before the capture
+                if not patch.begun:  # the first scan may have begun before the capture
                     patch.begun = not chunk
                     continue
                 take = patch.assembler.on_chunk if chunk else patch.assembler.on_summary
@@ -79,7 +79,7 @@ class ScanCapture:
         self.syncs.append((t_ns, counter))
 
     def facts(self, node_id: int, scale: CodeScale, stated_noise: float) -> ScanFacts | None:
-        """Return the scans captured from a patch; None if there are none.
+        """Return the scans captured from a patch; None if no scan was captured.
 
         Args:
             node_id: The node.
@@ -114,7 +114,10 @@ class ScanCapture:
         )
 
     def _sync_ns(self, scan: Scan) -> int | None:
-        """Return the time of the last SYNC before ``scan`` with the same counter, or with no counter."""
+        """Return the time of the last SYNC before ``scan`` whose counter equals the scan's.
+
+        A SYNC without a counter always matches.
+        """
         for t_ns, number in reversed(list(self.syncs)):  # another thread may append
             if scan.t_first_ns - t_ns > _LONGEST_NS:
                 return None
@@ -126,7 +129,7 @@ class ScanCapture:
 def _conversions(scans: Sequence[Scan]) -> tuple[int | None, int]:
     """Return the numbers of scans with a new and with a repeated conversion.
 
-    Returns None and 0 if the scans carry no conversion phase.
+    Returns None and 0 if the scans contain no conversion phase.
     """
     pairs = [
         (before.phase, scan.phase)

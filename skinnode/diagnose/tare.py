@@ -3,7 +3,7 @@
 The node responds to the write to 0x2021:4 only after the measurement, so the response confirms the tare. The
 summary of the next scan reports that the baseline changed, and a running host then reads the baseline. An SDO
 server handles one transfer at a time, so a request from this program would abort the host's upload. The
-baseline is therefore read back only when the node's SDO channel is quiet.
+baseline is therefore read back only when the node's SDO channel is idle.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ from skinnode.model.layout import Float
 from skinnode.protocol.profile import PatchProfile
 
 QUIET_S: Final = 0.3
-"""Duration of silence on a node's SDO channel, s, that rules out an ongoing transfer by another client."""
+"""Time (s) without SDO frames of a node after which no other client's transfer can be in progress."""
 
 HOST_BEGINS_S: Final = 1.0
-"""Maximum time from the tare to the host's first SDO request, s, in addition to a SYNC period; an idle host
-takes 0.3 s."""
+"""Maximum time (s) from the tare to the host's first SDO request, in addition to a SYNC period. An idle host
+needs 0.3 s."""
 
 OTHERS_S: Final = 4.0
 """Maximum wait for other SDO clients to finish, s."""
@@ -164,7 +164,7 @@ def _baseline(connection: BusConnection, remote: RemoteOd, profile: PatchProfile
 
 
 def _let_others_finish(connection: BusConnection, node_id: int, *, at_least_s: float) -> None:
-    """Wait, at most OTHERS_S, until the node's SDO channel has been quiet for QUIET_S.
+    """Wait until the node's SDO channel has been idle for QUIET_S, but at most OTHERS_S.
 
     Waits at least ``at_least_s`` unless another client begins a transfer.
     """

@@ -233,7 +233,7 @@ BOMBS: dict[str, tuple[Callable[[], bytes], str]] = {
                 for index in range(0x2000, 0x2800)
             )
         ),
-        "got more than 65536 values, up to section 2101, allowed: at most 65536",
+        "got more than 65536 values in the sections up to 2101, allowed: at most 65536",
     ),
 }
 

@@ -147,8 +147,11 @@ def test_a_sheet_is_read() -> None:
         (("SupportedObjects=3", "SupportedObjects=4"), "SupportedObjects=4, but 3"),
         (("2=0x1017", "2=0x1016"), "0x1016 is listed only"),
         (("SubNumber=2", "SubNumber=3"), "SubNumber=3, but 2"),
-        (("VendorNumber=0x42", "VendorNumber=0x43"), "vendornumber=0x43, the device reports 0x00000042"),
-        (("DefaultValue=0\n[1018]", "DefaultValue=300\n[1018]"), "default 300 exceeds the range of its type"),
+        (("VendorNumber=0x42", "VendorNumber=0x43"), "vendornumber=0x43, but the device reports 0x00000042"),
+        (
+            ("DefaultValue=0\n[1018]", "DefaultValue=300\n[1018]"),
+            "default 300 exceeds the range of its data type",
+        ),
         (("AccessType=wo", "AccessType=write"), "access type 'write'"),
         (("DataType=0x9", "DataType=0x99"), "data type 0x0099"),
     ],
@@ -179,8 +182,11 @@ def test_a_sheet_that_contradicts_itself_or_the_device(
             ("DataType=0x9\nAccessType=const", "DataType=0xA\nAccessType=const\nPDOMapping=1"),
             "0x1008:00 (Name): mappable, but of variable length",
         ),
-        (("CompactSubObj=3", "CompactSubObj=3\nLowLimit=9\nHighLimit=8"), "low limit 9 above high limit 8"),
-        (("CompactSubObj=3", "CompactSubObj=3\nHighLimit=6"), "default 7 outside its limits"),
+        (
+            ("CompactSubObj=3", "CompactSubObj=3\nLowLimit=9\nHighLimit=8"),
+            "low limit 9 is above high limit 8",
+        ),
+        (("CompactSubObj=3", "CompactSubObj=3\nHighLimit=6"), "default 7 is outside the limits"),
     ],
 )
 def test_what_is_doubtful_in_a_sheet_is_a_warning(foreign: Dut, wrong: tuple[str, str], told: str) -> None:

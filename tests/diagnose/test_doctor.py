@@ -210,7 +210,7 @@ def test_chunks_too_far_apart(hand_file: HandFile, on: On) -> None:
     assert run(["od", "5", "1800:3", "--write", "100"], bus).status == 0
     status, found = examine(file)
     assert status == 1
-    assert found["thumb: the chunk PDO (TPDO1) is not at its COB-ID"][1] == "off, wanted 0x185"
+    assert found["thumb: the chunk PDO (TPDO1) is not at its COB-ID"][1] == "off, expected 0x185"
     assert "160 ms; the period is 25 ms" in found["thumb: a scan takes longer than a SYNC period"][1]
 
 

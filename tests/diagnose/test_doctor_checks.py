@@ -119,7 +119,7 @@ def test_a_guest_whose_master_sends_no_sync() -> None:
     idle = replace(WELL, found=node(state="pre-operational"), scans=None)
     finding = one(bus_of(idle, role="guest", sync_s=np.empty(0)))
     assert (finding.what, finding.sure) == ("no node sends SYNC", Sure.CERTAIN)
-    assert finding.evidence == "none in 6.0 s, and the host is a guest here"
+    assert finding.evidence == "no SYNC in 6.0 s, and the host is a guest on this bus"
     assert run_checks(bus_of(idle, sync_s=np.empty(0))) == []  # its host does not run
 
 

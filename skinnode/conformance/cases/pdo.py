@@ -180,7 +180,7 @@ def cyclic(dut: Dut) -> None:
             dut.bus.expect_silence(can_id, f"{pdo} of type {kind} without SYNC")
             first = _first_of_cycle(dut, can_id, kind, str(pdo))
             for number in range(first + 1, first + 2 * kind + 1):
-                what = f"{pdo} of type {kind} after SYNC {number}; the first {pdo} followed SYNC {first}"
+                what = f"{pdo} of type {kind} after SYNC {number}; the first TPDO followed SYNC {first}"
                 _after_sync(dut, can_id, length, (number - first) % kind == 0, what)
             dut.nmt(PRE_OPERATIONAL)
 

@@ -1,4 +1,4 @@
-"""Doctor checks of a bus: interface, controller, load, unknown frames, and masters."""
+"""Doctor checks of a bus: interface, controller, load, masters and unknown frames."""
 
 from __future__ import annotations
 
@@ -15,12 +15,14 @@ from skinnode.text.words import counted
 
 _SYNCS: Final = 10
 _ASTRAY: Final = 0.25
-"""Maximum fraction of SYNC counters that do not follow their predecessor. With two SYNC producers, the
-fraction is one half; with lost SYNCs, it is much smaller."""
+"""Maximum fraction of SYNC counters that are not the successor of the previous counter.
+
+Two SYNC producers cause a fraction of one half; lost SYNCs cause a much smaller fraction.
+"""
 
 _BEATS: Final = 4
 _TOO_OFTEN: Final = 0.7
-"""Minimum heartbeat period as a fraction of the configured period; a second sender halves the period."""
+"""Minimum heartbeat period as a fraction of the configured period; a second sender would halve the period."""
 
 
 def check_bus(bus: BusFacts) -> Iterator[Finding]:
@@ -34,7 +36,7 @@ def check_bus(bus: BusFacts) -> Iterator[Finding]:
             "the interface does not work",
             Sure.CERTAIN,
             bus.failure,
-            "bring it up: ip link set NAME up type can bitrate BPS; check that the adapter is plugged in",
+            "run ip link set NAME up type can bitrate BPS; check that the adapter is plugged in",
         )
         return
     if bus.link_state is not None and bus.link_state not in ("ERROR-ACTIVE", "ERROR-WARNING"):
@@ -42,13 +44,13 @@ def check_bus(bus: BusFacts) -> Iterator[Finding]:
             f"the controller is {bus.link_state}",
             Sure.CERTAIN,
             "reported by the kernel (ip -details link show)",
-            "check bit rate, cable and the two 120 ohm terminations; then take the interface down and up",
+            "check bit rate, cable and the two 120 ohm terminations; then restart the interface",
         )
     if bus.link_bitrate_bps not in (None, bus.bitrate_bps):
         yield found(
             "the bit rate of the interface differs from the hand file",
             Sure.CERTAIN,
-            f"{bus.link_bitrate_bps} bit/s, hand file: {bus.bitrate_bps}",
+            f"{bus.link_bitrate_bps} bit/s; the hand file specifies {bus.bitrate_bps}",
             "set the interface and the hand file to the same bit rate",
         )
     if bus.error_frames:
@@ -62,15 +64,15 @@ def check_bus(bus: BusFacts) -> Iterator[Finding]:
         yield found(
             "the bus load exceeds the planning limit",
             Sure.CERTAIN,
-            f"{bus.load:.0%} in the busiest second, {MAX_BUS_LOAD:.0%} allowed",
-            "lengthen sync.period_ms, set the send mode to changed, or put fewer patches on this bus",
+            f"{bus.load:.0%} in the busiest second; at most {MAX_BUS_LOAD:.0%} is allowed",
+            "increase sync.period_ms, set the send mode to changed, or put fewer patches on this bus",
         )
     if bus.outages:
         yield found(
             "the interface failed during the examination",
             Sure.CERTAIN,
             counted(bus.outages, "time"),
-            "check cable and power of the adapter, and the kernel log (dmesg)",
+            "check the adapter's cable and power, and the kernel log (dmesg)",
         )
     if bus.foreign:
         shown = ", ".join(f"0x{cob_id:03X}: {count}" for cob_id, count in Counter(bus.foreign).most_common(6))
@@ -78,7 +80,7 @@ def check_bus(bus: BusFacts) -> Iterator[Finding]:
             "frames of unknown origin",
             Sure.POSSIBLE,
             f"{shown} in {bus.seconds:.1f} s",
-            "normal if drives or another master share the bus; otherwise find the sender of these frames",
+            "this is normal if drives or another master share the bus; otherwise find the sender",
         )
     for address in bus.unconfigured:
         yield found(
@@ -95,7 +97,7 @@ def check_masters(bus: BusFacts) -> Iterator[Finding]:
     def found(what: str, sure: Sure, evidence: str, advice: str) -> Finding:
         return Finding("bus", bus.name, what, sure, evidence, advice)
 
-    stop_one = "run one host per hand: stop the other host, or give this host the role guest (buses.role)"
+    stop_one = "run one host per hand: stop the other host, or configure this host as a guest (buses.role)"
     counters = [counter for counter in bus.sync_counters if counter]
     steps = list(pairwise(counters))
     astray = sum(after not in (before + 1, 1) for before, after in steps)
@@ -103,7 +105,7 @@ def check_masters(bus: BusFacts) -> Iterator[Finding]:
         yield found(
             "two SYNC producers",
             Sure.CERTAIN,
-            f"{astray} of {len(steps)} SYNC counters do not follow their predecessor",
+            f"{astray} of {len(steps)} SYNC counters are not the successor of the previous counter",
             stop_one,
         )
     if bus.master_beats_s is not None and len(bus.master_beats_s) >= _BEATS and bus.heartbeat_ms:
@@ -112,8 +114,8 @@ def check_masters(bus: BusFacts) -> Iterator[Finding]:
             yield found(
                 "two masters send the same heartbeat",
                 Sure.LIKELY,
-                f"node-ID {bus.master_node_id} has a heartbeat every {period_s * 1e3:.0f} ms, "
-                f"hand file: {bus.heartbeat_ms}",
+                f"the heartbeat of node-ID {bus.master_node_id} arrives every {period_s * 1e3:.0f} ms; "
+                f"the hand file specifies {bus.heartbeat_ms} ms",
                 stop_one,
             )
     if bus.nmt_commands and bus.role == "master" and not any(patch.boot_ups for patch in bus.patches):
@@ -121,5 +123,5 @@ def check_masters(bus: BusFacts) -> Iterator[Finding]:
             "another device sends NMT commands",
             Sure.POSSIBLE,
             f"{counted(bus.nmt_commands, 'NMT command')} in {bus.seconds:.1f} s",
-            f"normal while a host starts; otherwise there is a second master: {stop_one}",
+            f"this is normal while a host starts; otherwise there is a second master: {stop_one}",
         )

@@ -42,8 +42,8 @@ def _check_layout(patch: PatchFacts) -> Iterator[Finding]:
             "the layout differs from the hand file",
             Sure.CERTAIN,
             f"layout hash 0x{own.layout_hash:08X} ({own.layout}, {own.upper_wires} × {own.lower_wires} "
-            f"wires), wanted 0x{patch.layout_hash:08X}",
-            "correct [patches.layout] or mount the right patch; until then, the fields are wrong",
+            f"wires), expected 0x{patch.layout_hash:08X}",
+            "correct [patches.layout] or install the right patch; until then, the displacements are wrong",
         )
     if own.code_bits != wanted.code_bits:
         yield Finding(
@@ -51,13 +51,13 @@ def _check_layout(patch: PatchFacts) -> Iterator[Finding]:
             patch.name,
             "the code width differs from the hand file",
             Sure.CERTAIN,
-            f"{own.code_bits} bits, hand file: {wanted.code_bits}",
+            f"{own.code_bits} bits; the hand file specifies {wanted.code_bits}",
             "correct code_bits in the hand file",
         )
 
 
 def _check_pdos(bus: BusFacts, patch: PatchFacts) -> Iterator[Finding]:
-    """Compare the PDOs with the host's settings; a value that the host has yet to write is not a fault."""
+    """Compare the PDOs with the host's settings. A value that the host will still write is not a fault."""
     info = patch.info
     assert info is not None
     if info.patch is None or patch.found is None:
@@ -66,7 +66,7 @@ def _check_pdos(bus: BusFacts, patch: PatchFacts) -> Iterator[Finding]:
     def found(what: str, sure: Sure, evidence: str, advice: str) -> Finding:
         return Finding("configuration", patch.name, what, sure, evidence, advice)
 
-    again = "skinnode host sets this value at bring-up: find the other program that writes to the node"
+    again = "skinnode host sets this value at bring-up; find the program that overwrites it"
     pdos = {(pdo.direction, pdo.number): pdo for pdo in info.pdos}
     chunk, summary = pdos.get(("TPDO", 1)), pdos.get(("TPDO", 2))
     running = patch.found.state == "operational"
@@ -77,7 +77,7 @@ def _check_pdos(bus: BusFacts, patch: PatchFacts) -> Iterator[Finding]:
         if pdo is None or not pdo.enabled or pdo.cob_id != cob_id:
             has = "missing" if pdo is None else "off" if not pdo.enabled else f"at 0x{pdo.cob_id:03X}"
             yield found(
-                f"the {what} is not at its COB-ID", Sure.CERTAIN, f"{has}, wanted 0x{cob_id:03X}", again
+                f"the {what} is not at its COB-ID", Sure.CERTAIN, f"{has}, expected 0x{cob_id:03X}", again
             )
     if chunk is not None and bus.period_s is not None and chunk.inhibit_100us is not None:
         yield from _check_inhibit(bus.period_s, patch, chunk, running, found)
@@ -88,12 +88,12 @@ def _check_pdos(bus: BusFacts, patch: PatchFacts) -> Iterator[Finding]:
             "the patch scans on its own timer, not on SYNC",
             Sure.LIKELY,
             f"period {info.patch.period_ms} ms (0x2021:1)",
-            f"run skinnode od {patch.node_id} 2021:1 --write 0, so that all patches scan at the same time",
+            f"run skinnode od {patch.node_id} 2021:1 --write 0 to make all patches scan simultaneously",
         )
     if running and info.heartbeat_ms == 0:
         yield found("no heartbeat: a loss of the node goes unnoticed", Sure.CERTAIN, "0x1017 is 0", again)
     elif running and bus.heartbeat_ms is not None and info.heartbeat_ms not in (None, bus.heartbeat_ms):
-        evidence = f"every {info.heartbeat_ms} ms, hand file: {bus.heartbeat_ms}"
+        evidence = f"a heartbeat every {info.heartbeat_ms} ms; the hand file specifies {bus.heartbeat_ms} ms"
         yield found("the heartbeat period differs from the hand file", Sure.POSSIBLE, evidence, again)
 
 
@@ -106,7 +106,7 @@ def _check_inhibit(
     profile = PatchProfile(*sizes, bus="classic" if own.pdo_bytes == 8 else "fd")
     at_default = chunk.inhibit_100us == profile.default_inhibit_100us
     if at_default and not running and patch.inhibit_100us is not None:
-        return  # a host replaces this default at bring-up
+        return  # the host replaces this default at bring-up
     chunks, inhibit_s = profile.n_chunks, (chunk.inhibit_100us or 0) * 1e-4
     if chunks * inhibit_s > period_s:
         yield found(
@@ -120,6 +120,6 @@ def _check_inhibit(
         yield found(
             "the inhibit time differs from the host's setting",
             Sure.POSSIBLE,
-            f"{chunk.inhibit_100us} × 100 µs, the host sets {patch.inhibit_100us}",
-            "normal if another master configures the patches",
+            f"{chunk.inhibit_100us} × 100 µs; the host sets {patch.inhibit_100us} × 100 µs",
+            "this is normal if another master configures the patches",
         )

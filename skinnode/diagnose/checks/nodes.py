@@ -13,7 +13,7 @@ from skinnode.text.words import counted, known
 
 
 def check_nodes(bus: BusFacts) -> Iterator[Finding]:
-    """Check that each node is present, is the expected device, runs and reports no error."""
+    """Check that each node is present, is the expected device, is running and reports no error."""
     if bus.failure:
         return
     if bus.patches and all(patch.found is None for patch in bus.patches):
@@ -22,9 +22,9 @@ def check_nodes(bus: BusFacts) -> Iterator[Finding]:
             bus.name,
             "no node of the hand answers",
             Sure.CERTAIN,
-            f"{counted(len(bus.patches), 'node')} asked, {counted(bus.frames, 'frame')} received "
+            f"{counted(len(bus.patches), 'node')} queried, {counted(bus.frames, 'frame')} received "
             f"in {bus.seconds:.1f} s",
-            "check supply of the patches, cable, termination, bit rate, channel",
+            "check the patches' supply, the cable, the termination, the bit rate and the channel",
         )
         return
     for patch in bus.patches:
@@ -59,9 +59,8 @@ def _check_node(bus: BusFacts, patch: PatchFacts) -> Iterator[Finding]:
         yield found(
             "the node is missing",
             Sure.CERTAIN,
-            f"node {patch.node_id} neither answers SDO requests nor sends heartbeats; "
-            f"other nodes on {bus.name} do",
-            "check supply and connector of the node; skinnode scan shows whether it has another node-ID",
+            f"node {patch.node_id} sends neither SDO responses nor heartbeats; other nodes on {bus.name} do",
+            "check the node's supply and connector; skinnode scan shows whether its node-ID has changed",
         )
         return
     if node.duplicate:
@@ -93,7 +92,7 @@ def _check_node(bus: BusFacts, patch: PatchFacts) -> Iterator[Finding]:
         yield found(
             "the serial number differs from the hand file",
             Sure.CERTAIN,
-            f"serial {known(node.serial)}, hand file: {wanted.serial}",
+            f"serial {known(node.serial)}; the hand file specifies {wanted.serial}",
             "if two patches were swapped, swap them back or correct the hand file and its calibration",
         )
     yield from _check_state(bus, patch, node)
@@ -113,14 +112,14 @@ def _check_state(bus: BusFacts, patch: PatchFacts, node: FoundNode) -> Iterator[
             "the node restarts by itself",
             Sure.CERTAIN,
             f"{counted(max(patch.boot_ups, node.boot_ups), 'boot-up message')} in {bus.seconds:.1f} s",
-            "check the supply voltage under load, the connector, and the watchdog of the board",
+            "check the supply voltage under load, the connector and the board's watchdog",
         )
     if bus.running and node.state != "operational":
         yield found(
             f"the node is {node.state} while other nodes are operational",
             Sure.LIKELY,
             f"NMT state by {node.state_known_by}",
-            "see the errors of the node below; a running host restarts the node after they are cleared",
+            "see the node's errors below; a running host restarts the node when they are cleared",
         )
     if info is not None and info.error_register:
         yield found(

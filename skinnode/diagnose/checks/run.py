@@ -16,7 +16,7 @@ _SURENESS: Final = {sure: rank for rank, sure in enumerate(Sure)}
 
 
 def run_checks(facts: BusFacts) -> list[Finding]:
-    """Return all findings about a bus; within each area, the most certain findings come first."""
+    """Return all findings about a bus; each check's findings are sorted by certainty."""
     checks: tuple[Callable[[BusFacts], Iterator[Finding]], ...] = (
         bus.check_bus,
         bus.check_masters,
@@ -73,12 +73,12 @@ def not_judged(facts: BusFacts) -> list[str]:
         elif patch.scans is not None and skin.is_touched(patch.scans):
             lines.append(
                 f"{patch.name}: noise of single crossings, and drift from the baseline: something "
-                "touched the skin; do not touch it while the doctor listens"
+                "touched the skin; do not touch the skin during the next run"
             )
         elif patch.scans is not None and skin.may_be_frozen(patch.scans):
             lines.append(
-                f"{patch.name}: frozen or only quiet: no code changed in {scans} scans, and the stated "
-                f"noise, {patch.scans.stated_noise:.0e}, is below one code, {patch.scans.step:.0e}: touch "
-                "the patch while the doctor listens; if this line appears again, the converter has stopped"
+                f"{patch.name}: frozen or only quiet: no code changed in {scans} scans, but the stated "
+                f"noise ({patch.scans.stated_noise:.0e}) is less than one code ({patch.scans.step:.0e}): "
+                "touch the patch during the next run; if this line appears again, the converter has stopped"
             )
     return lines

@@ -1,6 +1,6 @@
 """Doctor checks of the skin, based on captured scans: wires, noise, frozen values, jumps, baseline.
 
-A touch is not a defect: a finding that a touch can explain is not reported.
+A finding is not reported if a touch can explain it.
 """
 
 from __future__ import annotations
@@ -17,16 +17,18 @@ from skinnode.protocol.device_time import TIME_WRAP_US
 from skinnode.text.words import counted
 
 NOISY: Final = 5.0
-"""Minimum ratio of a noisy crossing's noise to the stated noise; not exceeded by chance in 20 scans."""
+"""Minimum ratio of a noisy crossing's noise to the stated noise. Chance does not cause it in 20 scans."""
 
 _DRIFT: Final = 0.003
-"""Minimum |R/R0 − 1| at rest that justifies a tare: 100 times the noise of a good converter, or
-1 % of the effect of a press."""
+"""Minimum deviation |R/R0 − 1| at rest that justifies a tare.
+
+It is 100 times the noise of a good converter, or 1 % of the effect of a press.
+"""
 
 _MANY: Final = 0.8
 _FEW: Final = 0.1
 _SHARE: Final = 0.7
-"""Minimum fraction of noisy crossings on a noisy wire; some crossings may be quiet by chance."""
+"""Minimum fraction of a noisy wire's crossings that are noisy; others may be quiet by chance."""
 
 
 def _judged(bus: BusFacts) -> Iterator[tuple[PatchFacts, ScanFacts, NoiseAnalysis]]:
@@ -36,7 +38,7 @@ def _judged(bus: BusFacts) -> Iterator[tuple[PatchFacts, ScanFacts, NoiseAnalysi
 
 
 def check_wires(bus: BusFacts) -> Iterator[Finding]:
-    """Check fault masks and codes of each node for open, shorted and out-of-range wires and crossings."""
+    """Check each node's fault masks and codes for open, shorted and out-of-range wires and crossings."""
     for patch in bus.patches:
         own = patch.info.patch if patch.info is not None else None
         upper: set[int] = set()
@@ -44,8 +46,8 @@ def check_wires(bus: BusFacts) -> Iterator[Finding]:
         if own is not None:
             upper, lower = {*own.open_upper, *own.shorted_upper}, {*own.open_lower, *own.shorted_lower}
             for what, wires, advice in (
-                ("upper wires open", own.open_upper, "check connector and solder joint of these wires"),
-                ("lower wires open", own.open_lower, "check connector and solder joint of these wires"),
+                ("upper wires open", own.open_upper, "check connector and solder joints of these wires"),
+                ("lower wires open", own.open_lower, "check connector and solder joints of these wires"),
                 ("upper wires shorted", own.shorted_upper, "look for a short to a lower wire, or moisture"),
                 ("lower wires shorted", own.shorted_lower, "look for a short to an upper wire, or moisture"),
             ):
@@ -68,25 +70,25 @@ def _check_crossings(
         (
             "open",
             scans.n_open,
-            "look for a broken electrode or wire; the values of these crossings are left out",
+            "look for a broken electrode or wire; the values of these crossings are not used",
         ),
-        ("shorted", scans.n_short, "look for rubber that is pressed through, or for moisture"),
+        ("shorted", scans.n_short, "look for squeezed-out rubber, and for moisture"),
         (
             "out of range",
             scans.n_over,
-            "tare at rest if the baseline is missing or old; a press may exceed the range",
+            "if the baseline is missing or old, tare at rest; a press may also exceed the range",
         ),
     ):
         always, sometimes = rest & (counts >= whole), rest & (counts > 0) & (counts < whole)
         for side, wires in (("upper", always.all(axis=1)), ("lower", always.all(axis=0))):
-            if wires.any():  # the masks may be older than the scans
+            if wires.any():  # the node's fault masks may be out of date
                 yield Finding(
                     "wires",
                     patch.name,
                     f"{side} wires {what}: {_listed(tuple(int(i) for i in np.flatnonzero(wires)))}",
                     Sure.CERTAIN,
                     f"every crossing, {_in_all(scans)}",
-                    "check connector and solder joint of these wires" if what == "open" else advice,
+                    "check connector and solder joints of these wires" if what == "open" else advice,
                 )
         always &= ~(always.all(axis=1, keepdims=True) | always.all(axis=0, keepdims=True))
         if always.any():
@@ -105,7 +107,7 @@ def _check_crossings(
                 f"{_crossings(sometimes)} intermittently {what}",
                 Sure.LIKELY if what == "open" else Sure.POSSIBLE,
                 f"in up to {int(counts[sometimes].max())} of {scans.scans} scans: {_places(sometimes)}",
-                "look for a loose contact: move the cable and watch" if what == "open" else advice,
+                "look for a loose contact: move the cable and repeat the test" if what == "open" else advice,
             )
 
 
@@ -121,9 +123,9 @@ def check_noise(bus: BusFacts) -> Iterator[Finding]:
                 patch.name,
                 f"{_crossings(analysis.steps)} jumped and kept the new value",
                 Sure.POSSIBLE,
-                f"{_places(analysis.steps)}; at {row}/{column} by {analysis.step_by[row, column]:.2%} of R0, "
-                f"scan {int(analysis.step_at[row, column]) + 1}",
-                "look for a loose contact, unless the skin was touched there",
+                f"{_places(analysis.steps)}; crossing {row}/{column} by "
+                f"{analysis.step_by[row, column]:.2%} of R0 in scan {int(analysis.step_at[row, column]) + 1}",
+                "look for a loose contact, unless something touched the skin there",
             )
 
 
@@ -138,7 +140,7 @@ def _check_noise(patch: PatchFacts, scans: ScanFacts, analysis: NoiseAnalysis) -
     figures = ""
     if noisy.any():
         median, worst = float(np.median(analysis.noise[noisy])), float(np.max(factor[noisy]))
-        figures = f"median {median:.1e} of R0, at worst {worst:.0f} times the stated noise, {over}"
+        figures = f"median noise {median:.1e} of R0, maximum {worst:.0f} × stated noise, {over}"
     all_alike = noisy.sum() > 0.5 * judged.sum()
     if analysis.is_touched:
         levels = (analysis.floor, np.median(analysis.upper), np.median(analysis.lower))
@@ -150,7 +152,7 @@ def _check_noise(patch: PatchFacts, scans: ScanFacts, analysis: NoiseAnalysis) -
             f"{int(noisy.sum())} of {_crossings(judged)}; {figures}"
             if all_alike
             else f"all crossings together: {analysis.supply:.0f} times the stated noise, {over}",
-            "check supply and shield of the patch, and relative_noise in the hand file",
+            "check the patch's supply and shield, and relative_noise in the hand file",
         )
         return
     names = [
@@ -161,7 +163,7 @@ def _check_noise(patch: PatchFacts, scans: ScanFacts, analysis: NoiseAnalysis) -
     ]
     if names:
         shown = ", ".join(names[:6]) + (" …" if len(names) > 6 else "")
-        yield found(f"noise on {shown}", Sure.LIKELY, figures, "check the contact of that wire")
+        yield found(f"noise on {shown}", Sure.LIKELY, figures, "check the contacts of the noisy wires")
     elif noisy.any() and not analysis.is_touched:
         yield found(
             f"noise at {_crossings(noisy)}",
@@ -172,7 +174,7 @@ def _check_noise(patch: PatchFacts, scans: ScanFacts, analysis: NoiseAnalysis) -
 
 
 def _stands_out(levels: Float, wire: int) -> bool:
-    """Return whether a wire is noisier than its neighbours; a touch affects adjacent wires alike."""
+    """Return whether a wire is noisier than its neighbours; a touch would affect them equally."""
     neighbours = [levels[i] for i in (wire - 1, wire + 1) if 0 <= i < len(levels)]
     return bool(neighbours) and bool(levels[wire] > NOISY * max(1.0, *neighbours))
 
@@ -185,7 +187,7 @@ def _check_frozen(patch: PatchFacts, scans: ScanFacts) -> Iterator[Finding]:
             patch.name,
             "the node repeats the same scan",
             Sure.CERTAIN,
-            f"the clock of the node did not change over {len(device)} scans",
+            f"the node's clock did not change over {len(device)} scans",
             "sampling has stopped: reset the node",
         )
     known, still = _still(scans)
@@ -204,8 +206,8 @@ def _check_frozen(patch: PatchFacts, scans: ScanFacts) -> Iterator[Finding]:
             patch.name,
             "the values are frozen",
             Sure.LIKELY,
-            f"{int(still.sum())} of {_crossings(known)} without any change in {scans.scans} scans, "
-            f"although the stated noise is {scans.stated_noise:.0e} and one code is {scans.step:.0e}",
+            f"{int(still.sum())} of {_crossings(known)} did not change in {scans.scans} scans, "
+            f"although the stated noise ({scans.stated_noise:.0e}) exceeds one code ({scans.step:.0e})",
             "the converter has stopped: switch the patch off and on",
         )
 
@@ -243,7 +245,7 @@ def check_baseline(bus: BusFacts) -> Iterator[Finding]:
                 f"{counted(own.baseline_missing, 'crossing has', 'crossings have')} no baseline",
                 Sure.CERTAIN,
                 "R0 is 0 (0x2301)",
-                f"with nothing touching the skin, run skinnode tare {patch.node_id}",
+                f"make sure that nothing touches the skin, then run skinnode tare {patch.node_id}",
             )
     for patch, scans, analysis in _judged(bus):
         at_rest = np.isfinite(analysis.level) & ~analysis.touched & ~analysis.steps
@@ -253,7 +255,7 @@ def check_baseline(bus: BusFacts) -> Iterator[Finding]:
         share = float(np.mean(np.abs(off) > _DRIFT))
         one_way = max(float(np.mean(off > 0)), float(np.mean(off < 0)))
         figures = f"median R/R0 − 1 is {np.median(off):+.2%} over {scans.scans} scans; {share:.0%} of "
-        figures += f"{off.size} crossings are off by more than {_DRIFT:.1%}"
+        figures += f"{off.size} crossings deviate by more than {_DRIFT:.1%}"
         if share > _MANY and one_way > 0.9:
             yield Finding(
                 "baseline",
@@ -261,7 +263,7 @@ def check_baseline(bus: BusFacts) -> Iterator[Finding]:
                 "the baseline no longer matches the skin at rest",
                 Sure.LIKELY,
                 figures,
-                "temperature or age changed the resistances: run skinnode tare with the skin untouched",
+                "temperature or ageing changed the resistances: run skinnode tare with the skin untouched",
             )
         elif share > 0.02 and not analysis.is_touched:
             yield Finding(
@@ -275,7 +277,7 @@ def check_baseline(bus: BusFacts) -> Iterator[Finding]:
 
 
 def is_touched(scans: ScanFacts) -> bool:
-    """Return whether something touched the skin; a touch rules out some of the checks."""
+    """Return whether something touched the skin, which makes some of the checks impossible."""
     return scans.scans >= LEAST_SCANS and analyse_noise(scans).is_touched
 
 

@@ -32,8 +32,8 @@ def check_timing(bus: BusFacts) -> Iterator[Finding]:
                 bus.name,
                 "no node sends SYNC",
                 Sure.CERTAIN,
-                f"none in {bus.seconds:.1f} s, and "
-                + ("nodes are operational" if bus.running else "the host is a guest here"),
+                f"no SYNC in {bus.seconds:.1f} s, and "
+                + ("nodes are operational" if bus.running else "the host is a guest on this bus"),
                 "start the host or the robot's master, because patches scan only at SYNC",
             )
     yield from _check_sync(bus)
@@ -47,7 +47,7 @@ def check_timing(bus: BusFacts) -> Iterator[Finding]:
                 patch.name,
                 "scans end after the next scan has begun",
                 Sure.CERTAIN,
-                f"median {np.median(latency_s) * 1e3:.1f} ms after SYNC, period {period_s * 1e3:g} ms",
+                f"median {np.median(latency_s) * 1e3:.1f} ms after SYNC; the period is {period_s * 1e3:g} ms",
                 "set a shorter inhibit time or a longer SYNC period, or reduce the bus load",
             )
 
@@ -66,7 +66,7 @@ def _check_sync(bus: BusFacts) -> Iterator[Finding]:
                 bus.name,
                 "the SYNC period differs from the hand file",
                 Sure.CERTAIN,
-                f"{period_s * 1e3:.2f} ms, hand file: {bus.period_s * 1e3:g} ms",
+                f"{period_s * 1e3:.2f} ms; the hand file specifies {bus.period_s * 1e3:g} ms",
                 "look for a second master, or for a host that uses another hand file",
             )
         missing = int(np.sum(np.rint(intervals / period_s) - 1))
@@ -85,13 +85,14 @@ def _check_sync(bus: BusFacts) -> Iterator[Finding]:
                 bus.name,
                 "SYNC is irregular",
                 Sure.LIKELY,
-                f"99 % of intervals within {jitter_s * 1e3:.1f} ms of the period, {period_s * 1e3:.1f} ms",
+                f"99 % of the intervals are within {jitter_s * 1e3:.1f} ms of the "
+                f"{period_s * 1e3:.1f} ms period",
                 "reduce the load on the machine that sends SYNC; give the host a real-time priority",
             )
 
 
 def check_losses(bus: BusFacts) -> Iterator[Finding]:
-    """Check for lost frames, and locate the loss: in this machine, on the bus or at the node."""
+    """Check for lost frames, and locate the loss in this machine, on the bus or at the node."""
 
     def found(where: str, what: str, sure: Sure, evidence: str, advice: str) -> Finding:
         return Finding("losses", where, what, sure, evidence, advice)
@@ -101,7 +102,7 @@ def check_losses(bus: BusFacts) -> Iterator[Finding]:
             bus.name,
             "this machine dropped frames",
             Sure.CERTAIN,
-            f"{bus.dropped} of {bus.frames + bus.dropped}, by the kernel or the receive queue",
+            f"{bus.dropped} of {bus.frames + bus.dropped} frames, dropped by the kernel or the receive queue",
             "raise net.core.rmem_max or reduce the load; the dropped frames may explain findings about scans",
         )
     for patch in bus.patches:
@@ -113,9 +114,9 @@ def check_losses(bus: BusFacts) -> Iterator[Finding]:
                 patch.name,
                 "incomplete scans",
                 Sure.LIKELY if bus.dropped else Sure.CERTAIN,
-                f"{stats.scans_torn} of {scans} torn, {counted(stats.chunks_lost, 'chunk')} and "
+                f"{stats.scans_torn} of {scans} scans torn; {counted(stats.chunks_lost, 'chunk')} and "
                 f"{counted(stats.summaries_lost, 'summary', 'summaries')} lost",
-                "check bus errors and load; compare with the other patches",
+                "check the bus errors and the bus load, and whether other patches lose frames too",
             )
         if stats.scans_missed:
             yield found(
@@ -140,7 +141,7 @@ def check_losses(bus: BusFacts) -> Iterator[Finding]:
                 Sure.CERTAIN,
                 f"{stats.scans_corrupt} of {scans + stats.scans_corrupt} scans failed the check",
                 "check the node's memory and software, and any gateways on the path; "
-                "CAN itself detects bus errors",
+                "CAN itself detects transmission errors",
             )
         wrong = stats.bad_length + stats.bad_index + stats.bad_counter + stats.bad_form
         if wrong:
@@ -148,7 +149,7 @@ def check_losses(bus: BusFacts) -> Iterator[Finding]:
                 patch.name,
                 "frames that are not chunks of this patch",
                 Sure.CERTAIN,
-                f"{stats.bad_length} with wrong length, {stats.bad_index} with wrong index, "
-                f"{stats.bad_counter} with wrong counter, {stats.bad_form} summaries without a check",
+                f"{stats.bad_length} with a wrong length, {stats.bad_index} with a wrong index, "
+                f"{stats.bad_counter} with a wrong counter, {stats.bad_form} summaries without a check",
                 "look for another node that uses the COB-IDs of this patch, and check its PDO mapping",
             )

@@ -38,8 +38,8 @@ class Warned(Exception):
 class Case:
     """One conformance case.
 
-    ``run`` returns if the device passes, and otherwise raises Failed, NotApplicable or Warned (a pass with a
-    warning).
+    ``run`` returns if the device passes without a warning. Otherwise, it raises Failed, NotApplicable or
+    Warned.
     """
 
     id: str

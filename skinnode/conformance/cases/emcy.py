@@ -84,5 +84,9 @@ def history_after(dut: Dut) -> None:
     dut.sdo.aborts(request, _HISTORY, 0, (0x0609_0030, 0x0609_0031), "write of 1 to 0x1003:00")
     dut.sdo.write_integer(_HISTORY, 0, 0, 1)
     dut.sdo.aborts(
-        b"\x40" + mux(_HISTORY, 1), _HISTORY, 1, (_NO_DATA,), "read of 0x1003:01 after clearing it"
+        b"\x40" + mux(_HISTORY, 1),
+        _HISTORY,
+        1,
+        (_NO_DATA,),
+        "read of 0x1003:01 after the history was cleared",
     )

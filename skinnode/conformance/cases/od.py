@@ -172,7 +172,7 @@ def rest_defaults(dut: Dut) -> None:
 
 @case(
     "OD-09",
-    "Objects from 0x2000 to 0x9FFF with access rw accept their own value, unless ObjFlags bit 0 is set",
+    "rw objects from 0x2000 to 0x9FFF accept a write of the value read, unless ObjFlags bit 0 is set",
     "CiA 306-1",
 )
 def write_back(dut: Dut) -> None:

@@ -162,7 +162,7 @@ def mapping_of_valid(dut: Dut) -> None:
             pdo.mapping,
             0,
             OUT_OF_ORDER,
-            f"{pdo}: write to the number of entries while the PDO is valid",
+            f"{pdo}: write of the number of entries while the PDO is valid",
         )
         _still(dut, pdo, words)
     if not tried:
@@ -230,7 +230,7 @@ def _accepts(dut: Dut, pdos: list[Pdo], fits: Fits, lack: str) -> None:
 def _refuses(dut: Dut, pdos: list[Pdo], fits: Fits, lack: str) -> None:
     """Check that the device refuses an invalid mapping entry.
 
-    The device may refuse the entry when it is written, or the number of entries, which is written last.
+    The device may refuse either the entry itself or the number of entries, which is written last.
     """
     for pdo, word in _each(dut, pdos, fits, lack):
         what = f"{pdo}: mapping of 0x{word:08X}"

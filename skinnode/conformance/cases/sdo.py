@@ -31,7 +31,10 @@ _STRINGS = (0x1008, 0x1009, 0x100A)
 
 
 def first(entries: Iterable[EdsEntry], fits: Callable[[EdsEntry], bool], lack: str) -> EdsEntry:
-    """Return the first entry that ``fits`` accepts. Raises NotApplicable with ``lack`` if none fits."""
+    """Return the first entry that ``fits`` accepts.
+
+    Raises NotApplicable if there is no such entry; ``lack`` describes the missing object.
+    """
     for entry in entries:
         if fits(entry) and entry.index not in _SPECIAL:
             return entry

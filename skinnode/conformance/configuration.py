@@ -17,8 +17,8 @@ _MAPPINGS: Final = (*range(0x1600, 0x1800), *range(0x1A00, 0x1C00))
 _INVALID: Final = 1 << 31
 _LAST: Final = {_SYNC_COUNTER: 1, _PERIOD: 2, _SYNC: 3, _VERIFY: 4}
 """Objects to write after all others, in this order. The SYNC counter overflow value can be written only while
-the period is 0, and the producer starts after both. 0x1020 is last, because writing any other object clears
-it."""
+the period is 0. The producer is started after both have been written. 0x1020 is written last, because a write
+to any other object clears it."""
 
 
 def read_configuration(dut: Dut) -> dict[tuple[int, int], bytes]:
@@ -107,4 +107,4 @@ def _try(problems: list[str], dut: Dut, index: int, subindex: int, value: bytes)
     try:
         dut.sdo.write(index, subindex, value)
     except Failed as failure:
-        problems.append(f"0x{index:04X}:{subindex:02X} not written back: {failure}")
+        problems.append(f"0x{index:04X}:{subindex:02X} could not be restored: {failure}")

@@ -59,7 +59,7 @@ class Dut:
         self.bus.send(0x000, bytes((command, self.node_id)))
 
     def reset(self, command: int = RESET_NODE) -> None:
-        """Reset the node and await its boot-up message. Raises Failed if it is missing or wrong."""
+        """Reset the node and await its boot-up message. Raises Failed unless it arrives."""
         self.bus.clear()
         self.nmt(command)
         frame = self.bus.expect(

@@ -78,12 +78,12 @@ class EdsEntry:
 
     @property
     def into_rpdo(self) -> bool:
-        """Whether an RPDO may map the entry: mappable, writable and not declared as process input."""
+        """Whether an RPDO may map the entry: it is mappable, writable and not declared as process input."""
         return self.mappable and self.access in ("wo", "rww", "rw")
 
     @property
     def into_tpdo(self) -> bool:
-        """Whether a TPDO may map the entry: mappable, readable and not declared as process output."""
+        """Whether a TPDO may map the entry: it is mappable, readable and not declared as process output."""
         return self.mappable and self.access in ("ro", "rwr", "rw", "const")
 
     @property
@@ -176,7 +176,7 @@ def _hex(text: str) -> bytes | None:
 
 
 def parse_eds_file(path: Path, key: str = "EDS") -> tuple[Eds, EdsText]:
-    """Read an EDS or DCF in any encoding; the result's ``source`` names an encoding other than ASCII.
+    """Read an EDS or DCF in any encoding; the result's ``source`` names the encoding unless it is ASCII.
 
     Args:
         path: The file.

@@ -90,7 +90,7 @@ def read_only(dut: Dut) -> None:
     for entry in dut.eds.entries.values():
         if entry.access in ("ro", "const"):
             request = expedited(entry.index, entry.subindex, bytes(entry.size if 0 < entry.size <= 4 else 4))
-            if entry.size > 4:  # an expedited request holds at most four bytes
+            if entry.size > 4:  # an expedited request contains at most four bytes of data
                 request = b"\x21" + mux(entry.index, entry.subindex) + bytes((entry.size, 0, 0, 0))
             dut.sdo.aborts(request, entry.index, entry.subindex, READ_ONLY, f"write to {entry}")
 

@@ -32,7 +32,7 @@ _EVENT_MS = 20
 
 @case(
     "STATE-01",
-    "Reset node causes one boot-up message and restores every parameter",
+    "The reset node command causes one boot-up message and restores every parameter",
     "7.3.2.2.1, 7.2.8.3.3",
 )
 def boot_up(dut: Dut) -> None:

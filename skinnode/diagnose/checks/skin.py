@@ -17,12 +17,15 @@ from skinnode.protocol.device_time import TIME_WRAP_US
 from skinnode.text.words import counted
 
 NOISY: Final = 5.0
-"""Minimum ratio of a noisy crossing's noise to the stated noise. Chance does not cause it in 20 scans."""
+"""Minimum ratio of a noisy crossing's noise to the stated noise.
+
+In 20 scans, noise at the stated level practically never reaches this ratio.
+"""
 
 _DRIFT: Final = 0.003
 """Minimum deviation |R/R0 − 1| at rest that justifies a tare.
 
-It is 100 times the noise of a good converter, or 1 % of the effect of a press.
+The limit is 100 times the noise of a good converter and 1 % of the effect of a press.
 """
 
 _MANY: Final = 0.8
@@ -174,7 +177,7 @@ def _check_noise(patch: PatchFacts, scans: ScanFacts, analysis: NoiseAnalysis) -
 
 
 def _stands_out(levels: Float, wire: int) -> bool:
-    """Return whether a wire is noisier than its neighbours; a touch would affect them equally."""
+    """Return whether a wire is noisier than its neighbours; a touch would affect adjacent wires equally."""
     neighbours = [levels[i] for i in (wire - 1, wire + 1) if 0 <= i < len(levels)]
     return bool(neighbours) and bool(levels[wire] > NOISY * max(1.0, *neighbours))
 

@@ -24,7 +24,7 @@ def check_timing(bus: BusFacts) -> Iterator[Finding]:
     def found(where: str, what: str, sure: Sure, evidence: str, advice: str) -> Finding:
         return Finding("timing", where, what, sure, evidence, advice)
 
-    awaited = (bus.running and not bus.sync_ours) or bus.role == "guest"  # SYNC must come from another master
+    awaited = (bus.running and not bus.sync_ours) or bus.role == "guest"  # another master must send SYNC
     if awaited and len(bus.sync_s) == 0 and bus.seconds > 0 and not bus.failure:
         timers = any(p.info and p.info.patch and p.info.patch.period_ms for p in bus.patches)
         if not timers:

@@ -1,7 +1,7 @@
 """Provides the electronic data sheet (EDS) of a node: generated for a patch, otherwise read from a file.
 
-This module uses the conformance suite's EDS reader, which preserves defaults as written; the canopen library
-does not. The host uses the canopen library as an independent reader to check a patch's EDS.
+This module uses the conformance suite's EDS reader, which preserves default values as written; the canopen
+library does not. The host uses the canopen library as an independent reader to check a patch's EDS.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from skinnode.protocol.profile import BusType, PatchProfile
 
 
 class DataSheet(NamedTuple):
-    """An electronic data sheet, parsed and as text."""
+    """An electronic data sheet as text and in parsed form."""
 
     eds: Eds
     text: str

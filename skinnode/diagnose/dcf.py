@@ -48,14 +48,15 @@ class Dcf(NamedTuple):
 def as_dcf(sheet: DataSheet, readings: Sequence[Reading], node_id: int, bitrate_bps: int, name: str) -> Dcf:
     """Return the DCF of a device: its EDS, device commissioning and the values of its writable objects.
 
-    The file is in UTF-8, whatever the EDS's encoding. A string that UTF-8 would change is written as bytes.
+    The file is in UTF-8, even if the EDS has another encoding. A string that UTF-8 would change is written
+    as bytes.
 
     Args:
         sheet: The EDS.
         readings: Values of the node.
         node_id: Its node-ID.
         bitrate_bps: Bit rate of the bus.
-        name: Name of the node.
+        name: The node's name.
     """
     parser = _parser(sheet.text)
     sections = {title.lower(): title for title in parser.sections()}

@@ -21,7 +21,7 @@ from skinnode.text.printable import printable
 from skinnode.text.words import counted
 
 PACE_S: Final = 0.001
-"""Interval between requests, s; at 1 Mbit/s, the requests use a sixth of the bus and do not delay PDOs."""
+"""Interval between requests, s. At 1 Mbit/s, the requests use a sixth of the bus and do not delay PDOs."""
 
 ANSWER_S: Final = 0.12
 """Time to wait for responses after the last request of a sweep, s."""
@@ -31,10 +31,10 @@ SWEEPS: Final = 2
 request."""
 
 LISTEN_S: Final = 1.2
-"""Minimum listening time, s; stopped nodes are detected only by their heartbeats."""
+"""Minimum listening time, s. Stopped nodes are detected only by their heartbeats."""
 
 LSS_S: Final = 1.5
-"""Maximum time to search for nodes without a node-ID, s; nodes not found in this time are reported as
+"""Maximum time (s) to search for nodes without a node-ID. Nodes not found in this time are reported as
 "more"."""
 
 OTHERS_S: Final = 1.0
@@ -72,7 +72,7 @@ class FoundNode:
     duplicate: str
     """Evidence that two nodes have this node-ID; empty without such evidence."""
     wrong_answer: str = ""
-    """Newest frame on the COB-ID for SDO responses, as hexadecimal text, if no response was valid."""
+    """Newest invalid SDO response as hexadecimal text, if there was no valid response."""
 
     @property
     def profile(self) -> str:
@@ -84,7 +84,7 @@ class FoundNode:
 
     @property
     def identity(self) -> list[str]:
-        """Profile, vendor and product in words, as far as the node reports them."""
+        """Texts for those of profile, vendor and product that the node reports."""
         known = [self.profile] if self.profile else []
         for what, number in (("vendor", self.vendor_id), ("product", self.product_code)):
             if number is not None:

@@ -1,4 +1,4 @@
-"""Defines the facts about a bus and its patches as plain data, which is the only input of the checks."""
+"""Defines the facts about a bus and its patches as plain data, the only input of the checks."""
 
 from __future__ import annotations
 
@@ -68,8 +68,8 @@ class ScanFacts:
     """Relative noise of the converter, from the hand file."""
     stats: AssemblerStats
     conversions: int | None = None
-    """Number of scans with a new conversion, among the scans that can be compared with the previous scan;
-    None if the patch does not count its conversions."""
+    """Number of scans whose conversion differs from the previous scan's; None if the patch does not count its
+    conversions."""
     repeated: int = 0
     """Number of scans that repeat the conversion of the previous scan."""
 
@@ -120,7 +120,7 @@ class BusFacts:
     """Listening time, s."""
     frames: int = 0
     load: float = 0.0
-    """Bus load as a fraction: in the busiest second of the capture or, without scans, in the last second."""
+    """Bus load as a fraction, in the busiest second of the capture; without scans, in the last second."""
     error_frames: int = 0
     dropped: int = 0
     outages: int = 0

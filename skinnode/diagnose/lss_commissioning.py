@@ -17,7 +17,7 @@ from skinnode.errors import ConfigError
 from skinnode.host.lss_master import LssFailed
 
 BOOT_S: Final = 5.0
-"""Maximum time for a node to boot with its new node-ID, s."""
+"""Maximum time (s) for a node to boot with its new node-ID."""
 
 _ASKED_S: Final = 0.15
 _ASK_DEVICE_TYPE: Final = upload_request(od.DEVICE_TYPE, 0)
@@ -76,8 +76,7 @@ def commission(
         connection: The bus.
         address: The node.
         wanted: Values to set.
-        agreed: Called with the current node-ID before anything is written; if it returns False, nothing is
-            written.
+        agreed: Callback that receives the current node-ID; if it returns False, nothing is written.
 
     Returns:
         The result; None if ``agreed`` returned False.

@@ -129,7 +129,7 @@ def _unexplained(moved: Float) -> Float:
     """Return the (U, K) standard deviations of the motion that the other wires do not explain.
 
     For each upper wire, the leading half of the temporal components of all other upper wires is projected
-    out. The same is done for each lower wire. At each crossing, the larger of the two residuals is used.
+    out; for each lower wire, that of all other lower wires. At each crossing, the larger residual is used.
     ``moved`` has mean 0.
     """
     count = len(moved)
@@ -174,7 +174,7 @@ def _of_noise(shape: tuple[int, int], values: int) -> float:
 
 
 def _steps(safe: Float) -> tuple[Counts, Float, Mask]:
-    """Return the scan and height of each crossing's largest jump, and whether it is otherwise constant.
+    """Return scan and height of each crossing's largest jump, and whether the crossing is otherwise constant.
 
     A crossing is otherwise constant if its medians before and after the jump differ by the jump's height and
     the remaining variation is small.

@@ -251,7 +251,7 @@ def compare(
 
     Args:
         remote: The node.
-        eds: The file. Its readable values are compared, except objects that hold the node's state.
+        eds: The file. Its readable values are compared, except objects that contain the node's state.
         node_id: Replaces $NODEID.
         progress: Called repeatedly with a description of the progress.
 

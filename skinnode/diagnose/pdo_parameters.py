@@ -25,7 +25,10 @@ _KINDS: Final = {
 
 @dataclass(frozen=True, slots=True)
 class Pdo:
-    """Parameters of one PDO. Times are in CiA 301 units; a value is None if the node lacks the sub-index."""
+    """Parameters of one PDO, with times in the units of CiA 301.
+
+    A value is None if the node lacks its sub-index.
+    """
 
     direction: Direction
     number: int
@@ -42,7 +45,7 @@ class Pdo:
 
     @property
     def bits(self) -> int:
-        """Length of the mapped data, bits."""
+        """Length of the mapped data in bits."""
         return sum(entry & 0xFF for entry in self.mapped)
 
 

@@ -160,7 +160,7 @@ RULES: Final = (
 def grouped(buses: Sequence[BusFacts]) -> list[Group]:
     """Return all findings about these buses, grouped by root cause.
 
-    Groups are sorted by the certainty of their most certain finding, then by their number of consequences.
+    Groups are sorted by their most certain finding, then by their number of consequences.
     """
     groups = [group for facts in buses for group in _of_bus(facts.name, run_checks(facts))]
     return sorted(groups, key=lambda group: (group.rank, -len(group.consequences)))

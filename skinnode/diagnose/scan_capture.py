@@ -33,7 +33,7 @@ class ScanCapture:
 
     def __init__(self) -> None:
         self.syncs: deque[tuple[int, int]] = deque(maxlen=_MOST_SYNCS)
-        """Time in ns and counter of each SYNC; the counter is 0 if the SYNC has none."""
+        """Time (ns) and counter of each SYNC; 0 for a SYNC without a counter."""
         self._patches: dict[int, _Patch] = {}
         self._takers: dict[int, tuple[_Patch, bool]] = {}
 
@@ -127,7 +127,7 @@ class ScanCapture:
 
 
 def _conversions(scans: Sequence[Scan]) -> tuple[int | None, int]:
-    """Return the numbers of scans with a new and with a repeated conversion.
+    """Return the number of scans with a new conversion and the number with a repeated conversion.
 
     Returns None and 0 if the scans contain no conversion phase.
     """

@@ -53,9 +53,9 @@ class Tared:
     crossings: int = 0
     """Number of crossings with a new R0."""
     median_ohm: float | None = None
-    """Median R0 after the tare."""
+    """Median R0 after the tare, in ohm."""
     median_change: float | None = None
-    """Median of the ratio of new to old R0, minus one; None if there was no old R0."""
+    """Median of (new R0 / old R0) − 1; None if there was no old R0."""
 
     @property
     def done(self) -> bool:

@@ -57,7 +57,7 @@ def _check_layout(patch: PatchFacts) -> Iterator[Finding]:
 
 
 def _check_pdos(bus: BusFacts, patch: PatchFacts) -> Iterator[Finding]:
-    """Compare the PDOs with the host's settings. A wrong value is not a fault if the host will overwrite it."""
+    """Compare the PDOs with the host's settings. A value that the host will overwrite is not a fault."""
     info = patch.info
     assert info is not None
     if info.patch is None or patch.found is None:

@@ -197,7 +197,7 @@ def test_nonsense_is_not_called_silence(
 ) -> None:
     monkeypatch.setattr(discovery, "LISTEN_S", 0.5)
     monkeypatch.setattr(discovery, "PACE_S", 0.0001)
-    said = f"sends SDO frames that do not respond to the request (newest: {shown})"
+    said = f"sends SDO frames that are not responses to the request (newest: {shown})"
     with _babbler(bus, 9, answer):
         for command in (["info", "9"], ["od", "9", "1000"], ["od", "9"]):
             done = run(command, bus)

@@ -17,11 +17,11 @@ class Place(NamedTuple):
 
     @property
     def patches(self) -> tuple[PatchConfig, ...]:
-        """The hand's patches on this bus; empty without a hand."""
+        """The hand's patches on the bus; empty if no hand file is given."""
         return () if self.hand is None else self.hand.patches_on(self.bus.name)
 
     def patch_name(self, node_id: int) -> str:
-        """Return the name of the patch with this node-ID, or an empty string."""
+        """Return the name of the patch that has the node-ID ``node_id``, or an empty string."""
         return next((patch.name for patch in self.patches if patch.node_id == node_id), "")
 
 

@@ -14,7 +14,7 @@ def contact_tables(field: FieldFrame | None) -> list[dict[str, Any]] | None:
     """Return a field's contacts, strongest first, including the standard deviation of each quantity.
 
     Returns:
-        The contacts, with lengths in m, areas in m² and forces in N; None if there is no field yet.
+        The contacts (lengths in m, areas in m², forces in N); None if no field has been solved yet.
     """
     if field is None:
         return None

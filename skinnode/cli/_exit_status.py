@@ -42,7 +42,9 @@ class Stopped(SystemExit):
 
 
 def main_of(module: str, argv: Sequence[str] | None = None) -> NoReturn:
-    """Run a typer application and exit with its status. From this call on, signals end the process.
+    """Run a typer application and exit with its status.
+
+    After the call, the termination signals end the process.
 
     BLAS libraries are limited to one thread unless the environment sets their number of threads. BLAS threads
     wait by spinning, and under a real-time policy (``chrt -f``), threads that spin on every processor block a
@@ -65,7 +67,7 @@ def main_of(module: str, argv: Sequence[str] | None = None) -> NoReturn:
     except Stopped as stopped:
         status = int(stopped.code or 0)
         _flush(status)
-    _handle(_exit_at_once)  # a signal during Python's final wait for threads would print a traceback
+    _handle(_exit_at_once)  # otherwise, a signal during the wait for threads prints a traceback
     sys.exit(status)
 
 
@@ -89,7 +91,7 @@ def _exit_at_once(number: int, _frame: FrameType | None) -> None:
 
 
 def _stop(number: int, frame: FrameType | None) -> None:
-    """Unwind the stack, or exit immediately if an import is in progress and there is no other thread.
+    """Unwind the stack, or exit immediately if the only thread is importing a module.
 
     During an import, some of Python's callbacks would swallow the exception or print it. An immediate exit is
     safe while there is only one thread, because no resource is open yet.

@@ -28,7 +28,7 @@ def find_layout(text: str) -> PatchLayout:
             PatchLayout; see HELP.
 
     Raises:
-        ConfigError: There is no such layout.
+        ConfigError: The text does not name a layout.
     """
     from skinnode.config import load_layout
     from skinnode.model.layout import PRESETS, PatchLayout

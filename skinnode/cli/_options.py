@@ -1,4 +1,4 @@
-"""Defines the options and arguments that several commands share, with their shell completions."""
+"""Defines options and arguments used by several commands, and their shell completions."""
 
 from __future__ import annotations
 

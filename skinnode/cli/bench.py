@@ -219,7 +219,7 @@ def scale(
     plot: PlotFile = None,
     patches: Annotated[
         list[int] | None,
-        typer.Option(min=1, max=1000, help="Number of patches, of which one is touched. Can be repeated."),
+        typer.Option(min=1, max=1000, help="Number of patches; one patch is touched. Can be repeated."),
     ] = None,
     scans: Annotated[int, typer.Option(min=1, max=10_000, help="Number of scans per measurement.")] = 20,
 ) -> None:

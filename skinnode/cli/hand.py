@@ -29,7 +29,7 @@ def check(
     hand: Annotated[Path, typer.Argument(help="The hand to check.", metavar="HAND.toml")],
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON instead of tables.")] = False,
 ) -> None:
-    """Validate a hand file and the files it names, compute the load of its buses, and list its limitations.
+    """Validate a hand file and all files named in it, compute the hand's bus load, and list its limitations.
 
     For each bus, the command prints the planned load with every frame at its maximum length and with random
     data. The command also prints the worst-case time from SYNC to the end of each patch's summary (absolute

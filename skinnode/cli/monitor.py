@@ -61,8 +61,8 @@ def monitor(
 
     The command runs the hand as `skinnode host` does, but waits for missing patches. Keys: 1-9 select a
     patch, z shows only that patch, t tares it, r records, space freezes the picture, ? shows help, q quits.
-    The screen requires the optional packages of the extra `tui`. The exit status is 0 if there was no fault,
-    1 if there was one (printed at the end), 2 if the monitor could not run.
+    The screen requires the optional packages of the extra `tui`. The exit status is 0 if no fault occurred, 1
+    if any fault occurred (faults are printed at the end), 2 if the monitor could not run.
     """
     from skinnode.errors import NOTHING, ConfigError, Shown
 
@@ -121,7 +121,7 @@ def _require_screen() -> None:
 
 
 def _plan(hand: Path | None, interface: str | None, channel: str | None, simulate: bool) -> HandConfig:
-    """Return the hand to run, with its settings changed so that the host waits for missing patches."""
+    """Return the hand to run, after changing its settings so that the host waits for missing patches."""
     from skinnode.config import load_hand
     from skinnode.demo.hand import demo_hand
 
@@ -182,7 +182,7 @@ def _recording(stack: ExitStack, path: Path, speed: float) -> Source:
 
 
 def _show(source: Source, stop: threading.Event, seconds: float | None, output: Path) -> list[str]:
-    """Show the screen until it is closed and return the faults.
+    """Show the screen until the user closes it; return the faults found.
 
     Raises the SkinError that stopped the source.
     """

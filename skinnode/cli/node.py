@@ -134,7 +134,7 @@ def node(
 
 @contextmanager
 def _memory(store: Path | None) -> Iterator[FileMemory | None]:
-    """Yield the non-volatile memory in the file ``store``, which stays locked for this process."""
+    """Yield the non-volatile memory in the file ``store``; the process holds a lock on the file."""
     from skinnode.errors import ConfigError
     from skinnode.files.file_lock import FileInUse, NotARegularFile
     from skinnode.node.memory_file import FileMemory

@@ -65,7 +65,7 @@ def replay(
 
 
 def field_table(field: FieldFrame) -> dict[str, Any]:
-    """Return a field as JSON-compatible data, with numbers at full precision."""
+    """Return a field as JSON-compatible data; numbers keep their full precision."""
     from skinnode.cli._contacts import contact_tables
     from skinnode.host.trust_report import trust_table
 

@@ -1,4 +1,4 @@
-"""Configuration of a hand, read from ``hand.toml``, with one module per table of the file.
+"""Reads the configuration of a hand from ``hand.toml``; each table of the file has its own module.
 
 ::
 

@@ -42,7 +42,7 @@ class BusConfig(Table):
     """CAN bus, identified by the names of its interface and channel in python-can."""
 
     name: Name = "can0"
-    """Name of the bus, to which the key ``bus`` of each patch refers."""
+    """Name of the bus, used in the key ``bus`` of each patch."""
     interface: Annotated[str, Field(min_length=1), Allowed("the name of a python-can interface")] = "virtual"
     """Name of the interface in python-can: socketcan, pcan, kvaser, udp_multicast, ..."""
     channel: Annotated[str, Field(min_length=1), Allowed("the name of a channel, as a string")] = "skin"
@@ -62,7 +62,8 @@ class BusConfig(Table):
     options: dict[str, bool | int | float | str] = Field(default={})
     """Additional keyword arguments for the python-can interface."""
     role: Annotated[Role, one_of(Role)] = "master"
-    """``guest`` if the robot's own master sends NMT and SYNC on this bus; the host then sends neither."""
+    """Role of the host: ``master`` if it sends NMT and SYNC on the bus, ``guest`` if the robot's own master
+    does."""
     guest_sends: Annotated[GuestSends, one_of(GuestSends)] = "nothing"
     """Frames that the host may send as a guest: ``nothing``, or ``sdo`` requests that identify and configure
     the patches and read their data."""
@@ -72,7 +73,7 @@ class BusConfig(Table):
     max_load: Annotated[
         float, Field(gt=0, le=1, allow_inf_nan=False), Allowed("a number above 0 and up to 1")
     ] = MAX_BUS_LOAD
-    """Maximum planned bus load, as a fraction, with every frame at its maximum length."""
+    """Maximum planned bus load, as a fraction, assuming that every frame has its maximum length."""
     others: Annotated[tuple[OtherFrame, ...], Field(strict=False)] = ()
     """Frames that other devices send on this bus; the planned bus load includes these frames."""
 

@@ -90,7 +90,7 @@ def _place(location: KeyPath, table: type[BaseModel]) -> tuple[list[str], str | 
 
 
 def allowed_in(field: FieldInfo) -> str | None:
-    """Return a description of the values allowed for a key; None if the key's type is description enough."""
+    """Describe the values allowed for a key; return None if the key's type describes them sufficiently."""
     marks = [mark.text for mark in field.metadata if isinstance(mark, Allowed)]
     return next(iter([*marks, *_marks_in(field.annotation)]), None)
 

@@ -135,7 +135,7 @@ class HandConfig(Table):
         return self
 
     def _check_links(self) -> None:
-        """Check that each link has only one entry in the file, and that a patch is mounted on it."""
+        """Check that each link has only one entry in the file, and carries at least one patch."""
         _require_unique("links", "name", [link.name for link in self.links])
         used = list(dict.fromkeys(patch.link for patch in self.patches if patch.link is not None))
         for i, link in enumerate(self.links):

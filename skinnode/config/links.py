@@ -63,7 +63,7 @@ class LinkConfig(Table):
     """Link of the robot on which patches are mounted."""
 
     name: Name
-    """Name of the link, to which the key ``link`` of each patch refers."""
+    """Name of the link, used in the key ``link`` of each patch."""
     pose: PoseConfig = PoseConfig()
     """Pose of the link's frame in the hand's frame, used until the program sets another pose
     (``HandFrame.at``)."""

@@ -36,7 +36,7 @@ def existing_file(value: Path | None, info: ValidationInfo, what: str) -> Path |
     """Resolve ``value``, a path relative to the hand file's folder.
 
     Raises:
-        ValueError: There is no such file.
+        ValueError: The file does not exist.
     """
     if value is None:
         return None

@@ -78,7 +78,7 @@ def read_toml(path: Path, what: str) -> Document:
         raise ConfigError(
             f"byte {error.start}", error.object[error.start : error.end], "UTF-8", where=str(path)
         ) from None
-    if _LONG_KEY.search(text):  # tomllib would take minutes to parse a key this long
+    if _LONG_KEY.search(text):  # tomllib would take minutes to parse so long a key
         raise ConfigError(what, Shown("deeper nesting"), _TOO_DEEP, where=str(path))
     try:
         table = tomllib.loads(text)

@@ -110,7 +110,7 @@ class MonitorApp(App[None]):
         self._scale = Scale()
         self._view: View | None = None
         self._tares: queue.SimpleQueue[tuple[str, Level]] = queue.SimpleQueue()
-        """Result of each tare, with its severity."""
+        """Result of each tare, and the severity of the result."""
         self._begun_s = time.monotonic()
         self._cpu_s = 0.0
         self._wall_minus_mono_ns = time.time_ns() - time.monotonic_ns()

@@ -15,7 +15,7 @@ from skinnode.monitor.touches import Touch
 from skinnode.monitor.view_model import History, PatchView, View
 
 SETTLE_NS: Final = 3_000_000_000
-"""Time after the start at which a live patch that is not yet operational is recorded as a fault, ns."""
+"""Time limit, after the start, for all patches of a live hand to become operational, ns."""
 
 LOOK_S: Final = 0.1
 """Interval at which the source is checked for faults, s."""

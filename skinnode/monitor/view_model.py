@@ -120,7 +120,7 @@ class LogLine:
 
 
 class History:
-    """Snapshots of the last few seconds, from which views are computed."""
+    """Snapshots of the last few seconds, used to compute views."""
 
     def __init__(self, hand: HandConfig, *, live: bool = True) -> None:
         self._hand, self._live = hand, live
@@ -208,7 +208,7 @@ def _patch_view(patch: PatchConfig, history: Sequence[Snapshot], elapsed_s: floa
 
 
 def _latencies_s(history: Sequence[Snapshot], name: str) -> list[float]:
-    """Return the latency of each field of a patch in these snapshots, s."""
+    """Return the latencies of a patch's fields in the given snapshots, s."""
     found: dict[int, float] = {}
     since_ns = history[-1].t_ns - HISTORY_NS
     for snapshot in history:

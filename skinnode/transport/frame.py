@@ -1,4 +1,4 @@
-"""Received CAN frame, with the same fields for every type of interface."""
+"""Received CAN frame; its fields are the same for every type of interface."""
 
 from __future__ import annotations
 

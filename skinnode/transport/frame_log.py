@@ -1,4 +1,4 @@
-"""Write CAN frames to a candump text file (``.log``) or a Vector BLF file, with python-can's writers.
+"""Write CAN frames to a candump text file (``.log``) or a Vector BLF file.
 
 In both formats, all frames written before the last :meth:`FrameLog.flush` survive if the process is killed
 later. Each frame is simply appended to a ``.log`` file. For BLF files, python-can's writer buffers up to 128
@@ -31,8 +31,7 @@ class LoggedFrame(NamedTuple):
 
     frame: Frame
     channel: str
-    """Name of the channel. BLF files store no names; for these files, the channel's number, counted from
-    0."""
+    """Name of the channel; in a BLF file, the channel's number, counted from 0, because BLF has no names."""
     sent: bool
     """Whether the recording program sent the frame."""
 
@@ -83,7 +82,7 @@ class FrameLog:
         self.frames += 1
 
     def flush(self, *, to_disk: bool) -> None:
-        """Pass all data written so far to the kernel, so that the data survive if this process is killed.
+        """Pass all data written so far to the kernel, so that the data survive if the process is killed.
 
         Args:
             to_disk: Whether to wait until the data are on the disk, so that they survive a loss of power.

@@ -49,7 +49,7 @@ class _Container(NamedTuple):
     """Container in a BLF file."""
 
     end: int
-    """File offset from which to search for the next container, bytes."""
+    """File offset at the start of the search for the next container, bytes."""
     objects: bytes | None
     """Readable part of the container's content; None if no part is readable."""
     intact: bool = False

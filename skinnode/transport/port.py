@@ -2,8 +2,8 @@
 
 Every error of python-can is converted to a :class:`~skinnode.errors.BusError` with a one-line message. The
 arrival time of each frame is a time on the host's monotonic clock. Some interfaces (virtual, udp_multicast,
-socketcan) timestamp frames with the wall clock. The arrival time is then the time of reading minus the
-timestamp's age, so that time spent in a queue does not matter.
+socketcan) timestamp frames with the wall clock. For these interfaces, the arrival time is the time of reading
+minus the timestamp's age, so time spent in a queue has no effect.
 """
 
 from __future__ import annotations
@@ -320,7 +320,7 @@ class CanPort:
         the call.
 
         Raises:
-            BusError: if the interface cannot be opened; the call may then be repeated.
+            BusError: if the interface cannot be opened; the call may be repeated later.
         """
         if not self._away:
             self._away = True
@@ -338,7 +338,8 @@ class CanPort:
         receiving thread must have ended before the call.
 
         Raises:
-            BusError: if the interface rejects the bit rate; the interface is then open at the previous rate.
+            BusError: if the interface rejects the bit rate; the interface stays open at the previous bit
+                rate.
         """
         before = self.config
         self.config = before.model_copy(update={"bitrate_bps": bitrate_bps})

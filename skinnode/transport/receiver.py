@@ -43,11 +43,11 @@ moment when the predicted frame arrives."""
 _SHORT_NS: Final = 300_000
 """Minimum pause between two fetches, ns; used while a predicted frame is imminent or slightly overdue."""
 _LATE_NS: Final = 600_000
-"""Time after a predicted arrival, ns, during which fetches are separated by the minimum pause."""
+"""Period after a predicted arrival, ns, in which the receiver fetches at the minimum pause."""
 _GIVEN_UP_NS: Final = 200_000_000
-"""Time after a predicted arrival, ns, after which the predicted frame is no longer expected."""
+"""Time limit, after a predicted arrival, for the predicted frame to arrive, ns."""
 _ANSWER_NS: Final = 20_000_000
-"""Time after a request is sent, ns, during which the arrival of the response cannot be predicted."""
+"""Period after sending a request, ns, in which a response may arrive at any time."""
 _LAG_NS: Final = 50_000
 """Delay from a frame's arrival until the frame can be read from the socket, ns."""
 
@@ -108,7 +108,7 @@ class Intake:
             BusError: if the bus failed and all frames received before the failure have already been taken.
             Exception: any other exception raised by the receiving thread.
         """
-        # read the error before the queue: frames received before the error are then already queued
+        # read the error before the queue, which then contains all frames received before the error
         error, batches = self._error, self._queue
         if not batches:
             if error is not None:
@@ -206,7 +206,7 @@ class _Shared:
     """Intakes and poll object of the shared receiving thread."""
 
     intakes: dict[Intake, None]
-    """Intakes in the order in which they were added, without duplicates."""
+    """Intakes in order of addition, without duplicates."""
     poll: select.poll
 
 
@@ -348,7 +348,7 @@ def _together(now_ns: int, pause_ns: int) -> int:
 
 
 def _before(t_ns: int, now_ns: int) -> int:
-    """Return the time at which to fetch a frame predicted for ``t_ns``."""
+    """Return the fetch time for a frame that is predicted to arrive at ``t_ns``."""
     due_ns = t_ns + _LAG_NS
     if due_ns >= now_ns + _BEFORE_NS + GATHER_NS:
         due_ns -= _BEFORE_NS

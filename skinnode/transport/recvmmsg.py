@@ -98,7 +98,7 @@ class MessageBatch:
     def taken(self) -> memoryview:
         """Return the memory that contains the received messages.
 
-        Each message occupies a record of fixed size: the data, padded, then the ancillary data, padded.
+        Each message occupies a record of fixed size: the padded data, followed by the padded ancillary data.
         """
         return self._room[: self._got * self._record]
 

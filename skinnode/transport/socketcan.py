@@ -2,7 +2,8 @@
 
 python-can opens and configures the socket and sends frames. Frames are not received with python-can, which
 needs a ``select``, a ``recvmsg`` and a ``Message`` for each frame and ignores the drop counter. Structures
-and constants are those of <linux/can.h>, <linux/can/raw.h>, <asm-generic/socket.h> and <linux/net_tstamp.h>.
+and constants are defined in <linux/can.h>, <linux/can/raw.h>, <asm-generic/socket.h> and
+<linux/net_tstamp.h>.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Trust in a field: decide whether the field is trusted and, if it is not, state the reason.
 
-A field is trusted if all used upper wires converged, if the readings and upper wires used are sufficiently
-many, and if the readings do not contradict each other. The host additionally requires the patch to be alive.
+A field is trusted if all upper wires in use converged, if sufficient readings and upper wires are in use, and
+if the readings do not contradict each other. The host additionally requires the patch to be alive.
 """
 
 from __future__ import annotations

@@ -29,7 +29,7 @@ GAIN_STD: Final = 0.02
 """Assumed standard deviation of a wire's relative gain error; the same value is used for gain drift. Not
 tuned."""
 LEAST: Final = 1e-9
-"""Minimum precision of a reading, in units of 1 / noise²; smaller values are rounding errors."""
+"""Minimum precision of a reading, in units of 1 / noise²; smaller values result from rounding errors."""
 
 Mask = NDArray[np.bool_]
 
@@ -80,9 +80,9 @@ class WireFinding:
     gain: float
     """Gain in log evidence, nats."""
     wire: int
-    """Number of the upper wire, or U plus the number of the lower wire."""
+    """Number of the wire; for a lower wire, U plus its number."""
     factor: float
-    """Common error of the wire's readings, in units of their noise; nan if the wire is unrelated to the
+    """Error common to all readings of the wire, in units of their noise; nan if the wire is unrelated to the
     others."""
 
 

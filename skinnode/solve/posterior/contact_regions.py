@@ -43,16 +43,17 @@ PRESSED: Final = 6.0
 PRESSED_STILL: Final = 5.0
 """Minimum indentation of the skin, in standard deviations, for a contact of the last frame to be kept."""
 RELEVANT: Final = 0.2
-"""Minimum ratio of a peak's load sum to that of the strongest contact for the peak to be another contact.
+"""Minimum ratio of a peak's load sum to the strongest contact's load sum, for the peak to be another contact.
 Ringing next to a contact reaches a tenth of the contact's load sum."""
 RELEVANT_STILL: Final = 0.15
-"""Minimum ratio of a peak's load sum to that of the strongest contact for a contact of the last frame to
-remain a contact."""
+"""Minimum ratio of a peak's load sum to the strongest contact's load sum, for a contact of the last frame to
+be kept."""
 PART: Final = 0.1
-"""Minimum ratio of a cell's load sum to the peak's load sum for the cell to belong to the contact."""
+"""Minimum ratio of a cell's load sum to the peak's load sum, for the cell to belong to the contact."""
 PART_SIGNIFICANT: Final = 3.0
-"""Minimum load sum for a cell to belong to a contact, in standard deviations of the peak's load sum. Without
-this limit, noise around a touch near the detection limit would shift the centre by a pitch."""
+"""Minimum load sum of a cell, in standard deviations of the peak's load sum, for the cell to belong to the
+contact. Without this limit, noise around a touch near the detection limit would shift the centre by a
+pitch."""
 PART_MOST: Final = 0.6
 """Minimum ratio of a cell's load sum to the peak's load sum for the cell to belong to the contact even if the
 cell's load sum is not significant."""

@@ -27,7 +27,8 @@ from skinnode.solve.posterior.elastic_prior import ElasticPrior
 from skinnode.solve.posterior.map_estimate import PRIOR_DOUBT
 
 HERTZ_SPREAD: Final = 2.5
-"""Ratio of the squared contact radius a² to the mean of r² weighted by the Hertz pressure √(1 − r²/a²)."""
+"""Ratio of the squared contact radius a² to the mean of r²; the weight of this mean is the Hertz pressure √(1
+− r²/a²)."""
 PULLING: Final = 0.25
 """Threshold for the ratio of the sum of all loads of a contact to the sum of its pressing loads; below the
 threshold, pulling loads are left out. Real objects do not pull on the skin, but the half-space model needs
@@ -39,7 +40,7 @@ PULLED_OFF: Final = 0.1
 Measured RMS errors on layers of 2, 4 and 8 mm were 0.11, 0.08 and 0.05; the maximum was 0.25. If pulling
 loads are left out, the standard deviation of the contact's area is at least as large as the area."""
 BEYOND: Final = 1.0
-"""Standard deviation of the loads in the outermost ring of cells, relative to these loads. The ring
+"""Standard deviation of the loads in the outermost ring of cells, relative to these loads. The outermost ring
 represents all loads beyond the patch. With a value of 0.5, the force errors of plates larger than the patch
 reached 4.8 standard deviations."""
 
@@ -100,7 +101,7 @@ class ContactFinder:
         near = np.pad(np.arange(cells).reshape(prior.shape), 1, constant_values=-1)
         rows, columns = prior.shape
         box = np.stack([near[i : i + rows, j : j + columns] for i in range(3) for j in range(3)], axis=-1)
-        self._near: Index = box.reshape(cells, 9)  # each cell with its neighbours; −1 outside the lattice
+        self._near: Index = box.reshape(cells, 9)  # cell and neighbour indices; −1 outside the lattice
         self._has_electrode = np.zeros(cells, bool)
         self._has_electrode[self._own] = True
         self._number, self._outside, self._before = np.zeros((3, cells), np.int64)
@@ -152,7 +153,7 @@ class ContactFinder:
         self.reset()
 
     def _contact(self, number: int, loads: LoadEstimate) -> Contact:
-        """Measure the contact whose cells have this number."""
+        """Measure the contact with the given number."""
         prior, mean, std = self._prior, np.empty(7), np.empty(7)
         middle, pulls, pressing_n = _measure(
             number, self._number, self._outside, self._outermost, loads.mean, prior.load_n, prior.cell_m,
@@ -199,8 +200,8 @@ def _prepare(  # noqa: PLR0913 - a kernel: loads, field and outputs by name
 ) -> None:
     """Write pressing loads (Q,), depths (Q,) in m and in standard deviations, and forces (UN, 3) in N.
 
-    ``field`` (2, UN, 3) contains the displacement and its standard deviations, m. The depth is 0 where the
-    standard deviation is infinite. Depths of cells without an electrode are not written.
+    ``field`` (2, UN, 3) contains the displacement and its standard deviations, m. A depth with an infinite
+    standard deviation is written as 0. Depths of cells without an electrode are not written.
     """
     for cell in range(press.size):
         press[cell] = -q[cell, 2]

@@ -11,8 +11,9 @@ from skinnode.solve.posterior.map_estimate import PRIOR_DOUBT, SMOOTH_SHARE
 def data_share(std: Float, core: Float, prior_variance: Float) -> Float:
     """Return 1 minus the ratio of the posterior variance to the prior variance; 0 where ``std`` is infinite.
 
-    ``std`` and ``core`` weight the variance that only the prior determines by :data:`PRIOR_DOUBT` and by
-    :data:`SMOOTH_SHARE`. This variance, and thus the posterior variance, is recovered from their difference.
+    The part of the variance that only the prior determines is multiplied by :data:`PRIOR_DOUBT` in ``std``
+    and by :data:`SMOOTH_SHARE` in ``core``. The difference between ``std``² and ``core``² therefore yields
+    this part, and the posterior variance.
 
     Args:
         std: (U, f) standard deviations, pitches.

@@ -7,8 +7,8 @@ the electrodes by the response G of an elastic half-space (Boussinesq, Cerruti;
     u ~ N(0, s² C),   C = G diag(q) Gᵀ + ε² I
 
 One scale s for the whole patch is estimated from the data. The cells extend beyond the outermost electrodes,
-because the skin can also be pressed there. The term with ε allows for small independent deviations of each
-electrode from the half-space.
+because the skin can also be pressed there. The ε term allows each electrode to deviate slightly and
+independently from the half-space.
 """
 
 from __future__ import annotations
@@ -99,7 +99,7 @@ def bonded_response(layout: PatchLayout) -> Float:
     if the loads have a standard deviation of 1.
     """
     cells = LoadCells.of(layout)
-    radius_m = math.sqrt(cells.size_m[0] * cells.size_m[1] / math.pi)  # a disc as large as a cell
+    radius_m = math.sqrt(cells.size_m[0] * cells.size_m[1] / math.pi)  # disc with the area of a cell
     distance = np.linalg.norm(cells.offset_m, axis=-1)
     normal, outwards = bonded_layer_compliance(Rubber(), cells.height_m, distance, radius_m)
     direction = cells.offset_m / np.where(distance > 0.0, distance, 1.0)[..., None]

@@ -1,11 +1,11 @@
 """Posterior of a patch, tracked through a stream of frames without testing their readings for faults.
 
 - Gate: use only the equations of wires whose resistances differ from those at rest by more than the noise.
-- Hold: keep the last field if it explains the whole frame within the noise.
+- Hold: keep the last field if this field explains the whole frame within the noise.
 - Track: take chord or Gauss-Newton steps from the last field; after a jump, anneal from rest
   (``map_estimate``).
 - Adapt: set the prior's scale, the expected load locations and, on request, the noise from the evidence.
-- Reject: mark a wire as INCONSISTENT if no deformation explains its residual, leave the wire out, and solve
+- Reject: if no deformation explains a wire's residual, mark the wire as INCONSISTENT, leave it out, and solve
   the other wires again.
 """
 
@@ -39,8 +39,8 @@ from skinnode.solve.wires.decode import A_MAX, A_MIN
 from skinnode.solve.wires.problem import PatchProblem
 
 NOISE_LEAST: Final = 1e-6
-"""Minimum relative noise: a fifth of a 16-bit code, which is also the accuracy of the forward model. Lower
-noise would force the field onto a root of F = b, which can be a wrong root. On layouts with folds, wrong
+"""Minimum relative noise: a fifth of a 16-bit code, which is also the accuracy of the forward model. With
+lower noise, the field would be forced to a root of F = b, possibly a wrong root. On layouts with folds, wrong
 roots occur even at ten times the minimum noise."""
 LEFT_OUT: Final = 3
 """Maximum number of wires left out of a frame, one at a time; if that is not sufficient, the whole frame is
@@ -424,7 +424,7 @@ class FrameEstimator:
     # -- the field -------------------------------------------------------------------------------------
 
     def _data_share(self) -> Float:
-        """Return the data share of each coordinate, (U, 3N); 0 for coordinates that are not free."""
+        """Return the data share (U, 3N) of each coordinate; 0 for coordinates that are not free."""
         prior, share = self._estimator.load_prior, np.zeros_like(self._trusted)
         variance = prior.scale2 * prior.covariance.diagonal()
         share[:, self._free] = data_share(self._estimator.std, self._estimator.core, variance)

@@ -1,4 +1,4 @@
-"""Gating: χ² tests for wires that moved and for wires whose resistances no deformation explains.
+"""Gating: χ² tests that find the wires that moved, and the wires whose resistances no deformation explains.
 
 Each wire is tested with the χ² of its residuals and with the apparent movement of each coordinate. The χ²
 test alone can miss an electrode that moved by 7 standard deviations.

@@ -25,7 +25,7 @@ the whole patch, which increases errors by 14 %."""
 
 
 class LoadPosterior:
-    """Posterior of the loads on one patch, given the frame that its estimator solved.
+    """Posterior of the loads on one patch, for the frame that the estimator solved last.
 
     Args:
         estimator: Estimator of the patch.

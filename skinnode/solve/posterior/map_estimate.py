@@ -1,7 +1,7 @@
 """MAP estimate of one frame: Gauss-Newton steps, chord steps, and annealing for large jumps.
 
-- Chord: start at the last field with the factors of an older frame. A typical solve needs two evaluations of
-  F and J.
+- Chord: start at the last field with the factors of an older frame. A typical solve by chord steps needs two
+  evaluations of F and J.
 - Newton: refactorise at the current field, then take chord steps.
 - Anneal: start at the rest position with an assumed noise of 3 %, which is divided by four until it reaches
   the true noise. At high noise, the posterior has a single maximum, close to the maximum of the prior.
@@ -33,8 +33,8 @@ from skinnode.solve.posterior.observation import Observation, eased
 from skinnode.solve.wires.problem import PatchProblem
 
 ANNEAL_NOISE: Final = 0.03
-"""Initial relative noise for annealing; at this noise, one Gauss-Newton step from rest ends near the
-maximum."""
+"""Initial relative noise for annealing; at such high noise, one Gauss-Newton step from rest nearly reaches
+the maximum."""
 ANNEAL_RATIO: Final = 4.0
 """Ratio of the noise in one annealing step to the noise in the next step. In 80 presses of up to 70 % from
 rest on the staggered and aligned layouts, h = 0.5 and 1, a ratio of 3 leads to the correct maximum in 80
@@ -323,7 +323,7 @@ class MapEstimator:
         return kernels.residuals(members, x, self._problem.lower, o.a, o.weight, o.h, g, self._b.r)
 
     def _fits(self, observation: Observation, members: Index) -> bool:
-        """Return whether the current factors were computed for these wires, this prior and similar noise."""
+        """Return whether the current factors are valid for the given wires, prior and noise."""
         if self._factored is None:
             return False
         weight, scale2, version = self._factored
@@ -331,7 +331,7 @@ class MapEstimator:
         if version != prior.version or scale2 != prior.scale2 or not np.array_equal(members, self.members):
             return False
         new, old = observation.weight[members], weight[members]
-        return bool((np.abs(new - old) <= 0.1 * old).all())  # False if a resistance was lost or regained
+        return bool((np.abs(new - old) <= 0.1 * old).all())  # False if a resistance became unusable or usable
 
     def _effects_fit(self) -> bool:
         """Return whether the geometry errors' effects are still close to their values in the factors."""

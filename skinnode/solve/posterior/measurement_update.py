@@ -13,8 +13,8 @@ With J = ∂r/∂x, block-diagonal over wires, one Gauss-Newton step from x is
 
 S is the innovation covariance, s² J C the cross-covariance and K = s² C Jᵀ S⁻¹ the Kalman gain. The posterior
 covariance at x⁺ is s² C − Vᵀ V with V = L⁻¹ (s² J C) and L Lᵀ = S (Tarantola, Inverse Problem Theory, 2005,
-3.4). All eigenvalues of S are at least 1. Rounding errors are therefore at most ε ‖S‖ standard deviations, or
-one thousandth of a standard deviation for signals of 10⁶ σ, regardless of the condition number of J.
+3.4). All eigenvalues of S are at least 1. Regardless of the condition number of J, rounding errors are
+therefore at most ε ‖S‖ standard deviations: a thousandth of a standard deviation for signals of 10⁶ σ.
 
 Steps with the factors of an older J converge to the same point. At the maximum of the posterior,
 e_x = −s² C Jᵀ (r − H g) − x and e_g = d Hᵀ (r − H g) − g vanish. With the old J, H and S, the Newton
@@ -53,7 +53,7 @@ from skinnode.solve.posterior.geometry_error import add_effect, effect_on
 
 
 class Buffers(NamedTuple):
-    """Arrays that a step writes for one patch.
+    """Arrays written by a Gauss-Newton step, for one patch.
 
     A patch has U wires with K equations and f free coordinates each, and p nuisances. Each wire has
     R = min(K, f + p) rows after reduction, or R = K with geometry errors.

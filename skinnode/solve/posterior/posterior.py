@@ -1,7 +1,8 @@
-"""Posterior of a patch: fields estimated from a stream of frames whose readings are tested.
+"""Posterior of a patch: estimates fields from a stream of frames, and tests the readings of each frame.
 
 Each frame is solved by ``frame_estimator``. :mod:`skinnode.solve.checks.data_check` then tests the readings
-for consistency with the field; if it finds wrong readings, the frame is solved again without them.
+for consistency with the field; if the data check finds wrong readings, the frame is solved again without
+these readings.
 """
 
 from __future__ import annotations
@@ -108,7 +109,7 @@ class Posterior(FrameEstimator):
 
 
 def _model_std(options: PosteriorOptions) -> float:
-    """Return the forward model's standard error set in the options, relative to the largest change."""
+    """Return the forward model's standard error from the options, relative to the largest change."""
     made = options.tolerances or EXACT
     placed = PLACED * math.hypot(made.placement, made.electrode_radius)
     return math.hypot(options.model_error, placed, made.thickness, made.gain)

@@ -42,13 +42,13 @@ class AbortCode(IntEnum):
 
 
 class Refused(Exception):
-    """Error raised to refuse access to an object; the SDO server sends its abort code to the client.
+    """Refusal of access to an object, for which the SDO server sends an abort code to the client.
 
     Args:
-        code: abort code that gives the reason for the refusal.
+        code: abort code that states the reason for the refusal.
     """
 
     def __init__(self, code: AbortCode) -> None:
         self.code = code
-        """Abort code that gives the reason for the refusal."""
+        """Abort code that states the reason for the refusal."""
         super().__init__(f"0x{code:08X} {code.name}")

@@ -1,4 +1,4 @@
-"""Communication objects 0x1000 to 0x1FFF of a node (CiA 301 v4.2, 7.5.2), with a patch's default values."""
+"""Communication objects 0x1000 to 0x1FFF (CiA 301 v4.2, 7.5.2), and their default values in a patch."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ _GROUPS = ("all", "communication", "application")
 
 @dataclass(frozen=True, slots=True)
 class PdoDefault:
-    """Configuration that a PDO has after a reset."""
+    """Default configuration of a PDO, which applies after a reset."""
 
     purpose: str
-    """Purpose of the PDO, which becomes part of its records' names."""
+    """Purpose of the PDO, included in the names of its communication and mapping records."""
     cob_id: int
     """COB-ID with its flag bits, as in 0x1800:1; the node-ID is added if ``plus_node_id`` is true."""
     kind: int = 254
@@ -160,7 +160,7 @@ def _mapping(index: int, name: str, pdo: PdoDefault, slots: int) -> Object:
     entries = tuple(
         Entry(index, sub, f"Mapped object {sub}", _U32, "rw", value) for sub, value in enumerate(values, 1)
     )
-    # No upper limit is declared, because too many mapped objects must cause a different abort code than a
-    # value above its limit.
+    # No upper limit is declared: for too many mapped objects, CiA 301 requires a different abort code from
+    # the one for a value above its limit.
     first = Entry(index, 0, "Number of mapped objects", _U8, "rw", len(pdo.mapped))
     return record(index, f"{name} mapping parameter: {pdo.purpose}", entries, first)

@@ -34,7 +34,7 @@ class DataType(enum.IntEnum):
 
     @property
     def bits(self) -> int:
-        """Length of a value of this data type, bits; 0 if the length varies."""
+        """Length of this data type in bits; 0 for a type of variable length."""
         return _BITS[self]
 
 
@@ -61,7 +61,8 @@ class Entry:
     access: str
     """Access type: ro, rw, wo, const or rww, where rww means rw and mappable into an RPDO."""
     default: Value | None = None
-    """Default value; None for a device-specific value, such as a serial number, which is initially zero."""
+    """Default value; None for a value specific to each device, such as its serial number, which is initially
+    zero."""
     plus_node_id: bool = False
     """Whether the node-ID is added to the default value at start-up, as for a COB-ID."""
     mappable: bool = False
@@ -89,7 +90,7 @@ class Entry:
 
 @dataclass(frozen=True, slots=True)
 class Object:
-    """Object of an object dictionary; an object of type VAR or DOMAIN has a single entry at sub-index 0."""
+    """Object of an object dictionary. An object of type VAR or DOMAIN has a single entry, at sub-index 0."""
 
     index: int
     name: str

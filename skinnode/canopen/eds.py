@@ -1,9 +1,9 @@
 """Conversion of an object dictionary to the text of an EDS or DCF file (CiA 306).
 
 An EDS (electronic data sheet) describes a type of device. A DCF (device configuration file) describes the
-configuration of one device. REAL32 defaults are written as hexadecimal IEEE 754 bit patterns, as conforming
-tools expect. The Python library ``canopen`` expects decimal numbers and ignores a hexadecimal REAL32 default;
-only 0 is the same in both notations.
+configuration of one device. REAL32 defaults are written as hexadecimal IEEE 754 bit patterns, the notation
+that CiA 306 tools expect. The Python library ``canopen`` expects decimal numbers and ignores a hexadecimal
+REAL32 default; only 0 is the same in both notations.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from typing import Final
 from skinnode.canopen import indices as od
 from skinnode.canopen.dictionary import DataType, Entry, Object, ObjectType
 
-_DATE, _TIME = "01-01-2025", "12:00AM"  # fixed, so that a regenerated file is identical
+_DATE, _TIME = "01-01-2025", "12:00AM"  # fixed, so that regenerating an EDS yields an identical file
 _BIT_RATES_KBPS: Final = (10, 20, 50, 125, 250, 500, 800, 1000)
 _MANDATORY: Final = (0x1000, 0x1001, 0x1018)
 _DUMMY_TYPES: Final = range(1, 8)
@@ -50,7 +50,7 @@ class Commissioning:
 
 
 def render_eds(info: DeviceInfo, objects: Iterable[Object], device: Commissioning | None = None) -> str:
-    """Return the text of an EDS or DCF file, with LF line endings; equal arguments give equal text.
+    """Return the text of an EDS or DCF file with LF line endings; the text depends only on the arguments.
 
     Args:
         info: description of the device.
@@ -118,7 +118,7 @@ def _head(info: DeviceInfo, device: Commissioning | None) -> Iterator[str]:
     )
     if device is not None:
         yield from _section(
-            "DeviceComissioning",  # the misspelling is part of CiA 306
+            "DeviceComissioning",  # CiA 306 itself misspells this section title
             [
                 ("NodeID", str(device.node_id)),
                 ("NodeName", device.node_name),
@@ -171,7 +171,7 @@ def _options(entry: Entry, kind: ObjectType, device: Commissioning | None) -> It
 
 
 def _is_configuration(entry: Entry) -> bool:
-    """Return whether a DCF contains a value for the entry; commands and the error history have none."""
+    """Return whether a DCF states a value for the entry, unlike commands and the error history."""
     refused = entry.index in (od.ERROR_FIELD, od.STORE, od.RESTORE)
     return entry.access not in ("ro", "const") and entry.default is not None and not refused
 

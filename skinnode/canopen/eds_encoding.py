@@ -13,8 +13,8 @@ from typing import Final, NamedTuple
 ASCII: Final = "ASCII"
 
 MOST_EDS_BYTES: Final = 2 << 20
-"""Maximum size of an EDS file, bytes; twenty times the size of a patch's EDS, and more than the largest known
-EDS."""
+"""Maximum accepted size of an EDS file, in bytes. This limit is twenty times the size of a patch's EDS and
+exceeds the size of the largest known EDS."""
 
 _UTF_16: Final = {codecs.BOM_UTF16_LE: "utf-16-le", codecs.BOM_UTF16_BE: "utf-16-be"}
 _CODECS: Final = {
@@ -25,7 +25,7 @@ _CODECS: Final = {
     "Windows-1252": "cp1252",
     "Latin-1": "latin-1",
 }
-"""Python codec that decodes the original bytes of an :class:`EdsText`, keyed by the name of the encoding."""
+"""Python codec for the original bytes of an :class:`EdsText`, by the name of its encoding."""
 
 
 class EdsText(NamedTuple):
@@ -56,8 +56,7 @@ def read_eds_text(data: bytes) -> EdsText:
     """Return the text and the encoding of an EDS or DCF file.
 
     A byte order mark determines the encoding. Without a byte order mark, the encoding is the first of ASCII,
-    UTF-8, Windows-1252 and Latin-1 that can decode the file. The text contains everything except the byte
-    order mark.
+    UTF-8, Windows-1252 and Latin-1 that can decode the file. The returned text omits the byte order mark.
 
     Args:
         data: content of the file.

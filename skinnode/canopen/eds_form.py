@@ -13,7 +13,7 @@ _OBJECT: Final = re.compile(r"[0-9a-f]{4}(sub[0-9a-f]{1,2})?", re.IGNORECASE)
 _FURTHER: Final = re.compile(r"[0-9a-f]{4}(?!sub)[g-z]\w*", re.IGNORECASE)
 """Pattern for titles of supplementary object sections, such as 1003Value and 1003ObjectLinks."""
 _OF_OBJECT: Final = re.compile(r"[0-9]\w*|[0-9a-f]{4}sub.*", re.IGNORECASE)
-"""Pattern for section titles that were probably meant to denote an object, even if they are malformed."""
+"""Pattern for section titles that are probably meant to denote an object, including malformed titles."""
 _NUMBER: Final = re.compile(r"0x[0-9a-f]{1,8}|[0-9]{1,10}", re.IGNORECASE)
 _LISTS: Final = ("mandatoryobjects", "optionalobjects", "manufacturerobjects")
 _NUMBERS: Final = ("objecttype", "datatype", "pdomapping", "subnumber", "compactsubobj")
@@ -28,7 +28,7 @@ def check_form(text: str, source: str) -> None:
         source: name of the EDS file, shown in the error.
 
     Raises:
-        ProfileError: if there is a format error; the error names the line of the first one.
+        ProfileError: if the file has a format error; the message states the line of the first format error.
     """
     for line, section, key, value in _lines(text):
         if not key:
@@ -46,7 +46,7 @@ def check_form(text: str, source: str) -> None:
 
 
 def no_eds(error: Exception, source: str, text: str = "") -> ProfileError:
-    """Convert an EDS parser's error to a ProfileError that names the line or section, if known."""
+    """Convert an EDS parser's error to a ProfileError that states the line or section, if known."""
     numbers = [getattr(error, "lineno", None), *(line for line, _ in getattr(error, "errors", ()))]
     line = next(filter(None, numbers), None)
     if line is not None:
@@ -82,7 +82,7 @@ def _mistake(key: str, got: str, allowed: str, source: str, line: int | None = N
 
 
 def _lines(text: str) -> Iterator[tuple[int, str, str, str]]:
-    """Yield line number, section, key and value for each line; key and value of a section header are empty.
+    """Yield the line number, section, key and value of each line; key and value of a header are empty.
 
     Comments and continuation lines are skipped.
     """

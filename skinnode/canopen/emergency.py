@@ -1,7 +1,7 @@
 """Human-readable texts for emergency messages (EMCY), the error register and the error history.
 
 The codes follow CiA 301 v4.2, 7.2.7, tables 26 and 48. The manufacturer-specific bytes after an error code
-are decoded only for skinnode patches, which also give some codes a more precise meaning.
+are decoded only for skinnode patches, which also use some codes in a more specific sense than CiA 301.
 """
 
 from __future__ import annotations
@@ -25,28 +25,29 @@ class EmcyCode(IntEnum):
     BUS_OFF_RECOVERED = 0x8140
     CAN_ID_COLLISION = 0x8150
     SYNC_WINDOW = 0x8200
-    """A synchronous TPDO was not ready within the synchronous window (0x1007). Detail bytes: u16 TPDO number.
-    CiA 301 does not define a code for this error, so a patch sends the generic protocol error code."""
+    """Error reported if a synchronous TPDO was not ready within the synchronous window (0x1007). Detail
+    bytes: u16 TPDO number. CiA 301 defines no specific code for a late synchronous TPDO, so a patch sends the
+    generic protocol error code."""
     PDO_NOT_PROCESSED = 0x8210
     PDO_LENGTH_EXCEEDED = 0x8220
     SYNC_LENGTH = 0x8240
     RPDO_TIMEOUT = 0x8250
     SOURCE = 0xFF00
-    """The converter did not return a valid reading. Detail bytes: u8 fault (1 failed, 2 wrong array shape),
-    u16 number of failures.
+    """Error reported if the converter did not return a valid reading. Detail bytes: u8 fault (1 failed, 2
+    wrong array shape), u16 number of failures.
     """
 
     @property
     def register_bit(self) -> int:
-        """Error register mask for this code: bit 4 (communication) or bit 7 (manufacturer-specific)."""
+        """Error register bit set by this code: bit 4 (communication) or bit 7 (manufacturer-specific)."""
         return 0x10 if self >> 12 == 8 else 0x80
 
 
 TOO_SLOW: Final = 1
 """Third detail byte of EMCY 0x8110 if scans were skipped because the node's computer or the bus is too slow.
 
-The first two detail bytes contain the number of skipped scans. A third byte of 0 means that a scan takes
-longer than the scan period even at the pace set by the inhibit time.
+The first two detail bytes contain the number of skipped scans. A third byte of 0 means that the scan period
+is too short for a scan whose chunks are spaced by the inhibit time.
 """
 
 _CODES: Final = {
@@ -71,7 +72,7 @@ _OWN_CODES: Final[dict[int, str]] = {
     EmcyCode.PDO_NOT_PROCESSED: "PDO not processed: too short",
     EmcyCode.SOURCE: "no reading from the converter",
 }
-"""Meaning of each error code that a skinnode patch uses in a more precise sense than CiA 301."""
+"""Meanings of the error codes that skinnode patches use in a more specific sense than CiA 301."""
 _CLASSES: Final = {
     0x10: "generic error",
     0x20: "current",
@@ -125,8 +126,8 @@ def error_text(code: int, detail: bytes = b"", *, ours: bool) -> str:
     Args:
         code: error code.
         detail: manufacturer-specific bytes; the error history contains only the first two.
-        ours: whether vendor-ID and product code identify a skinnode patch; if not, the description follows
-            CiA 301.
+        ours: whether the sender is a skinnode patch, according to its vendor-ID and product code; otherwise,
+            the description follows CiA 301.
     """
     own = _OWN_CODES.get(code) if ours else None
     text = own or _CODES.get(code) or _CLASSES.get(code >> 8) or f"error of class 0x{code >> 12:X}000"
@@ -139,7 +140,8 @@ def history_text(entry: int, *, ours: bool) -> str:
 
     Args:
         entry: error code in the lower 16 bits, two manufacturer-specific bytes in the upper 16 bits.
-        ours: whether vendor-ID and product code identify a skinnode patch; the two bytes are then decoded.
+        ours: whether the sender is a skinnode patch, according to its vendor-ID and product code. The two
+            manufacturer-specific bytes are decoded only for a skinnode patch.
     """
     code, more = entry & 0xFFFF, entry >> 16
     text = f"0x{code:04X} {error_text(code, more.to_bytes(2, 'little'), ours=ours)}"
@@ -147,9 +149,9 @@ def history_text(entry: int, *, ours: bool) -> str:
 
 
 def says_too_slow(code: int, detail: bytes) -> bool:
-    """Return whether an emergency reports scans skipped because of a slow computer or bus.
+    """Return whether an emergency message reports scans skipped because of a slow computer or bus.
 
-    Scans that were skipped for this reason do not indicate a fault in the skin.
+    Scans skipped because of a slow computer or bus do not indicate a fault in the skin.
 
     Args:
         code: error code.
@@ -212,5 +214,5 @@ _DETAILS: Final[dict[int, Callable[[bytes], str]]] = {
     EmcyCode.CAN_ID_COLLISION: lambda detail: f"0x{_word(detail):03X}",
     EmcyCode.SOURCE: lambda detail: _SOURCE_FAULTS.get(detail[0], ""),
 }
-"""For each error code, the function that describes the manufacturer-specific bytes (at least two) of a
-skinnode patch."""
+"""Functions, keyed by error code, that describe the manufacturer-specific bytes sent by a skinnode patch.
+Each function requires at least two bytes."""

@@ -10,20 +10,21 @@ from typing import Final
 
 # --- identity (0x1018)
 VENDOR_ID: Final = 0
-"""Vendor-ID; 0, which CiA assigns to no vendor, because this project has no vendor-ID."""
+"""Vendor-ID of a patch. The value 0, which CiA assigns to no vendor, means that this project has no
+vendor-ID."""
 PRODUCT_CODE: Final = 0x534B494E
-"""Product code, 'SKIN' in ASCII."""
+"""Product code of a patch: 'SKIN' in ASCII."""
 REVISION_NUMBER: Final = 0x0001_0001
-"""Revision number, with the major revision (CANopen behaviour) in the upper 16 bits and the minor revision
-below."""
+"""Revision number of a patch: major revision (CANopen behaviour) in the upper 16 bits, minor revision in the
+lower 16 bits."""
 UNCHECKED_REVISION_NUMBER: Final = 0x0001_0000
-"""Revision number of patches whose scan summaries contain no check."""
+"""Revision number of patches that send scan summaries without a scan check."""
 DEVICE_NAME: Final = "skinnode patch"
 
 MAX_NODE_ID: Final = 127
 """Maximum node-ID; the minimum node-ID is 1."""
 
-# --- COB-IDs: the pre-defined connection set of CiA 301
+# --- COB-IDs in the pre-defined connection set of CiA 301
 FUNCTION_MASK: Final = 0x780
 """Mask for the function code in a COB-ID."""
 NODE_ID_MASK: Final = 0x7F
@@ -125,10 +126,10 @@ TPDO1_PARAMETER: Final = 0x1800
 TPDO2_PARAMETER: Final = 0x1801
 TPDO1_MAPPING: Final = 0x1A00
 TPDO2_MAPPING: Final = 0x1A01
-"""Index of TPDO2's mapping record. The records of all PDOs of one kind have consecutive indices."""
+"""Index of TPDO2's mapping record. The mapping records of consecutive TPDOs have consecutive indices."""
 MAX_PDOS: Final = 512
-"""Maximum number of RPDOs, and maximum number of TPDOs; each index range, such as 0x1400 to 0x15FF, has this
-length."""
+"""Maximum number of RPDOs and of TPDOs: the number of indices in each PDO index range, such as 0x1400 to
+0x15FF."""
 PDO_MAPPING_OFFSET: Final = 0x200
 """Offset from the index of a PDO's communication record to the index of its mapping record."""
 PDO_INVALID: Final = 1 << 31
@@ -136,10 +137,10 @@ PDO_INVALID: Final = 1 << 31
 PDO_COB_ID, PDO_TYPE, PDO_INHIBIT_TIME, PDO_EVENT_TIMER, PDO_SYNC_START = 1, 2, 3, 5, 6
 """Sub-indices of a PDO's communication record."""
 DUMMY_BITS: Final = {0x0002: 8, 0x0003: 16, 0x0004: 32, 0x0005: 8, 0x0006: 16, 0x0007: 32}
-"""Length in bits of each data type that an RPDO can map as a dummy object, by index of the data type.
+"""Lengths (bits) of the data types that an RPDO can map as dummy objects, by data type index.
 
-A node ignores the bytes of a dummy object. BOOLEAN is not included, because the objects in a PDO consist of
-whole bytes.
+A node ignores the received bytes of a dummy object. BOOLEAN is excluded, because every object in a PDO must
+consist of whole bytes.
 """
 ERROR_FIELD_LENGTH: Final = 8
 HEARTBEAT_CONSUMERS: Final = 8
@@ -149,23 +150,23 @@ DESCRIPTOR: Final = 0x2000
 ROWS, COLUMNS, UPPER_ELECTRODES, LOWER_ELECTRODES, CODE_BITS = 1, 2, 3, 4, 5
 CODE_LO, CODE_HI, RESISTIVITY, LAYOUT_ID, LAYOUT_HASH, SERIAL = 6, 7, 8, 9, 10, 11
 PDO_BYTES: Final = 12
-"""Sub-index of the maximum PDO length, which is 8 bytes, or 64 bytes over CAN FD."""
+"""Sub-index of the maximum PDO length: 8 bytes, or 64 bytes over CAN FD."""
 CHUNK: Final = 0x2010
 CHUNK_INDEX, CHUNK_SCAN = 1, 2
 """Sub-indices of the chunk index and the scan counter. Over CAN FD, sub-index 1 contains the upper wire
-instead, and sub-index 3 the first column."""
+instead of the chunk index, and sub-index 3 contains the first column."""
 SUMMARY: Final = 0x2011
 SUMMARY_SCAN, SUMMARY_FLAGS, SUMMARY_CHUNKS, SUMMARY_TIME = 1, 2, 3, 4
 SUMMARY_TIME_64US, SUMMARY_CHECK = 5, 6
-"""Sub-indices of the 16-bit device time and the scan check, which TPDO2 carries from revision 1.1 on, instead
-of the device time in µs."""
+"""Sub-indices of the 16-bit device time and the scan check. From revision 1.1 on, TPDO2 carries these two
+objects instead of the device time in µs."""
 SEND_POLICY: Final = 0x2020
 SEND_MODE, SEND_THRESHOLD, SEND_REFRESH = 1, 2, 3
 ACQUISITION: Final = 0x2021
 ACQUISITION_PERIOD, ACQUISITION_AVERAGING, SELF_TEST, TARE, SINGLE_SCAN = 1, 2, 3, 4, 5
 COMMANDS: Final = frozenset({(ACQUISITION, SELF_TEST), (ACQUISITION, TARE), (ACQUISITION, SINGLE_SCAN)})
-"""Index and sub-index of each object that acts as a command when written. These command objects are not
-parameters, so a node neither saves nor verifies them."""
+"""Index and sub-index of each command object: writing the object triggers an action. Command objects are not
+parameters, so they are neither saved nor included in parameter verification."""
 TIME_OF_DAY: Final = 0x2022
 TIME_DAYS, TIME_MS, TIME_MESSAGES, TIME_DEVICE_US = 1, 2, 3, 4
 SELF_TEST_RESULT: Final = 0x2023
@@ -173,22 +174,22 @@ TEST_STATUS, TEST_FAULTS, TEST_READINGS, TEST_NOISE = 1, 2, 3, 4
 TEST_OPEN_WIRES, TEST_SHORTED_WIRES, TEST_OUT_OF_RANGE, TEST_UNTARED = 5, 6, 7, 8
 UPPER_WIRE_FAULTS: Final = 0x2030
 LOWER_WIRE_FAULTS: Final = 0x2031
-"""Index of the lower wires' fault masks, 32 wires each. For the wires from 32 i on, sub-index 2 i + 1
-contains the open wires and sub-index 2 i + 2 the shorted wires."""
+"""Index of the fault masks for the lower wires, with 32 wires per mask. For lower wires 32 i to 32 i + 31,
+sub-index 2 i + 1 is the mask of open wires, and sub-index 2 i + 2 the mask of shorted wires."""
 REJECTED_FRAMES: Final = 0x2040
 """Index of the counters of rejected frames; see :class:`skinnode.node.rejected.Rejected`."""
 CODES: Final = 0x2100
-"""Index of the latest codes of upper wire 0, one per sub-index. The codes of upper wire r have index CODES +
-r."""
+"""Index of the array of upper wire 0's latest codes, with one code per sub-index. The codes of upper wire r
+have index CODES + r."""
 BASELINE: Final = 0x2200
-"""Index of the R0 values of upper wire 0, ohm (0 if unknown), one per sub-index. The R0 values of upper wire
-r have index BASELINE + r."""
+"""Index of the array of upper wire 0's R0 values in ohms (0 if unknown), with one value per sub-index. The R0
+values of upper wire r have index BASELINE + r."""
 COORDINATES: Final = 0x2300
 """Index of the electrode coordinates, a DOMAIN; see
 :func:`skinnode.protocol.coordinates.pack_coordinates`."""
 BASELINE_DOMAIN: Final = 0x2301
-"""Index of the baseline as a DOMAIN: U·K REAL32 values of R0, ohm, upper wire by upper wire. A client must
-write all values together."""
+"""Index of the DOMAIN that contains the baseline: U·K REAL32 values of R0 in ohms, ordered by upper wire. A
+client must write the whole baseline in one transfer."""
 
 TARE_SIGNATURE: Final = int.from_bytes(b"tare", "little")
 SELF_TEST_SIGNATURE: Final = int.from_bytes(b"test", "little")

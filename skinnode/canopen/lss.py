@@ -1,4 +1,4 @@
-"""Layer setting services (LSS, CiA 305 v3.0): constants that the LSS master and the LSS slave share."""
+"""Constants for layer setting services (LSS, CiA 305 v3.0), shared by the LSS master and slave."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from enum import IntEnum
 from typing import Final, NamedTuple
 
 NOT_CONFIGURED: Final = 0xFF
-"""Node-ID value which means that a node has no node-ID."""
+"""Value that represents a missing node-ID."""
 
 BIT_RATES_BPS: Final = {
     0: 1_000_000,
@@ -18,17 +18,17 @@ BIT_RATES_BPS: Final = {
     7: 20_000,
     8: 10_000,
 }
-"""Bit rate for each entry of the CiA 301 bit timing table, bit/s. Entry 5 is reserved, and entry 9 means
-automatic bit rate detection."""
+"""Bit rates (bit/s) in the order of the CiA 301 bit timing table. Table index 5 is reserved, and table index
+9 selects automatic bit rate detection."""
 
 LSS_DONE: Final = 0
-"""Error code in the response to a configuration request that succeeded."""
+"""Error code that reports the success of a configuration request."""
 
 LSS_MANUFACTURER_ERROR: Final = 0xFF
-"""Error code that indicates a manufacturer-specific error code in the next byte."""
+"""Error code that announces a manufacturer-specific error code in the next byte of the response."""
 
 RESET_SCAN: Final = 0x80
-"""Fastscan bit-check value that makes every node without a node-ID answer, and restarts the search at the
+"""Fastscan bit-check value to which every node without a node-ID responds. The search then restarts at the
 vendor-ID."""
 
 
@@ -62,7 +62,7 @@ class LssState(IntEnum):
 
 
 class LssAddress(NamedTuple):
-    """LSS address, which is unique to each device: the fields of the identity object (0x1018), in order."""
+    """LSS address of a device: the four fields of its identity object (0x1018), which together are unique."""
 
     vendor_id: int
     product_code: int

@@ -11,7 +11,7 @@ STOPPED           command 2            NMT, error control
 
 A node executes NMT commands in every state except INITIALISING, in which it receives no commands. The command
 *reset node* (129) resets all objects to their power-on values. The command *reset communication* (130) resets
-only the objects from 0x1000 to 0x1FFF. After either command the node boots.
+only the objects from 0x1000 to 0x1FFF. The node boots after *reset node* or *reset communication*.
 """
 
 from __future__ import annotations
@@ -28,11 +28,14 @@ STATE_MASK: Final = 0x7F
 """Mask for the NMT state in a heartbeat or guarding response."""
 
 GUARD_TOGGLE: Final = 0x80
-"""Bit that toggles between successive guarding responses of a node."""
+"""Bit that toggles with each guarding response from a node."""
 
 
 class NmtState(IntEnum):
-    """NMT states, with their values in heartbeats. A node that is switched off is also INITIALISING."""
+    """NMT states, with their values in heartbeats.
+
+    In this project, a node that is switched off also has the state INITIALISING.
+    """
 
     INITIALISING = 0
     STOPPED = 4
@@ -68,7 +71,7 @@ AFTER_COMMAND: Final = {
     NmtCommand.STOP: NmtState.STOPPED,
     NmtCommand.ENTER_PRE_OPERATIONAL: NmtState.PRE_OPERATIONAL,
 }
-"""NMT state that each command other than a reset leads to."""
+"""NMT state that a node enters after each command, for the commands other than resets."""
 
 
 def state_name(state: int) -> str:
@@ -91,7 +94,7 @@ def encode(command: NmtCommand, node_id: int) -> bytes:
 
 
 def parse(data: bytes, node_id: int) -> NmtCommand | None:
-    """Return the command in a frame with COB-ID 0; None if the frame addresses another node.
+    """Return the NMT command in a frame with COB-ID 0; None if the frame addresses another node.
 
     Args:
         data: payload of the frame.

@@ -1,4 +1,4 @@
-"""Service data objects (SDO, CiA 301 v4.2, 7.2.4.3): definitions that SDO clients and servers share."""
+"""Definitions for service data objects (SDO, CiA 301 v4.2, 7.2.4.3), shared by SDO clients and servers."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ MAX_BLOCK_SEGMENTS: Final = 127
 """Maximum number of segments in a block of an SDO block transfer."""
 
 ABORT: Final = 0x80
-"""First byte of an SDO abort, sent by a client or a server."""
+"""First byte of an SDO abort message, which a client or a server can send."""
 
 UPLOAD: Final = 0x40
 """First byte of an SDO request to read an object."""

@@ -13,19 +13,25 @@ from skinnode.node.storage import Storage
 
 
 class Application(Protocol):
-    """Application of a CANopen device, whose object dictionary contains the application's objects."""
+    """Application of a CANopen device, which shares the device's object dictionary."""
 
     @property
     def deadline_ns(self) -> int:
-        """Time at which :meth:`on_timer` must be called next, ns."""
+        """Time (ns) at which :meth:`on_timer` must be called next."""
         ...
 
     def power_on(self, t_ns: int) -> None:
-        """Start the application at power-on, before the boot-up message; not called at a reset."""
+        """Start the application at power-on, before the boot-up message.
+
+        The device does not call this method on a reset.
+        """
         ...
 
     def reset(self) -> None:
-        """Reset the application, after its objects have been set to their power-on values."""
+        """Reset the application.
+
+        The device has already set the application's objects to their power-on values.
+        """
         ...
 
     def enter(self, *, operational: bool) -> None:
@@ -33,7 +39,7 @@ class Application(Protocol):
         ...
 
     def on_sync(self, counter: int | None, turns: frozenset[int], t_ns: int) -> None:
-        """Handle a SYNC in OPERATIONAL; ``turns`` contains the numbers of the synchronous TPDOs now due."""
+        """Handle a SYNC in OPERATIONAL; ``turns`` contains the numbers of the due synchronous TPDOs."""
         ...
 
     def on_timer(self, t_ns: int) -> None:
@@ -54,4 +60,4 @@ class ApplicationServices:
     emcy: EmcyProducer
     """Emergency producer."""
     now: Clock
-    """Function that returns the time of the event being handled, ns."""
+    """Function that returns the time (ns) of the event being handled."""

@@ -1,9 +1,10 @@
 """CANopen device: the CiA 301 communication services and an application that uses them.
 
 The device is synchronous and deterministic: it has no thread and reads no clock. The caller passes received
-frames and the current time to the device, and asks it for the time of the next call. On a bus, the caller is
-:class:`~skinnode.node.runner.NodeRunner`; tests call the device directly. No received frame causes an
-exception in the device itself, but exceptions from the application and from ``send`` propagate to the caller.
+frames and the current time to the device, and calls the device again at the time that the device requests. On
+a bus, the caller is :class:`~skinnode.node.runner.NodeRunner`; tests call the device directly. No received
+frame causes an exception in the device itself, but exceptions from the application and from ``send``
+propagate to the caller.
 """
 
 from __future__ import annotations
@@ -39,21 +40,22 @@ HARDWARE_VERSION: Final = "none"
 """Hardware version (0x1009) of a software node, which has no board."""
 
 Handler = Callable[[bytes, int], None]
-"""Callback that takes a frame's payload and its time of reception, ns."""
+"""Callback with two arguments: a frame's payload, and its time of reception in ns."""
 
 
 class CanopenDevice:
-    """CANopen device with its communication services; it sends nothing before :meth:`power_on`.
+    """CANopen device with its communication services. The device sends nothing before :meth:`power_on`.
 
     Args:
-        node_id: 1 to 127, or 255 to wait until LSS assigns a node-ID; a node-ID that LSS has stored in the
-            memory takes precedence.
+        node_id: 1 to 127, or 255 to wait until LSS assigns a node-ID. A node-ID stored in the memory by LSS
+            takes precedence.
         objects: declarations of the node's object dictionary.
         application: called once, with the device's services, to create the application.
         send: called with the COB-ID and payload of each frame that the node sends, in order.
         serial: serial number (0x1018:4), u32.
         memory: memory for the values that survive a power cycle; None for a device without a memory.
-        kind: sizes and layout of the patch, with which the memory's content must agree; see
+        kind: sizes and layout of the patch. The content of the memory must have been saved with the same
+            value; see
             :class:`~skinnode.node.memory.Kept`.
         set_bit_rate: changes the bit rate (bit/s) for LSS; None if the node cannot change it.
 
@@ -109,7 +111,7 @@ class CanopenDevice:
     # --- events
 
     def power_on(self, t_ns: int) -> None:
-        """Start the application and boot into PRE-OPERATIONAL or, without a node-ID, wait for a node-ID.
+        """Start the application, then boot into PRE-OPERATIONAL or, without a node-ID, wait for LSS.
 
         Args:
             t_ns: current time, ns.
@@ -124,7 +126,7 @@ class CanopenDevice:
         self._reset(EVERYTHING, t_ns)
 
     def power_off(self) -> None:
-        """Switch the device off, so that it stops sending immediately."""
+        """Switch the device off: the device stops sending immediately."""
         self._enter(NmtState.INITIALISING, self._now_ns)
         self._bit_rate_change.cancel()
         self._handlers = {}
@@ -156,8 +158,8 @@ class CanopenDevice:
     def on_bus(self, state: BusState, t_ns: int) -> None:
         """Handle a change of the CAN controller's state.
 
-        The error behaviour (0x1029) applies immediately at bus-off. An emergency message reports bus-off
-        after the bus has recovered.
+        The error behaviour (0x1029) applies immediately at bus-off. The emergency message about bus-off
+        follows after the bus has recovered.
 
         Args:
             state: new state of the CAN controller.
@@ -175,7 +177,7 @@ class CanopenDevice:
         self._report_passive(t_ns)
 
     def next_deadline_ns(self) -> int | None:
-        """Return the time at which :meth:`on_timer` must be called next, ns; None if nothing is scheduled."""
+        """Return the time (ns) of the next required :meth:`on_timer` call; None if nothing is scheduled."""
         if self._bit_rate_change.deadline_ns != NO_DEADLINE_NS:
             return self._bit_rate_change.deadline_ns
         if self.nmt_state is NmtState.INITIALISING:
@@ -193,14 +195,14 @@ class CanopenDevice:
 
     @property
     def silent_from_ns(self) -> int:
-        """Time from which :meth:`on_timer` reports a master or a monitored node as silent, ns.
+        """Time (ns) from which :meth:`on_timer` reports the silence of the master or a monitored node.
 
         The caller must first pass all frames received before that time to :meth:`on_frame`.
         """
         return self._error_control.silent_from_ns
 
     def on_timer(self, t_ns: int) -> None:
-        """Perform all actions that are due at ``t_ns``. Early or repeated calls have no effect.
+        """Perform all actions that are due at ``t_ns``. Calls before the next deadline have no effect.
 
         Args:
             t_ns: current time, ns.
@@ -241,7 +243,7 @@ class CanopenDevice:
                 self._nmt.obey(command, t_ns)
 
     def _reset(self, objects: tuple[int, int], t_ns: int) -> None:
-        """Reset objects and services, and boot unless LSS has not assigned a node-ID yet."""
+        """Reset objects and services, then boot; without a node-ID, wait until LSS assigns one."""
         self._enter(NmtState.INITIALISING, t_ns)
         self._lss.reset_communication()
         self.node_id = self._lss.node_id
@@ -269,7 +271,7 @@ class CanopenDevice:
         self._nmt.enter(state, t_ns)
 
     def _entered(self, state: NmtState, before: NmtState, t_ns: int) -> None:
-        # Must come first, because the calls below may queue messages.
+        # The EMCY producer must be updated first, because the following calls may queue emergency messages.
         self._emcy.allow(state.communicates, t_ns)
         if not state.communicates:
             self._sdo.reset()
@@ -361,12 +363,12 @@ class CanopenDevice:
         self._reload()
 
     def _reload(self) -> None:
-        """Register a handler for each COB-ID that the device receives, except those of RPDOs."""
+        """Register a handler for each received COB-ID, except the COB-IDs of RPDOs."""
         handlers: dict[int, Handler] = self._error_control.handlers()
         if self._time.cob_id is not None:
             handlers[self._time.cob_id] = self._on_time
-        # These handlers are registered last, so that no configuration can replace the handlers of SYNC, SDO,
-        # NMT and LSS.
+        # The handlers of SYNC, SDO, NMT and LSS are registered last, so that configured COB-IDs cannot
+        # replace them.
         handlers[self._sync.cob_id] = self._on_sync
         handlers[od.sdo_request_cob_id(self.node_id)] = self._on_sdo
         handlers[od.NMT_COB_ID] = self._on_nmt
@@ -375,5 +377,5 @@ class CanopenDevice:
 
 
 def _count(objects: Sequence[Object], first: int) -> int:
-    """Return the number of PDOs whose communication records have indices from ``first`` on."""
+    """Return the number of RPDOs or TPDOs, where ``first`` is the index of the first communication record."""
     return sum(first <= item.index < first + od.MAX_PDOS for item in objects)

@@ -20,8 +20,8 @@ from skinnode.node.object_dictionary import ObjectStore
 from skinnode.node.pdo.parameters import COB_ID_MASK, INVALID_BIT, check_cob_id
 
 _WAITING: Final = 16
-"""Maximum number of queued messages; if more messages must wait, the oldest message is dropped. Messages wait
-for the end of the inhibit time, for the end of the STOPPED state, or for the bus."""
+"""Maximum number of queued emergency messages; if the queue is full, the oldest message is dropped. Messages
+are queued during the inhibit time, in the STOPPED state, and while the bus refuses frames."""
 _RESERVED_BIT: Final = 1 << 30
 
 
@@ -38,14 +38,14 @@ class EmcyProducer:
         self._present: dict[tuple[EmcyCode, int], bytes] = {}
         self._history: deque[int] = deque(maxlen=od.ERROR_FIELD_LENGTH)  # newest first
         self._waiting: deque[bytes] = deque()
-        self._lost = 0  # number of dropped messages that have not been reported yet
+        self._lost = 0  # number of dropped messages not yet reported
         self._sent_ns = -NO_DEADLINE_NS
         self._allowed = False
         self._connect()
 
     @property
     def register(self) -> int:
-        """Value of the error register; bit 0 is set while any error is active."""
+        """Value of the error register (0x1001); bit 0 is set while an error is active."""
         bits = 0
         for code, _ in self._present:
             bits |= code.register_bit | 1
@@ -53,11 +53,11 @@ class EmcyProducer:
 
     @property
     def deadline_ns(self) -> int:
-        """Time at which the next queued message may be sent, ns."""
+        """Time (ns) at which the next queued message may be sent."""
         return self._free_ns if self._waiting and self._allowed else NO_DEADLINE_NS
 
     def report_once(self, code: EmcyCode, detail: bytes, t_ns: int) -> None:
-        """Report a momentary error by two messages: one for the error, and one for its end.
+        """Report a momentary error in two messages: one for the error, and one for its end.
 
         Args:
             code: error code.
@@ -81,7 +81,7 @@ class EmcyProducer:
             self._send_error(code, self.register, detail, t_ns)
 
     def clear(self, code: EmcyCode, t_ns: int, who: int = 0) -> None:
-        """Report the end of an error that :meth:`report` has reported; otherwise, do nothing.
+        """Report the end of an error; do nothing if :meth:`report` has not reported the error.
 
         Args:
             code: error code.
@@ -92,15 +92,15 @@ class EmcyProducer:
             self._send_end(code, t_ns)
 
     def allow(self, allowed: bool, t_ns: int) -> None:
-        """Allow or hold back messages, depending on the node's NMT state."""
+        """Allow or withhold messages, depending on the node's NMT state."""
         self._allowed = allowed
         self._try(t_ns)
 
     def on_timer(self, t_ns: int) -> None:
-        """Send the messages allowed at ``t_ns``. A message that the bus refuses stays queued."""
+        """Send the messages allowed at ``t_ns``. A message refused by the bus stays in the queue."""
         cob_id = self._store.integer(od.COB_ID_EMCY) & COB_ID_MASK
         while self._waiting and self._allowed and t_ns >= self._free_ns:
-            if self._lost:  # reported first, because the dropped messages are the oldest
+            if self._lost:  # the loss is reported first, because the dropped messages were the oldest
                 self._send(cob_id, self._loss())
                 self._lost = 0
             else:
@@ -120,11 +120,11 @@ class EmcyProducer:
         self._queue(_message(code, register, detail), t_ns)
 
     def _send_end(self, code: EmcyCode, t_ns: int) -> None:
-        """Queue a message that reports the end of an error; its error register shows the remaining errors."""
+        """Queue a message about the end of an error; its register byte shows the remaining errors."""
         self._queue(_message(EmcyCode.RESET, self.register, code.to_bytes(2, "little")), t_ns)
 
     def _remember(self, code: EmcyCode, detail: bytes) -> None:
-        # The upper 16 bits of an entry are manufacturer-specific: they contain the first two detail bytes.
+        # The manufacturer-specific upper 16 bits of an entry contain the first two detail bytes.
         self._history.appendleft(code | int.from_bytes(detail[:2], "little") << 16)
 
     def _queue(self, message: bytes, t_ns: int) -> None:
@@ -139,16 +139,16 @@ class EmcyProducer:
     def _try(self, t_ns: int) -> None:
         """Send the queued messages; if the bus refuses a message, try again at the next timer event.
 
-        A BusError is suppressed, because the caller must still be able to handle the error that it reports.
+        A BusError is suppressed, so that the caller can continue to handle the error being reported.
         """
         with contextlib.suppress(BusError):
             self.on_timer(t_ns)
 
     def _loss(self) -> bytes:
-        """Return the message that reports dropped messages.
+        """Return the emergency message that reports dropped emergency messages.
 
-        Detail bytes 0 and 1 contain the number of skipped scans, here 0, and bytes 2 and 3 the number of
-        dropped messages.
+        Detail bytes 0 and 1, which otherwise contain a number of skipped scans, are 0. Detail bytes 2 and 3
+        contain the number of dropped messages.
         """
         detail = struct.pack("<HH", 0, min(self._lost, 0xFFFF))
         self._remember(EmcyCode.CAN_OVERRUN, detail)
@@ -156,7 +156,7 @@ class EmcyProducer:
 
     @property
     def _free_ns(self) -> int:
-        """Earliest time at which the inhibit time allows the next message, ns."""
+        """End (ns) of the inhibit time after the last message, when the next message may be sent."""
         return self._sent_ns + self._store.integer(od.EMCY_INHIBIT_TIME) * 100_000
 
     # --- object dictionary
@@ -188,7 +188,7 @@ class EmcyProducer:
         check_cob_id(value, self._store.integer(od.COB_ID_EMCY))
 
     def _on_cob_id(self) -> None:
-        if not self._exists:  # queued messages must not be sent after EMCY has been switched on again
+        if not self._exists:  # messages queued so far must not be sent when EMCY is enabled again
             self._waiting.clear()
             self._lost = 0
 

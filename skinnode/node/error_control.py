@@ -24,11 +24,11 @@ from skinnode.node.services import NodeServices
 Handler = Callable[[bytes, int], None]
 
 _RIVAL_BEATS: Final = 3
-"""Time without frames after which another node with this node-ID counts as gone, in heartbeat periods of this
-node. Both nodes usually have the same heartbeat period, and one heartbeat may be lost."""
+"""Silence, in heartbeat periods of this node, that ends a node-ID conflict with another node. Both nodes
+usually have the same heartbeat period, and the margin allows for a lost heartbeat."""
 _RIVAL_NS: Final = 750_000_000
-"""Time without frames after which another node with this node-ID counts as gone if this node sends no
-heartbeats, ns; three default heartbeat periods.
+"""Silence (ns) that ends a node-ID conflict with another node if this node sends no heartbeats: three default
+heartbeat periods.
 """
 
 
@@ -37,8 +37,8 @@ class ErrorControl:
 
     Args:
         services: resources that all services of the node share.
-        listen: called when the result of :meth:`handlers` has changed.
-        failed: called with the time of a heartbeat event or life guarding event, ns.
+        listen: called when the handlers returned by :meth:`handlers` have changed.
+        failed: called after a heartbeat event or life guarding event with the time of the event, in ns.
     """
 
     def __init__(
@@ -47,14 +47,14 @@ class ErrorControl:
         listen: Callable[[], None],
         failed: Callable[[int], None],
     ) -> None:
-        self._cob_id = 0  # set as soon as the node has a node-ID
+        self._cob_id = 0  # set when the node receives its node-ID
         store, emcy, now = services.store, services.emcy, services.now
         self._store, self._emcy, self._now = store, emcy, now
         self._rejected, self._send = services.rejected, services.send
         self._listen = listen
-        self._booted_ns: int | None = None  # time of boot-up, until the boot-up message has been sent
+        self._booted_ns: int | None = None  # time of boot-up; None after the boot-up message has been sent
         self._producer = HeartbeatProducer()
-        self._rival_until_ns = NO_DEADLINE_NS  # time at which another node with this node-ID counts as gone
+        self._rival_until_ns = NO_DEADLINE_NS  # end of a node-ID conflict if the other node stays silent
         self._guarding = Guarding(store, emcy, failed)
         self._consumer = HeartbeatConsumer(store, emcy, failed)
         store.watch(od.HEARTBEAT_PRODUCER, lambda _: self._on_period())
@@ -64,17 +64,17 @@ class ErrorControl:
 
     @property
     def deadline_ns(self) -> int:
-        """Time at which :meth:`on_timer` must be called next, ns."""
+        """Time (ns) at which :meth:`on_timer` must be called next."""
         boot_up_ns = NO_DEADLINE_NS if self._booted_ns is None else self._booted_ns
         return min(boot_up_ns, self._producer.deadline_ns, self.silent_from_ns, self._rival_until_ns)
 
     @property
     def silent_from_ns(self) -> int:
-        """Time from which a monitored node or the guarding master counts as silent, ns."""
+        """Time (ns) from which a monitored node or the guarding master is reported as silent."""
         return min(self._guarding.deadline_ns, self._consumer.deadline_ns)
 
     def handlers(self) -> dict[int, Handler]:
-        """Return the handlers of received data frames, by COB-ID."""
+        """Return the handlers for received data frames, keyed by COB-ID."""
         handlers: dict[int, Handler] = {
             od.heartbeat_cob_id(node_id): functools.partial(self._on_heartbeat, node_id)
             for node_id in self._consumer.node_ids
@@ -122,9 +122,11 @@ class ErrorControl:
             self._booted_ns = None
 
     def _on_own(self, _: bytes, t_ns: int) -> None:
-        """Report another node with this node-ID once; the error ends after three silent periods.
+        """Report once that another node has this node-ID.
 
-        Every frame from the other node is counted. The operator must correct the node-IDs.
+        The error ends after three heartbeat periods without frames from the other node.
+
+        Each frame from the other node is counted. Only an operator can resolve the node-ID conflict.
         """
         self._rival_until_ns = t_ns + (_RIVAL_BEATS * self._producer.period_ns or _RIVAL_NS)
         self._rejected.count(Rejected.OWN_ERROR_CONTROL)

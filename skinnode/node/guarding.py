@@ -13,12 +13,12 @@ from skinnode.node.object_dictionary import ObjectStore
 
 
 class Guarding:
-    """Guarding slave, which answers the master's guarding requests and reports if the requests stop.
+    """Guarding slave, which answers the master's guarding requests and reports when the requests stop.
 
     Args:
         store: object dictionary.
         emcy: emergency producer, which reports life guarding events.
-        failed: called after the emergency message, with the time of a life guarding event, ns.
+        failed: called after the emergency message with the time of the life guarding event, in ns.
     """
 
     def __init__(self, store: ObjectStore, emcy: EmcyProducer, failed: Callable[[int], None]) -> None:
@@ -26,10 +26,13 @@ class Guarding:
         self._toggle = 0
         self._guarded = False  # true after the first guarding request
         self.deadline_ns = NO_DEADLINE_NS
-        """Time at which the node life time expires, ns."""
+        """Time (ns) at which the node life time expires."""
 
     def reset(self) -> None:
-        """Reset the toggle bit and end guarding. The toggle bit is reset only by *reset communication*."""
+        """Reset the toggle bit and end guarding.
+
+        In CiA 301, only *reset communication* resets the toggle bit.
+        """
         self._toggle = 0
         self._guarded = False
         self.deadline_ns = NO_DEADLINE_NS
@@ -50,19 +53,20 @@ class Guarding:
     def on_written(self, t_ns: int) -> None:
         """Apply a new guard time or life time factor.
 
-        A running node life time restarts. If the new node life time is 0, a life guarding error ends.
+        The node life time restarts if guarding is active. A new node life time of 0 ends a life guarding
+        error.
         """
         if self._guarded or not self._life_ns:
             self._start(t_ns)
 
     def end(self, t_ns: int) -> None:
-        """End guarding, because heartbeats replace guarding. The next guarding request starts it again."""
+        """End guarding, because heartbeats replace guarding. The next guarding request restarts guarding."""
         self._guarded = False
         self.deadline_ns = NO_DEADLINE_NS
         self._emcy.clear(EmcyCode.HEARTBEAT, t_ns)
 
     def on_timer(self, t_ns: int) -> None:
-        """Report a life guarding event, once until the next request, if the node life time has expired."""
+        """Report a life guarding event if the node life time has expired, once until the next request."""
         if t_ns >= self.deadline_ns:
             self._guarded = False
             self.deadline_ns = NO_DEADLINE_NS

@@ -158,6 +158,7 @@ def test_a_file_without_an_end_is_refused() -> None:
 MISTAKES = {
     "[2010]": ("[201q]", "section: got '[201q]', allowed: [1018] for an object, "),
     "[2010sub1]": ("[201qsub1]", "section: got '[201qsub1]', allowed: [1018] for an object, "),
+    "[2010sub3]": ("[2010sb3]", "section: got '[2010sb3]', allowed: [1018] for an object, "),
     "[2010sub2]": ("[2010subq]", "section: got '[2010subq]', allowed: [1018] for an object, "),
     "2=0x2010": ("2=0x201q", "[ManufacturerObjects] 2: got '0x201q', allowed: an index such as 0x1018"),
     "1=0x1000": ("1=0x11000", "[MandatoryObjects] 1: got '0x11000', allowed: an index such as 0x1018"),

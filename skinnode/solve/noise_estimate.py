@@ -59,7 +59,7 @@ SAME: Final = 1e-14
 DEVIATIONS: Final = 4.0
 """Margin of each threshold, in standard deviations of the scatter.
 
-By chance, one block in 16,000 exceeds it.
+By chance, one block in 16,000 exceeds a threshold.
 """
 DEPARTED: Final = math.log(1.5)
 """Logarithm of the ratio of estimated to stated noise above which the estimate replaces the stated noise.

@@ -40,8 +40,8 @@ class EstimateOptions:
             under strain), as a fraction of each resistance's change. The full value applies to an error
             common to all resistances; 0.7 times this value applies to each resistance's independent error.
         tolerances: Manufacturing tolerances of the patch, to be included in the standard deviations; the
-            default None means an exact patch. Tolerances require resistances at rest measured on the patch
-            itself.
+            default None means an exact patch. The solver assumes that the resistances at rest were measured
+            on the patch itself.
         contacts: Whether to estimate contacts and forces.
         force_calibrated: Whether ``rubber`` reproduces known forces on this patch, for instance from presses
             with a load cell. A data sheet's modulus is not a calibration: forces are computed for a

@@ -40,14 +40,14 @@ The distance times this factor is added in quadrature to the standard deviation,
 distinguish roots that are very close.
 """
 NEAR_FOLD: Final = 2.0
-"""Factor applied, for the same reason as :data:`APART`, to the standard deviation of a posterior estimate
-that replaces a root near a fold."""
+"""Factor for the standard deviation of a posterior estimate that replaces a root near a fold; the reason
+is the same as for :data:`APART`."""
 
 Mask = NDArray[np.bool_]
 
 
 class RootGate:
-    """Gate that checks every field of an exact tracker with the posterior of its patch.
+    """Gate that checks each field of an exact tracker, using the posterior of the same patch.
 
     Each exact tracker needs its own gate.
 
@@ -119,7 +119,7 @@ class RootGate:
         Args:
             field: Field of the exact tracker.
             start: Value of :func:`skinnode.process.clock.perf_counter` when the update began, s.
-            again: Whether the same frame was already checked with a different selection of readings.
+            again: True if the same frame has already been checked with a different selection of readings.
         """
         doubtful: Mask | None = None
         self.hurried = False
@@ -148,7 +148,7 @@ class RootGate:
         return field
 
     def _doubtful(self) -> bool:
-        """Return whether any wire has no root (``_lost``) or a possibly wrong root (``_unsure``)."""
+        """Return whether any wire has no root (``_lost``), or a root that may be wrong (``_unsure``)."""
         found = check_roots(self._root_check.table)
         if found & SOME_ROUGH:
             if self._confirmed is not None:
@@ -175,7 +175,7 @@ class RootGate:
         )
 
     def _give_up(self, field: FieldFrame, doubtful: Mask) -> FieldFrame:
-        """Leave the doubtful wires without a root, because there is no time for a posterior solve."""
+        """Reject the roots of the doubtful wires, because there is no time for a posterior solve."""
         std = field.displacement_std_m.copy()
         std[doubtful] = np.inf
         self._apart[doubtful] = 0.0

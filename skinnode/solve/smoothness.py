@@ -1,7 +1,7 @@
-"""Gaussian covariance of the displacement of one upper wire, a model of the smoothness of rubber.
+"""Gaussian covariance of an upper wire's displacement, which models the smoothness of rubber.
 
 C_ij = s² exp(−d_ij² / 2ℓ²) for each coordinate, where d is the distance between two electrodes at rest. This
-covariance assumes less than an elastic model of the patch does, and requires no material constant. The
+model makes fewer assumptions than an elastic model of the patch, and requires no material constants. The
 covariance provides starting points for solves (:mod:`skinnode.solve.starts`) and ranks two roots of one wire:
 the root with the smaller roughness √(uᵀ C⁻¹ u) is likelier.
 """
@@ -17,10 +17,10 @@ from skinnode.model.layout import Float, PatchLayout
 from skinnode.solve.wires.problem import PatchProblem
 
 CORRELATION_PITCHES: Final = 1.0
-"""Correlation length ℓ, pitches. With a value of 1.0, the guided start finds 3204 of the 3209 roots on the
+"""Correlation length ℓ, pitches. At a value of 1.0, the guided start finds 3204 of the 3209 roots on the
 branch of the rest position. These roots come from four sets of 82 random presses on the staggered layout:
-presses of 70 % at h = 0.5, and of 10, 30 and 50 % at h = 1. With values of 0.7 and 1.5, the guided start
-finds fewer roots."""
+presses of 70 % at h = 0.5, and of 10, 30 and 50 % at h = 1. At 0.7 and 1.5, the guided start finds fewer
+roots."""
 ROUGH_SHARE: Final = 1e-3
 """Relative increase in the diagonal of C, which makes C invertible in floating point."""
 
@@ -55,7 +55,7 @@ class Smoothness:
 
 @functools.lru_cache(maxsize=64)
 def _covariance(layout: PatchLayout, size: float) -> tuple[Float, Float]:
-    """Return C (U, n, n) and its whitening matrix for displacements of roughly ``size`` pitches."""
+    """Return C (U, n, n) for displacements of roughly ``size`` pitches, and C's whitening matrix."""
     electrodes: Float = layout.upper_m / layout.pitch_m
     wires, most = electrodes.shape[:2]
     gaps = electrodes[:, :, None, :] - electrodes[:, None, :, :]

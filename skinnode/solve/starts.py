@@ -1,11 +1,10 @@
-"""Starting points for a sample or frame that cannot be solved from an earlier solution.
+"""Starting points for samples or frames that cannot be solved from an earlier solution.
 
 - ``guided_start`` finds the smooth displacement that explains the resistances (the maximum a posteriori
-  estimate), lowering the assumed noise in steps (data-space Gauss-Newton, Tarantola 2005, section 3.4).
-- ``near_twin`` estimates the second root, which is close by, across the fold, if J is nearly singular. Along
-  the direction v of the smallest singular value σ, the equation σ α + ½ α² wᵀF″[v, v] = 0 holds to second
-  order. Its solution α = −2σ / wᵀF″[v, v] is the position of the twin (Golubitsky & Schaeffer 1985, chapter
-  I.3).
+  estimate), while lowering the assumed noise in steps (data-space Gauss-Newton, Tarantola 2005, section 3.4).
+- ``near_twin`` estimates the second root across a fold, which is nearby if J is nearly singular. Along the
+  direction v of the smallest singular value σ, the equation σ α + ½ α² wᵀF″[v, v] = 0 holds to second order.
+  Its solution α = −2σ / wᵀF″[v, v] is the position of the twin (Golubitsky & Schaeffer 1985, chapter I.3).
 """
 
 from __future__ import annotations
@@ -23,11 +22,14 @@ from skinnode.solve.linalg.vectors import Index, dot, largest, padded
 from skinnode.solve.wires.problem import PatchProblem
 
 NOISE_LEVELS: Final[Float] = np.power(10.0, -0.5 * np.arange(2.0, 16.0))
-"""Noise levels of r in the guided start, from 0.1 to 3e-8, two per decade, with one step per level. With one
-level per decade, the guided start fails on one more wire in a hundred, for presses of 50 % at h = 1."""
+"""Noise levels of r in the guided start: two per decade from 0.1 to 3e-8, with one step per level.
+
+If there were only one level per decade, the guided start would fail on one more wire in a hundred (presses of
+50 % at h = 1).
+"""
 POWER_STEPS: Final = 8
-"""Number of inverse iterations; sufficient because the second-smallest singular value is about 3 times the
-smallest."""
+"""Number of inverse iterations, which is sufficient because the second-smallest singular value is about 3
+times the smallest."""
 DIFFERENCE: Final = 1e-4
 """Step of the central difference of Jacobians, pitches. The step exceeds eps^(1/3) = 6e-6, at which rounding
 and truncation errors are equal, and is far below any clearance."""
@@ -44,8 +46,8 @@ def guided_start(problem: PatchProblem, wire: int, a: Float, covariance: Float) 
             covariance of elastic rubber would also involve the neighbouring wires.
 
     Returns:
-        (n,) position, pitches, and the number of evaluations of F and J. If the iteration runs into an
-        electrode, the position is the rest position.
+        (n,) position, pitches, and the number of evaluations of F and J. The rest position is returned if the
+        iteration runs into an electrode.
     """
     n, equations = problem.rest.shape[1], a.size
     x = problem.rest[wire].copy()
@@ -73,8 +75,8 @@ def _follow_noise(  # noqa: PLR0913, C901 - a kernel: arrays and scratch by name
 ) -> int:
     """Take one Gauss-Newton step per noise level, in place: x = rest + C Jᵀ (J C Jᵀ + σ²)⁻¹ y.
 
-    Here y = J (x − rest) − r. All arguments after ``noises`` are scratch; ``inner`` is padded with zeros for
-    :func:`lu_factor`. Returns the number of evaluations.
+    In this formula, y = J (x − rest) − r. All arguments after ``noises`` are scratch; ``inner`` is padded
+    with zeros for :func:`lu_factor`. Returns the number of evaluations.
     """
     n, equations = jt.shape
     for level in range(noises.size):
@@ -115,7 +117,7 @@ def _follow_noise(  # noqa: PLR0913, C901 - a kernel: arrays and scratch by name
 
 
 def near_twin(problem: PatchProblem, x: Float, a: Float, inverse: Float) -> Float:
-    """Estimate, from two Jacobians, the root on the other side of the nearest fold.
+    """Estimate the root on the other side of the nearest fold, using two Jacobians.
 
     Args:
         problem: The patch.

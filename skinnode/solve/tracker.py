@@ -2,12 +2,12 @@
 
 ``exact`` inverts each wire separately, as the paper does; ``posterior`` estimates the whole patch with an
 elastic prior. ``auto`` chooses the exact inverse if this method is accurate enough at the converter's noise.
-Wires on which the exact inverse is doubtful are checked with the posterior (:mod:`skinnode.solve.root_gate`).
+Wires with a doubtful exact inverse are checked with the posterior (:mod:`skinnode.solve.root_gate`).
 
 If the stream shows that its noise differs from the stated noise, the tracker scales the stated noise
 (:mod:`skinnode.solve.noise_estimate`). With ``auto``, the tracker switches to the posterior if the noise is
-too large for the exact inverse, and back when the noise falls again. After a switch, the new method starts
-from the rest position.
+too large for the exact inverse, and back to the exact inverse when the noise falls again. After a switch, the
+new method starts from the rest position.
 """
 
 from __future__ import annotations
@@ -35,12 +35,11 @@ from skinnode.solve.root_gate import RootGate
 from skinnode.solve.wires.problem import PatchProblem
 
 NO_CODE: Final = np.uint32(0xFFFF_FFFF)
-"""Code that no converter sends; replaces the codes of readings that are left out."""
+"""Placeholder code for readings that are left out; no converter sends this code."""
 EXACT_STD: Final = 0.0025
-"""Standard deviation of the exact inverse at rest, in clearances, up to which ``auto`` chooses the exact
-inverse. The limit is 2.5 % of the depth of a press that indents the layer by a tenth of its thickness. With
-16-bit codes, the standard deviation is 0.0005 on the staggered layout, h = 0.5, and 0.05 on the aligned
-layout."""
+"""Maximum standard deviation at rest, in clearances, for ``auto`` to choose the exact inverse. The limit
+is 2.5 % of the depth of a press that indents the layer by a tenth of its thickness. For 16-bit codes, the
+standard deviation is 0.0005 on the staggered layout, h = 0.5, and 0.05 on the aligned layout."""
 
 
 class Tracker:
@@ -107,10 +106,10 @@ class Tracker:
         self.reset()
 
     def prepare(self) -> None:
-        """Compute tables in advance, for which the first frames of a touch would otherwise wait up to 0.1 s.
+        """Compute tables in advance; otherwise, the first frames of a touch would be delayed by up to 0.1 s.
 
         For the reference patch, computing the tables takes 0.25 s and 85 MB; trackers of the same layout
-        share them. A host calls this method before it starts the nodes.
+        share them. The host calls this method before starting the nodes.
         """
         self._posterior.check.prepare()
 
@@ -159,14 +158,13 @@ class Tracker:
         return self._judged(field)
 
     def update_codes(self, codes: NDArray[np.uint32]) -> tuple[FieldFrame, int]:
-        """Compute the field of a scan from its codes, much faster than by decoding and :meth:`update`.
+        """Compute the field of a scan from its codes; much faster than decoding followed by :meth:`update`.
 
         Args:
             codes: (U, K) uint32, converted by the mapping that the constructor received as ``codes``.
 
         Returns:
-            The field, as computed from the decoded resistances and their noise, and the number of invalid
-            codes.
+            The field, computed from the decoded resistances and their noise; and the number of invalid codes.
 
         Raises:
             ValueError: If the shape or type is wrong, or the tracker was created without ``codes``.
@@ -196,7 +194,7 @@ class Tracker:
 
     @property
     def scan(self) -> int | None:
-        """Scan number of the next frame, used for ``DataFault.since``; None if the tracker counts frames."""
+        """Scan number of the next frame, used for ``DataFault.since``; if None, the tracker counts frames instead."""
         return self._posterior.check.scan
 
     @scan.setter
@@ -206,7 +204,7 @@ class Tracker:
             self._check.scan = number
 
     def _checked(self, field: FieldFrame, ohm: Float, start: float) -> FieldFrame:
-        """Return the exact tracker's field with its data faults and the verdict on trust."""
+        """Return the exact tracker's field after adding its data faults and whether it is trusted."""
         exact = self._exact
         assert exact is not None
         its = exact.arrays
@@ -222,7 +220,7 @@ class Tracker:
         return self._check.check(solved(field), solve_without, until)
 
     def _judged(self, field: FieldFrame) -> FieldFrame:
-        """Return the field with its verdict on precision and, if the field is exact, with its contacts."""
+        """Return the field after adding whether it is precise and, for an exact field, its contacts."""
         if field.method == "exact" and self._contacts is not None:
             field = self._contacts.add(field)
         return field if is_precise(field, self._limits) else amended(field, precise=False)

@@ -25,8 +25,8 @@ NOISE: Final = EPS ** (2 / 3)
 """Relative rounding error of a central difference with the step :data:`DIFFERENCE`."""
 CURVED: Final = 0.05
 """Smallest scaled eigenvalue of the Hessian that is treated as positive. On the problems of Moré, Garbow &
-Hillstrom, this eigenvalue is at most 2e-6 at flat points and at least 0.38 at isolated minima. The
-exception is 0.003 on Watson's problem with n = 12, where rounding hides the curvature."""
+Hillstrom, this eigenvalue is at most 2e-6 at flat points and at least 0.38 at isolated minima. On Watson's
+problem with n = 12, where rounding hides the curvature, the eigenvalue is only 0.003."""
 CONTRACTION: Final = 0.5
 """Maximum ratio of successive Newton steps during convergence."""
 NEWTON_STEPS: Final = 8

@@ -77,12 +77,11 @@ def solve_system(  # noqa: PLR0913 - keyword arguments of the public interface
 
     Returns:
         The best iterate with its status and kind. CONVERGED means a root or, if there are more equations
-        than unknowns, an isolated minimum of ‖r‖; ``kind`` distinguishes the two. A minimum of a square
-        system with r ≠
-        0 is not a solution: its status is ILL_CONDITIONED, because J is singular there. A point that the
-        equations do not determine is ILL_CONDITIONED too. INVALID_START means fewer equations than unknowns,
-        or a residual or Jacobian that is not finite at ``x0``. Testing a minimum requires at least 2 n
-        Jacobians; ``stats`` includes them.
+        than unknowns, an isolated minimum of ‖r‖; ``kind`` distinguishes the two. In a square system, a
+        minimum with r ≠ 0 is not a solution: J is singular, so the status is ILL_CONDITIONED. A point that
+        the equations do not determine is ILL_CONDITIONED too. INVALID_START means fewer equations than
+        unknowns, or a residual or Jacobian that is not finite at ``x0``. Testing a minimum requires at least
+        2 n Jacobians; ``stats`` includes them.
 
     Raises:
         ValueError: If an argument is out of range, or an argument or returned array has the wrong shape. A

@@ -164,7 +164,7 @@ loads. For the only wrong maximum observed, the difference was 23.
 SUSPICIOUS: Final = 3.0
 """Value of a nuisance parameter, in prior standard deviations, above which the estimate is not held, but
 compared with an annealed estimate. A wrong drift or model error can mimic a displacement, and a stream
-that held it would not recover."""
+that held such an estimate would not recover."""
 BELIEVABLE: Final = 5.0
 """Value of a nuisance parameter, in prior standard deviations, above which the frame is INCONSISTENT."""
 IMPOSSIBLE_CHANCE: Final = 1e-9

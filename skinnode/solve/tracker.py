@@ -194,7 +194,7 @@ class Tracker:
 
     @property
     def scan(self) -> int | None:
-        """Scan number of the next frame, used for ``DataFault.since``; if None, the tracker counts frames instead."""
+        """Scan number of the next frame, for ``DataFault.since``; if None, the tracker counts frames."""
         return self._posterior.check.scan
 
     @scan.setter

@@ -1,4 +1,4 @@
-"""Creates the skeleton of this project's HTML pages, and escapes untrusted text in pages."""
+"""Creates the HTML skeleton of all pages that skinnode writes, and escapes untrusted text."""
 
 from __future__ import annotations
 

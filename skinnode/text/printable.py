@@ -2,12 +2,13 @@ r"""Makes untrusted text printable; only this module defines which characters ou
 
 Text from a device, a file, a recording or the command line is untrusted. The rules are:
 
-* Text from a bus or an EDS is made printable when it is decoded (:func:`printable`); its length is limited to
-  one line. The original bytes are preserved in ``od --json``, in a DCF and in comparisons.
-* A name in hand.toml that is not printable is rejected (``skinnode.config``).
-* The output of every command passes through :class:`PrintableStream`, and output from rich passes through the
-  console of ``skinnode.cli``. Both are safety nets for echoed text such as file names and arguments.
-* In HTML pages, text is also escaped, and untrusted text is never interpreted as markup.
+* Text from a bus or an EDS is made printable when decoded (:func:`printable`), and is limited to one line.
+The original bytes are preserved in ``od --json``, in a DCF and in comparisons. * A name in hand.toml that is
+not printable is rejected (``skinnode.config``). * The output of every command passes through
+:class:`PrintableStream`, and output from rich passes through the
+  console of ``skinnode.cli``. Both mechanisms are safety nets for echoed text, such as file names and
+  arguments.
+* In HTML pages, text is also HTML-escaped, so that untrusted text is never interpreted as markup.
 
 Text is printable according to :meth:`str.isprintable` if it contains no control characters (C0, DEL, C1), no
 format characters (some of which reverse the text direction or have no width) and no surrogates. Such
@@ -20,8 +21,8 @@ import re
 from typing import Any, Final, TextIO
 
 MOST: Final = 200
-"""Maximum number of characters of an untrusted text that are shown: longer than any name, but short enough
-for one line."""
+"""Maximum number of characters shown of an untrusted text; longer than any name, but short enough for one
+line."""
 
 _SUSPECT: Final = re.compile(r"[^ -~]")
 _SUSPECT_IN_LINES: Final = re.compile(r"[^\n\t -~]")
@@ -42,7 +43,7 @@ def printable(text: str | bytes, most: int = MOST) -> str:
 
 
 def printable_lines(text: str) -> str:
-    """Return ``text`` at full length without control sequences, but with its line ends and tabs.
+    """Return the whole ``text`` without control sequences, but keep its line ends and tabs.
 
     Use this function for messages that contain untrusted parts.
     """
@@ -57,7 +58,7 @@ def _escaped(found: re.Match[str]) -> str:
 class PrintableStream:
     """Wrapper for a text stream, such as stdout, that escapes control characters.
 
-    The attribute ``rich_proxied_file`` lets output from rich bypass the wrapper.
+    Because of the attribute ``rich_proxied_file``, output from rich bypasses the wrapper.
     """
 
     def __init__(self, stream: TextIO) -> None:

@@ -1,10 +1,10 @@
-"""Formats numbers with nouns, and unknown values, for messages."""
+"""Formats counted nouns and unknown values for messages."""
 
 from __future__ import annotations
 
 
 def counted(number: int, one: str, several: str = "") -> str:
-    """Return a number with its noun: ``1 node``, ``2 nodes``.
+    """Return a number with its noun, such as ``1 node`` or ``2 nodes``.
 
     Args:
         number: The number.

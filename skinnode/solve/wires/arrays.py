@@ -1,4 +1,4 @@
-"""Declarations of the arrays of a patch that kernels read and write, with name, element type and axes.
+"""Declarations (name, element type and axes) of the arrays of a patch that kernels read and write.
 
 A patch has U upper wires with N electrodes each and K lower wires with M electrodes each. An upper wire has n
 unknowns, which belong to E of its electrodes. Lengths are in pitches (see ``problem``).
@@ -25,11 +25,11 @@ Mask = NDArray[np.bool_]
 
 # Columns of a wire's integer report
 STATUS, EVALUATIONS, STEPS, BRANCH, HELD, SPARE, TURN, REPORT = range(8)
-# Columns of a wire's floating-point report. RESIDUAL is the weighted RMS over the equations in use; CHI2 is
+# Columns of a wire's floating-point report: RESIDUAL is the weighted RMS over the equations in use; CHI2 is
 # the χ² of the residual at the end of a solve, with SPARE (equations minus unknowns) degrees of freedom.
 RESIDUAL, OPTIMALITY, ERROR_ESTIMATE, CHI2, MEASURES = range(5)
 
-# Entry of a code map: relative noise before the converter
+# Index in a code map: relative noise before the converter
 NOISE: Final = 3
 
 # Actions for a wire
@@ -38,15 +38,15 @@ SOLVE: Final = 1
 PREDICT: Final = 2
 """Solve the wire, starting at x + (∂x/∂a) (a − a of the last solve)."""
 HOLD: Final = 3
-"""Like PREDICT, but keep x unchanged if its residual is within noise."""
+"""Like PREDICT, but keep x unchanged if the residual at x is within noise."""
 
 # Additional tasks of a solve, combined with bitwise or
 COVARIANCE: Final = 1
-"""Compute J⁻¹, and from it the standard deviation and the rounding error of x."""
+"""Compute J⁻¹, and use it to compute the standard deviation and the rounding error of x."""
 SKIP: Final = 2
 """Skip a wire whose first-order optimality ‖Jᵀr‖∞ is below tol_f (Xu et al. 2018, section 5.2)."""
 REUSE: Final = 4
-"""Follow a wire that moved only a little with its stored inverse, and keep this inverse."""
+"""If a wire has moved only a little, follow it using its stored inverse, and keep this inverse."""
 
 
 class SolveOptions(ArrayTable):
@@ -59,7 +59,7 @@ class SolveOptions(ArrayTable):
         tol_x: Largest remaining correction, relative to max(1, max|x|).
         max_steps: Maximum number of trial steps per wire.
 
-    Raises TypeError if a value has the wrong type, ValueError if a tolerance or ``max_steps`` is not
+    Raises TypeError if a value has the wrong type, and ValueError if a tolerance or ``max_steps`` is not
     positive.
     """
 
@@ -85,7 +85,7 @@ def solve_options(
 
 
 class SolverArrays(ArrayTable):
-    """State, results and workspace of a patch's solver, for wires with unknowns on E electrodes."""
+    """State, results and workspace of a patch's solver, for wires that have unknowns on E electrodes."""
 
     x: Annotated[Float, "U 3N"]
     """Starting point, then solution."""
@@ -100,7 +100,7 @@ class SolverArrays(ArrayTable):
     report: Annotated[Index, "U report"]
     measure: Annotated[Float, "U measures"]
     tally: Annotated[Index, "3"]
-    """Numbers of evaluations of F, evaluations of J, and steps, summed over calls."""
+    """Total numbers of evaluations of F, evaluations of J, and steps, over all calls."""
     lower: Annotated[Float, "3 M K", READONLY]
     electrodes: Annotated[Index, "U N"]
     """Indices of each wire's electrodes; electrodes with unknowns come first."""
@@ -109,7 +109,7 @@ class SolverArrays(ArrayTable):
     still_std: Annotated[Float, "U 3N"]
     """Standard deviation of the coordinates that are not unknowns."""
     turn: Annotated[Index, "1"]
-    """Frame number; determines which wires get a new inverse if inverses are reused."""
+    """Frame number, which determines the wires whose inverse is recomputed if inverses are reused."""
     step_limit: float
     """Initial trust radius, pitches per coordinate."""
     point: Annotated[Float, "3E"]
@@ -145,7 +145,7 @@ class FrameArrays(ArrayTable):
     todo: Annotated[Bytes, "U"]
     """LEAVE, SOLVE, PREDICT or HOLD."""
     order: Annotated[Index, "U"]
-    """Wires in processing order."""
+    """Indices of the wires, in processing order."""
     first: int
     """HOLD or PREDICT, the action for a wire that can be predicted."""
     pitch_m: float
@@ -154,9 +154,9 @@ class FrameArrays(ArrayTable):
     a_solved: Annotated[Float, "U K"]
     """Value of a at the last trusted position."""
     weight_solved: Annotated[Float, "U K"]
-    """Weights with which the inverse of each wire was computed."""
+    """Weights that were used to compute each wire's inverse."""
     predictable: Annotated[Mask, "U"]
-    """Whether the inverse of each wire in the solver was computed for the wire's x."""
+    """Whether the solver's inverse of each wire was computed at the wire's x."""
     unknowns: Annotated[Index, "U"]
     """Number of unknowns of each wire."""
     rest: Annotated[Float, "U 3N"]
@@ -164,7 +164,7 @@ class FrameArrays(ArrayTable):
     """Sign of det J at rest."""
     clearance: Annotated[Float, "U N"]
     good: Annotated[Mask, "U"]
-    """Whether the solver reached an acceptable root for each wire."""
+    """Whether the solver found an acceptable root for each wire."""
     status: Annotated[Index, "U"]
     moved_m: Annotated[Float, "U 3N"]
     """Displacement."""
@@ -220,4 +220,4 @@ class FrameArrays(ArrayTable):
 
 
 read_options, read_solver, read_frame = reader(SolveOptions), reader(SolverArrays), reader(FrameArrays)
-"""Functions that kernels use to read the fields of a table."""
+"""Functions with which kernels read the fields of a table."""

@@ -1,9 +1,9 @@
 """Compiled corrector: solves r = w (a F − 1) = 0 for one wire with an operator.
 
-The unknowns of a wire are all coordinates of its electrodes or fewer: some electrodes may stay at rest, or z
-may be the only unknown (``normal_only``). A system with fewer unknowns than equations is tall; χ² = Σ
-(ρ_k/σ_k)² at its minimum tests the fit. If χ² is above its 1 − 1e-9 quantile, no position explains the frame,
-and the wire is ILL_CONDITIONED. If χ² is above its 95 % quantile, the standard deviations are multiplied by
+A wire's unknowns are all or some of its electrodes' coordinates: some electrodes may be fixed at rest, and x
+and y may be fixed (``normal_only``). A system with fewer unknowns than equations is tall; χ² = Σ (ρ_k/σ_k)²
+at the minimum is used to test the fit. If χ² is above the 1 − 1e-9 quantile, no position explains the frame,
+and the wire is ILL_CONDITIONED. If χ² is above the 95 % quantile, the standard deviations are multiplied by
 √(χ²/dof) (Birge, Physical Review 40, 207, 1932). The χ² test replaces the test of the sign of det J, which is
 defined only for a square system.
 """
@@ -68,9 +68,9 @@ def _data_rounding(inverse: Float, weight: Float) -> float:
 def _evaluate(  # noqa: PLR0913 - arrays of one wire
     x: Float, point: Float, still: Float, lower: Float, a: Float, weight: Float, r: Float, raw: Float
 ) -> None:
-    """Copy the unknowns ``x`` into ``point``, and evaluate r = w (a F − 1) and the Jacobian of F there.
+    """Copy the unknowns ``x`` into ``point``; evaluate r = w (a F − 1) and the Jacobian of F at ``point``.
 
-    ``still`` (K,) is the potential of the electrodes that are not in ``point``.
+    ``still`` (K,) is the contribution to F from electrodes that are not in ``point``.
     """
     if x.size == point.size:
         for j in range(x.size):
@@ -95,7 +95,7 @@ def _take_jacobian(raw: Float, a: Float, weight: Float, jt: Float) -> None:
 
 @njit_part
 def coordinate(electrodes: Index, j: int, each: int) -> int:
-    """Return the coordinate index (< 3N) of unknown ``j``; ``each`` = 3 or 1 (z) unknowns per electrode."""
+    """Return the coordinate index (< 3N) of unknown ``j``; ``each`` is 3, or 1 if z is the only unknown."""
     if each == 3:
         return int(3 * electrodes[j // 3] + j % 3)
     return int(3 * electrodes[j] + 2)
@@ -158,11 +158,11 @@ def report_correction(  # noqa: C901, PLR0913 - one wire of a call; its results 
     u: int, solver: SolverArrays, options: SolveOptions, a_u: Float, w_u: Float, sigma: float, count: int,
     status: int, skipped: bool,
 ) -> int:  # fmt: skip
-    """Write x, report and measures of wire ``u``, for which :func:`correct` returned ``status``.
+    """Write x, report and measures of wire ``u``, after :func:`correct` returned ``status`` for this wire.
 
-    ``count`` is the number of equations. If COVARIANCE is one of the tasks, also writes the inverse and the
-    arrays that depend on it. Returns ``status``, or ILL_CONDITIONED if the root is poorly determined or fails
-    the χ² test.
+    ``count`` is the number of equations. If the tasks include COVARIANCE, also writes the inverse and the
+    arrays that depend on the inverse. Returns ILL_CONDITIONED if the root is poorly determined or fails the
+    χ² test, otherwise ``status``.
     """
     w: Any = solver.work
     unknowns, tol_f = w.x.size, options.tol_f
@@ -171,7 +171,7 @@ def report_correction(  # noqa: C901, PLR0913 - one wire of a call; its results 
     x_u, electrodes, measure = solver.x[u], solver.electrodes[u], solver.measure[u]
     for j in range(unknowns):
         value = w.x[j]
-        if status == CONVERGED and not skipped:  # adds the Newton correction of the convergence test
+        if status == CONVERGED and not skipped:  # add the Newton correction computed by the convergence test
             value += w.newton[j]
         x_u[coordinate(electrodes, j, each)] = value
     measure[RESIDUAL] = math.sqrt(dot(w.r, w.r) / count)

@@ -1,4 +1,4 @@
-"""Compiled conversion of the codes of a scan to the numbers that the solver uses.
+"""Compiled conversion of a scan's codes to the quantities that the solver uses.
 
 ``decode`` converts codes to resistances, by the formula of :mod:`skinnode.protocol.codes`, and to their
 standard deviations; ``scale`` converts resistances to a and weights (see ``problem``).
@@ -15,7 +15,7 @@ from skinnode.solve.wires.arrays import FrameArrays
 
 A_MIN: Final = 1e-12
 A_MAX: Final = 1e12
-"""Range of usable a. At rest, a is about 1 / (N M), so no plausible resistance is outside this range."""
+"""Range of usable a. At rest, a is about 1 / (N M); all plausible resistances are within this range."""
 
 
 @njit_part
@@ -48,7 +48,7 @@ def decode(frame: FrameArrays) -> int:
 def scale(frame: FrameArrays, sigma: float) -> float:
     """Compute ``a``, ``weight`` and ``used`` from ``ohm``, ``noise`` and ``valid``.
 
-    Returns σ, the smallest known standard deviation, or ``sigma`` if none is known.
+    Returns σ, the smallest known standard deviation, or ``sigma`` if no standard deviation is known.
     """
     frame_ohm, gain, noise, valid = frame.ohm, frame.gain, frame.noise, frame.valid
     a, weight, used = frame.a, frame.weight, frame.used

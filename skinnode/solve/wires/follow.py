@@ -1,4 +1,4 @@
-"""Compiled solver for a wire that moved only a little, using the inverse of an earlier position.
+"""Compiled solver for a wire that moved only a little; uses the inverse from an earlier position.
 
 Simplified Newton steps with the old inverse require only F, not J, and use the same convergence test as
 Newton's method (Deuflhard, Newton methods for nonlinear problems, 2004, 2.1). The contraction ratio of the
@@ -20,9 +20,9 @@ from skinnode.solve.linalg.vectors import largest
 FOLLOW_STEPS: Final = 4
 """Maximum number of simplified steps; each step takes a fifth of the time of a new inverse."""
 CONTRACTION: Final = 0.1
-"""Maximum size of a step relative to the previous step; a larger step requires a new Jacobian."""
+"""Maximum size of a step, relative to the previous step. If a step is larger, a new Jacobian is required."""
 FRESH: Final = 0.01
-"""Maximum size of the first step, relative to the prediction, for the inverse to be kept."""
+"""Maximum size of the first step, relative to the predicted step, for keeping the inverse."""
 
 
 @njit_part
@@ -52,12 +52,12 @@ def follow(  # noqa: PLR0913 - arrays of one wire
     x: Float, lower: Float, a: Float, inverse: Float, moved: float, tol_f: float, tol_x: float,
     rho: Float, step: Float,
 ) -> tuple[int, int, float]:  # fmt: skip
-    """Take simplified Newton steps for a square system whose unknowns are all coordinates ``x`` (3N,).
+    """Take simplified Newton steps for a square system in which all coordinates ``x`` (3N,) are unknowns.
 
-    ``moved`` is the size of the prediction that led to ``x``. Returns the number of evaluations of F
+    ``moved`` is the size of the predicted step that led to ``x``. Returns the number of evaluations of F
     (negative if no root was found), the number of steps added to ``x``, and the size of the first step
-    relative to the prediction. If a root was found, it is ``x`` + ``step``, and ``rho`` (K,) is the residual
-    at ``x``; otherwise ``x`` is the best iterate.
+    relative to the prediction. If a root was found, the root is ``x`` + ``step``, and ``rho`` (K,) is the
+    residual at ``x``. Otherwise, ``x`` is the best iterate.
     """
     before, first = moved, math.inf
     for evaluations in range(1, FOLLOW_STEPS + 1):

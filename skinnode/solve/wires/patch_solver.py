@@ -1,8 +1,8 @@
 """Buffers of one patch, and the single compiled call that reads and writes them.
 
 Each frame requires computations before and after its solve (see ``decode`` and ``stages``). A single compiled
-call performs all of them: each call from Python must check and unpack its arguments, which takes longer than
-any of these steps, especially with cold caches.
+call performs all of these computations, because checking and unpacking the arguments of a call from Python
+takes longer than any of the steps, especially if caches are cold.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from skinnode.solve.wires.problem import PatchProblem
 from skinnode.solve.wires.solve_wires import solve_wires
 from skinnode.solve.wires.stages import accept_roots, choose, start, store
 
-# Stages of a call, combined with bitwise or; they run in this order
+# Stages of a call, in the order in which they run; combined with bitwise or
 DECODE: Final = 1
 """Convert codes to resistances."""
 SCALE: Final = 2
@@ -43,7 +43,7 @@ SOLVE: Final = 8
 ACCEPT: Final = 16
 """Determine which wires reached an acceptable root."""
 STORE: Final = 32
-"""Store the outcome; if ACCEPT runs in the same call, only if all wires are good."""
+"""Store the outcome. If ACCEPT runs in the same call, the outcome is stored only if all wires are good."""
 
 # Findings of a call, combined with bitwise or
 ALL_GOOD: Final = 1
@@ -51,7 +51,7 @@ INCOMPLETE: Final = 2
 """See :func:`skinnode.solve.wires.stages.store`."""
 
 REST_TOLERANCE: Final = 1e-9
-"""Tolerance of the solve at the rest position, which is a root by construction, apart from rounding."""
+"""Tolerance for the solve at the rest position, which is a root by construction, apart from rounding."""
 _NO_FRAME: Final = np.zeros((1, 4), np.int64)
 
 
@@ -68,7 +68,7 @@ def solve_patch(  # noqa: PLR0913 - numba unpacks a tuple of arguments eight tim
     sigma: float,
     units: float,
 ) -> tuple[float, float, int, int]:
-    """Run ``stages`` of a frame; the arguments are as in :func:`solve_wires`.
+    """Run ``stages`` of a frame; the other arguments are the same as for :func:`solve_wires`.
 
     Returns the cost of the solve, σ, the number of invalid codes, and the findings.
     """
@@ -119,10 +119,13 @@ class PatchSolver:
         self.report = np.zeros((upper, wires.REPORT), np.int64)
         self.measure = np.zeros((upper, wires.MEASURES))
         self.tally = np.zeros(3, np.int64)
-        """Numbers of evaluations of F, evaluations of J, and steps since this array was last set to zero."""
+        """Numbers of evaluations of F, evaluations of J, and steps since this array was last reset to
+        zero."""
         self.turn = np.zeros(1, np.int64)
-        """(1,) frame number, incremented by SCALE; determines which wires receive a new inverse if inverses
-        are reused."""
+        """(1,) frame number, incremented by SCALE.
+
+        It determines the wires whose inverse is recomputed if inverses are reused.
+        """
         self.still_std = np.full((upper, unknowns), np.inf)
         """(U, 3N) standard deviation of the coordinates that are not unknowns, pitches."""
         self.each = 1 if normal_only else 3
@@ -130,21 +133,21 @@ class PatchSolver:
         most = unknowns // 3
         self.free = np.full(upper, most)
         """(U,) number of electrodes with unknowns."""
-        self._sizes: list[int] | None = [most]  # distinct values of ``free``; None if outdated
+        self._sizes: list[int] | None = [most]  # distinct values of ``free``; None if they must be recomputed
         self._in_turn = np.arange(upper)
         self._electrodes = np.tile(np.arange(most), (upper, 1))
         self._still = np.zeros((upper, lower))
         self._lower = problem.lower.copy()
-        self._arrays: dict[int, SolverArrays] = {}  # keyed by the number of electrodes with unknowns
+        self._arrays: dict[int, SolverArrays] = {}  # key: number of electrodes with unknowns
 
     def electrodes(self, u: int) -> Index:
         """Return the electrodes of wire u that have unknowns."""
         return self._electrodes[u, : self.free[u]]
 
     def set_electrodes(self, u: int, electrodes: Index) -> None:
-        """Make only these electrodes of wire u unknowns, and move the others to rest.
+        """Make only the given electrodes of wire u unknowns, and move all others to rest.
 
-        The call invalidates ``inverse`` and the arrays that depend on it until the next converged solve.
+        Until the next converged solve, ``inverse`` and the arrays that depend on ``inverse`` are invalid.
         """
         n = self.problem.layout.unknowns // 3
         rest = np.setdiff1d(np.arange(n), electrodes)
@@ -154,7 +157,7 @@ class PatchSolver:
         self._still[u] = self.problem.share_at_rest[u, rest].sum(axis=0)
 
     def solve_rest(self) -> Index:
-        """Compute J⁻¹ at the rest position; return the sign of det J (U,), 0 if det J is 0 or undefined."""
+        """Compute J⁻¹ at the rest position; return the sign of det J (U,), or 0 if it is undefined."""
         todo, weight = np.full(len(self.x), wires.SOLVE, np.uint8), np.ones_like(self.a_solved)
         self.x[:] = self.problem.rest
         options = solve_options(self.operator, wires.COVARIANCE, REST_TOLERANCE, REST_TOLERANCE, 1)
@@ -182,8 +185,8 @@ class PatchSolver:
             options: Operator, tasks and tolerances.
             sigma: Standard deviation of a residual of weight 1; 0 if unknown.
             order: (U,) wires in processing order; the default is 0, 1, 2, …
-            units: Time allowed, as in :func:`skinnode.solve.wires.solve_wires.solve_wires`. The report of a
-                processed wire has TURN = 1.
+            units: Time allowed, as in :func:`skinnode.solve.wires.solve_wires.solve_wires`. In the report of
+                each processed wire, TURN is 1.
 
         Raises TypeError if ``todo``, ``a`` or ``weight`` has the wrong element type or shape.
         """
@@ -200,7 +203,7 @@ class PatchSolver:
                     f"{np.dtype(dtype)} array of shape {due}"
                 )
         sizes = self._sizes or sorted(set(self.free[todo != wires.LEAVE].tolist()))
-        for size in sizes:  # more than one size only if electrodes are omitted
+        for size in sizes:  # there is more than one size only if electrodes are omitted
             chosen = todo if len(sizes) == 1 else np.where(self.free == size, todo, wires.LEAVE)
             spent, _, _, _ = solve_patch(
                 SOLVE,
@@ -219,7 +222,7 @@ class PatchSolver:
     def advance(
         self, stages: int, frame: FrameArrays, options: SolveOptions, sigma: float, units: float
     ) -> tuple[float, int, int]:
-        """Run ``stages`` of a frame in one call; SOLVE requires equal numbers of unknowns on all wires.
+        """Run ``stages`` of a frame in one call; SOLVE requires the same number of unknowns on all wires.
 
         Returns σ, the number of invalid codes, and the findings (ALL_GOOD, INCOMPLETE).
         """
@@ -238,7 +241,7 @@ class PatchSolver:
         return sigma, invalid, found
 
     def _table(self, size: int) -> NDArray[np.int64]:
-        """Return the table of all arrays, with a workspace for wires with unknowns on ``size`` electrodes."""
+        """Return the table of all arrays; its workspace is for wires with unknowns on ``size`` electrodes."""
         if size not in self._arrays:
             lower = self.problem.layout.shape[1]
             self._arrays[size] = SolverArrays(

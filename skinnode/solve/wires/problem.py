@@ -2,8 +2,8 @@
 
 Lengths are in pitches, and residuals are relative: r_k = w_k (a_k F_k − 1) with a_k = R_k / (R₀ F₀)_k. A
 residual is therefore a fraction of a resistance, regardless of the rubber and the size of the patch. If the
-rest resistances R₀ were measured, the resistivity and the gain of the front end cancel; otherwise R₀ F₀ is
-the layout's resistivity. The weights w_k = σ_min / σ_k account for noise that differs between equations, so
+rest resistances R₀ have been measured, the resistivity and the front end's gain cancel; otherwise, R₀ F₀ is
+the layout's resistivity. The weights w_k = σ_min / σ_k account for different noise in different equations, so
 that solving a tall system minimises χ². A weight of 0 drops an equation.
 """
 
@@ -21,9 +21,11 @@ from skinnode.model.kernels import lower_rows
 from skinnode.model.layout import Float, PatchLayout, require_array
 
 TRUST_SHARE: Final = 0.25
-"""Initial trust radius as a fraction of the electrodes' clearance at rest. F is smooth on the scale of the
-distance to the nearest charge, and in a live stream the skin moves less than this radius between two
-frames."""
+"""Initial trust radius as a fraction of the electrodes' clearance at rest.
+
+F is smooth on the scale of the distance to the nearest charge. In a live stream, the skin moves less than the
+trust radius between two frames.
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,20 +73,20 @@ class PatchProblem:
         return np.asarray((x - self.rest) * self.layout.pitch_m).reshape(self.layout.upper_m.shape)
 
     def out_of_reach(self, x: Float) -> NDArray[np.bool_]:
-        """Return the wires (U,) with an electrode farther from rest than its clearance at rest.
+        """Return a mask (U,) of the wires with an electrode farther from rest than its clearance at rest.
 
         F does not change if electrodes are reflected in the lower layer, or if two electrodes swap places.
-        Such roots are out of reach, because rubber pressed from outside does not move by more than its own
-        thickness.
+        Roots created by these symmetries are out of reach, because rubber that is pressed from outside does
+        not move farther than its own thickness.
         """
         moved = (x - self.rest).reshape(self.layout.upper_m.shape)
         with np.errstate(over="ignore"):
             return np.asarray(((moved**2).sum(axis=-1) > self.clearance**2).any(axis=1))
 
 
-@functools.lru_cache(maxsize=64)  # cached, because this takes 2 ms per layout
+@functools.lru_cache(maxsize=64)  # cached, because the computation takes 2 ms per layout
 def _at_rest(layout: PatchLayout) -> tuple[Float, Float, Float, Float, Float]:
-    """Return rest, lower, F, share_at_rest and clearance for a :class:`PatchProblem`, all read-only."""
+    """Return read-only arrays for a :class:`PatchProblem`: rest, lower, F, share_at_rest and clearance."""
     pitch = layout.pitch_m
     rest = layout.upper_m.reshape(layout.shape[0], -1) / pitch
     gaps = layout.upper_m[:, :, None, :] - layout.lower_m.reshape(1, 1, -1, 3)

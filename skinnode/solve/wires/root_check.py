@@ -37,14 +37,14 @@ class RootCheck(ArrayTable):
     lost: Annotated[Mask, "U"]
     """Output of the check: wires without a root."""
     unsure: Annotated[Mask, "U"]
-    """Output of the check: solved wires that have folds, or that moved by more than ``jump_m``."""
+    """Output of the check: solved wires that have folds or moved by more than ``jump_m``."""
     rough: Annotated[Mask, "U"]
     """Output of the check: solved wires farther than ``far_m`` from rest and rougher than ``rough_limit``."""
     jump_m: float
     far_m: float
     pitch_m: float
     rough_limit: float
-    """Largest ratio of the roughness of a displacement to its length."""
+    """Maximum ratio of a displacement's roughness to its length."""
 
 
 _read = reader(RootCheck)
@@ -66,9 +66,9 @@ def _rougher(moved_m: Float, pitch_m: float, whitening: Float, limit: float) -> 
 
 @njit_brief
 def check_roots(table: Index) -> int:
-    """Write ``lost``, ``unsure`` and ``rough`` of a :class:`RootCheck` from its other fields.
+    """Compute ``lost``, ``unsure`` and ``rough`` of a :class:`RootCheck` from the other fields.
 
-    Returns SOME_SUSPECT if any wire is lost or unsure, combined with SOME_ROUGH if any wire is rough.
+    Returns a combination of SOME_SUSPECT (a wire is lost or unsure) and SOME_ROUGH (a wire is rough), or 0.
     """
     check = _read(table)
     moved_m, last_m, status = check.moved_m, check.last_m, check.status

@@ -30,12 +30,12 @@ COVARIANCE_UNITS: Final = 3.0
 """Cost of the covariance of a square system with 30 unknowns, in units of one evaluation of F and J plus one
 step."""
 HELD_UNITS: Final = 0.25
-"""Cost of finding that a wire can be held, in units of one evaluation of F and J plus one step."""
+"""Cost of testing whether a wire can be held, in units of one evaluation of F and J plus one step."""
 
 
 @njit_part
 def _drop_unusable(a: Float, weight: Float) -> tuple[int, int]:
-    """Set a to 1 and weight to 0 where either is unusable; return the numbers of kept and lost equations."""
+    """Set a to 1 and weight to 0 if either is unusable; return the numbers of kept and dropped equations."""
     count, lost = 0, 0
     for k in range(a.size):
         if weight[k] > 0.0:
@@ -85,7 +85,7 @@ def _predict(u: int, solver: SolverArrays, a: Float, weight: Float) -> float:
 def _follow(  # noqa: PLR0913 - one wire of a call
     u: int, solver: SolverArrays, options: SolveOptions, a: Float, weight: Float, moved: float
 ) -> tuple[int, int, bool]:
-    """Follow wire ``u`` after a prediction of size ``moved``.
+    """Follow wire ``u`` after a predicted step of size ``moved``.
 
     Returns the number of evaluations of F, the number of steps, and whether the wire keeps its inverse.
     """
@@ -189,18 +189,18 @@ def solve_wires(  # noqa: PLR0913 - what changes from call to call
     sigma: float,
     units: float,
 ) -> float:
-    """Solve r_k = w_k (a_k F_k(x) − 1) = 0 for every upper wire in ``todo``, from its x in ``solver``.
+    """Solve r_k = w_k (a_k F_k(x) − 1) = 0 for every upper wire in ``todo``, starting at x in ``solver``.
 
     Args:
-        solver: Starting points and results; ``x`` and ``inverse`` come from the last converged solve.
+        solver: Starting points and results; ``x`` and ``inverse`` are those of the last converged solve.
         options: Operator, tasks and tolerances.
         todo: (U,) action for each wire: LEAVE, SOLVE, PREDICT or HOLD.
         a: (U, K) resistances; a value out of range is replaced with 1 and its weight with 0.
         weight: (U, K) weights; 0 drops an equation.
         order: (U,) wires in processing order.
         sigma: Standard deviation of a residual of weight 1; 0 if unknown.
-        units: Time allowed, in units of one evaluation of F and J plus one step. The call ends before the
-            first wire that may need more than the remaining time.
+        units: Time allowed, in units of one evaluation of F and J plus one step. The call returns before the
+            first wire that may take longer than the remaining time.
 
     Returns the estimated time spent, in the same unit as ``units``. A wire with fewer equations than unknowns
     keeps its x and is ILL_CONDITIONED, or NON_FINITE if a weight was set to 0.

@@ -1,7 +1,7 @@
-"""Compiled stages of a frame before and after its solve.
+"""Compiled computations that precede and follow the solve of a frame.
 
 ``start`` and ``choose`` run before the solve, ``accept_roots`` and ``store`` after it. These kernels replace
-about thirty NumPy calls on 300 numbers each, which would take longer than solving a patch at rest.
+about thirty NumPy calls on arrays of 300 numbers; the calls would take longer than solving a patch at rest.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ from skinnode.solve.wires import arrays as wires
 from skinnode.solve.wires.arrays import FrameArrays, SolverArrays
 
 STALE: Final = 2.0
-"""Factor by which an equation's weight may change before the J⁺ of a tall system is recomputed."""
+"""Maximum factor by which an equation's weight may change before J⁺ of a tall system is recomputed."""
 DEADLINE: Final = int(Status.DEADLINE)
 
 
 @njit_part
 def start(solver: SolverArrays, frame: FrameArrays) -> None:
-    """Start the solver at the last trusted positions, with every wire reported as unprocessed."""
+    """Start the solver at the last trusted positions, and mark every wire as unprocessed."""
     x, start_x, std = frame.x, solver.x, solver.std
     report, measure = solver.report, solver.measure
     for u in range(x.shape[0]):
@@ -53,8 +53,8 @@ def _stale(weight: Float, before: Float) -> bool:
 def choose(frame: FrameArrays) -> None:
     """Write the action for each wire into ``todo``: ``first`` if the wire can be predicted, else SOLVE.
 
-    The action is also SOLVE if the J⁺ of a tall system was computed for different weights, because
-    resistances on which that J⁺ relies may have become noisy.
+    If a tall system's J⁺ was computed for different weights, the action is also SOLVE, because resistances
+    that this J⁺ relies on may have become noisy.
     """
     predictable, unknowns, todo = frame.predictable, frame.unknowns, frame.todo
     used, weight, first = frame.used, frame.weight_solved, frame.first
@@ -102,8 +102,8 @@ def accept_roots(solver: SolverArrays, frame: FrameArrays) -> bool:
 def store(solver: SolverArrays, frame: FrameArrays) -> bool:
     """Store the position, a and weights of each solved wire; write the outcome of all wires.
 
-    The outcome of a wire is its displacement, the standard deviation, and whether the wire was held. Returns
-    whether a solved wire had an equation with zero weight; the value of ``a`` in such an equation is still
+    A wire's outcome consists of its displacement and standard deviation, and whether the wire was held.
+    Returns whether any solved wire had an equation of zero weight, for which the value of ``a`` is still
     unknown.
     """
     report, good = solver.report, frame.good

@@ -17,7 +17,7 @@ class FaultyPart(enum.StrEnum):
 
 
 class FaultKind(enum.StrEnum):
-    """Kind of error in the readings."""
+    """Kind of fault in the readings."""
 
     CONTRADICTS = "contradicts the other readings"
     CROSSED = "exchanged with another wire"

@@ -1,4 +1,4 @@
-"""Explanation, as text, of why a field is not trusted."""
+"""Text that states the reason why a field is not trusted."""
 
 from __future__ import annotations
 

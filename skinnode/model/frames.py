@@ -1,4 +1,4 @@
-"""Records that pass through the host: resistances of a scan as input, displacement fields as output."""
+"""Input and output records of the host: resistances of a scan, and displacement fields."""
 
 from __future__ import annotations
 
@@ -52,7 +52,8 @@ class ResistanceFrame:
     resistance_ohm: Float
     """(U, K) wire-to-wire resistances, ohm; NaN if not valid."""
     valid: NDArray[np.bool_]
-    """(U, K) validity; False if a chunk is missing, a wire is open or shorted, or a code is out of range."""
+    """(U, K) mask of the valid resistances; False if a chunk is missing, a wire is open or shorted, or a code
+    is out of range."""
     stamp: ScanStamp
 
 
@@ -106,7 +107,7 @@ class Contact:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FieldFrame:
-    """Displacement field of a patch with its uncertainty, and one status per wire."""
+    """Displacement field of a patch, its uncertainty, and the status of each wire."""
 
     displacement_m: Float
     """(U, N, 3) displacement from the rest position, metres."""

@@ -16,11 +16,11 @@ class Tolerances:
     """
 
     placement: float = 0.0
-    """Position of each upper and lower wire along each axis, pitches."""
+    """Position of each upper and lower wire along each axis, in pitches."""
     thickness: float = 0.0
     """Thickness of the layer between the electrodes, as a fraction of the clearance."""
     electrode_radius: float = 0.0
-    """Radius of the electrodes, which the forward model treats as points, pitches."""
+    """Radius of the electrodes, in pitches; the forward model treats electrodes as points."""
     gain: float = 0.0
     """Gain of the front end, as a fraction of the change in each resistance."""
 

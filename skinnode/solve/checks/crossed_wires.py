@@ -1,8 +1,8 @@
 """Crossed wires: two wires of the same layer whose readings are exchanged.
 
-If two wires were already crossed when the readings at rest were measured, the error stays invisible until the
-skin moves. After the exchange, the displacements of each wire are attributed to the other wire. Exchanging
-the readings of two wires changes the log evidence of a frame by −αᵀδ − ½ δᵀPδ. Here P is the precision of the
+If two wires were already crossed when the readings at rest were measured, the error is invisible until the
+skin moves. The displacements of each crossed wire are then attributed to the other wire. Exchanging the
+readings of two wires changes the log evidence of a frame by −αᵀδ − ½ δᵀPδ. Here P is the precision of the
 readings z, α = P z, and δ is the change of z due to the exchange. The test has no fitted parameters, so a
 difference of a few nats is significant.
 
@@ -109,8 +109,8 @@ def _gain(  # noqa: PLR0913 - a kernel: arrays by name
     """Return the gain in log evidence from exchanging the ``count`` readings of two wires.
 
     The first wire's readings have the indices ``start``, ``start + step``, …; add ``across`` to obtain the
-    indices of the second wire's readings. The upper bound −αᵀδ is computed first. If the bound does not
-    exceed ``enough``, it is returned instead of the gain.
+    indices of the second wire's readings. The upper bound −αᵀδ of the gain is computed first. If the bound
+    does not exceed ``enough``, the bound is returned instead of the gain.
     """
     linear, both = 0.0, 0
     for i in range(count):

@@ -52,7 +52,7 @@ EXCUSED_FRAMES: Final = 8
 """Number of frames after an examination during which similar frames are not examined again; an examination
 takes 9 ms."""
 PATIENCE: Final = 4
-"""Number of suspicious frames without time for an examination after which one is examined despite its
+"""Number of suspicious frames without time for an examination, of which the last is examined despite its
 deadline. A fault makes all subsequent frames suspicious; a press rarely does."""
 EXAMINATION_S: Final = 3e-3
 """Expected duration of the first examination, s. Later examinations use measured durations."""
@@ -433,7 +433,8 @@ class DataCheck:
         """Return the most likely wrong readings if several upper wires have no solution.
 
         If several upper wires have no solution, loads cannot explain the frame, so the search omits loads.
-        :meth:`check` compares the wrong readings with the field solved without them before it reports them.
+        Before :meth:`check` reports wrong readings, it compares them with the field that was solved without
+        them.
         """
         with np.errstate(divide="ignore", invalid="ignore"):
             np.log(self._problem.a_rest / solved.a, out=self._z)

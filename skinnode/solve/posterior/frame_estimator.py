@@ -57,7 +57,7 @@ class FrameEstimator:
     """Estimator of the displacement, loads and contacts of one patch, frame by frame.
 
     This class uses all available readings; :class:`skinnode.Posterior` also detects wrong readings. Do not
-    share an instance between owners. Compiled code releases the GIL; :meth:`warm_up` compiles it.
+    share an instance between owners. The kernels release the GIL; :meth:`warm_up` compiles them.
 
     Args:
         layout: The patch, with any number of lower wires.

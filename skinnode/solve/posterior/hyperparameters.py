@@ -26,8 +26,8 @@ its thickness."""
 SCALE_MOST: Final = 1.0
 """Maximum prior scale s, in clearances; with a larger scale, the surface could be below the lower layer."""
 SCALE_STEP: Final = math.log(1.25)
-"""Logarithm of the minimum change of the prior scale that triggers an update. The standard deviations change
-by a smaller factor than the scale."""
+"""Logarithm of the minimum change of the prior scale that triggers an update. A change of the scale changes
+the standard deviations by a smaller factor."""
 SCALE_LEAST: Final = 1.0
 """Minimum prior scale, relative to the scale of a field whose mean change of the resistances equals their
 noise. Smaller fields cannot be detected, so the standard deviations of an untouched patch must allow for

@@ -29,20 +29,21 @@ LOCAL_SPREAD: Final = 0.7
 smaller value improves the estimate if the rubber matches the prior, but makes the estimate overconfident if
 the rubber differs from the prior. With a value of 1, a quarter of the improvement is lost."""
 LOCAL_FLOOR: Final = 0.05
-"""Mean square load expected in cells without a found load, relative to the mean over the patch. This minimum
-allows for light touches near a press."""
+"""Mean square load expected in cells where no load was found, relative to the mean over the patch. This
+minimum allows for light touches near a press."""
 LOCAL_CHANGE: Final = 0.35
 """Minimum fraction of the expected loads that must change location before the prior is rebuilt. With a value
 of 0.5, errors in a slow press reach 6 standard deviations; with 0.25, twice as many frames need a rebuild."""
 LOCAL_SURPRISE: Final = 16.0
-"""Ratio of a cell's squared load to its expected squared load above which the prior is rebuilt even if the
-load locations hardly changed. Without this limit, the error of a press twice as deep as in the previous frame
-was 7 standard deviations after an unusual motion that left small expected loads. A value of 16 costs no time:
-in slow presses, the number of frames that need a factorisation is the same as without the limit."""
+"""Maximum ratio of a cell's squared load to its expected squared load; at larger ratios, the prior is rebuilt
+even if the load locations hardly changed. Without this limit, the error reached 7 standard deviations when an
+unusual motion had left small expected loads and the depth of the press then doubled in one frame. A value of
+16 costs no time: in slow presses, the number of frames that need a factorisation is the same as without the
+limit."""
 
 
 class LoadPrior:
-    """Prior u ~ N(0, s² C) of a patch's free coordinates, displaced by loads of unequal variance.
+    """Prior u ~ N(0, s² C) of a patch's free coordinates u; the variances of the loads may be unequal.
 
     Args:
         elastic: Elasticity of the patch.

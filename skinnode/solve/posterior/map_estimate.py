@@ -44,8 +44,8 @@ SETTLED: Final = 0.02
 CHORDS: Final = 4
 """Maximum number of chord steps per factorisation."""
 CHORD_RATE: Final = 0.35
-"""Ratio of successive chord step sizes above which a new factorisation is cheaper than further chord steps. A
-factorisation costs as much as ten chord steps."""
+"""Maximum ratio of successive chord step sizes; at larger ratios, a new factorisation is cheaper than further
+chord steps. A factorisation costs as much as ten chord steps."""
 NEWTONS: Final = 12
 """Maximum number of factorisations in a solve that starts near the maximum. A solve that starts near the
 maximum typically needs one or two factorisations, or more if full steps would oscillate."""
@@ -68,13 +68,14 @@ HALVINGS: Final = 6
 PRIOR_DOUBT: Final = 3.0
 """Factor applied to the part of the variance that only the prior determines, because the expected load at a
 location is known only roughly. With a factor of 1, the errors on one wire in 20 000 were 5 to 7 standard
-deviations at a first touch and in dents that a half-space cannot form. With a factor of 2, the error was 5.6
-standard deviations on one coordinate in 12 000 in such dents, and at most 5 in the hard cases."""
+deviations, at a first touch and in dents that cannot form on a half-space. With a factor of 2, the error in
+such dents was 5.6 standard deviations on one coordinate in 12 000, and at most 5 standard deviations in other
+difficult cases."""
 SMOOTH_SHARE: Final = 0.25
 """Factor that the 95 % interval applies to the part of the variance that only the prior determines.
-Independent loads on cells are rougher than the loads of real bodies. In measurements, the fraction of this
-variance that appeared in the errors was 0.0 to 0.13 for spheres, and 0.02 to 0.5 for Gaussian dents.
-The standard deviation covers the tail of the error distribution; the 95 % interval covers its centre."""
+Independent loads on cells are rougher than the loads of real bodies. The measured errors contain a fraction
+of 0.0 to 0.13 of the prior's part of the variance for spheres, and 0.02 to 0.5 for Gaussian dents. The
+standard deviation covers the tail of the error distribution; the 95 % interval covers its centre."""
 
 
 class MapEstimator:

@@ -28,8 +28,7 @@ PLACED: Final = 2.0
 class Posterior(FrameEstimator):
     """Estimator of the displacement, loads and contacts of one patch, frame by frame.
 
-    Do not share an instance between owners. Compiled code releases the GIL. The constructor compiles the
-    kernels.
+    Do not share an instance between owners. The kernels release the GIL. The constructor compiles them.
 
     Args:
         layout: The patch, with any number of lower wires.

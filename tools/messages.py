@@ -2,7 +2,7 @@
 
     python tools/messages.py [FOLDER...]
 
-A message is a string that contains a space and is not a docstring; help texts of options are messages, too.
+A message is a string, such as an option's help text, that contains a space and is not a docstring.
 Placeholders in braces stand for the values inserted by an f-string.
 """
 

@@ -1,4 +1,4 @@
-"""Measures accuracy, speed and the calibration of the reported uncertainty, and checks the requirements."""
+"""Measures accuracy, speed and calibration of the reported uncertainty, and checks the requirements."""
 
 from __future__ import annotations
 
@@ -104,7 +104,9 @@ def _text(value: float | None) -> str:
 
 
 def _print_front(panels: list[dict[str, Any]], echo: Callable[[str], object]) -> None:
-    echo(f"\nfour wires, no noise: each solver's fastest result with error {ACCURACY:.0e}; *: Pareto front")
+    echo(
+        f"\nfour wires, no noise: each solver's fastest result (error up to {ACCURACY:.0e}); *: Pareto front"
+    )
     for panel in panels:
         echo(f"  {panel['scene']:32}{'':22}{'tolerance':>10}{'µs per wire':>11}{'error':>10}")
         for row in best_of_each(panel["rows"]):
@@ -118,7 +120,7 @@ def _print_front(panels: list[dict[str, Any]], echo: Callable[[str], object]) ->
 
 
 def best_of_each(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return each solver's fastest row with an error up to ACCURACY, or its most accurate row if none."""
+    """Return each solver's fastest row with an error up to ACCURACY, or else its most accurate row."""
 
     def rank(row: dict[str, Any]) -> tuple[bool, float]:
         error = float("inf") if row["error"] is None else row["error"]
@@ -165,7 +167,7 @@ def _cell(row: dict[str, Any]) -> str:
 
 
 def _print_coverage(rows: list[dict[str, Any]], echo: Callable[[str], object]) -> None:
-    echo("\nrandom scenes: one or two sharp or blunt bodies at random positions, 5 to 30% deep")
+    echo("\nrandom scenes: one or two sharp or blunt bodies press 5 to 30% deep at random positions")
     echo(
         f"  {'layout':16}{'noise':>7} {'method':10}{'scenes':>7}{'conv.':>7}{'error':>10}{'reported':>10}"
         f"{'ratio':>7}{'in 95 %':>9}"
@@ -180,7 +182,7 @@ def _print_coverage(rows: list[dict[str, Any]], echo: Callable[[str], object]) -
             f"{row['scenes']:7}{row['converged']:7.0%}{_text(row['error']):>10}{_text(row['reported']):>10}"
             f"{ratio:>7}{covered:>9}"
         )
-    echo("  forces and contacts found by the posterior: RMS error (reported), fraction in the 95 % interval")
+    echo("  posterior's forces and contacts: RMS error (RMS reported), fraction inside the 95 % interval")
     for row in rows:
         if row["method"] == "posterior":
             where = f"{row['layout']} h={row['height']:g}"
@@ -200,7 +202,7 @@ def _print_coverage(rows: list[dict[str, Any]], echo: Callable[[str], object]) -
 
 
 def _print_parts(rows: list[dict[str, Any]], echo: Callable[[str], object]) -> None:
-    echo("  posterior errors divided by √(n + b): variance n due to noise, variance b due to the prior")
+    echo("  posterior errors / √(n + b), with the variances n due to noise and b due to the prior")
     echo(
         f"  {'b / (n + b)':16}{'coordinates':>12}{'RMS':>7}{'by noise':>10}{'b in it':>9}{'95 %':>7}"
         f"{'99.9 %':>8}{'kurtosis':>10}"

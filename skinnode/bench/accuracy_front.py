@@ -1,10 +1,10 @@
-"""Measures error versus time for four wires: our solvers and their peers use the same compiled F and J.
+"""Measures error versus time for our solvers and other libraries, with the same compiled F and J.
 
 Only the patch's four middle wires, which are pressed most deeply, are solved. The simulated samples are
 noise-free. Every solver starts from rest. A solver solves either only the last sample or, as in the paper, a
 sequence of samples: the solution of each sample is the initial guess for the next sample. Each solver is run
-with several tolerances, and each run yields one data point. The time of ``solve_path`` includes work that the
-bare operators omit: setting up the patch, following the branch, and estimating the error.
+with several tolerances, and each run yields one data point. The time of ``solve_path`` includes work that is
+not part of the other times: setting up the patch, following the branch, and estimating the error.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ class Scene:
     name: str
     layout: PatchLayout
     samples_ohm: Float
-    """(T, U, K), resistances of the pressed samples, ohm; the sample at rest is omitted."""
+    """(T, U, K), resistances in all samples except the sample at rest, ohm."""
     truth_m: Float
     """(U, N, 3), true displacement at the last sample, metres."""
 
@@ -96,7 +96,7 @@ def _path(scene: Scene, operator: str, schedule: Schedule, samples: int) -> tupl
 
 
 def _bare(scene: Scene, solve: Solve, samples: int, tolerance: float) -> tuple[float, float]:
-    """Time a bare operator or a peer; return the time per wire (µs) and the error."""
+    """Time an operator or another library's solver; return the time per wire (µs) and the error."""
     problem = PatchProblem.of(scene.layout)
     truth = problem.rest + scene.truth_m.reshape(len(problem.rest), -1) / scene.layout.pitch_m
     frames = scene.thinned(samples) * problem.gain
@@ -110,7 +110,7 @@ def _bare(scene: Scene, solve: Solve, samples: int, tolerance: float) -> tuple[f
                 x = solve(Case(problem, wire, frame, np.ascontiguousarray(x), truth[wire]), loose)
             found[wire] = x
 
-    with np.errstate(all="ignore"):  # a solver that diverges and overflows is recognised by its error
+    with np.errstate(all="ignore"):  # solvers that overflow are recognised by their errors
         us = _timed_us(paths) / len(found)
         return us, scene.error(problem.displacement_m(found))
 
@@ -161,7 +161,7 @@ def _rows(scene: Scene) -> list[dict[str, Any]]:
 
 
 def _schedules(tolerance: float) -> dict[str, tuple[Schedule, int]]:
-    """Return a mapping from a name to a step control and its number of samples."""
+    """Return the step controls and their numbers of samples, by name."""
     loose = max(tolerance, LOOSE)
     uniform = Uniform(intermediate_tolerance=loose, final_tolerance=tolerance)
     found: dict[str, tuple[Schedule, int]] = {

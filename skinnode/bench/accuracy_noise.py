@@ -76,7 +76,7 @@ class Pool:
         self._size += float((truth_m[used] ** 2).sum())
 
     def row(self) -> dict[str, Any]:
-        """Return the pooled statistics; errors are NaN if no wire converged."""
+        """Return the statistics of all added scenes; errors are NaN if no wire converged."""
         size = self._size or math.nan
         return {
             "scenes": self.scenes,
@@ -110,8 +110,8 @@ class Parts:
     def rows(self) -> list[dict[str, Any]]:
         """Return a row of statistics for each interval of b / (n + b), the prior's share of the variance.
 
-        Each row contains the RMS, quantiles and kurtosis of error / √(n + b), the RMS expected from n alone,
-        and the fraction of b that the errors actually contain.
+        Each row contains the RMS, quantiles and kurtosis of error / √(n + b), the RMS expected for b = 0, and
+        the ratio of the observed to the predicted variance due to the prior.
         """
         if not self._error:
             return []
@@ -316,8 +316,9 @@ def _random_scene(rng: np.random.Generator, layout: PatchLayout) -> tuple[Press,
 def coverage(scenes: int) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
     """Solve random scenes with both methods.
 
-    Returns: First, one row per layout, noise level and method; a posterior's row includes force errors.
-    Second, statistics of the posterior's errors in all scenes, grouped by the prior's share of the variance.
+    Returns: Two lists. The first list has one row per layout, noise level and method; rows of the posterior
+    include force errors. The second list contains statistics of the posterior's errors in all scenes, grouped
+    by the prior's share of the variance.
     """
     rows, parts = [], Parts()
     for kind, height, sigma in COVERAGE:

@@ -50,7 +50,7 @@ class Cycle:
 
 
 def _frames(skin: Skin, press: Press, sigma: float) -> Float:
-    """Return the frames (T, U, K) of a press from half to full depth, ohm."""
+    """Return the resistances (T, U, K), ohm, while a press deepens from half to full depth."""
     shares = np.linspace(0.5, 1.0, FRAMES)
     return stream(skin, (press,), shares, Converter(sigma=sigma), np.random.default_rng(5)).frames_ohm
 
@@ -58,10 +58,10 @@ def _frames(skin: Skin, press: Press, sigma: float) -> Float:
 def run(rounds: int) -> list[dict[str, Any]]:
     """Time each solver; return its time per frame (µs), its time limit, and its mean number of solved wires.
 
-    The time per frame is averaged over a cycle; the reported value is the median of all rounds. A real press
-    always moves more than three wires, because it deforms the whole half-space. To measure only three active
-    wires, the benchmark therefore masks the resistances of all other wires. Holding is disabled, so every
-    frame is solved.
+    The time per frame is averaged over a cycle; the median of all rounds is reported. A real press always
+    moves more than three wires, because it deforms the whole half-space. To measure only three active wires,
+    the benchmark therefore masks the resistances of all other wires. Holding is disabled, so every frame is
+    solved.
     """
     skin = Skin(preset("staggered", 0.5))
     layout, rest = skin.layout, skin.rest_ohm

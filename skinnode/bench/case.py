@@ -18,7 +18,7 @@ PITCH_M: Final = 4e-3
 FINE: Final = Converter(sigma=1e-5)
 """Converter with roughly the noise of a 16-bit converter."""
 STRIDE: Final = 4
-"""Stride at which a tracker takes its frames from the samples of a path."""
+"""Interval, in path samples, between the frames passed to a tracker."""
 DRIFT: Final = 0.02
 MODEL_ERROR: Final = 0.05
 """Relative error of ΔR as predicted by the wrong models of case 13. For a 30 % press on ``staggered`` at h =

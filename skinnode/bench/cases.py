@@ -250,7 +250,7 @@ def _wrong_roots() -> Iterator[Case]:
 
 
 def _sheared() -> Iterator[Case]:
-    """Yield deep presses with a friction coefficient of 0.8; the true displacement passes folds of F.
+    """Yield deep presses with a friction coefficient of 0.8; the true displacement passes through folds of F.
 
     For some wires, the posterior and the live trackers then converge to a smooth but wrong root. Only path
     methods use the intermediate samples that reveal this error.
@@ -319,7 +319,7 @@ def _after_detour(
         frames, valid, noise = converter.read(resistance, skin.rest_ohm, rng)
         press = (random_press(rng, skin.layout, 0.2),)
         after = stream(skin, press, np.array([0.3, 0.6, 1.0, 0.0]), converter, rng)
-        odd[0], odd[1:-1], odd[-1] = 0.0, np.nan, 0.0  # all resistances are back at their rest values
+        odd[0], odd[1:-1], odd[-1] = 0.0, np.nan, 0.0  # at both ends, R equals its rest value
         return Stream(
             np.concatenate([frames, after.frames_ohm]),
             np.concatenate([valid, after.valid]),

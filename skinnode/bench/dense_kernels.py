@@ -1,8 +1,8 @@
 """Compares our dense kernels with LAPACK in a child process that limits LAPACK to a single thread.
 
-After each call, LAPACK's worker threads keep spinning for some time. If a worker thread shares a core with
-the next kernel to be timed, that kernel takes up to three times as long. On a busy machine, the worker
-threads also have to wait for each other.
+After each call, LAPACK's worker threads keep spinning for a while. If a worker thread shares a core with the
+next kernel to be timed, that kernel takes up to three times as long. On a busy machine, the worker threads
+also have to wait for each other.
 """
 
 from __future__ import annotations

@@ -2,8 +2,8 @@
 
 In case 14, the data are wrong but not marked invalid. A solver claims to be accurate only for wires that are
 CONVERGED and trusted. Only trackers check their input data, so case 14 does not use the posterior without a
-tracker. The host detects a frozen wire by its repeated codes (:mod:`skinnode.host.frozen_parts`); a tracker
-receives only resistances and cannot perform this check.
+tracker. The host detects frozen wires from repeated codes (:mod:`skinnode.host.frozen_parts`); a tracker
+cannot, because it receives only resistances.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ SHARES: Final = np.array([0.0, 0.0, 0.0, 0.0, 0.25, 0.5, 0.75, 1.0, 1.0, 1.0, 1.
 FAILS: Final = 5
 """Index of the first frame with wrong data in case 14; by then, the press has begun."""
 TESTED: Final = ("exact", "auto")
-"""Methods that case 14 tests with wrong data."""
+"""Methods tested with wrong data in case 14."""
 KNOWN: Final = {
     ("upper wire frozen", "1e-5"),
     ("upper wire frozen", "1e-4"),
@@ -175,7 +175,7 @@ def _shorted(axis: int) -> Spoil:
 
 
 def _crossed(axis: int) -> Spoil:
-    """Return a function that swaps the R/R₀ of two adjacent wires, as if swapped before the baseline."""
+    """Return a function that swaps the R/R₀ of two adjacent wires, which were crossed before taring."""
 
     def spoil(rng: np.random.Generator, taken: Stream, skin: Skin) -> Stream:
         frames, wire = taken.frames_ohm.copy(), _wire(rng, taken, skin, axis)

@@ -1,7 +1,7 @@
 """Compares the compiled kernels with NumPy and LAPACK.
 
-The benchmark times F + J and one step of each operator for one wire of the reference patch, and the dense
-kernels at the size used by the patch's posterior.
+For one wire of the reference patch, the benchmark times F + J and one step of each operator. The dense
+kernels are timed with the matrix sizes of the reference patch's posterior.
 """
 
 from __future__ import annotations
@@ -91,7 +91,7 @@ def numpy_step(operator: str, wire: NumpyWire, x: Float, a: Float) -> Float:
                 )
         else:
             n = x.size
-            augmented = np.zeros((r.size + n, n + 1))  # yields Qᵀr 30 % faster than forming Q
+            augmented = np.zeros((r.size + n, n + 1))  # computes Qᵀr 30 % faster than with Q
             augmented[: r.size, :n] = j
             augmented[: r.size, n] = r
             np.fill_diagonal(augmented[r.size :], 0.1 * scale)
@@ -135,7 +135,7 @@ def compiled_steps(  # noqa: PLR0913 - a kernel takes its buffers
 
 
 def run(rounds: int) -> dict[str, Any]:
-    """Run the benchmark; return times (µs) per wire or dense-kernel call, and their ratios to ours."""
+    """Run the benchmark; return times (µs) per wire or per dense-kernel call, and ratios to our times."""
     layout = PatchLayout.preset("staggered", pitch_m=4e-3, height_m=2e-3)
     problem = PatchProblem.of(layout)
     rng = np.random.default_rng(1)

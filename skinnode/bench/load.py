@@ -45,7 +45,7 @@ _BEAT_S: Final = 0.1
 _FULL_S: Final = 1e-4
 
 _Queued = tuple[int, int, bytes, bool]
-"""Queued frame: time at which the node queued it (ns), COB-ID, data, and whether it is a CAN FD frame."""
+"""Queued frame: queueing time (ns), COB-ID, data, and whether the frame is a CAN FD frame."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,7 +53,7 @@ class Sent:
     """Results of a replay."""
 
     frames: dict[str, int]
-    """Number of frames sent on each bus, excluding heartbeats sent before the replay."""
+    """Number of frames sent on each bus, without the heartbeats sent before the replay."""
     bus_load: dict[str, float]
     """Bus load: fraction of the time that each simulated bus was busy."""
     late_p99_ms: float
@@ -198,7 +198,7 @@ def _node_frames(
         out.clear()
         command = (
             0x23 | (4 - size) << 2
-        )  # command byte of an expedited SDO download of `size` bytes, CiA 301, 7.2.4.3.3
+        )  # command byte of an expedited SDO download of `size` bytes (CiA 301, 7.2.4.3.3)
         multiplexer = index.to_bytes(2, "little") + bytes([subindex])
         node.on_frame(request, bytes([command]) + multiplexer + value.to_bytes(4, "little"), now_ns)
         assert out[-1][2][0] == 0x60, f"0x{index:04X}:{subindex} refused"

@@ -1,4 +1,4 @@
-"""Sets up the solvers of a hard case like an informed user would, and solves the case's streams."""
+"""Sets up the solvers for a hard case as an informed user would, and solves the case's streams."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def set_up(case: Case, name: str) -> Method:
 
 
 def last_only(name: str) -> bool:
-    """Return whether a method solves only for the last frame of a stream (path methods)."""
+    """Return whether a method yields a result only for the last frame of a stream."""
     return name.startswith("path ")
 
 
@@ -46,8 +46,7 @@ def _path(case: Case, how: str, stream: Stream) -> Solved:
         schedule=Adaptive() if adaptive else Uniform(),
         baseline_ohm=case.skin.rest_ohm,
     )
-    # Converts the error estimate to a standard deviation: an error up to LIMIT standard deviations is
-    # accepted, and the estimate is an upper bound.
+    # The error estimate is an upper bound, and errors up to LIMIT standard deviations are accepted.
     std = np.broadcast_to(path.error_estimate_m[:, None, None] / LIMIT, path.displacement_m.shape)
     return Solved(path.displacement_m[None], std[None], _converged(path.status)[None])
 

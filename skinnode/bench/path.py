@@ -14,12 +14,12 @@ optimality is that of the dimensionless residual r = a F − 1, with lengths in 
 that of F: larger by a factor of F² and dependent on the unit of length, which the paper does not state.
 
 Settings: At the paper's press depth of 10 %, our Gauss-Newton never fails: on ``aligned`` with h = 0.3, 0.4 …
-1, all 10 experiments are solved with any number of steps. The ``aligned`` setting for a depth of 10 % is
-therefore h = 1, the hardest. With h = 0.7 and a depth of 30 %, Gauss-Newton fails as often as in the paper:
-in 6 of 10 experiments with 5 steps, in 2 of 10 with 10 steps, and in none with 20 or more steps. This setting
-was found by a search over h = 0.3 … 1 and depths of 15 … 30 %. With h = 1 and a depth of 25 %, Gauss-Newton
-fails in 5 experiments with 5 steps and in 3 with 10 steps, but Levenberg-Marquardt also fails with more
-steps.
+1, all 10 experiments are solved with any number of steps. For a depth of 10 %, the benchmark therefore uses
+the hardest ``aligned`` setting, h = 1. With h = 0.7 and a depth of 30 %, Gauss-Newton fails as often as in
+the paper: in 6 of 10 experiments with 5 steps, in 2 of 10 with 10 steps, and in none with 20 or more steps.
+The setting h = 0.7 and 30 % was found by a search over h = 0.3 … 1 and depths of 15 … 30 %. With h = 1 and a
+depth of 25 %, Gauss-Newton fails in 5 experiments with 5 steps and in 3 with 10 steps, but
+Levenberg-Marquardt also fails with more steps.
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ def printed() -> dict[str, Any]:
 
 @dataclass(frozen=True, eq=False)
 class Experiment:
-    """A press and the resistances of one wire along it."""
+    """A press, and one wire's resistances during the press."""
 
     layout: PatchLayout
     """Layout of the single wire."""
@@ -213,7 +213,7 @@ def _mean(values: Sequence[float]) -> float | None:
 
 
 def _path_rows(path: PathResult) -> slice:
-    """Return the slice of rows that belong to the path, without cycle search, second attempts and checks."""
+    """Return the slice of the path's own rows, which excludes cycle search, second attempts and checks."""
     at = path.position[path.searched :, 0]
     return slice(path.searched, path.searched + int(np.argmax(at == np.nanmax(at))) + 1)
 
@@ -378,8 +378,8 @@ def print_all(figures: dict[str, Any], say: Say) -> None:
     """Print the tables and the figure data, with the paper's values for comparison."""
     paper, count = figures["paper"], figures["experiments"]
     say(f"Means of {count} experiments; one wire, {UNKNOWNS} unknowns; tolerances 1e-6 and 1e-12.")
-    say("As in the paper: Uniform(plain=True). Ours: Uniform(), with extrapolation and a second attempt.")
-    say("Tol_X: largest remaining correction, in pitches. Times: median per call for the single wire.")
+    say("As in the paper: Uniform(plain=True). Ours: Uniform(), adding extrapolation and a second attempt.")
+    say("Tol_X: largest component of the next correction, in pitches. Times: median for one wire.")
     say("Ten-step path of one wire (paper: 2.03 s)")
     for row in figures["ten_steps"]:
         say(f"  {row['what']:32}{row['ms']:6.2f} ms, error {100 * row['error']:.0e} %")
@@ -391,7 +391,7 @@ def print_all(figures: dict[str, Any], say: Say) -> None:
     wrong = sum(row["wrong"] for setting in figures["settings"] for row in _rows(setting))
     say(f"\nWires CONVERGED but wrong, over all settings and schedules: {wrong}")
     surface = figures["surface"]
-    say("figure 13, surface at the last setting: maximum coordinate error, wires not converged")
+    say("figure 13, surface in the last setting: maximum coordinate error, number of unconverged wires")
     for path in surface["paths"]:
         say(f"  {path['title']:44}{path['error_um']:10.2e} µm  {path['converged'].count(False)} of 10")
 
@@ -444,7 +444,7 @@ def _print_operators(setting: dict[str, Any], paper: dict[str, Any], count: int,
                 f"  {_accuracy(own, count)}"
             )
     say(
-        f"cells in which ours solves all experiments more accurately than the paper: {better} of "
+        f"cells in which our path solver solves all experiments more accurately than the paper: {better} of  "
         f"{len(LABELS) * len(STEPS)}"
     )
 
@@ -481,7 +481,7 @@ def _print_figures(setting: dict[str, Any], paper: dict[str, Any], say: Say) -> 
         shown = calls if len(calls) <= 19 else calls[:19]
         dots = "" if len(calls) <= 19 else " …"
         say(f"  {n:>3} steps  " + " ".join(f"{each:.1f}" for each in shown) + dots)
-    say("figures 9 and 10, first-order optimality: number of samples between solves (cycle T)")
+    say("figures 9 and 10, first-order optimality: cycle T, the number of samples between solves")
     say(f"  {'tolerance':>10}" + "".join(f"{n + ' samples':>13}" for n in ("20", "50", "100")))
     for tolerance, cycles in setting["cycles"].items():
         say(f"  {tolerance:>10}" + "".join(f"{_figure(cycles[n], 'g'):>13}" for n in ("20", "50", "100")))

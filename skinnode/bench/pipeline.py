@@ -48,8 +48,8 @@ SCENES: Final = (
 )
 """Scenes as (CAN FD or not, patches touched or not, offset between SYNCs in ms)."""
 DEADLINE_US: Final = 1000
-"""Deadline for solving a scan, µs. An exact inverse takes 200 µs, but 13 ms if the posterior is needed to
-verify it."""
+"""Deadline for solving a scan, µs. An exact inverse takes 200 µs; if the posterior has to verify the result,
+it takes 13 ms."""
 RECEIVE_US: Final = 5.0
 LATENCY_MS: Final = 5.0
 SETTLE_S: Final = 5.0
@@ -170,7 +170,7 @@ def _measure(hand: HandConfig, generator: Generator) -> Row:
     generator.send_heartbeats(names)
     with Host.from_config(hand, open_port=open_port) as host, _Reader(host.fields()) as reader:
         begin_ns = generator.begin()
-        time.sleep(LEAD_S / 2)  # wait until the last heartbeat sent before the replay has been received
+        time.sleep(LEAD_S / 2)  # until the last heartbeat sent before the replay has arrived
         read_before = _read(host)
         before, begin_s = _cpu_s(), time.monotonic()
         sent = generator.wait()
@@ -279,7 +279,7 @@ def _read(host: Host) -> int:
 
 
 def _settle(host: Host) -> None:
-    """Wait until the host's counters stop changing."""
+    """Wait until the host's counters no longer change."""
     end_s, last = time.monotonic() + SETTLE_S, None
     while time.monotonic() < end_s:
         stats = host.stats()

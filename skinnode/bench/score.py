@@ -18,8 +18,8 @@ from skinnode.model.layout import Float, PatchLayout
 
 OUTLIER_DEVIATIONS = 6.0
 """Maximum permissible error of a coordinate, in reported standard deviations. A run scores about 1e5
-coordinates, of which on average only 2e-4 exceed six standard deviations by chance. The false-alarm rate is
-therefore one per 5,000 runs."""
+coordinates; on average, the errors of 2e-4 coordinates exceed six standard deviations by chance. The expected
+false-alarm rate is therefore one per 5,000 runs."""
 
 EXCESS_LIMIT = 1.15
 """Maximum permissible ratio of a run's RMS error to its RMS reported standard deviation."""
@@ -86,7 +86,7 @@ class Scorer:
     layout: PatchLayout
     code_std: float
     bound_every: int = 10
-    """Interval, in scans, at which the slowly changing Cramér-Rao bound is computed."""
+    """Number of scans between computations of the Cramér-Rao bound, which changes slowly."""
     _scans: int = 0
     _untrusted: int = 0
     _squares: float = 0.0

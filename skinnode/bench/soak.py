@@ -1,13 +1,13 @@
 """Soak test with random faults: checks that host and patches recover, and that all frame counters agree.
 
-The host and the simulated nodes run in the same process and communicate over two virtual buses. Each round
-injects one to three kinds of fault, such as dropped frames, into one patch or all patches. During the round,
-subscribers subscribe and unsubscribe. At the end of the round, the faults are removed, and the test waits
-until every patch is operational and publishes fields again. In some rounds, additional child processes keep
-all processors busy. Memory use is measured without faults, after a warm-up and at the end. The measurements
-are the resident memory and the number of blocks allocated by Python (:func:`sys.getallocatedblocks`). The
-number of blocks would reveal even a leak of one object per scan. This module may import the simulator, like
-the demo, because the simulator injects the faults.
+The host and the simulated nodes run in the same process and communicate over two virtual buses. Each round of
+the test injects one to three kinds of fault, such as dropped frames, into one or all patches. Subscribers
+come and go during each round. At the end of the round, the faults are removed, and the test waits until every
+patch is operational and publishes fields again. In some rounds, additional child processes keep all
+processors busy. Memory use is measured without faults, after a warm-up and at the end. The measurements are
+the resident memory and the number of blocks allocated by Python (:func:`sys.getallocatedblocks`). The number
+of blocks would reveal even a leak of one object per scan. This module may import the simulator, like the
+demo, because the simulator injects the faults.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ TARED: Final = 0.2
 CALM_S: Final = 1.5
 _PATCHES: Final = 4
 _MANY: Final = 8
-"""Number of simultaneous fault kinds from which a report states only the number instead of the names."""
+"""Minimum number of simultaneous fault kinds for which a report states the number instead of the names."""
 
 _KINDS: Final[tuple[dict[str, Any], ...]] = (
     {"lost": 0.05},
@@ -170,7 +170,7 @@ def run(minutes: float, seed: int, report: Callable[[str], None]) -> dict[str, A
     try:
         fleet = Fleet(hand, faults=Faults(seed=seed))
         for source in fleet.patches.values():
-            for k in range(REMEMBERED_READINGS):  # a growing history would look like a leak
+            for k in range(REMEMBERED_READINGS):  # fill the history, which otherwise grows
                 source.read(-1000 * TIME_STEP_US * (k + 1))
         with fleet:
             before = {bus.name: Counter(fleet.passed(bus.name).sent) for bus in hand.buses}
@@ -346,8 +346,8 @@ def _wait_for_patches(host: Host, names: list[str]) -> tuple[float, str]:
     """Wait until every patch is operational and has published a field whose SYNC was sent after the call.
 
     Returns:
-        The waiting time in s, and a text that names the last patch to become ready and the reason for the
-        delay.
+        The waiting time in s, and a text that names the last patch for which the function waited and the
+        reason.
     """
     begin_ns, waited_for = time.monotonic_ns(), ""
 

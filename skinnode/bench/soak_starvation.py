@@ -10,8 +10,8 @@ from collections.abc import Iterator
 from typing import Final
 
 _NICE: Final = -5
-"""Nice value of the child processes. If the user lacks the permission to set it, the parent's nice value is
-used."""
+"""Nice value of the child processes. If the user may not set this value, the child processes inherit the
+parent's nice value."""
 _CHILDREN_PER_PROCESSOR: Final = 3
 _LONGEST_S: Final = 30.0
 """Maximum lifetime of a child process, s; a child also exits when its parent has exited."""
@@ -27,7 +27,7 @@ while time.monotonic() < end_s and os.getppid() == parent:
 
 @contextlib.contextmanager
 def starved_processor() -> Iterator[int]:
-    """Keep every processor busy with child processes during the ``with`` block. Yields their number."""
+    """Keep all processors busy during the ``with`` block. Yields the number of child processes."""
     count = _CHILDREN_PER_PROCESSOR * len(os.sched_getaffinity(0))
     children: list[subprocess.Popen[bytes]] = []
     try:

@@ -102,7 +102,7 @@ def of_host(fleet: Fleet) -> list[KindSums]:
 def received_otherwise(fleet: Fleet, counter: FrameCounter, before: Mapping[str, Counter[Kind]]) -> list[str]:
     """Compare the counters of frames from the nodes to the host; return a line of text for each mismatch.
 
-    The nodes must be silent during the call.
+    All nodes must be silent during the call.
 
     Args:
         fleet: Simulated nodes.

@@ -1,7 +1,7 @@
 """Compares our solvers with other libraries, using the same F and J for one wire at a time.
 
-The benchmark solves each wire of the reference patch. The initial guess is the solution for a 9 % press, as
-in the last of ten steps to a 10 % press. Every solver is timed with its loosest tolerance that leads to a
+The benchmark solves each wire of the reference patch. The initial guess is the solution for a 9 % press, and
+the benchmark solves for a 10 % press. Every solver is timed with its loosest tolerance that leads to a
 displacement error of at most 1e-9. A solver that does not reach this error with any tolerance is listed
 without a time.
 """
@@ -55,7 +55,7 @@ class Case:
         return np.asarray(self._jt * self.a)
 
     def residual_beside_jacobian(self) -> Float:
-        """Return the residual at the point of the latest Jacobian; both were computed together."""
+        """Return the residual that was computed together with the latest Jacobian."""
         return np.asarray(self.a * self._scratch - 1.0)
 
     def jacobian(self, x: Float) -> Float:

@@ -47,7 +47,7 @@ SHORT: Final[dict[str, Any]] = {
 }
 """Options for a short run of :func:`run`."""
 WATCHED: Final = 4000
-"""Number of scans, with ten touches in total, in each stream for counting false alarms."""
+"""Number of scans in a stream for counting false alarms; such a stream contains ten touches."""
 QUIET: Final = Timeline(rest=200, press=10, hold=30, slide=40, release=10, after=110)
 """Phases of each touch in the streams for counting false alarms."""
 PAIRED: Final = Timeline(rest=9, press=6, hold=7, slide=6, release=4, after=6)
@@ -60,7 +60,7 @@ class Item:
 
     section: str
     row: str
-    """Report row to which the stream's score is added."""
+    """Name of the report row to which the stream's score is added."""
     setting: Setting
     load: str
     faults: tuple[str, ...] = ()

@@ -9,8 +9,7 @@ read    readings, after the converter has added noise
 sent    codes, on their way to the host
 stated  noise or tolerances stated in the hand file
 
-``Signal.bad`` marks the readings changed by a fault. If the host reports a fault of other readings, this is a
-false alarm.
+``Signal.bad`` marks the readings changed by a fault. A fault reported for any other reading is a false alarm.
 """
 
 from __future__ import annotations
@@ -155,7 +154,7 @@ def _stick(constant: bool) -> InPlace:
     def sent(signal: Signal) -> None:
         t, (u, k) = _at_rest(signal), _crossing(signal)
         value = signal.codes[t, u, k]
-        if constant:  # a constant R/R₀ between 0.6 and 1.1
+        if constant:  # the stuck value is an R/R₀ between 0.6 and 1.1
             value = np.uint32(round((float(signal.rng.uniform(0.6, 1.1)) - SCALE.lo) / SCALE.step))
         signal.codes[t + 1 :, u, k] = value
         signal.bad[t + 1 :, u, k] = True
@@ -170,7 +169,7 @@ def _flip(signal: Signal, scans: slice, u: int, k: int, bit: int) -> None:
 
 
 def _flip_once(signal: Signal) -> None:
-    """Flip a bit of one code in one scan; the bit is more significant than the noise."""
+    """Flip one bit of one code in one scan; the bit's value exceeds the noise."""
     t = int(signal.rng.integers(2, signal.shape[0] - 2))
     _flip(signal, slice(t, t + 1), *_crossing(signal), int(signal.rng.integers(6, 16)))
 

@@ -1,9 +1,9 @@
-"""Loads for ``skinnode bench trust``; they do not comply with the posterior's prior.
+"""Loads for ``skinnode bench trust``, which violate the assumptions of the posterior's prior.
 
-The prior assumes independent loads on the cells of a lattice. The loads in this module are independent of the
-lattice: closed-form solutions for a sphere and for a flat punch, line loads at any angle, a dent that no load
-on a half-space can produce, and a rigid plate that covers the whole patch. The true force is known for bodies
-that press on a half-space or on a layer.
+The prior assumes independent loads on the cells of a lattice. The loads in this module do not use a lattice:
+closed-form solutions for a sphere and for a flat punch, line loads at any angle, a dent that no load on a
+half-space can produce, and a rigid plate that covers the whole patch. The true force is known for bodies that
+press on a half-space or on a layer.
 
 The shear traction is proportional to the pressure. The rubber is incompressible (ν = ½). On a half-space,
 pressure therefore causes no tangential displacement, and shear causes no normal displacement.
@@ -49,7 +49,7 @@ class Punch:
     def displacement_m(self, points_m: Float, share: float) -> Float:
         """Return the displacement due to the pressure p₀/√(1 − r²/a²) and a proportional shear traction.
 
-        With Φ = ∫ p/|d| and S = ∫₀ʳ Φ s ds / r², ∫ p d dᵀ/|d|³ = (Φ − S) I + (2S − Φ) d dᵀ/r².
+        Let Φ = ∫ p/|d| and S = ∫₀ʳ Φ s ds / r². Then ∫ p d dᵀ/|d|³ = (Φ − S) I + (2S − Φ) d dᵀ/r².
         """
         offset, a = points_m - self.center_m, self.radius_m
         r = np.maximum(np.hypot(*offset.T), 1e-12)

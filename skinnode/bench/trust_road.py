@@ -1,7 +1,7 @@
 """Runs a host and simulated nodes with faults on virtual buses, for ``skinnode bench trust``.
 
 Simulated spheres press on a hand of full-size patches. After a fault-free period, a different fault is
-injected into each patch. This module may import the simulator, because the simulator injects the faults.
+injected into each patch. This module is permitted to import the simulator, which injects the faults.
 """
 
 from __future__ import annotations
@@ -138,7 +138,7 @@ def _row(
 
 
 def _truth_m(field: FieldFrame, source: SimulatedPatch) -> Float:
-    """Return the true electrode positions at the time of conversion, or of the SYNC if that is unknown."""
+    """Return the true electrode positions at the conversion time or, if unknown, at the time of the SYNC."""
     stamp = field.stamp
     assert stamp is not None
     try:

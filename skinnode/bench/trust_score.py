@@ -141,11 +141,11 @@ def is_right(fault: DataFault, bad: Mask) -> bool:
 
 
 Naming = tuple[FaultyPart, int | None, int | None, int]
-"""Reported fault: part, upper wire, lower wire, and number of the first affected scan."""
+"""Reported fault: part, upper wire, lower wire, and first affected scan."""
 
 
 def judge(taken: CodeStream, fields: Sequence[FieldFrame], known: set[Naming] | None = None) -> Score:
-    """Score the fields of a stream.
+    """Score the fields of a stream, and count false alarms.
 
     Args:
         taken: The stream.

@@ -2,7 +2,7 @@
 
 ::
 
-    load, timeline -> displacement -> resistances of the true patch -> noise -> faults -> codes -> faults
+    load, timeline -> displacement -> true resistances -> noise -> faults -> codes -> faults
 
 A stream has six phases: the patch is at rest; a load is applied, held, moved sideways and released; the patch
 is at rest again.
@@ -132,7 +132,7 @@ class Setting:
 
     @property
     def name(self) -> str:
-        """Short description, which is printed in reports and seeds the streams."""
+        """Short description for reports; also used to seed the streams."""
         return f"{self.preset} h={self.height:g}, {self.noise:.0e}".replace("e-0", "e-")
 
     def layout(self) -> PatchLayout:

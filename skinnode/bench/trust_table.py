@@ -72,7 +72,7 @@ def _streams(  # noqa: PLR0913 - parts of a stream
     timeline: Timeline | None = None,
     config: PatchConfig | None = None,
 ) -> Iterator[Solved]:
-    """Yield ``count`` solved streams; ``seed`` and ``name`` seed them, and the default load is a sphere."""
+    """Yield ``count`` solved streams, seeded with ``seed`` and ``name``; the default load is a sphere."""
     for number in range(count):
         rng = np.random.default_rng([seed, zlib.crc32(name.encode()), number])
         layout = setting.layout()
@@ -171,7 +171,7 @@ def _whole(seed: int) -> tuple[str, bool]:
 
 
 def _paths(seed: int) -> tuple[str, bool]:
-    """Solve 72 noise-free paths to sheared presses of a patch with 10 wires."""
+    """Solve noise-free paths to 72 sheared presses of a patch with 10 upper wires."""
     skin = Skin(PatchLayout.preset("aligned", pitch_m=PITCH_M, height_m=0.5 * PITCH_M))
     right, wrong, errors = 0, 0, []
     for number in range(72):

@@ -60,7 +60,7 @@ class Press:
     minus that of a frictionless contact."""
 
     def contacts(self, share: float) -> tuple[tuple[int, HertzContact], ...]:
-        """Return the closed-form solutions to be added or subtracted, with their signs."""
+        """Return closed-form solutions and their signs (+1 to add, −1 to subtract)."""
         depth = share * self.depth_m
         full = HertzContact(RUBBER, self.radius_m, depth, self.center_m, self.traction_ratio)
         if not self.shear_only:
@@ -166,7 +166,7 @@ class Skin:
         return self._points(self.body.upper_m)
 
     def _points(self, upper: Float) -> Float:
-        """Return the result of :func:`skinnode.model.forward.resistance_ohm`, but five times as fast."""
+        """Compute the same as :func:`skinnode.model.forward.resistance_ohm` in a fifth of the time."""
         lower = self.body.lower_m.reshape(-1, 3)
         square = np.zeros((upper.shape[0] * upper.shape[1], len(lower)))
         for axis in range(3):
@@ -272,7 +272,7 @@ class Stream:
     presses: tuple[Load, ...] = ()
 
     def every(self, stride: int) -> Stream:
-        """Return a stream with only every ``stride``-th frame, starting with the first."""
+        """Return a stream that contains every ``stride``-th frame, starting with the first."""
         return Stream(
             self.frames_ohm[::stride],
             self.valid[::stride],

@@ -5,19 +5,19 @@ Each wire of a frame receives one of three verdicts:
 flagged    no accuracy was claimed, because the status is not CONVERGED or the data failed a test
            (``wires_trusted``)
 accurate   accuracy was claimed, and every coordinate is within the reported uncertainty
-wrong      accuracy was claimed but an error is too large, or, whatever the status, a value is not finite
+wrong accuracy was claimed but an error is too large, or a value is not finite (with any status)
 
 With noise, errors up to 5 reported standard deviations are accepted, but 6e-7 of all coordinates exceed this
 limit by chance. A long run must not fail by chance, and a genuine fault must not be dismissed as chance. Each
-row is therefore tested for two conditions. For Gaussian errors with the reported standard deviation, the
-probability of violating a condition is 1e-4:
+row of the report is therefore tested for two conditions. For Gaussian errors with the reported standard
+deviation, the probability of violating a condition is 1e-4:
 
 - No error exceeds the larger of z(n) and 5 standard deviations. With a probability of 1e-4, at least one of n
   independent coordinates exceeds z(n), which is 5.7 for 9,000 coordinates and 6.4 for 1e6. z(n) is
   Bonferroni's bound, so the probability is lower if coordinates are correlated.
 - The number of seeds with an error above 5 standard deviations does not exceed a limit computed from a
-  binomial distribution. The probability per seed is bounded by the expected number of such errors per seed.
-  The test counts seeds instead of coordinates, because only seeds are independent.
+  binomial distribution. The binomial probability per seed is bounded by the expected number of such errors
+  per seed. The test counts seeds instead of coordinates, because only seeds are independent.
 
 If the second condition is violated, every wire with an error above 5 standard deviations is wrong. With exact
 data, no error is attributed to chance: the limit is 5 reported standard deviations or 1e-6 of the wire's
@@ -128,7 +128,7 @@ class Tally:
         """Add the error and standard deviation of the converged wires in the deepest frame.
 
         Errors and standard deviations are divided by the displacement in the deepest frame. The worst error
-        is the largest such quotient of all frames.
+        is the largest error in any frame, divided by the same displacement.
         """
         deepest = int(np.argmax(np.linalg.norm(truth.reshape(len(truth), -1), axis=1)))
         used = np.isfinite(error[deepest])

@@ -50,7 +50,7 @@ class PlannedFrame:
     length: int
     """Data length, bytes."""
     period_s: float
-    """Period of the frames, s."""
+    """Period at which the frames are sent, s."""
     count: int
     """Number of frames with this identifier per period."""
     spacing_s: float
@@ -203,7 +203,7 @@ def plan_of(hand: HandConfig) -> tuple[BusPlan, ...]:
 
 
 def inhibit_time_100us(period_ms: int, frames: int) -> int:
-    """Return the inhibit time (0x1800:3), in 100 µs, that spreads a scan over SCAN_SHARE of a period.
+    """Return the inhibit time (0x1800:3, unit 100 µs) that spreads a scan over SCAN_SHARE of a period.
 
     Args:
         period_ms: SYNC period, ms.
@@ -309,7 +309,7 @@ def _typical_fd_bits(can_id: int, length: int) -> tuple[float, float]:
 
 
 def _responses_s(frames: tuple[PlannedFrame, ...], bus: BusConfig) -> dict[int, float | None]:
-    """Return a mapping from identifier to worst-case response time, s; None if unbounded."""
+    """Return each identifier's worst-case response time, s; None if unbounded."""
     messages = [
         Message(
             frame.can_id,

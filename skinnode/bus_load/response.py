@@ -8,8 +8,8 @@ instance.
 
 This module extends the analysis to messages that are sent in bursts, such as the chunks of a scan: each
 period starts with ``count`` frames at intervals of ``spacing_ns``. The number of frames in a time window is
-greatest if the window starts with a burst. With this maximum number instead of the paper's ⌈(t + J) / T⌉, the
-analysis remains valid.
+greatest if the window starts with a burst. The analysis remains valid if the number of frames in such a
+window replaces the paper's ⌈(t + J) / T⌉.
 
 Retransmissions after errors are not modelled, nor are controllers that do not always send their
 highest-priority frame first.
@@ -23,7 +23,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True, slots=True)
 class Message:
-    """A message, i.e. all frames with the same identifier. Times are integers in nanoseconds.
+    """A message: all frames with the same identifier. Times are integers in nanoseconds.
 
     Raises:
         ValueError: if a burst is longer than its period, or a time is not positive.
@@ -96,7 +96,7 @@ def response_time_ns(message: Message, others: Sequence[Message], bit_ns: int) -
     longest_ns, wait_ns = 0, blocking_ns
     for instance in range(message.most_in(busy_ns)):
         own_ns = blocking_ns + instance * message.time_ns
-        wait_ns = max(wait_ns, own_ns)  # lower bound for the search: the previous instance's waiting time
+        wait_ns = max(wait_ns, own_ns)  # start from the previous instance's waiting time, a lower bound
         while (longer_ns := own_ns + _work_ns(higher, wait_ns + bit_ns)) > wait_ns:
             wait_ns = longer_ns
         passed_ns = wait_ns - message.due_ns(instance) + message.time_ns

@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 
 from skinnode.compiled.jit import njit_brief
 
-HEAD_BITS: Final = 19  # head: SOF, 11-bit identifier, RTR, IDE, r0, 4-bit DLC
+HEAD_BITS: Final = 19  # bits of SOF, 11-bit identifier, RTR, IDE, r0 and 4-bit DLC
 CRC_BITS: Final = 15
 TAIL_BITS: Final = 13
 """Number of bits in CRC delimiter, ACK slot, ACK delimiter, end of frame (7) and inter-frame space (3)."""
-FD_NOMINAL_BITS: Final = 17 + 12  # SOF, 11-bit identifier, RRS, IDE, FDF, res, BRS, and the tail
+FD_NOMINAL_BITS: Final = 17 + 12  # SOF, 11-bit identifier, RRS, IDE, FDF, res and BRS; plus the tail
 _CRC_POLYNOMIAL: Final = 0x4599
 _RUN: Final = 5
 ALTERNATING: Final = 0x5555_5555_5555  # ends in 1
@@ -29,7 +29,7 @@ _Bytes = NDArray[np.uint8]
 
 @functools.cache
 def tables() -> tuple[tuple[int, ...], tuple[int, ...], tuple[int, ...]]:
-    """Return three tables: CRC, next run, and number of stuff bits.
+    """Return three lookup tables: CRC, next run, and number of stuff bits.
 
     The CRC table is indexed by byte, the other tables by ``run << 8 | byte``. A run of 1 to 4 equal bits is
     encoded as (value << 2 | length − 1) + 1; before the first bit of a frame, the run is 0. After five equal

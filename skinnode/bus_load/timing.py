@@ -3,7 +3,7 @@
 Classic frames. From the start of frame to the end of the CRC sequence, five consecutive equal bits are
 followed by a stuff bit of the opposite value. A stuff bit may itself be the first of the next five equal
 bits. The 13-bit tail is not stuffed; it consists of CRC delimiter, ACK slot, ACK delimiter, 7-bit end of
-frame and 3-bit inter-frame space. The CRC has 15 bits, the polynomial 0x4599 and the initial value 0.
+frame and 3-bit inter-frame space. The 15-bit CRC has the polynomial 0x4599 and the initial value 0.
 
 CRC and stuff bits are computed from tables, one byte at a time. The head of a frame is therefore padded to
 whole bytes with leading filler bits. For the CRC, the filler bits are zeros, which do not change the initial
@@ -229,7 +229,7 @@ def fd_worst_case_bits(length: int) -> tuple[int, int]:
                 equal = equal + 1 if bit == value else 1
                 stuffed = equal == _RUN
                 state = ((1 - bit) << 2) + 1 if stuffed else (bit << 2 | equal - 1) + 1
-                # The first fixed stuff bit replaces a stuff bit that is due after the last bit.
+                # A stuff bit due after the last bit is replaced by the first fixed stuff bit.
                 total = count + (stuffed and number < len(choices))
                 after[state] = max(after.get(state, 0), total)
         stuff = after
@@ -269,9 +269,10 @@ def exact_bits_batch(can_id: ArrayLike, dlc: ArrayLike, data: ArrayLike) -> _Int
 
 
 class BusLoad:
-    """Counts frames and their exact total length in bits.
+    """Counts frames, and the exact number of their bits.
 
-    Frames are added quickly, because their bits are counted later in batches. An instance is not thread-safe.
+    Adding a frame is fast, because the bits of several frames are later counted in one batch. An instance is
+    not thread-safe.
 
     Args:
         bitrate_bps: nominal bit rate, bit/s.

@@ -103,7 +103,7 @@ class _Watch:
 
     def take(self, frame: FieldFrame, true_upper_m: Float, t_start_ns: int) -> None:
         stamp = frame.stamp
-        assert stamp is not None  # the host attaches a stamp to every field
+        assert stamp is not None  # always true: the host stamps every field
         truth = true_upper_m - self.scorer.layout.upper_m
         error_m = self.scorer.add(frame, true_upper_m)
         depth_m = float(-truth[..., 2].min())
@@ -207,7 +207,7 @@ def play(hand: HandConfig, seconds: float, console: Console) -> Run:
         SkinError: The simulated patches or the host cannot run.
     """
     if jit.is_cold():
-        console.print("compiling the kernels; this happens only once, so the next start is immediate")
+        console.print("compiling the kernels; they are then cached, so the next start is immediate")
     layouts = {patch.name: patch.layout.build() for patch in hand.patches}
     watches = {
         patch.name: _Watch(patch, Scorer(layouts[patch.name], CodeScale(patch.code_bits).relative_std))
@@ -215,7 +215,7 @@ def play(hand: HandConfig, seconds: float, console: Console) -> Run:
     }
     count = len(hand.patches)
     console.print(
-        f"bringing up {count} simulated {'patch' if count == 1 else 'patches'} on a virtual CAN bus: "
+        f"bringing up {count} simulated {'patch' if count == 1 else 'patches'} on a virtual CAN bus:  "
         "boot-up, identity, configuration, start",
         soft_wrap=True,
     )
@@ -277,7 +277,7 @@ def play(hand: HandConfig, seconds: float, console: Console) -> Run:
 
 
 def _take(frame: FieldFrame, watches: dict[str, _Watch], fleet: Fleet, t_start_ns: int) -> None:
-    assert frame.stamp is not None  # the host attaches a stamp to every field
+    assert frame.stamp is not None  # always true: the host stamps every field
     if frame.stamp.device_time_us == 0:  # the time of a scan is unknown if its summary was lost
         return
     true_upper_m = fleet.truth_m(frame.stamp.patch, frame.stamp.device_time_us)

@@ -1,7 +1,7 @@
 """Runs simulated patches for commands that demonstrate the host.
 
 The patches run in a separate process, so that they do not share a Python interpreter with the host.
-Performance figures are therefore those of the host only, as with a real hand.
+Like with a real hand, performance figures therefore include only the host.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ def simulated(hand: HandConfig) -> Iterator[None]:
             raise SkinError(f"simulated patches: {complaint}")
         yield
     finally:
-        ours.close()  # makes the child process exit
+        ours.close()  # closing the pipe makes the child process exit
         process.join()
 
 

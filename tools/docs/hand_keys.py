@@ -1,6 +1,6 @@
-"""Generates the references of hand.toml and scene files from their models. For each key, a reference states
+"""Generates the references of hand.toml and scene files from their models.
 
-purpose, type, unit, default and range.
+For each key, a reference states purpose, type, unit, default and range.
 """
 
 from __future__ import annotations

@@ -305,7 +305,7 @@ class Session:
                 raise SystemExit(f"{path}: exit status {run.status} without a mutant; see {self._tree.log}")
             failed = [
                 test for test in run.failed if run_tests(self._tree, [test], 900.0).status != _PASSED
-            ]  # if the test passes when run alone, the failure was probably caused by CPU load
+            ]  # a test that passes alone probably failed because of CPU load
             for test in failed:
                 print(f"test excluded because it fails without a mutant: {test}", flush=True)
             self._known[path] = {"took_s": run.took_s, "failed": failed}

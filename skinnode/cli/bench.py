@@ -223,7 +223,7 @@ def scale(
     ] = None,
     scans: Annotated[int, typer.Option(min=1, max=10_000, help="Number of scans per measurement.")] = 20,
 ) -> None:
-    """Measure the CPU time of simulator and host against skin area and against contact.
+    """Measure the CPU time of simulator and host as a function of skin area and of contact.
 
     Hands run in virtual time. Each patch takes about 20 MB of memory.
     """

@@ -56,8 +56,8 @@ class StreamConfig(Table):
 
     partial: Annotated[Partial, one_of(Partial)] = "pass"
     """Handling of incomplete scans, which lack chunks or the summary with the scan check. ``pass`` delivers
-    these scans unchecked with a mask of the valid resistances; ``withhold`` does not deliver incomplete
-    scans. Incomplete scans are counted in either case."""
+    incomplete scans unchecked, together with a mask of the valid resistances; ``withhold`` does not deliver
+    incomplete scans. Incomplete scans are counted in either case."""
     capacity_fields: Annotated[int, Field(ge=1, le=1_000_000), Allowed("an integer from 1 to 1000000")] = 64
     """Maximum number of fields in a subscriber's queue; if the queue is full, the oldest field is dropped.
     The default, 64, holds more than one second of fields from four patches at 12.5 scans per second."""

@@ -35,8 +35,8 @@ _DEEPEST: Final = 32
 """Maximum number of parts in a key; a hand file needs six."""
 _PART: Final = r"(?:[\w-]++|\"[^\"\n]*+\"|'[^'\n]*+')[ \t]*+"
 _LONG_KEY: Final = re.compile(rf"(?<![\w\-\"'])(?:{_PART}\.[ \t]*+){{{4 * _DEEPEST}}}")
-"""Pattern that matches a key with far more than ``_DEEPEST`` parts. It also matches long runs of numbers
-joined by dots, but no hand file contains such runs."""
+"""Pattern that matches a key with far more than ``_DEEPEST`` parts. The pattern also matches long sequences
+of numbers joined by dots, which no hand file contains."""
 _LEAST, _MOST = -(1 << 63), (1 << 63) - 1  # range of integers in TOML 1.0
 _INTEGERS: Final = "integers from -2^63 to 2^63 - 1"
 _TOO_LONG: Final = Shown("a longer integer")

@@ -49,8 +49,8 @@ _OLDEST_STAMP_S: Final = 10.0
 machine's wall clock; the time of reading replaces it."""
 
 _LINK_GONE: Final = (errno.ENETDOWN, errno.ENODEV, errno.ENXIO)
-"""Error codes by which the kernel reports that an interface went down: once per socket, from either a receive
-or a send call."""
+"""Error codes of the kernel for an interface that went down. The kernel reports the error once per socket,
+from either a receive or a send call."""
 
 _SOCKETCAN: Final = "socketcan"
 _MULTICAST: Final = "udp_multicast"

@@ -1,11 +1,11 @@
 """Compare ``solve_system`` with SciPy on the Moré-Garbow-Hillstrom problems: ``python -m tools.systems``.
 
-All solvers use the same functions, a tolerance of 1e-12, and at most 2000 evaluations. They start from the
-standard starting points multiplied by 1, 10 and 100. A square system with a root is solved if the final point
-is a root. Any other system is solved if the final point is a minimum of the residual norm. Whether a point is
-a root or a minimum is determined in 80-bit arithmetic, independently of the solver's reported status. A
-solver's claim is false if it reports success at a point that is neither a root nor a minimum, or a root of a
-square system at a point that is only a minimum.
+All solvers use the same functions, a tolerance of 1e-12, and at most 2000 evaluations. All solvers start from
+the standard starting points multiplied by 1, 10 and 100. A square system with a root is solved if the final
+point is a root. Any other system is solved if the final point is a minimum of the residual norm. Whether a
+point is a root or a minimum is determined in 80-bit arithmetic, independently of the solver's reported
+status. A solver's claim is false if it reports success at a point that is neither a root nor a minimum, or a
+root of a square system at a point that is only a minimum.
 """
 
 from __future__ import annotations
@@ -82,7 +82,7 @@ def solved(problem: Problem, truth: Verdict) -> bool:
 
 
 def outcomes(solve: Solve, square: bool) -> Iterator[dict[str, Any]]:
-    """Solve all square or all tall problems from every starting point; yield one outcome per attempt."""
+    """Solve all square (or all tall) problems from every starting point; yield one outcome per solution."""
     for problem in PROBLEMS:
         for factor in FACTORS if problem.square == square else ():
             calls = [0, 0]

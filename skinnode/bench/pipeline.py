@@ -313,10 +313,11 @@ HEAD: Final = (
     f"\n{'':94}{'p50   p99   max':>20}{'p50   p99':>14}{'frame':>6}{'fraction of a core':>24}"
 )
 LEGEND: Final = (
-    "lost: total number of frames, chunks and scans lost. published, read: time from the kernel timestamp\n"
-    "of a scan's last frame to the publication of the field, and to its delivery. µs: time per frame in the\n"
-    "receive and mainline threads, including wake-ups. load: of the bus (left) and of the load generator\n"
-    "(right). The scans of all patches end at the same time, unless the SYNCs of the buses are staggered."
+    "lost: total number of lost frames, chunks and scans. published: time from the kernel timestamp of a\n"
+    "scan's last frame to the publication of the field. read: time from that timestamp to the delivery of\n"
+    "the field. µs: CPU time per frame in the receive and mainline threads, including wake-ups. load: bus\n"
+    "load (left) and the load generator's CPU load (right). The scans of all patches end at the same time,\n"
+    "unless the SYNCs of the buses are staggered."
 )
 
 

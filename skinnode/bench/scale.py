@@ -1,10 +1,10 @@
-"""Measures how the cost of the simulator and of the host grows with skin area and with contact.
+"""Measures how the CPU time of simulator and host grows with skin area and number of contacts.
 
-Hands of several patches, four per bus, run in virtual time on timed buses. Bodies press on some of the
-patches. The CPU time of each thread is read from the thread's own clock: the threads of the nodes belong to
-the simulator, all other threads to the host. The thread that waits last simulates the timed bus, so the CPU
-time of the bus is measured separately and subtracted from that thread. Virtual time makes the load exact:
-each patch sends every scan, however slow the machine is.
+Hands with four patches per bus run on timed buses in virtual time, while bodies press on some of the patches.
+The CPU time of each thread is read from the thread's CPU clock: node threads belong to the simulator, all
+other threads to the host. A timed bus is simulated by whichever thread is the last to wait, so the CPU time
+of the bus is measured separately and subtracted from that thread's CPU time. Because of virtual time, each
+patch sends every scan even on a slow machine.
 """
 
 from __future__ import annotations
@@ -27,26 +27,26 @@ from vcan_sim.timed_interface import Segment, segment
 from vcan_sim.virtual_time import VirtualClock
 
 PATCHES: Final = (1, 4, 16, 64)
-"""Default numbers of patches, of which one is touched."""
+"""Default numbers of patches in the hands with one touched patch."""
 FIXED: Final = 16
-"""Number of patches of the hand in which more and more patches are touched."""
+"""Number of patches in the hand for measuring the effect of the number of touched patches."""
 TOUCHED: Final = (0, 1, 4, 16)
-"""Numbers of touched patches in this hand."""
+"""Numbers of touched patches to measure in the hand with :data:`FIXED` patches."""
 PATCHES_PER_BUS: Final = 4
 PERIOD_MS: Final = 100
 _SETTLED_S: Final = 1.0
-"""Time between the end of the bring-up and the start of the measurement, s; the presses have reached their
-depth."""
+"""Time from the end of the bring-up to the start of the measurement, s; long enough for the presses to reach
+their full depth."""
 
 Row = dict[str, Any]
 
 
 def run(patches: Sequence[int] = PATCHES, scans: int = 20) -> dict[str, Any]:
-    """Measure the cost against area and against contact.
+    """Measure the CPU time versus skin area and versus number of touched patches.
 
     Args:
-        patches: Numbers of patches of the hands with one touched patch.
-        scans: Number of scans of each measurement.
+        patches: Numbers of patches in the hands with one touched patch.
+        scans: Number of scans per measurement.
 
     Returns:
         ``machine``; ``area`` and ``contact``, lists of rows with ``patches``, ``touched``, CPU time per patch
@@ -54,18 +54,20 @@ def run(patches: Sequence[int] = PATCHES, scans: int = 20) -> dict[str, Any]:
         virtual to real time, and ``memory_mb`` of the process; and ``physics``, the time of one reading
         of a simulated patch in µs, untouched and touched.
     """
-    measure(1, 1, 2)  # compiles the kernels and fills caches
+    measure(1, 1, 2)  # compile the kernels and fill the caches
     contact = [measure(FIXED, count, scans) for count in TOUCHED]
     return {
         "machine": machine(),
-        "area": [measure(count, 1, scans) for count in sorted(patches)],  # memory only grows
+        "area": [
+            measure(count, 1, scans) for count in sorted(patches)
+        ],  # ascending, because peak memory never decreases
         "contact": contact,
         "physics": physics(),
     }
 
 
 def measure(patches: int, touched: int, scans: int) -> Row:
-    """Measure a hand of which some patches are touched.
+    """Measure a hand in which ``touched`` patches are touched.
 
     Args:
         patches: Number of patches.
@@ -102,7 +104,7 @@ def measure(patches: int, touched: int, scans: int) -> Row:
 
 
 def physics() -> dict[str, float]:
-    """Time one reading of a simulated patch, without frames: untouched, and under a press.
+    """Time one reading of a simulated patch, without sending frames: untouched and pressed.
 
     Returns:
         ``untouched_us`` and ``touched_us``, µs.
@@ -113,7 +115,7 @@ def physics() -> dict[str, float]:
 
 
 class _Reading:
-    """Readings of a patch, each at a new time."""
+    """Reads a simulated patch at a new time in every call."""
 
     def __init__(self, scene: PatchScene) -> None:
         self._patch, self._t_ns = SimulatedPatch(scene), 1_500_000_000
@@ -165,7 +167,7 @@ def _solved(host: Host) -> int:
 
 
 def _cpu_ns(segments: Sequence[Segment]) -> Counter[str]:
-    """Return the CPU time of the nodes, the buses and the host so far, ns."""
+    """Return the total CPU time of the nodes, the buses and the host so far, ns."""
     by_bus: Counter[str] = Counter()
     for each in segments:
         by_bus.update(each.cpu_ns)

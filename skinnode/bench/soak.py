@@ -170,7 +170,7 @@ def run(minutes: float, seed: int, report: Callable[[str], None]) -> dict[str, A
     try:
         fleet = Fleet(hand, faults=Faults(seed=seed))
         for source in fleet.patches.values():
-            for k in range(REMEMBERED_READINGS):  # fill the history, which otherwise grows
+            for k in range(REMEMBERED_READINGS):  # fill the history, so that it no longer grows
                 source.read(-1000 * TIME_STEP_US * (k + 1))
         with fleet:
             before = {bus.name: Counter(fleet.passed(bus.name).sent) for bus in hand.buses}

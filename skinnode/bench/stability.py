@@ -126,7 +126,7 @@ LEGEND = (
     "#: number of the hard case. Errors and reported standard deviations are relative to the displacement\n"
     "of the CONVERGED wires in the deepest frame. worst: largest error in any frame. accurate, flagged,\n"
     "wrong: numbers of wires in all frames. A wire is flagged if it is not CONVERGED or not trusted.\n"
-    "Another wire is wrong if its error exceeds what chance and reported standard deviation can explain."
+    "Any other wire is wrong if neither chance nor the reported standard deviation explains its error."
 )
 
 

@@ -5,7 +5,8 @@ streams of resistances. There are streams for five layouts and two noise levels,
 Each commit then computes the forward model and solves the streams with every tracker method, with every path
 operator, and with the solver for systems of equations. Each commit also replays the recordings and generates
 files, such as EDS files. For each part, the report contains one hash per commit, computed from all arrays of
-the part. For each array that differs between the commits, it also contains the largest relative difference.
+the part. For each array that differs between the commits, the report also contains the largest relative
+difference.
 
 The exit status is 0 if all arrays are equal, or if the relative differences between float arrays do not
 exceed ``--rtol`` and all other arrays are equal. Otherwise, the exit status is 1.
@@ -65,7 +66,7 @@ def relative_difference(old: Any, new: Any) -> float:
 
 
 def report(old: Any, new: Any, rtol: float) -> Iterable[tuple[str, bool]]:
-    """Yield each report line, together with whether the difference that it reports is permissible."""
+    """Yield pairs of a report line and whether the reported difference is permissible."""
     names = dict.fromkeys([*old.files, *new.files])
     for part in dict.fromkeys(name.partition(":")[0] for name in names):
         mine = [name for name in names if name.startswith(f"{part}:")]

@@ -11,7 +11,7 @@ _ROLE = re.compile(r":[a-z]+:`~?(?:[\w.]+\.)?([\w.]+)`")
 
 
 class Roles(griffe.Extension):
-    """Griffe extension that replaces the roles in docstrings when they are loaded."""
+    """Griffe extension that replaces the roles in docstrings during loading."""
 
     def on_object(self, *, obj: griffe.Object, **_: Any) -> None:
         if obj.docstring is not None:

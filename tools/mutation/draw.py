@@ -4,8 +4,8 @@ The mutation operators are those of cosmic-ray. First, places in the source are 
 then, one mutation is chosen for each place. If the choice were made directly among all mutations, a ``+``
 would be mutated eleven times as often as a ``not``, because it has eleven mutations.
 
-A mutant is identified by file, function, operator, and the text before and after the change. It has no line
-number, so a list of mutants remains valid when code moves. The selection depends only on the seed and on
+A mutant is identified by file, function, operator, and the text before and after the change. Line numbers are
+not used, so a list of mutants remains valid when code moves. The selection depends only on the seed and on
 digests of the places, so edits to other code do not affect whether a place is selected.
 """
 
@@ -36,7 +36,7 @@ GROUPS: Final = {
     "solve": ("solve",),
     "host": ("host",),
 }
-"""Groups of packages; each group's mutants are selected from its packages."""
+"""Packages from which mutants are selected, by group."""
 SEED: Final = 20260
 PER_PACKAGE: Final = 50
 
@@ -63,7 +63,7 @@ class Mutant:
 
     @property
     def name(self) -> str:
-        """Name: ten hexadecimal digits of a digest of all fields."""
+        """Name of the mutant: ten hexadecimal digits of a digest of all fields."""
         return _digest(self.file, self.function, self.operator, self.before, self.after, self.nth)[:10]
 
     @property
@@ -136,7 +136,7 @@ def _for_speed(decorator: ast.expr) -> bool:
 def _behaviour(source: str) -> str | None:
     """Return a representation of ``source`` that reflects only its behaviour; None if it does not compile."""
     try:
-        with warnings.catch_warnings(action="ignore"):  # for example, about "is" with a literal
+        with warnings.catch_warnings(action="ignore"):  # such as a warning about "is" with a literal
             compile(source, "mutant", "exec")
     except (SyntaxError, ValueError):
         return None

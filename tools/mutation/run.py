@@ -235,7 +235,7 @@ def _be_pytest(tree: Tree, arguments: Sequence[str], answer: Path, limit_s: floa
         failures = _Failures()
         options = ["-q", "-n", "0", "--tb=short", "-p", "no:cacheprovider", "-o", f"timeout={_TEST_S}"]
         options += ["-W", "ignore::pytest.PytestAssertRewriteWarning"]
-        options += ["-W", "ignore::SyntaxWarning"]  # for example, about "is" with a literal
+        options += ["-W", "ignore::SyntaxWarning"]  # such as a warning about "is" with a literal
         status = int(pytest.main([*options, *arguments], plugins=[failures]))
         answer.write_text(json.dumps(failures.failed), "utf-8")
     except BaseException:
@@ -282,7 +282,7 @@ def _expand(pattern: str) -> list[str]:
 
 
 class Session:
-    """Runs the tests on one tree, and stores the results without a mutant for reference."""
+    """Runs the tests on one tree; stores the results of the unmutated source as a reference."""
 
     def __init__(self, tree: Tree, table: dict[str, Any], *, quick: bool) -> None:
         self._tree, self._table, self._quick = tree, table, quick
@@ -332,7 +332,7 @@ class Session:
             files = sorted(files, key=lambda path: self._known[path]["took_s"])
             left_out = [test for path in files for test in self._known[path]["failed"]]
             limit_s = _GRACE_S + 6.0 * sum(self._known[path]["took_s"] for path in files)
-            for _ in range(8):  # repeat without the flaky test
+            for _ in range(8):  # repeat the stage without the flaky test
                 deselected = [word for test in left_out for word in ("--deselect", test)]
                 run = run_tests(self._tree, ["-x", *deselected, *files], limit_s)
                 if run.status is None:

@@ -262,7 +262,7 @@ class SdoClient:
     def write_block(
         self, index: int, subindex: int, data: bytes, *, crc: bool = False, wrong_crc: bool = False
     ) -> None:
-        """Download at most one sub-block by block transfer, with a wrong CRC if ``wrong_crc`` is true."""
+        """Download at most one sub-block by block transfer; if ``wrong_crc`` is true, the CRC is wrong."""
         what = f"block write to 0x{index:04X}:{subindex:02X}"
         start = bytes((0xC2 | crc << 2,)) + mux(index, subindex) + struct.pack("<I", len(data))
         answer = self.served(start, what)

@@ -24,7 +24,7 @@ PACE_S: Final = 0.001
 """Interval between requests, s. At 1 Mbit/s, the requests use a sixth of the bus and do not delay PDOs."""
 
 ANSWER_S: Final = 0.12
-"""Time to wait for responses after the last request of a sweep, s."""
+"""Time (s) to wait for responses after the last request of a sweep."""
 
 SWEEPS: Final = 2
 """Number of sweeps over all node-IDs; a node that is busy during the first sweep receives a second
@@ -70,7 +70,7 @@ class FoundNode:
     boot_ups: int
     """Boot-up messages received during the search."""
     duplicate: str
-    """Evidence that two nodes have this node-ID; empty without such evidence."""
+    """Evidence that two nodes have this node-ID; otherwise empty."""
     wrong_answer: str = ""
     """Newest invalid SDO response as hexadecimal text, if there was no valid response."""
 

@@ -41,7 +41,7 @@ class Commissioned:
 
 
 def only_unconfigured(connection: BusConnection) -> LssAddress:
-    """Return the only node without a node-ID. Raises ConfigError unless there is exactly one."""
+    """Return the only node without a node-ID. Raises ConfigError unless exactly one exists."""
     found, more = find_unconfigured(connection)
     if len(found) != 1 or more:
         serials = ", ".join(str(address.serial_number) for address in found)

@@ -6,8 +6,8 @@ explain is insensitive to quick touches. A touch affects the crossings of many w
 functions of time, whereas the noise of each crossing is independent. Both estimates are upper bounds on the
 noise, so the smaller of the two is used. A quick, deep and small touch affects both estimates. A touch
 hardly affects the smallest singular values of a wire. On touched skin, a wire's smallest singular values are
-therefore compared with those of its neighbours. The patch as a whole is judged by its own smallest singular
-values.
+therefore compared with those of its neighbours. The patch as a whole is assessed by its own smallest
+singular values.
 """
 
 from __future__ import annotations

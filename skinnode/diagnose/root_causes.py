@@ -46,13 +46,13 @@ class Rule:
 _HOLES: Final = ("incomplete scans", "whole scans are missing")
 _LATE: Final = (*_HOLES, "scans end after the next scan has begun")
 _OF_SYNC: Final = ("SYNCs are missing", "SYNC is irregular")
-_ERRORS: Final = ("emergency messages during the examination", "the node reports an error")
+_ERRORS: Final = ("emergency messages received during the check", "the node reports an error")
 _CONFIGURED_BY_OTHERS: Final = (
     "the (chunk|summary) PDO .* is not at its COB-ID",
     "chunks are not event-driven",
     "the inhibit time differs from the host's setting",
     "the heartbeat period differs from the hand file",
-    "no heartbeat: a loss of the node goes unnoticed",
+    "no heartbeat: a failure of the node would go unnoticed",
     "the patch scans on its own timer",
 )
 _UNEXPLAINED: Final = "^error register 0x|^last: none reported$"
@@ -98,7 +98,7 @@ RULES: Final = (
         _ANYTHING,
     ),
     Rule(
-        "the interface failed during the examination",
+        "the interface failed during the check",
         (
             *_LATE,
             *_OF_SYNC,
@@ -151,7 +151,7 @@ RULES: Final = (
     Rule("SYNCs are missing", ("whole scans are missing", "SYNC is irregular"), _ANYTHING),
     Rule(
         "the node reports an error",
-        ("emergency messages during the examination", "the node is .* while other nodes are operational"),
+        ("emergency messages received during the check", "the node is .* while other nodes are operational"),
         _ANYTHING,
     ),
 )

@@ -27,7 +27,7 @@ from skinnode.model.layout import Float
 from skinnode.protocol.profile import PatchProfile
 
 QUIET_S: Final = 0.3
-"""Time (s) without SDO frames of a node after which no other client's transfer can be in progress."""
+"""Time (s) without SDO frames, after which no other client can have a transfer in progress."""
 
 HOST_BEGINS_S: Final = 1.0
 """Maximum time (s) from the tare to the host's first SDO request, in addition to a SYNC period. An idle host
@@ -66,9 +66,9 @@ class Tared:
 def refusal(patch: PatchConfig, bus: BusConfig) -> str:
     """Return why the hand file forbids taring this patch; empty if taring is allowed."""
     if patch.baseline is not None:
-        return f"its baseline is kept in {patch.baseline}, from which a host would restore it"
+        return f"its baseline is stored in {patch.baseline}, and a host would restore it from there"
     if bus.role == "guest" and bus.guest_sends == "nothing":
-        return f"the hand sends nothing on {bus.name} (role guest, guest_sends nothing)"
+        return f"the hand file forbids sending on {bus.name} (role guest, guest_sends nothing)"
     return ""
 
 

@@ -80,14 +80,14 @@ def test_an_overload_and_five_faults_are_in_order() -> None:
     below = {(finding.where, finding.what) for finding in overload.consequences}
     assert ("ring", "incomplete scans") in below
     assert ("ring", "scans end after the next scan has begun") in below
-    assert ("ring", "emergency messages during the examination") in below
+    assert ("ring", "emergency messages received during the check") in below
     assert not any(where == "thumb" for where, _ in below)  # that it restarts is nearer
     restarts = named["thumb: the node restarts by itself"]
     assert {finding.what for finding in restarts.consequences} >= {"incomplete scans"}
     wire = named["index: upper wires open: 2"]
-    assert {finding.what for finding in wire.consequences} == {"emergency messages during the examination"}
+    assert {finding.what for finding in wire.consequences} == {"emergency messages received during the check"}
     places = {finding.what: where for finding, where in merged(overload.consequences)}
-    assert places["emergency messages during the examination"] == ("middle", "ring")
+    assert places["emergency messages received during the check"] == ("middle", "ring")
 
 
 def test_nothing_is_lost_by_grouping() -> None:
@@ -104,7 +104,7 @@ def test_an_emergency_that_names_something_else_stands_alone() -> None:
     other = Emergency(0, 0x4200, 0x09, bytes(5))
     facts = bus_of(patch("ring", 5, emergencies=(OVERRUN, other)), load=0.93)
     causes = {group.cause.what for group in grouped([facts])}
-    assert "emergency messages during the examination" in causes
+    assert "emergency messages received during the check" in causes
 
 
 def test_the_command_prints_causes_first(hand_file: Callable[..., Path], on: Callable[[Any], Any]) -> None:

@@ -236,7 +236,7 @@ def test_frozen_values_and_a_frozen_node() -> None:
     quiet = bus_of(replace(WELL, scans=scans_of(frozen, stated_noise=3e-6)))
     assert run_checks(quiet) == []
     (line,) = not_judged(quiet)
-    assert line.startswith("thumb: frozen or only quiet: no code changed in 50 scans")
+    assert line.startswith("thumb: frozen or merely quiet: no code changed in 50 scans")
     assert "touch the patch" in line
     assert not_judged(bus_of(replace(WELL, scans=scans_of(frozen)))) == []  # that is a finding
     flickers = frozen.copy()
@@ -276,7 +276,7 @@ def test_crossings_open_always_and_now_and_then() -> None:
     ("counts", "what"),
     [
         ({"scans_torn": 2, "chunks_lost": 5}, "incomplete scans"),
-        ({"scans_corrupt": 2}, "codes differ from those that the node packed"),
+        ({"scans_corrupt": 2}, "codes differ from the codes that the node packed"),
         ({"bad_form": 3}, "frames that are not chunks of this patch"),
         ({"scans_missed": 3}, "whole scans are missing"),
         ({"conflicts": 4}, "two different chunks with the same number"),

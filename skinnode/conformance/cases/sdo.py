@@ -248,7 +248,9 @@ def write_heartbeat(dut: Dut) -> None:
 
 
 @case(
-    "SDO-16", "An object of more than four bytes is read in segments, with its length announced", "7.2.4.3.6"
+    "SDO-16",
+    "An object of more than four bytes is read in segments, after its length is announced",
+    "7.2.4.3.6",
 )
 def read_announced(dut: Dut) -> None:
     entry, value = long_object(dut)

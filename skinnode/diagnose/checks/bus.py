@@ -69,7 +69,7 @@ def check_bus(bus: BusFacts) -> Iterator[Finding]:
         )
     if bus.outages:
         yield found(
-            "the interface failed during the examination",
+            "the interface failed during the check",
             Sure.CERTAIN,
             counted(bus.outages, "time"),
             "check the adapter's cable and power, and the kernel log (dmesg)",

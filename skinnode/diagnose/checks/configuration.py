@@ -91,7 +91,9 @@ def _check_pdos(bus: BusFacts, patch: PatchFacts) -> Iterator[Finding]:
             f"run skinnode od {patch.node_id} 2021:1 --write 0 to make all patches scan simultaneously",
         )
     if running and info.heartbeat_ms == 0:
-        yield found("no heartbeat: a loss of the node goes unnoticed", Sure.CERTAIN, "0x1017 is 0", again)
+        yield found(
+            "no heartbeat: a failure of the node would go unnoticed", Sure.CERTAIN, "0x1017 is 0", again
+        )
     elif running and bus.heartbeat_ms is not None and info.heartbeat_ms not in (None, bus.heartbeat_ms):
         evidence = f"a heartbeat every {info.heartbeat_ms} ms; the hand file specifies {bus.heartbeat_ms} ms"
         yield found("the heartbeat period differs from the hand file", Sure.POSSIBLE, evidence, again)

@@ -136,5 +136,5 @@ def _check_state(bus: BusFacts, patch: PatchFacts, node: FoundNode) -> Iterator[
         )
         shown = "; ".join(f"{count} × {text}" for text, count in kinds.most_common(3))
         yield found(
-            "emergency messages during the examination", Sure.CERTAIN, shown, "fix the reported faults"
+            "emergency messages received during the check", Sure.CERTAIN, shown, "fix the reported faults"
         )

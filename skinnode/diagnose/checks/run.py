@@ -72,12 +72,12 @@ def not_judged(facts: BusFacts) -> list[str]:
             )
         elif patch.scans is not None and skin.is_touched(patch.scans):
             lines.append(
-                f"{patch.name}: noise of single crossings, and drift from the baseline: something "
+                f"{patch.name}: noise of individual crossings, and drift from the baseline: something "
                 "touched the skin; do not touch the skin during the next run"
             )
         elif patch.scans is not None and skin.may_be_frozen(patch.scans):
             lines.append(
-                f"{patch.name}: frozen or only quiet: no code changed in {scans} scans, but the stated "
+                f"{patch.name}: frozen or merely quiet: no code changed in {scans} scans, but the stated "
                 f"noise ({patch.scans.stated_noise:.0e}) is less than one code ({patch.scans.step:.0e}): "
                 "touch the patch during the next run; if this line appears again, the converter has stopped"
             )

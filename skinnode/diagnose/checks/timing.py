@@ -137,7 +137,7 @@ def check_losses(bus: BusFacts) -> Iterator[Finding]:
         if stats.scans_corrupt:
             yield found(
                 patch.name,
-                "codes differ from those that the node packed",
+                "codes differ from the codes that the node packed",
                 Sure.CERTAIN,
                 f"{stats.scans_corrupt} of {scans + stats.scans_corrupt} scans failed the check",
                 "check the node's memory and software, and any gateways on the path; "

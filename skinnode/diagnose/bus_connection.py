@@ -157,8 +157,8 @@ class BusConnection:
     def guarded(self, node_id: int) -> bool:
         """Return whether a master guards the node.
 
-        A remote frame from this program would start life guarding in a guarded node. When the program then stops
-        sending, the node would report the loss of its master.
+        A remote frame from this program would start life guarding in a guarded node. When the program then
+        stops sending, the node would report the loss of its master.
         """
         remote = self.od(node_id)
         try:

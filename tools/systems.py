@@ -82,7 +82,7 @@ def solved(problem: Problem, truth: Verdict) -> bool:
 
 
 def outcomes(solve: Solve, square: bool) -> Iterator[dict[str, Any]]:
-    """Solve all square (or all tall) problems from every starting point; yield one outcome per solution."""
+    """Solve all square (or all tall) problems from every starting point; yield one outcome per attempt."""
     for problem in PROBLEMS:
         for factor in FACTORS if problem.square == square else ():
             calls = [0, 0]

@@ -3,8 +3,8 @@
 Only the patch's four middle wires, which are pressed most deeply, are solved. The simulated samples are
 noise-free. Every solver starts from rest. A solver solves either only the last sample or, as in the paper, a
 sequence of samples: the solution of each sample is the initial guess for the next sample. Each solver is run
-with several tolerances, and each run yields one data point. The time of ``solve_path`` includes work that is
-not part of the other times: setting up the patch, following the branch, and estimating the error.
+with several tolerances, and each run yields one data point. The time of ``solve_path`` includes work that the
+other solvers' times exclude: setting up the patch, following the branch, and estimating the error.
 """
 
 from __future__ import annotations

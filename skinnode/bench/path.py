@@ -149,7 +149,7 @@ def run(count: int) -> dict[str, Any]:
 
 def _setting(made: list[Experiment]) -> dict[str, Any]:
     first = made[0]
-    first.solve(Uniform())  # exclude the time to load the kernels from the measurements
+    first.solve(Uniform())  # load the kernels, so that loading is not timed
     operators, ours = (
         {operator: [_row(made, Uniform(plain=plain), operator, n) for n in STEPS] for operator in LABELS}
         for plain in (True, False)
@@ -335,7 +335,7 @@ def _ten_steps() -> list[dict[str, Any]]:
 def _surface() -> dict[str, Any]:
     """Return the data of figure 13: surface of the whole patch in the hardest setting, µm.
 
-    The patch is solved in 5 and in 20 steps like in the paper, and with our adaptive step control.
+    The patch is solved in 5 and in 20 steps as in the paper, and with our adaptive step control.
     """
     name, height, depth = SETTINGS[-1]
     layout = preset(name, height)

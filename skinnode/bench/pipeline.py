@@ -170,7 +170,7 @@ def _measure(hand: HandConfig, generator: Generator) -> Row:
     generator.send_heartbeats(names)
     with Host.from_config(hand, open_port=open_port) as host, _Reader(host.fields()) as reader:
         begin_ns = generator.begin()
-        time.sleep(LEAD_S / 2)  # until the last heartbeat sent before the replay has arrived
+        time.sleep(LEAD_S / 2)  # wait for the last heartbeats before the replay
         read_before = _read(host)
         before, begin_s = _cpu_s(), time.monotonic()
         sent = generator.wait()

@@ -1,6 +1,6 @@
 """Processes a code stream with the host's solver and fault detection, for ``skinnode bench trust``.
 
-Like in the host, each scan is first checked for frozen parts and open wires. The scan is then solved without
+As in the host, each scan is first checked for frozen parts and open wires. The scan is then solved without
 the readings that these checks exclude. Finally, the scan is added to the statistics for detecting slowly
 developing faults.
 """

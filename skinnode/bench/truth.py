@@ -49,7 +49,7 @@ class Load(Protocol):
 
 @dataclass(frozen=True)
 class Press:
-    """A press by a sphere (lengths in metres); ``share`` is the current depth over the full depth."""
+    """A press by a sphere (lengths in metres); ``share`` is the fraction of the full depth."""
 
     center_m: tuple[float, float]
     radius_m: float
@@ -209,7 +209,7 @@ class Skin:
 class Converter:
     """Converter with relative noise ``sigma``; quantises R/R₀ to ``bits``-bit codes if ``bits`` is not 0.
 
-    Like in the protocol, the codes cover the range from ``lo`` to ``hi``, and three codes are reserved. Codes
+    As in the protocol, the codes cover the range from ``lo`` to ``hi``, and three codes are reserved. Codes
     of 16 and 24 bits are encoded and decoded with the protocol's codec.
     """
 

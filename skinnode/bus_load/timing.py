@@ -305,7 +305,7 @@ class BusLoad:
         dlc: int = 0,
         fd: bool = False,
     ) -> None:
-        """Add a frame; its bits are counted like in :func:`exact_bits` or, for CAN FD, :func:`fd_bits`.
+        """Add a frame; its bits are counted as in :func:`exact_bits` or, for CAN FD, :func:`fd_bits`.
 
         Until the bits are counted, the counter keeps a reference to ``data``, not a copy.
         """

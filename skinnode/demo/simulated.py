@@ -1,7 +1,7 @@
 """Runs simulated patches for commands that demonstrate the host.
 
 The patches run in a separate process, so that they do not share a Python interpreter with the host.
-Like with a real hand, performance figures therefore include only the host.
+As with a real hand, performance figures therefore include only the host.
 """
 
 from __future__ import annotations

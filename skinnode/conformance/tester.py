@@ -129,7 +129,10 @@ class Tester:
         within_s: float = ANSWER_S,
         match: Callable[[Frame], bool] | None = None,
     ) -> Frame:
-        """Return a frame as :meth:`take` does. Raises Failed with ``what`` if no frame arrives."""
+        """Return a frame as :meth:`take` does.
+
+        Raises Failed if no frame arrives; the message then describes the frame as ``what``.
+        """
         frame = self.take(can_id, within_s, match)
         if frame is None:
             raise Failed(f"{what} (0x{can_id:03X}) within {within_s:g} s", "nothing")

@@ -34,8 +34,8 @@ LISTEN_S: Final = 1.2
 """Minimum listening time, s. Stopped nodes are detected only by their heartbeats."""
 
 LSS_S: Final = 1.5
-"""Maximum time (s) to search for nodes without a node-ID. Nodes not found in this time are reported as
-"more"."""
+"""Maximum time (s) to search for nodes without a node-ID. Nodes not found within this time are only
+reported as "more"."""
 
 OTHERS_S: Final = 1.0
 """Maximum wait for other SDO clients to finish, s."""

@@ -28,7 +28,7 @@ class Group:
 
     @property
     def rank(self) -> int:
-        """Rank of the most certain finding in the group; 0 is certain."""
+        """Certainty rank of the group's most certain finding; 0 means certain."""
         return min(_RANK[finding.sure] for finding in (self.cause, *self.consequences))
 
 

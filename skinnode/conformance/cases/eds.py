@@ -48,7 +48,7 @@ def _missing(eds: Eds) -> Iterator[str]:
 
 
 def _miscounted(eds: Eds) -> Iterator[str]:
-    """Yield a line for each PDO count in section DeviceInfo that differs from the PDOs in the EDS."""
+    """Yield a line for each PDO count in DeviceInfo that differs from the number of PDOs in the EDS."""
     for key, name, first in (("nrofrxpdo", "NrOfRXPDO", 0x1400), ("nroftxpdo", "NrOfTXPDO", 0x1800)):
         stated, count = eds.device.get(key) or "", len(eds.indices(first, first + 0x1FF))
         try:

@@ -42,7 +42,7 @@ def counted(dut: Dut) -> None:
     check_period(frames, _PERIOD_MS, "a heartbeat")
 
 
-@case("HB-03", "A producer time of 0 stops the heartbeats", "7.5.2.20")
+@case("HB-03", "A producer heartbeat time of 0 stops the heartbeats", "7.5.2.20")
 def ended(dut: Dut) -> None:
     dut.need(HEARTBEAT)
     dut.start_heartbeat(_PERIOD_MS)
@@ -54,7 +54,7 @@ def ended(dut: Dut) -> None:
     )
 
 
-@case("HB-04", "The same node-ID in two entries of 0x1016 is refused", "7.5.2.19")
+@case("HB-04", "A write of the same node-ID to two entries of 0x1016 is refused", "7.5.2.19")
 def twice(dut: Dut) -> None:
     dut.need(CONSUMER, 2)
     partner = foreign_id(dut)

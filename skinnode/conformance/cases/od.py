@@ -72,7 +72,7 @@ def _compare_defaults(dut: Dut, entries: Iterable[EdsEntry]) -> None:
 
 @case(
     "OD-01",
-    "Every readable object from 0x1000 to 0x1FFF can be read and has the length of its data type",
+    "Every readable object from 0x1000 to 0x1FFF can be read, and its length is that of its data type",
     "7.4, 7.5.2",
 )
 def read_communication(dut: Dut) -> None:
@@ -132,7 +132,7 @@ def structure(dut: Dut) -> None:
 def limits(dut: Dut) -> None:
     found = False
     for entry in dut.eds.entries.values():
-        # Other rules apply to mapping counts (case PDO-25), the error field (only 0) and signatures.
+        # Other rules apply to mapping counts (PDO-25), the error field (accepts only 0) and signatures.
         if (entry.index in _PDOS and entry.subindex == 0) or entry.index in (*_COMMANDS, _ERROR_FIELD):
             continue
         for limit, beyond, codes in ((entry.high, 1, TOO_HIGH), (entry.low, -1, TOO_LOW)):
@@ -147,7 +147,7 @@ def limits(dut: Dut) -> None:
 
 @case(
     "OD-07",
-    "Every readable object from 0x2000 to 0x9FFF can be read and has the length of its data type",
+    "Every readable object from 0x2000 to 0x9FFF can be read, and its length is that of its data type",
     "7.4",
 )
 def read_rest(dut: Dut) -> None:

@@ -56,7 +56,7 @@ def producer(dut: Dut) -> None:
     dut.bus.expect_silence(SYNC_ID, "SYNC after the producer was stopped", 3 * PERIOD_MS * 1e-3)
 
 
-@case("SYNC-03", "A TPDO of type 10 is sent 3 times in 30 SYNCs", "7.2.2.2, 7.5.2.37")
+@case("SYNC-03", "A TPDO of type 10 is sent three times during 30 SYNCs", "7.2.2.2, 7.5.2.37")
 def count(dut: Dut) -> None:
     pdo = _synchronous(dut)
     for other in tpdos(dut):

@@ -168,7 +168,7 @@ def _unchanged(dut: Dut, entry: EdsEntry, before: bytes) -> None:
 
 
 def limited(entry: EdsEntry, limit: int | None, beyond: int) -> bytes | None:
-    """Return the value just beyond a limit; None without a limit or if the type cannot represent the value."""
+    """Return the value just beyond a limit; None without a limit or if the type cannot hold the value."""
     if limit is None or not entry.writable or entry.data_type not in (*SIGNED, *UNSIGNED):
         return None
     try:

@@ -19,12 +19,13 @@ exceptions, ``retry_pause`` sets the pauses between attempts, and ``tap`` passes
 
 **Containment.** Exceptions do not end the host's threads. If an exception is raised while serving a patch,
 the patch is marked faulty, and the exception is recorded as the reason. The scans of a faulty patch are
-withheld, and the patch is brought up again after a pause. The pause starts at 0.1 s and doubles after each
-exception, up to 1 s; a boot-up message from the node ends the pause early. After an exception raised while
-serving a bus, the host either stops serving the bus for a pause of the same length, or closes and reopens the
-bus interface. If an exception is raised while serving a subscriber, a callback or a tap, only the item for
-that recipient is lost. All exceptions are counted by subject (``Host.stats().defects``) and published as
-events. Each distinct exception message is logged once; see :mod:`skinnode.host.containment`.
+withheld, and the patch is brought up again after a pause. The pause before a faulty patch is brought up again
+starts at 0.1 s and doubles after each exception, up to 1 s. A boot-up message from the node ends the pause
+early. After an exception raised while serving a bus, the host either stops serving the bus for 0.1 s to 1 s,
+or closes and reopens the bus interface. If an exception is raised while serving a subscriber, a callback or a
+tap, only the item for that recipient is lost. All exceptions are counted by subject
+(``Host.stats().defects``) and published as events. Each distinct exception message is logged once; see
+:mod:`skinnode.host.containment`.
 
 ==========  ==============================  ==============================  ==============================
 thread      calls                           an exception there affects      recovers

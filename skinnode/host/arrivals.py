@@ -15,7 +15,7 @@ REMEMBERED: Final = 8
 """Number of recent scans whose end times are used to predict the end of the next scan."""
 APART_NS: Final = 1_000_000
 """Maximum difference (ns) between two scan ends that are treated as the same phase of the scan period.
-Differences caused by stuff bits and by the SYNC producer's clock are smaller.
+Stuff bits and the SYNC producer's clock shift a scan's end by less than this value.
 """
 MOST: Final = 3
 """Maximum number of predicted end times; if recent scans ended at more phases of the period, no prediction is

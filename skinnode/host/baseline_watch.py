@@ -22,7 +22,7 @@ _DOUBT_NS: Final = 2_000_000_000
 _REGISTER_NS: Final = 500_000_000
 """Minimum interval (ns) between two reads of a nonzero error register. A patch must be reported as
 operational within a second after its error ends, even if the emergency message that clears the error is lost.
-The reads add four SDO frames per second to the bus load.
+Reading the register at this interval adds four SDO frames per second to the bus load.
 """
 
 
@@ -65,7 +65,7 @@ class BaselineWatch:
         node.job = self._pool.submit(read)
 
     def _watch_register(self, node: Supervised, now_ns: int) -> None:
-        """Reread a nonzero error register, because the emergency that clears the error may have been lost."""
+        """Reread a nonzero error register, because the EMCY message that clears the error may be lost."""
         remote = node.remote
         if not remote.monitor.error_register or remote.listen_only or now_ns < node.register_ns:
             return
@@ -98,7 +98,7 @@ class BaselineWatch:
         solver = read.solver
         if solver is not None:
             remote.link.call(lambda: stream.resume(solver, read.withholdings, anew=False), remote.defects)
-            node.announced = True  # the announcement may have been in a lost summary
+            node.announced = True  # even if the announcement was in a lost summary
             note_baseline(node)
 
 

@@ -68,7 +68,7 @@ class FieldCallback:
 
     @property
     def ended(self) -> bool:
-        """Whether the user's function will not be called again."""
+        """Whether the callback has ended and will not call the user's function again."""
         return not self._thread.is_alive()
 
     def _run(self) -> None:

@@ -4,8 +4,8 @@ A crossing's *run* is the number of consecutive scans that have repeated its cod
 *lead* measures how far the codes of its neighbours have changed since the run began. The lead along the upper
 wire is the smaller of the changes of the two neighbours on the same upper wire, or 0 if the changes have
 different signs. The lead along the lower wire (``ACROSS``) is defined in the same way for the two neighbours
-on the same lower wire. For a crossing at the edge, the neighbours are the two nearest crossings on the inner
-side.
+on the same lower wire. For a crossing at the edge, the two nearest crossings on the same wire serve as the
+neighbours.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ _PLANES: Final = 10
 
 UPPER, LOWER, CROSSING, WIRE_LEAD, CROSSING_LEAD, STEPS, FRESH = range(7)
 """Indices of the limits. ``UPPER``, ``LOWER`` and ``CROSSING``: minimum runs for which an upper wire, a lower
-wire and a crossing are considered frozen. ``WIRE_LEAD`` and ``CROSSING_LEAD``: minimum leads at which a
-repeated code is evidence of a frozen wire and of a frozen crossing. ``STEPS``: highest code that represents a
+wire and a crossing are considered frozen. ``WIRE_LEAD`` and ``CROSSING_LEAD``: minimum leads for a repeated
+code to be evidence of a frozen wire and of a frozen crossing. ``STEPS``: highest code that represents a
 measurement. ``FRESH``: 1 if the node sent every code of the scan; 0 if the node omitted unchanged codes, so
 that a repeated code is no evidence of a frozen part.
 """
@@ -53,7 +53,7 @@ _Int = NDArray[np.int64]
 
 
 def new_runs(shape: tuple[int, int]) -> _Int:
-    """Return a new (10, U, K) int64 state array, as needed before the first scan."""
+    """Return the initial state array, (10, U, K) int64."""
     state = np.zeros((_PLANES, *shape), np.int64)
     state[LAST] = state[BEFORE] = -1
     return state
@@ -64,7 +64,7 @@ def follow(codes: NDArray[np.uint32], state: _Int, limits: _Int, found: _Int) ->
     """Update the runs and leads with the codes of a scan.
 
     Args:
-        codes: (U, K) codes; a missing code neither repeats nor changes.
+        codes: (U, K) codes; missing codes are ignored.
         state: (10, U, K) state array; updated in place.
         limits: (7,) limits.
         found: (8,) results; overwritten.

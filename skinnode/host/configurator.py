@@ -37,7 +37,7 @@ itself.
 """
 
 HEARTBEATS_WATCHED: Final = 3
-"""Number of consecutive heartbeats from the host that a node may miss before the node stops sending."""
+"""Number of consecutive host heartbeats that a node may miss before it stops sending scans."""
 
 _POLL_S: Final = 0.02
 
@@ -103,7 +103,7 @@ class Configurator:
         )
 
     def _from_files(self, patch: PatchConfig, profile: PatchProfile) -> NodeFacts:
-        assert patch.baseline is not None  # the hand file was checked when loaded
+        assert patch.baseline is not None  # checked when the hand file was loaded
         baseline_ohm = load_baseline(patch.baseline, profile)
         scale, heartbeat_s = CodeScale(patch.code_bits), self.hand.bring_up.heartbeat_s
         return NodeFacts(patch, patch.layout.build(), profile, scale, baseline_ohm, None, heartbeat_s)
@@ -231,7 +231,7 @@ class Configurator:
                 remote.write_checked(index, sub, size, value)
 
     def _check_mapping(self, patch: PatchConfig, profile: PatchProfile, remote: RemoteOd) -> None:
-        """Check that the node's PDO mapping is as the decoder expects for the node's revision."""
+        """Check that the node has the PDO mapping that the decoder expects for the node's revision."""
         expected = {item.index: item for item in profile.objects()}
         for index in (od.TPDO1_MAPPING, od.TPDO2_MAPPING):
             count = int(expected[index][0].default or 0)
@@ -284,7 +284,7 @@ class Configurator:
 
         For 300 values, a block transfer requires 176 frames, and single reads require 600 frames. At 1
         Mbit/s, the block transfer takes 86 ms because the node sends its segments at a limited rate; the
-        single reads take 75 ms plus 300 response times. Single reads leave bus time for other frames.
+        single reads take 75 ms plus 300 response times. Single reads never saturate the bus.
         """
         try:
             data = remote.read_block(od.BASELINE_DOMAIN, 4 * profile.n_codes)

@@ -7,18 +7,18 @@ an equal phase proves nothing. A changed phase always proves that a conversion t
 
 **Repeats.** If a patch sends no phase, only its codes show whether the converter is running. A run is a
 sequence of scans in which no code changes. A run is considered frozen if, at the noise stated in the hand
-file, a live converter would produce the run with a probability below ``FALSE_ALARM``. The test is repeated
-with the limit ``FALSE_ALARM_QUIET`` and ``QUIETER`` times less noise, or half of the noise measured by
-:mod:`skinnode.host.wire_windows` if that is more. In addition, a code must have returned to its previous
-value in at least ``FLICKERS`` earlier scans, which proves that the codes are noisy. Finally, the run must be
-at least ``LONGER`` times as long as the longest run of the live converter so far. Runs at rest and runs under
-a press are compared separately, because the same converter repeats its codes for minutes at rest, but only
-for two or three scans under a press.
+file, a live converter would produce the run with a probability below ``FALSE_ALARM``. The run must also be
+improbable for a quieter converter: its probability must be below ``FALSE_ALARM_QUIET`` at the stated noise
+divided by ``QUIETER``, or at half of the noise measured by :mod:`skinnode.host.wire_windows`, whichever is
+higher. In addition, a code must have returned to its previous value in at least ``FLICKERS`` earlier scans,
+which proves that the codes are noisy. Finally, the run must be at least ``LONGER`` times as long as the
+longest run of the live converter so far. Runs at rest and runs under a press are compared separately, because
+the same converter repeats its codes for minutes at rest, but only for two or three scans under a press.
 
-**Doubt.** A few repeated scans cannot prove that a patch is frozen, although a press may already have
-changed. If the codes of a patch suddenly stop changing in mid-movement, the next ``DOUBT_RUN`` fields are
-therefore not trusted. This rule applies only to patches that send no phase, have noisy codes and have never
-repeated all their codes before.
+**Doubt.** A few repeated scans do not prove that a patch is frozen, but its fields may already show an
+outdated press. If the codes of a patch suddenly stop changing in mid-movement, the next ``DOUBT_RUN`` fields
+are therefore not trusted. This rule applies only to patches that send no phase, have noisy codes and have
+never repeated all their codes before.
 
 If the phase and the codes are inconclusive and no code has changed for a second, the converter's state is
 *cannot tell*.
@@ -48,15 +48,15 @@ repeats its codes as often as observed. A patch of 10 × 30 wires has 341 parts.
 undergo 1.2e9 tests in ten hours, so 0.001 false alarms are expected; at most one false alarm is permitted.
 """
 FALSE_ALARM_QUIET: Final = 1e-8
-"""Maximum probability that a live patch repeats its codes as often as observed if its noise is ``QUIETER``
-times less than stated. In ten hours (3.6e6 scans), a patch with so little noise would cause 0.04 false
-alarms; few converters are so quiet.
+"""Maximum probability that a live patch repeats its codes as often as observed if its noise is lower than
+stated by the factor ``QUIETER``. In ten hours (3.6e6 scans), a patch with so little noise would cause 0.04
+false alarms; few converters are so quiet.
 """
 QUIETER: Final = 10.0
 """Maximum ratio of the noise stated in the hand file to a converter's actual noise."""
 ABRUPT: Final = 16
-"""Minimum change (codes) of the most changed code in the last scan before a movement stops, for the stop to
-be classified as abrupt. The value has not been tuned.
+"""Threshold (codes) for an abrupt stop of a movement: at least one code must have changed by this amount in
+the last scan before the stop. The value has not been tuned.
 """
 DOUBT_RUN: Final = 64
 """Number of scans after an abrupt stop whose fields are not trusted; later fields are distrusted only if the
@@ -73,7 +73,8 @@ PROOF_NS: Final = 1_000_000_000
 """Time (ns) for which a converter is considered running after a code or the phase has changed."""
 PHASES_REPEATED: Final = 3
 """Number of scans without a new conversion after which a patch is reported as frozen. Fields are not trusted
-from the first such scan. A patch is reported as stale after the same number of missed scans.
+from the first such scan. The value equals the number of missed scans after which a patch is reported as
+stale.
 """
 _MOVED: Final = 16
 """Minimum distance (codes) of a code from its rest value for its quantization error to be considered
@@ -91,7 +92,7 @@ class Alive(enum.StrEnum):
     YES = "yes"
     NO = "no"
     CANNOT_TELL = "cannot tell"
-    """No scan has been received yet, or no code has changed for a second and the codes cannot show why.
+    """No scan has been received yet, or no code has changed for a second for an unknown reason.
     Repeated codes prove nothing if the patch does not count its conversions and its converter has very little
     noise.
     """
@@ -112,7 +113,7 @@ class ConverterLiveness:
         """Noise (codes) measured over recent windows of scans; 0 if no noise could be measured."""
         self._log_p = 0.0  # log probability of a frozen current run, else 0
         self._abrupt = False  # whether the current run began with an abrupt stop
-        self._improbable = False  # whether the current run is too improbable
+        self._improbable = False  # whether a live converter is very unlikely to produce the run
         self._largest = 0  # largest change (codes) in the last scan that changed
         self._run = self._codes = self._flickers = self._check_at = 0
         self._pressed = False
@@ -156,7 +157,7 @@ class ConverterLiveness:
             return f"its codes have not changed for {counted(self._run, 'scan')}"
         if self.doubtful:
             return (
-                "cannot tell whether its converter runs: its codes stopped in mid-movement, "
+                "cannot tell whether its converter runs: its codes stopped changing in mid-movement, "
                 f"{counted(self._run, 'scan')} ago"
             )
         if self.alive is Alive.YES:

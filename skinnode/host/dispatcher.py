@@ -46,7 +46,9 @@ class BusStats:
     foreign: int
     """Number of data frames with a COB-ID that the host does not expect on this bus."""
     ignored: int
-    """Number of remote and extended frames; on a bus without ``fd``, CAN FD frames are included."""
+    """Number of frames ignored because of their type: remote frames, extended frames and, on a bus without
+    ``fd``, CAN FD frames.
+    """
     error_frames: int
     """Number of error frames, i.e. the interface's reports of bus errors and controller states."""
     bus_offs: int
@@ -163,7 +165,7 @@ class Dispatcher:
     def dispatch(self, batch: Sequence[Frame]) -> None:
         """Pass frames to their handlers, in order of arrival.
 
-        If a handler raises an exception, only the frame in question is lost.
+        If a handler raises an exception, only the current frame is lost.
         """
         for listener in self._listeners:
             try:

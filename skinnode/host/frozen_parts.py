@@ -5,12 +5,12 @@ in the same direction by at least ``CROSSING_LEAD`` codes. A wire is frozen if a
 at least ``LEADS`` of its crossings, the codes of the neighbours on the adjacent wires change by at least
 ``WIRE_LEAD`` codes. The movement criteria do not depend on the converter's noise.
 
-The limits were verified with simulated presses on live patches; :mod:`skinnode.host.code_runs` defines a
-lead. In 696 presses (two layouts, layers of 0.3 to 1 pitch, depths of 2 to 50 %, friction of 0 to 0.8, noise
-of 0 to 3e-6, 16-bit codes), the maximum lead of a crossing whose code stayed constant for five scans was 75
-codes. In 1,800 presses without noise (depths from 0.2 %), the maximum lead of a wire whose codes stayed
-constant for at least one scan was 25 codes. For comparison, an indentation of 10 % changes codes by thousands
-of codes.
+The limits of these criteria were verified with simulated presses on live patches. The term *lead* is defined
+in :mod:`skinnode.host.code_runs`. In 696 presses (two layouts, layers of 0.3 to 1 pitch, depths of 2 to 50 %,
+friction of 0 to 0.8, noise of 0 to 3e-6, 16-bit codes), the maximum lead of a crossing whose code stayed
+constant for five scans was 75 codes. In 1,800 presses without noise (depths from 0.2 %), the maximum lead of
+a wire whose codes stayed constant for at least one scan was 25 codes. For comparison, an indentation of 10 %
+changes codes by thousands of codes.
 
 **Noise.** A wire or crossing is also frozen if the probability that a live converter would repeat its codes
 as often as observed is :data:`~skinnode.host.converter_liveness.FALSE_ALARM` or less. The probability of the
@@ -72,8 +72,8 @@ class FrozenParts:
     Args:
         scale: Scale of the codes.
         relative_noise: Converter noise stated in the hand file, as a fraction of the resistance.
-        state: State of the runs (:mod:`skinnode.host.code_runs`). The detector sets and clears the flags of
-            frozen crossings in this array.
+        state: State of the runs (:mod:`skinnode.host.code_runs`). The detector flags the frozen crossings in
+            ``state``.
     """
 
     def __init__(self, scale: CodeScale, relative_noise: float, state: NDArray[np.int64]) -> None:
@@ -135,7 +135,7 @@ class FrozenParts:
     def _wire(
         self, known: NDArray[np.bool_], run: NDArray[np.int64], lead: NDArray[np.int64], at: Any, limit: int
     ) -> float | None:
-        """Return the log probability of a wire's run if the wire were live; None if it is not frozen."""
+        """Return the log probability of a wire's run if the wire were live; None if not frozen."""
         here = known[at]
         if not here.any() or (least := int(run[at][here].min())) < 1:
             return None

@@ -68,7 +68,7 @@ def _ohm(word: str, key: str, allowed: str, where: str) -> float:
 
 
 def check_eds(path: Path, profile: PatchProfile) -> None:
-    """Check that an EDS file describes a patch's wire format; the scan check is optional.
+    """Check that an EDS file matches a patch's wire format, either with or without the scan check.
 
     Raises:
         ConfigError: if the file cannot be read.

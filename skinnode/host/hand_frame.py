@@ -221,7 +221,7 @@ class HandGatherer:
 
 
 class HandSubscription:
-    """Subscription to hand frames, read with ``for``, ``async for`` or :meth:`get`.
+    """Subscription to hand frames, which are read with ``for``, ``async for`` or :meth:`get`.
 
     A slow reader loses the oldest fields, which are counted in ``dropped``, and receives hand frames with
     missing fields. Only one thread may read the subscription.

@@ -63,7 +63,7 @@ class Condition(enum.StrEnum):
 class PatchHealth:
     """Snapshot of a patch's health.
 
-    The age of the newest heartbeat or scan is None before the first is received.
+    The age of the newest heartbeat or scan is None until a heartbeat or scan has been received.
     """
 
     patch: str
@@ -138,7 +138,9 @@ class PatchHealth:
                 silence_s = self.heartbeat_age_s or 0.0
                 return self._with_complaint(f"no heartbeat from node {self.node_id} for {silence_s:.1f} s")
             case Condition.RESTARTING:
-                return f"node {self.node_id} restarts by itself in a loop; {self.boot_ups} boot-ups so far"
+                return (
+                    f"node {self.node_id} keeps restarting without a command; {self.boot_ups} boot-ups so far"
+                )
             case Condition.BOOTING:
                 state = STATE_NAMES.get(self.nmt_state or 0, f"in NMT state {self.nmt_state}")
                 return self._with_complaint(f"node {self.node_id} is {state}, not operational yet")
@@ -223,7 +225,7 @@ class Evidence:
 
 
 def condition_of(facts: Evidence) -> Condition:
-    """Return the most serious condition that applies."""
+    """Return the most serious condition that applies to the patch."""
     late = facts.late_heartbeats
     stale = facts.late_scans is None or facts.late_scans > SCANS_MISSED
     rules = (

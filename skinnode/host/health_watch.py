@@ -122,7 +122,7 @@ class HealthWatch:
 
     def _compare_bus(self, name: str, before: BusHealth, now: BusHealth) -> None:
         if now.away != before.away:
-            self._publish(name, "away" if now.away else "back", now.away or "the bus is back")
+            self._publish(name, "away" if now.away else "back", now.away or "the bus is available again")
         if now.no_sync != before.no_sync:
             text = "no SYNC received from its master" if now.no_sync else "SYNC received again"
             self._publish(name, "no SYNC" if now.no_sync else "SYNC", text)

@@ -183,7 +183,7 @@ class Host:
             timeout_s: Maximum time (s) to wait for a field before the iteration raises TimeoutError; None for
                 no limit.
             capacity: Capacity of the subscriber's queue; when the queue is full, the oldest field is dropped.
-                The hand file's capacity by default.
+                Default: the hand file's capacity.
             patch: Patch whose fields are delivered; all patches by default.
 
         Raises:
@@ -196,7 +196,7 @@ class Host:
         """Subscribe to hand frames, each of which contains all patches' fields for one SYNC.
 
         Iterate over the subscription with ``for`` or ``async for``. A hand frame is delivered at most two
-        SYNC periods after its first field, and earlier if only absent patches are missing.
+        SYNC periods after its first field, without waiting for absent patches.
 
         Args:
             timeout_s: Maximum time (s) to wait for a hand frame before the iteration raises TimeoutError;
@@ -204,7 +204,7 @@ class Host:
             capacity: Capacity of the subscriber's queue, in hand frames; the hand file's capacity by default.
 
         Raises:
-            ValueError: if the hand's patches do not all follow the same SYNC producer, or its SYNC has no
+            ValueError: if the hand's patches do not all follow the same SYNC producer, or the SYNC has no
                 counter.
         """
         self._require_one_sync()

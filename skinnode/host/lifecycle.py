@@ -201,7 +201,7 @@ def _logged_already(error: Exception) -> None:
 
 
 def _let_scans_end(streams: Sequence[tuple[PatchStream, Ticks]], period_s: float) -> None:
-    """Wait for the scans started by the last SYNC, so that shutdown does not cut them off."""
+    """Wait for the scans started by the last SYNC, so that shutdown does not interrupt them."""
     end_s = clock.monotonic() + min(1.5 * period_s, LAST_SCAN_S)
     while not all(stream.settled(ticks.newest) for stream, ticks in streams):
         if clock.monotonic() > end_s:

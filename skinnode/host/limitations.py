@@ -24,12 +24,14 @@ from skinnode.solve.wires.problem import PatchProblem
 
 BY_PRIOR: Final = 0.3
 """Maximum useful standard deviation of the exact inverse at rest, as a fraction of the clearance. Above this
-value, the displacement is mostly determined by neighbours and elasticity. Few presses indent the layer by a
-larger fraction.
+value, neighbouring crossings and the elastic model mostly determine the displacement. Few presses indent the
+layer by more than this fraction.
 """
 
 
-_BY_PRIOR: Final = "neighbours and elasticity determine the rest (see data_share)"
+_BY_PRIOR: Final = (
+    "neighbouring crossings and the elastic model supply the missing information (see data_share)"
+)
 
 
 @dataclass(frozen=True, slots=True)

@@ -29,8 +29,8 @@ class BusLink(Dispatcher):
     """Connection to a bus; open from construction until :meth:`close` or the end of a ``with`` block.
 
     If a handler, poller, listener or job raises an exception, only the current frame or call is lost.
-    If the dispatcher itself raises an exception, the bus is paused, and received frames wait in the queue. If
-    the interface fails after it has been opened, a thread repeatedly tries to reopen it.
+    If the dispatcher itself raises an exception, dispatching is paused for this bus, and received frames wait
+    in the queue. If the interface fails after it has been opened, a thread repeatedly tries to reopen it.
 
     Threads: :meth:`send`, :meth:`ask_remote`, :meth:`call` and :meth:`stats` may be called from any thread.
     The other methods may be called only by a :class:`~skinnode.host.mainline.Mainline`. A separate thread
@@ -108,8 +108,8 @@ class BusLink(Dispatcher):
         Args:
             node_id: Node-ID of the node.
             on_answer: Function called on the mainline with the monotonic time (ns) of each SDO response.
-            defects: Collector of the response handler's exceptions, as in :meth:`handle`. If given,
-                exceptions that only cause a transfer to be retried are still reported to the bus's collector.
+            defects: Collector of the response handler's exceptions, as in :meth:`handle`. If ``defects`` is
+                given, exceptions after which a transfer is retried are reported to the bus's collector.
         """
 
         def on_response(data: bytes, t_ns: int) -> None:
@@ -202,7 +202,7 @@ class BusLink(Dispatcher):
             heard = self._dispatch_received()
             if self.failure is not None and (heard or clock.monotonic() > self._due_s):
                 self.failure = None
-                _log.warning("%s: the bus is back", self.config.name)
+                _log.warning("%s: the bus is available again", self.config.name)
         except Exception as error:
             if self.intake.failed:
                 self._go_away(error)
@@ -248,7 +248,7 @@ class BusLink(Dispatcher):
         return bool(batch)
 
     def _rest(self) -> None:
-        """End the bus's pause if it has elapsed; restart the reopening thread if it failed to start."""
+        """End an elapsed pause, or restart the reopening thread if the thread failed to start."""
         if not self._opening:
             self._rests = clock.monotonic() < self._rest_end_s
         elif (

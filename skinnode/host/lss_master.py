@@ -268,7 +268,7 @@ class LssMaster:
         """Send a request and return the first response that starts with ``expected``.
 
         The default for ``expected`` is the command itself. All other responses are discarded, because they
-        belong to earlier requests. Return None if no such response arrives before the timeout.
+        belong to earlier requests. Return None if no matching response arrives before the timeout.
         """
         expected = bytes((command,)) if expected is None else expected
         while not self._answers.empty():

@@ -50,7 +50,7 @@ limit.
 class NodeMonitor:
     """Collector of evidence about one node.
 
-    Only :meth:`health` may be called from any thread; all other methods belong to the mainline.
+    Only :meth:`health` may be called from any thread; all other methods may be called only from the mainline.
 
     Args:
         patch: Name of the patch.
@@ -77,7 +77,7 @@ class NodeMonitor:
         self._t_scan_ns: int | None = None
         self._boot_ups = self._emergencies = self._slow_overruns = self._error_register = 0
         self._registers_said = 0
-        self._last_emergency: tuple[int, bytes] | None = None  # error code and manufacturer-specific bytes
+        self._last_emergency: tuple[int, bytes] | None = None  # error code, other bytes
         self.running = False
         """Whether the node has been started; from then on, boot-up messages are counted as spontaneous
         restarts.
@@ -116,7 +116,7 @@ class NodeMonitor:
             self._on_register(0)  # a reset clears the register; persistent errors are reported again
             if self.running:
                 self._restarts.append(t_ns)
-                _log.warning("node %d (%s) restarted by itself", self.node_id, self.patch)
+                _log.warning("node %d (%s) restarted without a command", self.node_id, self.patch)
         else:
             self._beats.append(t_ns)
         self.nmt_state = state

@@ -1,6 +1,7 @@
 """Detect other masters on a bus from frames that only a master sends.
 
-The host does not receive its own frames, so every received master's frame comes from another master.
+The host does not receive its own frames. A received SYNC message or NMT command, for example, therefore comes
+from another master.
 """
 
 from __future__ import annotations
@@ -16,8 +17,8 @@ from skinnode.config import BusConfig
 _log = logging.getLogger(__name__)
 
 QUIET_NS: Final = 10_000_000_000
-"""Minimum pause (ns) in another master's frames of one type after which the next such frame is logged
-again.
+"""Minimum time (ns) without another master's frame of a given type, after which the next frame of this type
+is logged again.
 """
 
 SYNC, NMT, SDO, HEARTBEAT = "SYNC", "NMT commands", "SDO requests to our nodes", "our own heartbeat"
@@ -25,7 +26,7 @@ SYNC, NMT, SDO, HEARTBEAT = "SYNC", "NMT commands", "SDO requests to our nodes",
 
 @dataclass(frozen=True, slots=True)
 class OtherMasterStats:
-    """Counters of frames from other senders that only a master may send.
+    """Counters of master-only frames, such as SYNC and SDO requests, received from other senders.
 
     On a bus that another master runs, SYNC and NMT commands are not counted, so ``syncs`` and
     ``nmt_commands`` stay 0.
@@ -52,7 +53,7 @@ class OtherMasters:
         self._last_ns: dict[str, int] = {}
 
     def handlers(self, node_ids: list[int]) -> dict[int, Callable[[bytes, int], None]]:
-        """Return handlers, by COB-ID, that count the frames sent only by masters.
+        """Return handlers, by COB-ID, that count the frames of other masters.
 
         If another master runs the bus, SYNC and NMT commands are legitimate and have no handler.
 

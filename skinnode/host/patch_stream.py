@@ -1,8 +1,8 @@
 """Turn a patch's chunks into fields: assemble scans on the mainline, decode and solve them on workers.
 
-The mainline assembles scans and stores the newest complete scan in a one-element buffer (the *box*). A worker
-thread takes the scan from the box and solves it. If a newer scan replaces an unsolved scan in the box, the
-older scan is counted as skipped. A token ensures that at most one worker processes the stream at a time.
+The mainline assembles scans and stores the newest assembled scan in a one-element buffer (the *box*). A
+worker thread takes the scan from the box and solves it. If a newer scan replaces an unsolved scan in the box,
+the older scan is counted as skipped. A token ensures that at most one worker processes the stream at a time.
 """
 
 from __future__ import annotations
@@ -125,7 +125,7 @@ class StreamOptions:
     partial: Partial = "pass"
     """Handling of incomplete scans: ``pass`` or ``withhold``."""
     under_way: bool = False
-    """Whether another master starts the node. If so, the node may already be sending scans when the stream is
+    """Whether another master starts the node, which may therefore already be sending scans when the stream is
     resumed.
     """
 
@@ -220,8 +220,8 @@ class PatchStream:
 
         Args:
             solver: Solver for the scans.
-            withholdings: Value of ``withholdings`` known to the caller. If the value has changed since, the
-                call has no effect.
+            withholdings: Value of ``withholdings`` known to the caller. If ``withholdings`` has a different
+                value by now, the call has no effect.
             anew: Whether the node has been restarted, so that all earlier frames must be ignored.
         """
         if withholdings != self.withholdings:
@@ -237,7 +237,7 @@ class PatchStream:
             self.tap.resumed(self._patch, solver, anew=anew)
 
     def inform_tap(self) -> None:
-        """Record the current solver with a new tap, unless scans are being withheld."""
+        """Report the current solver to a newly added tap, unless scans are being withheld."""
         if self.tap is not None and self._solver is not None:
             self.tap.resumed(self._patch, self._solver, anew=False)
 
@@ -294,7 +294,7 @@ class PatchStream:
     def leave_out(self, times_ns: Sequence[int], within_ns: int) -> None:
         """Skip the scans that were replaced by newer scans when the recording was made.
 
-        The replaced scans are identified by arrival time. Their scan numbers are not unique: if reception
+        The replaced scans are identified by arrival time. Scan numbers are not unique: if reception
         pauses in the middle of a scan, both parts may be assembled as scans with the same number.
 
         Args:
@@ -312,7 +312,7 @@ class PatchStream:
     def settled(self, scan: int) -> bool:
         """Return whether ``scan`` has arrived and no scan is queued or being solved.
 
-        While scans are being withheld, ``scan`` need not have arrived.
+        While scans are being withheld, the method does not require ``scan`` to have arrived.
         """
         return (self._newest >= scan or self._solver is None) and not self._box and bool(self._token)
 

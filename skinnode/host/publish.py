@@ -163,7 +163,10 @@ class Subscription:
         self.close()
 
     def offer(self, item: FieldFrame | End, patch: str) -> None:
-        """Queue an end marker, or a field if its patch is subscribed to. Never blocks. Any thread."""
+        """Queue an end marker or a field; ignore fields of other patches than the subscribed patch.
+
+        Never blocks. Any thread.
+        """
         if patch and patch not in self._subscribed:
             return
         self._dropped[patch] += self._queue.put(item)

@@ -28,7 +28,7 @@ times a second unless the node's bus is unavailable.
 
 _ANSWER_S: Final = 0.05
 """Time (s) to wait for all responses to one SDO request when checking for a second node with the same
-node-ID. The check makes a failed bring-up at least twice this time longer.
+node-ID. Because of the check, a failed bring-up takes longer by at least twice this time.
 """
 
 _MUTE_S: Final = 0.4
@@ -96,7 +96,7 @@ class RemoteNode:
         abandoned: Callable[[], bool],
         on_answer: Callable[[PatchConfig], None] | None = None,
     ) -> ScanSolver:
-        """Configure the node while its scans are withheld.
+        """Withhold the node's scans, and configure the node.
 
         Args:
             deadline_s: Maximum time (s) to wait for the node's first response.
@@ -253,7 +253,7 @@ class RemoteNode:
     def _answers_to_one_question(self) -> int:
         """Return the number of responses to one SDO request; two responses reveal a shared node-ID.
 
-        A late response to an earlier request would also be counted. The method therefore sends two requests
+        A late response to an earlier request would inflate the count. The method therefore sends two requests
         and returns the smaller number of responses.
         """
         clock.sleep(_ANSWER_S)

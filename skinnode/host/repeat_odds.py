@@ -3,10 +3,10 @@
 The probability that a reading falls into the same code again is at most 2Φ(1/2σ) − 1, where σ is the standard
 deviation of the noise in codes. This bound is reached if the true value is in the middle of a quantization
 step, as for skin at rest after a tare. Under a press, each crossing has a different value, so the position of
-the value within its quantization step is practically random. The probability that n + 1 readings of one
-crossing all fall into the same code is then E max(0, 1 − σ R), where R is the range of n + 1 standard normal
-variables. For random positions, the probability of repeated codes is much lower than the bound, even for a
-converter with little noise.
+the value within its quantization step is practically random. For a random position, the probability that n +
+1 readings of one crossing all fall into the same code is E max(0, 1 − σ R), where R is the range of n + 1
+standard normal variables. For random positions, the probability of repeated codes is much lower than the
+bound, even for a converter with little noise.
 """
 
 from __future__ import annotations

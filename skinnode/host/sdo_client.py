@@ -136,7 +136,7 @@ class RemoteOd:
             self.abandoned = before
 
     def answers(self) -> bool:
-        """Return whether the node responds to a single SDO request, possibly with an abort."""
+        """Return whether the node responds to a single SDO request, even if with an abort."""
         try:
             self._upload(DEVICE_TYPE, 0, _MAX_NUMBER_BYTES)
         except SdoAbortedError:
@@ -296,13 +296,15 @@ class RemoteOd:
             return NodeTimeout(self.node_id, f"{where}: no response within {waited_s:.1f} s")
         if "returned a value for" in str(failure):  # response to another client or from another node
             got = f"{where}: got the response for another object"
-            why = f"two nodes answer with node-ID {self.node_id}, or another SDO client is using it"
+            why = f"two nodes respond with node-ID {self.node_id}, or another SDO client is using it"
             return NodeError(self.node_id, f"{got}; {why}")
         if isinstance(failure, SdoError):
-            return NodeError(self.node_id, f"{where}: got {failure}, expected a response as in CiA 301")
+            return NodeError(
+                self.node_id, f"{where}: got {failure}, expected a response that conforms to CiA 301"
+            )
         return NodeError(
             self.node_id,
-            f"{where}: the transfer failed ({one_line(failure)}), expected a response as in CiA 301",
+            f"{where}: the transfer failed ({one_line(failure)}), expected a response that conforms to CiA 301",
         )
 
 

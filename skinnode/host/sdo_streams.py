@@ -35,8 +35,8 @@ from skinnode.canopen.sdo import ABORT
 from skinnode.process import clock
 
 _QUIET_S: Final = 0.02
-"""Time (s) without a response after an abort, after which the node is assumed to send no more responses to
-the aborted transfer.
+"""Required quiet time (s) after an abort: if no response arrives for this time, the aborted transfer is
+considered finished.
 """
 
 _SETTLE_S: Final = 0.1

@@ -84,7 +84,7 @@ class _Start:
         self._answered: list[PatchConfig] = []
 
     def run(self) -> dict[RemoteNode, ScanSolver]:
-        """Configure the nodes, and return each node that responded with its solver."""
+        """Configure the nodes, and return the responding nodes, each with its solver."""
         threads = min(len(self._nodes), BRING_UP_THREADS)
         with clock.pool(threads, "bring-up") as pool:
             try:
@@ -160,7 +160,7 @@ class _Start:
 
 
 def start_all(ready: dict[RemoteNode, ScanSolver]) -> None:
-    """Start the nodes on the host's own buses, and wait until their heartbeats report operational.
+    """Start the nodes whose master is the host, and wait until their heartbeats report operational.
 
     The deadline is measured in polling intervals, so that time during which the computer is suspended is not
     included.

@@ -52,7 +52,7 @@ class Ticks:
         """Number of the newest SYNC; 0 before the first SYNC."""
 
     def note(self, number: int, t_ns: int) -> int:
-        """Store the time of SYNC ``number``. Return its counter value (1 to ``counter_overflow``)."""
+        """Store the time of SYNC ``number``. Return the SYNC's counter (1 to ``counter_overflow``)."""
         counter = (number - 1) % self.counter_overflow + 1
         self._ticks[counter] = Tick(number, t_ns)
         self.newest = number

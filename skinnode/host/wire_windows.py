@@ -32,7 +32,7 @@ from skinnode.protocol.scan import Scan
 WINDOW: Final = 16
 """Number of scans in a window."""
 WINDOWS: Final = 3
-"""Number of consecutive windows in which a wire must be noisy or drift before it is reported."""
+"""Number of consecutive windows in which a wire must be noisy or drifting before it is reported."""
 NOISY: Final = 25.0
 """Minimum ratio of a noisy wire's noise power to the median wire's; corresponds to an amplitude ratio of
 5.

@@ -87,7 +87,7 @@ ATTACKS = (
     attack("half the SYNCs lost", sync_lost=0.5),
     attack("all SYNCs lost", sync_lost=1.0, reason="no scan from node"),
     attack("reset in the middle of a scan", 0.4, reset=1.0),
-    attack("restart loop", 2.0, restart_every_s=0.3, reason="restarts by itself in a loop"),
+    attack("restart loop", 2.0, restart_every_s=0.3, reason="keeps restarting without a command"),
     attack("silent node", 1.5, silent=True, reason="no heartbeat from node"),
     attack("silent for a moment", 0.3, silent=True),
     attack("stuck receiver", 1.5, deaf=True),

@@ -86,7 +86,7 @@ def test_nothing_is_reported_while_nothing_changes(hand: HandHealth) -> None:
 
 def test_a_bus_goes_away_and_comes_back(hand: HandHealth) -> None:
     assert after(hand, bus={"away": "can0: unplugged"}) == [("can0", "away", "can0: unplugged")]
-    assert after(hand, bus={"away": None}) == [("can0", "back", "the bus is back")]
+    assert after(hand, bus={"away": None}) == [("can0", "back", "the bus is available again")]
 
 
 def test_a_counter_is_reported_by_how_much_it_grew(hand: HandHealth) -> None:

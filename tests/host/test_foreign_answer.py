@@ -18,5 +18,5 @@ def test_answer_for_another_object_names_who_may_have_caused_it() -> None:
         RemoteOd(network, 5).read(0x1A00, 4, "u32")
     assert str(caught.value) == (
         "node 5: read of object 0x1A00:4: got the response for another object; "
-        "two nodes answer with node-ID 5, or another SDO client is using it"
+        "two nodes respond with node-ID 5, or another SDO client is using it"
     )

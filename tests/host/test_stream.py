@@ -197,7 +197,7 @@ def test_node_that_restarts_by_itself(hand: HandConfig, rack: Rack, caplog: pyte
         take(host.fields(timeout_s=10, patch="p1"), 4)
         assert host.health("p1").condition is Condition.OPERATIONAL
     said = [record.getMessage() for record in caplog.records if record.name.startswith("skinnode.")]
-    assert said == ["node 6 (p1) restarted by itself", "node 6 (p1) was brought up and is running"]
+    assert said == ["node 6 (p1) restarted without a command", "node 6 (p1) was brought up and is running"]
 
 
 def test_bus_that_fails_is_opened_again_and_the_stream_goes_on(
@@ -216,7 +216,7 @@ def test_bus_that_fails_is_opened_again_and_the_stream_goes_on(
         take(fields, 10)
     said = [record.getMessage() for record in caplog.records]
     assert "cannot receive (Network is down); trying to reopen the interface" in said[0]
-    assert "can0: the bus is back" in said
+    assert "can0: the bus is available again" in said
 
 
 def test_two_buses_one_sync(make_hand: Callable[..., HandConfig]) -> None:

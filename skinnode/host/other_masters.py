@@ -21,7 +21,7 @@ QUIET_NS: Final = 10_000_000_000
 is logged again.
 """
 
-SYNC, NMT, SDO, HEARTBEAT = "SYNC", "NMT commands", "SDO requests to our nodes", "our own heartbeat"
+SYNC, NMT, SDO, HEARTBEAT = "SYNC", "NMT commands", "SDO requests to the hand's nodes", "the host's heartbeat"
 
 
 @dataclass(frozen=True, slots=True)

@@ -300,11 +300,11 @@ class RemoteOd:
             return NodeError(self.node_id, f"{got}; {why}")
         if isinstance(failure, SdoError):
             return NodeError(
-                self.node_id, f"{where}: got {failure}, expected a response that conforms to CiA 301"
+                self.node_id, f"{where}: got {failure}, expected a response according to CiA 301"
             )
         return NodeError(
             self.node_id,
-            f"{where}: the transfer failed ({one_line(failure)}), expected a response that conforms to CiA 301",
+            f"{where}: the transfer failed ({one_line(failure)}), expected a response according to CiA 301",
         )
 
 

@@ -96,7 +96,11 @@ def test_movement_that_ends_at_once_is_doubted_unless_the_patch_counts(counts: b
     for _ in range(100):
         patch.see(patch.read(), (patch.number % 3 + 1) << 6 if counts else 0)
     pressed = patch.read(0.9 * REST)
-    for expected in ("", "stopped in mid-movement, 1 scan ago", "stopped in mid-movement, 2 scans ago"):
+    for expected in (
+        "",
+        "stopped changing in mid-movement, 1 scan ago",
+        "stopped changing in mid-movement, 2 scans ago",
+    ):
         verdict = patch.see(pressed, (patch.number % 3 + 1) << 6 if counts else 0)
         assert verdict.distrust.endswith(expected) if expected and not counts else not verdict.distrust
         assert not verdict.faults

@@ -319,7 +319,7 @@ def test_the_load_of_each_bus_is_measured_though_in_turn(hand: HandConfig) -> No
             "60 17 10 00 00 00 00 00",
             NodeError,
             "node 5: read of object 0x1017:0: got Unexpected response 0x60, "
-            "expected a response that conforms to CiA 301",
+            "expected a response according to CiA 301",
         ),
         (
             "80 17 10 00 00 00 02 06",

@@ -268,7 +268,7 @@ def test_a_second_master_is_named(
         assert (other_masters.syncs, other_masters.nmt_commands, other_masters.heartbeats) == (3, 0, 0)
     assert [record.getMessage() for record in caplog.records] == [
         "can0: another node sends SYNC: is there a second host or master?",
-        "can0: another node sends SDO requests to our nodes: is there a second host or master?",
+        "can0: another node sends SDO requests to the hand's nodes: is there a second host or master?",
     ]
 
 

@@ -2,8 +2,8 @@
 
 The new content is first written to a temporary file with a random name in the same folder. The temporary file
 is created exclusively, never through a symbolic link, and is renamed when it is complete. Readers therefore
-always see either the complete old content or the complete new content. After an error, the old content
-remains.
+always see either the complete old content or the complete new content. If writing fails, the file keeps its
+old content.
 """
 
 from __future__ import annotations

@@ -154,8 +154,8 @@ def thread(target: Callable[..., object], name: str, args: tuple[Any, ...] = ())
 def pool(threads: int, name: str) -> Executor:
     """Create a :class:`concurrent.futures.ThreadPoolExecutor`.
 
-    To wait for a job, use :meth:`concurrent.futures.Future.add_done_callback`. Other ways of waiting ignore
-    the virtual clock.
+    To wait for a job of the pool, use :meth:`concurrent.futures.Future.add_done_callback`. Other ways of
+    waiting ignore the virtual clock.
     """
     return _here.clock.pool(threads, name)
 

@@ -13,8 +13,8 @@ def without_long_collections() -> Iterator[None]:
     """Exclude all objects that exist on entry to the ``with`` block from garbage collection during the block.
 
     With numba and canopen loaded, a full garbage collection on a small computer stops all threads for 30 ms.
-    Such a pause can make a node miss a scan, or delay the host's SYNC. Enter the block after setup is
-    complete. Objects that exist on entry and become cyclic garbage are freed only after the block.
+    Such a pause can make a node miss a scan, or delay the host's SYNC. Enter the ``with`` block after setup
+    is complete. Objects that exist on entry and become cyclic garbage are freed only after the block.
     """
     gc.collect()
     gc.freeze()

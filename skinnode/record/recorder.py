@@ -102,8 +102,8 @@ class Recorder:
     If recording begins before the host starts, a replay reproduces the fields bit for bit. A recording that
     begins while the host is running (:meth:`Host.tap`) lacks the solvers' initial state. If an exception ends
     the ``with`` block before the first frame, the empty recording is deleted. If the disk fails, recording
-    ends, a log message reports the failure, and the host continues. An entry that causes any other exception
-    is lost and counted in ``dropped``.
+    ends, a log message reports the failure, and the host continues. If writing an entry raises an exception
+    other than OSError, the entry is lost and counted in ``dropped``.
 
     Args:
         hand: The hand.

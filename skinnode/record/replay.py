@@ -90,7 +90,7 @@ class Replay:
         self.hand, self.started = header.hand, header.started
         self._speed, self._offset_ns = speed, header.wall_minus_mono_ns
         self.log = FrameLogReader(path)
-        """Log reader, whose attributes ``damaged`` and ``damages`` report unreadable parts."""
+        """Reader of the log; its attributes ``damaged`` and ``damages`` describe unreadable parts."""
         ends = [event for event in events if event["event"] == "ended"]
         self.ended = bool(ends)
         """Whether the recording was closed properly; False if the recording process was killed."""

@@ -62,10 +62,10 @@ DEVIATIONS: Final = 4.0
 By chance, one block in 16,000 exceeds a threshold.
 """
 DEPARTED: Final = math.log(1.5)
-"""Logarithm of the ratio of estimated to stated noise above which the estimate replaces the stated noise.
-Below this ratio, the results are bit-identical to those with the stated noise."""
+"""Logarithm of the noise ratio (estimated to stated) above which the estimate replaces the stated noise.
+Below this threshold, the results are bit-identical to results with the stated noise."""
 RETURNED: Final = math.log(1.25)
-"""Logarithm of the ratio of estimated to stated noise below which the stated noise is used again."""
+"""Logarithm of the noise ratio (estimated to stated) below which the stated noise is used again."""
 STEP: Final = math.log(1.05)
 """Minimum change in the logarithm of the noise, in addition to the scatter margin, that updates an
 estimate in use. Smaller changes are ignored because every update requires another solve of the frame."""

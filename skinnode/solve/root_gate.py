@@ -3,8 +3,8 @@
 A wire is doubtful if it has no root, if it moved a long way between two frames, or if its displacement is too
 rough to be a press. If presses can reach folds of a layout, every solved wire is doubtful, because the
 inverse alone cannot distinguish nearby roots of F = b. The posterior, which uses the neighbouring wires,
-confirms the root of a doubtful wire, replaces it, or leaves the wire without a root. The thresholds are in
-:mod:`skinnode.solve.roots`.
+confirms the root of a doubtful wire, replaces it, or leaves the wire without a root. The thresholds for these
+decisions are defined in :mod:`skinnode.solve.roots`.
 """
 
 from __future__ import annotations
@@ -216,7 +216,7 @@ class RootGate:
 
         self._apart[doubtful] = 0.0
         self._apart[agreed & self._folded] = apart[agreed & self._folded]
-        self._any_apart = True  # assume True until the next frame is checked
+        self._any_apart = True  # recomputed when the next frame is checked
 
         assert estimate.core_std_m is not None
         self._exact.adopt(replaced, moved)

@@ -92,8 +92,8 @@ smoothest displacement. For presses, the ratio is 0.67 on average, below 0.9 for
 for presses that move a single electrode. For wrong roots, the ratio is 0.7 to 2."""
 SMOOTH_PATH: Final = 0.2
 """Maximum distance of a sample's solution from the secant through the previous two solutions, relative to
-the final displacement, for a path to be smooth. The first sample's distance is measured from the rest
-position. The value was measured on 3500 wires of aligned and staggered layouts, h = 0.3 to 1, under
+the final displacement, on a smooth path. For the first sample of a path, the distance is measured from the
+rest position. The value was measured on 3500 wires of aligned and staggered layouts, h = 0.3 to 1, under
 presses of 30 to 70 % with shears of 0.3 to 0.8. On 59 of these wires, paths of 5 to 100 samples led across
 a fold to a root other than the accepted root. On 37 of the 59 wires, the accepted root was wrong; the
 largest distance was at most 0.2, except on 2 wires (0.27 and 0.67). On the other 22 wires, whose paths had
@@ -106,7 +106,7 @@ root, 0.21 from the secant. The other 17 samples were within 0.06 of the secant,
 wrong by 69 %.
 """
 ROOT_RESIDUAL: Final = 1e-9
-"""Maximum RMS of F/b − 1 for the end of a path to be a root.
+"""Maximum RMS of F/b − 1 for accepting the end of a path as a root.
 
 J may be too close to singular for the status CONVERGED.
 """
@@ -117,16 +117,16 @@ checked again."""
 # -- two roots of one wire ----------------------------------------------------------------------------------
 
 SAME_ROOT: Final = 1e-3
-"""Maximum distance between two solutions for them to be the same root, relative to the displacement."""
+"""Maximum distance between two solutions that are considered the same root, relative to the displacement."""
 TWIN_REACH: Final = 2.0
 """Maximum distance of a twin root that is solved for, relative to the wire's largest displacement. On the
 staggered layout, h = 0.3 to 1, more distant twins were at least 1.3 times as rough as the root."""
 TWIN_ROUGHNESS: Final = 1.05
-"""Minimum ratio of the roughnesses of two roots at a fold for the smoother root to be accepted. In 82
-random presses of 50 % on the staggered layout, h = 1, the twins of wrong roots were at most 1.044 times as
-rough as the wrong roots themselves. Of 100 correct roots, 4 have a twin within this ratio and lose the
-status CONVERGED. In 60 further presses of each depth and height (6710 wires, h = 0.3 to 1), no wrong root
-was reported as CONVERGED. In another 40 presses (4510 wires), one wrong root was reported as CONVERGED."""
+"""Minimum roughness ratio of two roots at a fold for accepting the smoother root. In 82 random presses of
+50 % on the staggered layout, h = 1, the twins of wrong roots were at most 1.044 times as rough as the
+wrong roots themselves. Of 100 correct roots, 4 have a twin within this ratio and lose the status
+CONVERGED. In 60 further presses of each depth and height (6710 wires, h = 0.3 to 1), no wrong root was
+reported as CONVERGED. In another 40 presses (4510 wires), one wrong root was reported as CONVERGED."""
 UNLIKELY: Final = 4.0
 """Minimum difference in energy between the accepted root and every other root. In 1530 pairs of roots from
 presses of 30 to 70 % (staggered layout, h = 1; aligned layout, h = 0.5), the wrong root was likelier in 19

@@ -3,15 +3,15 @@ r"""Makes untrusted text printable; only this module defines which characters ou
 Text from a device, a file, a recording or the command line is untrusted. The rules are:
 
 * Text from a bus or an EDS is made printable when decoded (:func:`printable`), and is limited to one line.
-The original bytes are preserved in ``od --json``, in a DCF and in comparisons. * A name in hand.toml that is
-not printable is rejected (``skinnode.config``). * The output of every command passes through
-:class:`PrintableStream`, and output from rich passes through the
+  The original bytes are preserved in ``od --json``, in a DCF and in comparisons.
+* A name in hand.toml that is not printable is rejected (``skinnode.config``).
+* The output of every command passes through :class:`PrintableStream`, and output from rich passes through the
   console of ``skinnode.cli``. Both mechanisms are safety nets for echoed text, such as file names and
   arguments.
 * In HTML pages, text is also HTML-escaped, so that untrusted text is never interpreted as markup.
 
 Text is printable according to :meth:`str.isprintable` if it contains no control characters (C0, DEL, C1), no
-format characters (some of which reverse the text direction or have no width) and no surrogates. Such
+format characters (some of which reverse the text direction or have no width) and no surrogates. Non-printable
 characters are replaced by Python escapes: ``\x1b``, ``\u202e``.
 """
 

@@ -3,7 +3,7 @@
 The recovery consists of three steps:
 
 - bridge: interpolate R from the last trusted frame to the new frame, and solve each substep;
-- restart: bridge from the rest position;
+- restart: bridge again, starting from the rest position;
 - give up: keep the last trusted position of a wire that still fails, with an infinite standard deviation and
   a status other than CONVERGED.
 """

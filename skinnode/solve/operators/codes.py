@@ -34,7 +34,9 @@ MINIMUM_SHARE: Final = EPS ** (1 / 3)
 """Maximum error estimate of a minimum, relative to max(1, ‖x‖∞). The limit is larger than for a root, because
 ‖r‖² determines x only to √eps."""
 STATIONARY: Final = 1e-6
-"""Maximum gradient, relative to ‖J_j‖ ‖r‖, that is treated as zero. Below this limit, ‖r‖² is flat to
-within rounding, about √eps."""
+"""Maximum gradient, relative to ‖J_j‖ ‖r‖, that is treated as zero.
+
+Because of rounding, a smaller gradient cannot be distinguished from zero.
+"""
 STALL_LIMIT: Final = 30
 """Maximum number of steps for refining x in a tall system while ‖r‖² changes only by rounding."""

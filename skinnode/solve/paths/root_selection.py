@@ -1,7 +1,7 @@
 """Root selection at the end of a path: second attempts, and the choice of the root to accept.
 
-The thresholds are in :mod:`skinnode.solve.roots`. All functions change :attr:`PathTracker.end` and the
-solver's positions in place. A rejected root becomes ILL_CONDITIONED.
+The thresholds for this choice are defined in :mod:`skinnode.solve.roots`. All functions change
+:attr:`PathTracker.end` and the solver's positions in place. A rejected root becomes ILL_CONDITIONED.
 """
 
 from __future__ import annotations
@@ -131,7 +131,7 @@ def keep_likeliest(
     unlikely: Float,
     accuracy: Accuracy,
 ) -> None:
-    """Search for other roots, starting from the twins and from ``starts``; keep the likeliest root.
+    """Search for other roots, starting from twin roots and from ``starts``; keep the likeliest root.
 
     A wire is CONVERGED only if the energies of all its other roots differ by at least ``unlikely``.
 

@@ -210,7 +210,7 @@ def _event(line: bytes, hand: HandConfig) -> dict[str, Any]:
 
 
 def _whole(value: object, least: int = 0) -> int:
-    """Return ``value``. Raises ValueError if it is not a 64-bit integer, or is less than ``least``."""
+    """Return ``value``. Raises ValueError if ``value`` is not a 64-bit integer, or is less than ``least``."""
     if not isinstance(value, int) or isinstance(value, bool) or not least <= value <= _MOST:
         raise ValueError
     return value

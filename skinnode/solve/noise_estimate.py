@@ -90,7 +90,7 @@ _ITERATIONS: Final = 30
 _ONE_CODE: Final = 12.5
 """Squared contrast of readings that differ by one code, plus a margin, in units of the rounding variance."""
 _HALF_A_CODE: Final = 4.0
-"""Total variance of half a code of noise plus rounding, in units of the rounding variance."""
+"""Total variance due to rounding and half a code of noise, in units of the rounding variance."""
 _CUBIC: Final = 1.0 / math.sqrt(20.0)
 
 
@@ -272,8 +272,7 @@ class NoiseEstimate:
         level = 0.5 * (levels[(len(levels) - 1) // 2] + levels[len(levels) // 2])
         agrees = abs(blocks[-1][1] - level) < RETURNED + DEVIATIONS * _STD / math.sqrt(8.0 * blocks[-1][0])
         self._pause = PAUSE if agrees and len(blocks) == WINDOW else 0
-        # standard deviation of the mean log standard deviation; the factor 1.25 accounts for the median of
-        # blocks
+        # standard error of the mean logarithm of the noise; 1.25 is the loss of precision due to the median
         std = 1.25 * 0.5 * _STD / math.sqrt(2.0 * values)
         self.relative_std = std
         unequal = math.fsum(block[2] for block in blocks) / len(blocks)

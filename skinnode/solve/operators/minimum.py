@@ -91,7 +91,7 @@ def curvature(jacobian: Callable[[Float], Float], at: Point) -> Curvature:
     n = at.x.size
     d = column_norms(at.j)
     d[d == 0.0] = 1.0
-    reach = at.norm / d  # change in one coordinate that changes r by ‖r‖
+    reach = at.norm / d  # length by which a coordinate must change to change r by ‖r‖
     size = np.maximum(np.abs(at.x), np.minimum(reach, 1.0))
     s = np.empty((n, n))
     for k in range(n):

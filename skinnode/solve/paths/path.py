@@ -75,7 +75,8 @@ class PathResult:
     searched: int
     """Number of rows at the start that describe the search for the cycle; the path's rows follow."""
     position: Float
-    """(S, U) sample solved, from 0; 1.5 is halfway between samples 1 and 2, and −1 is the rest position."""
+    """(S, U) number of the sample solved, counted from 0; 1.5 is halfway between samples 1 and 2, and −1
+    is the rest position."""
     steps: NDArray[np.int64]
     """(S, U) number of operator steps; 0 if the sample was skipped."""
     evaluations: NDArray[np.int64]

@@ -195,8 +195,8 @@ class PathTracker:
         """Advance the wires in ``todo`` (U,) to their ``position`` (U,): predict, then correct.
 
         Returns:
-            (U,) mask of the wires that reached a root on the rest position's branch. All other wires are left
-            unchanged.
+            (U,) mask of the wires that reached a root on the rest position's branch. The positions of all
+            other wires are left unchanged.
         """
         solver = self.solver
         before = solver.x.copy(), solver.inverse.copy(), solver.a_solved.copy()

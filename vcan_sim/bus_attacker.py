@@ -1,7 +1,7 @@
-"""Faults of a bus, as data, and a rogue device that sends the frames for some of these faults.
+"""Bus faults as plain data, and a rogue device that sends the frames that some of them need.
 
-The rogue device has its own endpoint on the bus. Nodes and hosts receive the rogue frames, and must win
-arbitration against them.
+The rogue device has its own endpoint on the bus. Nodes and hosts receive the rogue frames and compete with
+them in arbitration.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ _INTERMISSION_BITS: Final = 3
 _TICK_NS: Final = 1_000_000
 """Minimum time between two batches of rogue frames, ns."""
 _AHEAD_NS: Final = 2 * _TICK_NS
-"""Time by which flood frames are queued in advance, ns, so that a completely starved bus is never idle."""
+"""Lead time (ns) of the queued flood frames; it prevents idle gaps on a completely starved bus."""
 _MOST_AT_ONCE: Final = 256
 """Maximum number of overdue rogue frames of one kind to send at once; further overdue frames are dropped."""
 _RETRY_S: Final = 0.05
@@ -36,7 +36,7 @@ _RETRY_S: Final = 0.05
 _SHARES: Final = ("starved", "disturbed")
 _RATES: Final = ("rogue_nmt_per_s", "rogue_sync_per_s")
 _COUNTERS: Final = 240
-"""Maximum SYNC counter of the rogue master."""
+"""Highest SYNC counter value that the rogue master sends."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,7 +111,7 @@ def check_bus(faults: BusFaults, bus: BusConfig) -> None:
 
 
 class BusAttacker:
-    """Rogue device on a bus; its thread runs from the first fault that requires it until :meth:`stop`.
+    """Rogue device on a bus; its thread starts with the first fault that needs it and ends in :meth:`stop`.
 
     Args:
         bus: Configuration of the bus.
@@ -166,7 +166,7 @@ class BusAttacker:
             for name, period_ns in periods_ns.items():
                 ahead_ns = _AHEAD_NS if name == "starved" else 0
                 due_ns[name] = self._send_due(port, name, chance, due_ns[name], period_ns, now_ns + ahead_ns)
-            while port.recv(0.0) is not None:  # otherwise the receive queue would fill up
+            while port.recv(0.0) is not None:  # keeps the receive queue from filling up
                 pass
             first_ns = min(due_ns[name] - (_AHEAD_NS if name == "starved" else 0) for name in due_ns)
             wait_ns = max(first_ns - clock.monotonic_ns(), _TICK_NS if "starved" in due_ns else 0)
@@ -174,7 +174,7 @@ class BusAttacker:
             self._changed.clear()
 
     def _periods_ns(self) -> dict[str, float]:
-        """Return the time between two rogue frames of each kind, ns."""
+        """Return the interval (ns) between rogue frames of each kind."""
         faults, found = self._faults, {}
         if faults.starved:
             found["starved"] = self._flood_ns / faults.starved
@@ -193,7 +193,7 @@ class BusAttacker:
         period_ns: float,
         until_ns: float,
     ) -> float:
-        """Send the rogue frames of one kind that are due, and return the due time of the next frame, ns."""
+        """Send all due rogue frames of one kind, and return the time (ns) at which the next one is due."""
         make: Callable[[random.Random], tuple[int, bytes]] = getattr(self, f"_{name}")
         for _ in range(_MOST_AT_ONCE):
             if due_ns > until_ns:

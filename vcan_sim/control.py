@@ -31,7 +31,7 @@ _ANSWER_S: Final = 10.0
 _POLL_S: Final = 0.2
 """Interval at which a server thread checks whether it must stop, s."""
 KEY: Final = "inject"
-"""Key that refers to the faults in error messages."""
+"""Name under which error messages refer to the faults."""
 
 
 class ControlError(SkinError):
@@ -39,7 +39,7 @@ class ControlError(SkinError):
 
 
 class Controlled(Protocol):
-    """Interface of the fleet that a control socket changes and shows."""
+    """Interface through which a control socket reads and changes a fleet's faults."""
 
     @property
     def faults(self) -> Any:
@@ -96,10 +96,10 @@ class ControlServer:
 
     Args:
         fleet: Fleet to control.
-        hand: Name of its hand.
+        hand: Name of the fleet's hand.
 
     Raises:
-        ControlError: On entry, if there can be no socket.
+        ControlError: On entry, if the socket cannot be created.
     """
 
     def __init__(self, fleet: Controlled, hand: str) -> None:
@@ -111,7 +111,7 @@ class ControlServer:
 
     def __enter__(self) -> Self:
         self._path = control_folder() / f"{os.getpid()}.sock"
-        self._path.unlink(missing_ok=True)  # of an earlier process with this ID
+        self._path.unlink(missing_ok=True)  # left over from an earlier process with this ID
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
         try:
             self._socket.bind(str(self._path))
@@ -141,7 +141,7 @@ class ControlServer:
                 continue
             except OSError:
                 return
-            with connection, contextlib.suppress(OSError):  # a client that leaves is no fault of ours
+            with connection, contextlib.suppress(OSError):  # the client may disconnect early
                 connection.settimeout(_ANSWER_S)
                 _send(connection, self._answer(_receive(connection)))
 
@@ -166,7 +166,7 @@ def running_simulator(wanted: str | None = None) -> Path:
         wanted: Process-ID of the simulator, or name of its hand; None if only one simulator is running.
 
     Raises:
-        ControlError: If no simulator runs, none is the wanted one, or several could be meant.
+        ControlError: If no simulator is running, none matches ``wanted``, or several match.
     """
     found = dict(_running())
     if not found:
@@ -180,14 +180,14 @@ def running_simulator(wanted: str | None = None) -> Path:
 
 
 def request(path: Path, faults: list[str]) -> Answer:
-    """Change the faults of a running simulator, by a request to its control socket.
+    """Change a running simulator's faults by a request to its control socket.
 
     Args:
         path: Control socket of the simulator.
-        faults: Texts of the changes; none to leave the faults as they are.
+        faults: Changes in text form; if empty, the faults do not change.
 
     Returns:
-        What is injected afterwards.
+        Current faults and their counts after the change.
 
     Raises:
         ControlError: If the simulator refuses a text, or does not answer.
@@ -220,7 +220,7 @@ def _send(connection: socket.socket, message: dict[str, Any]) -> None:
 
 
 def _receive(connection: socket.socket) -> bytes:
-    """Return one line, at most 64 KiB."""
+    """Receive and return one line of at most 64 KiB."""
     received = b""
     while len(received) < _LONGEST_LINE and (part := connection.recv(4096)):
         received += part

@@ -45,7 +45,7 @@ class VirtualEventLoop(asyncio.SelectorEventLoop):
     def call_soon_threadsafe(
         self, callback: Callable[[*Ts], object], *args: *Ts, context: Context | None = None
     ) -> asyncio.Handle:
-        """Schedule a call of a function in this event loop, from any thread of the program."""
+        """Schedule a function call in this event loop; callable from any thread."""
         handle = super().call_soon_threadsafe(callback, *args, context=context)
         self._woken.set()
         return handle

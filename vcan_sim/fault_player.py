@@ -32,7 +32,7 @@ class FaultPlayer:
         """Start the schedule at scene time 0. Call this method only once.
 
         Args:
-            origin_ns: Monotonic time of scene time 0, ns.
+            origin_ns: Monotonic time (ns) that corresponds to scene time 0.
         """
         self._inbox.put(origin_ns)
 

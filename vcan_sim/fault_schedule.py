@@ -10,7 +10,7 @@ from typing import Final
 from vcan_sim.fault_text import Value
 
 CLOSE_S: Final = 1e-9
-"""Maximum rounding error of a scene time, s; a fault that starts within this time counts as active."""
+"""Tolerance (s) for rounded scene times; a fault that starts within the tolerance is already active."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,7 +50,7 @@ class FaultSchedule:
         return tuple(each for each in self.faults if each.from_s - CLOSE_S <= at_s < each.to_s - CLOSE_S)
 
     def next_change_s(self, t_s: float) -> float | None:
-        """Return the scene time, s, of the next start or end of a fault after ``t_s``; None if there is none.
+        """Return the scene time (s) of the first fault start or end after ``t_s``; None if no fault changes.
 
         Args:
             t_s: Scene time, s.

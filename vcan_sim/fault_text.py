@@ -20,7 +20,7 @@ from vcan_sim.bus_attacker import NO_BUS_FAULTS, BusFaults
 from vcan_sim.faults import NO_FAULTS, Faults
 
 NONE: Final = "none"
-"""Keyword that ends all faults of a patch or bus, or the fault of a wire."""
+"""Keyword that ends all faults of a patch or bus; as the value of a wire fault, it ends this fault."""
 
 Value = int | float | bool | None
 AnyFaults = TypeVar("AnyFaults", Faults, BusFaults)
@@ -41,7 +41,7 @@ class FaultChange:
     values: Mapping[str, Value] = field(default_factory=dict)
     """New values of the faults, by name."""
     clears: bool = False
-    """Whether all earlier faults of the patch or bus end."""
+    """Whether the change first ends all current faults of the patch or bus."""
 
     def of(self, faults: AnyFaults) -> AnyFaults:
         """Apply this change to ``faults`` and return the result.
@@ -65,7 +65,8 @@ def parse_changes(
         key: Name of the command-line option, for error messages.
 
     Raises:
-        ConfigError: If a place is not in the hand, a fault is unknown there, or a value has the wrong type.
+        ConfigError: If the hand has no such patch or bus, a fault is unknown for it, or a value has the wrong
+            type.
     """
     changes = []
     for text in texts:
@@ -86,7 +87,7 @@ def parse_values(text: str, *, on_bus: bool, key: str = "--fault") -> dict[str, 
     """Parse faults without a place, such as ``lost=0.01,silent``, and return their values by name.
 
     Args:
-        text: Names of faults with their values, separated by commas; at least one fault.
+        text: Comma-separated faults with their values; at least one fault.
         on_bus: Whether the text describes faults of a bus.
         key: Name of the command-line option, for error messages.
 
@@ -133,7 +134,7 @@ def _change(place: str, listed: str, key: str, *, on_bus: bool) -> FaultChange:
 
 
 def _everywhere(listed: str, patches: Sequence[str], buses: Sequence[str], key: str) -> Iterator[FaultChange]:
-    """Yield the changes of a text without a place; each fault's name determines whether it is on buses."""
+    """Yield the changes of a text without a place; the fault names decide between patches and buses."""
     parts = _parts(listed, key)
     clears = NONE in parts
     values = _values([part for part in parts if part != NONE], OF_PATCHES | OF_BUSES, key)

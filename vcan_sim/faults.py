@@ -29,7 +29,7 @@ LOST_IN: Final = {
     Kind.COMMAND: "command_lost",
     Kind.HEARTBEAT: "heartbeat_lost",
 }
-"""Faults that drop frames addressed to the node, by frame kind; SYNC has ``sync_lost``."""
+"""Faults that drop frames addressed to the node, by frame kind; for SYNC, see ``sync_lost``."""
 _SHARES: Final = (
     *OF_CHUNKS,
     *OF_SCANS,
@@ -52,10 +52,10 @@ OF_WIRES: Final = (
     "crossed_upper",
     "crossed_lower",
 )
-"""Faults whose value is the number of a wire, alternately an upper and a lower wire."""
+"""Faults whose value is a wire number; faults of upper and lower wires alternate."""
 _RATES: Final = ("emcy_per_s", "babble_per_s", "restart_every_s")
 _MOST: Final = {"drift_per_s": 1.0, "warmer_k": 100.0}
-"""Maximum absolute value of each signed fault."""
+"""Maximum absolute value of each fault that may be negative."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,15 +96,15 @@ class Faults:
     counter."""
     summary_lost: float = 0.0
     reset: float = 0.0
-    """Fraction of the scans in which the node is reset after half of the chunks, as by a watchdog."""
+    """Fraction of the scans in which the node is reset after half of the chunks, as if by a watchdog."""
     displaced: float = 0.0
     """Fraction of the scans in which a chunk carries the counter of the next scan; the chunk with the same
     index in the next scan is lost."""
     understated: float = 0.0
     """Fraction of the scans in which a chunk is lost, and the summary claims that only changed chunks were
-    sent and counts one chunk fewer. If the summary carries a check, the check is correct for this summary. If
-    the node really sends only changed chunks in this scan, the summary is not falsified, and the chunk is
-    only lost."""
+    sent and counts one chunk fewer. If the summary carries a check, the check is correct for the falsified
+    summary. In a scan in which the node sends only changed chunks, the chunk is lost but the summary is not
+    falsified."""
     unchecked: float = 0.0
     """Fraction of the scans whose summary carries no check, as in protocol revision 1.0."""
     struck: int | None = None
@@ -114,8 +114,8 @@ class Faults:
     sync_lost: float = 0.0
     """Fraction of the SYNCs that the node does not receive."""
     long: float = 0.0
-    """Fraction of the heartbeats that are one byte too long. (Chunks and summaries already fill their
-    frames.)"""
+    """Fraction of the heartbeats that are one byte too long. (A chunk or summary cannot be lengthened,
+    because it already fills its frame.)"""
     nmt_lost: float = 0.0
     """Fraction of the NMT commands that the node does not receive."""
     sdo_request_lost: float = 0.0
@@ -180,8 +180,8 @@ class Faults:
     """Fraction of the readings in which one bit of one code is flipped before the node computes its check."""
     drift_per_s: float = 0.0
     """Relative drift of every resistance per second, from -1 to 1. The accumulated drift is zero when the
-    fault starts, and returns to zero when the fault ends. Resistances stay within 0.1 to 10 times their
-    values."""
+    fault starts, and returns to zero when the fault ends. Drift changes a resistance by at most a factor of
+    10."""
     warmer_k: float = 0.0
     """Step change in the temperature of the patch, K, from -100 to 100. Every resistance changes according to
     the temperature coefficient of the patch, ``Imperfections.temperature_per_k``."""
@@ -240,7 +240,7 @@ class Injected:
     miscounted: int = 0
     torn: int = 0
     torn_chunks: int = 0
-    """Number of chunks sent in the first halves of torn scans."""
+    """Number of chunks sent in scans with the fault ``torn``."""
     summary_lost: int = 0
     reset: int = 0
     """Number of resets in the middle of a scan."""
@@ -311,6 +311,6 @@ def check_wires(faults: Faults, patch: str, shape: tuple[int, int]) -> None:
         ConfigError: If the patch does not have a named wire.
     """
     for number, name in enumerate(OF_WIRES):
-        wires = shape[number % 2] - name.startswith("crossed")  # the last wire has no next wire
+        wires = shape[number % 2] - name.startswith("crossed")  # the last wire has no successor
         if (wire := getattr(faults, name)) is not None and wire >= wires:
             raise ConfigError(f"{patch}: {name}", wire, f"an integer from 0 to {wires - 1}")

@@ -29,7 +29,7 @@ class Passed:
 
 
 class FaultyPort(CanPort):
-    """Port whose controller may go bus-off; the port then sends no frames and misses all received frames."""
+    """Port whose controller may go bus-off, and then neither sends frames nor delivers received frames."""
 
     off = False
 
@@ -90,7 +90,7 @@ class FaultyBus:
         self._apply()
 
     def stop(self) -> None:
-        """End all faults that affect the bus itself, so that its other users are no longer affected."""
+        """End all faults that affect the bus itself, so that they no longer affect its other users."""
         if self._attacker is not None:
             self._attacker.stop()
             self._attacker = None
@@ -123,7 +123,7 @@ class FaultyBus:
         self._disturb(self._faults.disturbed)
 
     def _disturb(self, share: float) -> None:
-        """Start destroying a fraction of the transmission attempts by error frames; 0 stops this."""
+        """Destroy a given fraction of all transmission attempts by error frames from now on."""
         if self._segment is None or share == (0.0 if self._rule is None else self._rule.share):
             return
         if self._rule is not None:

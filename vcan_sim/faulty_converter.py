@@ -15,7 +15,7 @@ from vcan_sim.injector import Injector
 from vcan_sim.skin.imperfections import EXACT
 
 MOST_DRIFT: Final = 10.0
-"""Maximum ratio, and inverse of the minimum ratio, by which resistances drift."""
+"""Maximum factor by which drift raises or lowers a resistance."""
 WIRE_NOISE: Final = 3e-3
 """Relative standard deviation of a resistance measured through a bad contact."""
 
@@ -24,8 +24,8 @@ class FaultyConverter:
     """Converter whose readings may be frozen, wrong, or taken through faulty wires.
 
     The wires are intact while the node boots, so that the tare at power-on is valid. Drift and temperature
-    also act on the tare. They scale the readings; with an ideal read-out, this is equivalent to scaling every
-    path of the patch.
+    also affect the tare. Drift and temperature scale the readings; with an ideal read-out, this is equivalent
+    to scaling every path of the patch.
 
     Args:
         source: Resistances that an intact converter would measure.
@@ -52,7 +52,7 @@ class FaultyConverter:
         self._drift, self._drifted_to_ns = 0.0, 0
         self._reading: Float | None = None
         self._conversions: int | None = None
-        self._held: dict[tuple[str, object], Float] = {}  # for each fault, the reading when it starts
+        self._held: dict[tuple[str, object], Float] = {}  # reading at the start of each fault
 
     @property
     def conversions(self) -> int | None:
@@ -126,7 +126,7 @@ class FaultyConverter:
         self._held = held
 
     def _flip(self, read: Float) -> Float:
-        """Flip one bit of one code in a reading, if the fault ``flipped`` is drawn."""
+        """Flip one bit of one code in a reading, with the probability ``flipped``."""
         if not self._injector.draw(self._injector.faults.flipped) or self._booting():
             return read
         random, scale, baseline_ohm = self._injector.random, self._scale, self._baseline_ohm()

@@ -37,7 +37,7 @@ four nodes send bursts of up to 270 frames, which fit into a socket's default re
 _STORM: Final = bytes.fromhex("0fff810000000000")
 """EMCY 0xFF0F with the generic and manufacturer-specific bits of the error register set."""
 _MOST_AT_ONCE: Final = 32
-"""Maximum number of overdue periodic events of one kind that are made up for; further events are dropped."""
+"""Maximum number of overdue periodic events of one kind to execute at once; the others are dropped."""
 
 
 TWIN_SERIAL: Final = 0x8000_0000
@@ -176,7 +176,7 @@ class FaultyNode(PatchNode):
         self._reset_if_due(t_ns)
 
     def _concerns(self, kind: Kind, can_id: int) -> bool:
-        """Return whether a frame is addressed to the node; requests to other nodes do not count as lost."""
+        """Return whether a frame is addressed to the node; only such a frame is counted as lost."""
         if kind is Kind.SDO_REQUEST:
             return can_id == od.sdo_request_cob_id(self.node_id)
         return kind is not Kind.COMMAND or can_id == od.command_cob_id(self.node_id)
@@ -206,7 +206,7 @@ class FaultyNode(PatchNode):
         return min((each for each in (own, of_twin) if each is not None), default=None)
 
     def _own_deadline_ns(self, faults: Faults) -> int | None:
-        """Return the time, ns, at which the node's timers or periodic events are due; None if none is due."""
+        """Return the time (ns) of the node's next timer or periodic event; None if there is none."""
         if faults.error_passive != self._passive:
             return 0
         own = super().next_deadline_ns()
@@ -218,7 +218,7 @@ class FaultyNode(PatchNode):
         return min(due) if own is None else min(own, *due)
 
     def on_bus(self, state: BusState, t_ns: int) -> None:
-        """Pass a change of the CAN controller's state to the node; a fault may change it to error-passive."""
+        """Pass the CAN controller's state to the node; a fault may replace the state with error-passive."""
         self._controller = state
         passive = self._passive and state is not BusState.OFF
         super().on_bus(BusState.PASSIVE if passive else state, t_ns)
@@ -350,7 +350,7 @@ class FaultyNode(PatchNode):
         return True
 
     def _from_twin(self, can_id: int, data: bytes) -> None:
-        """Put a frame of the second node on the bus; the node itself receives its heartbeats."""
+        """Put a frame of the second node on the bus; the first node receives the second node's heartbeats."""
         kind = kind_of(can_id, data)
         self.tally.handed[kind] += 1
         try:

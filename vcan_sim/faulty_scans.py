@@ -72,7 +72,7 @@ class FaultyScans:
         return self._fate in ("torn", "displaced")
 
     def power_off(self) -> None:
-        """Drop all late and swapped chunks that wait to be sent."""
+        """Drop all late and swapped chunks that have not been sent yet."""
         tally = self._injector.tally
         tally.silenced[Kind.CHUNK] += tally.waiting.pop(Kind.CHUNK, 0)
         self._swapped, self._late = None, []
@@ -167,7 +167,7 @@ class FaultyScans:
             return pack_summary(
                 said.scan, said.flags & ~SummaryFlag.CHECKED, said.chunks, said.device_time_us
             )
-        if len(self._packed) != self._profile.n_chunks:  # the codes of unsent chunks are unknown here
+        if len(self._packed) != self._profile.n_chunks:  # the codes of the unsent chunks are not available
             return data
         injected.understated += 1
         head = said.scan, said.flags | SummaryFlag.CHANGED_ONLY, said.chunks - 1, said.device_time_us

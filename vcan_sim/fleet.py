@@ -29,8 +29,8 @@ from vcan_sim.skin.imperfections import EXACT, Imperfections
 from vcan_sim.tally import Tally
 
 PREPARED_S: Final = 120.0
-"""Scene time that is computed before the nodes start, s, so that the nodes' threads need not wait for the
-contact mechanics. Later time steps are computed when they are first needed."""
+"""Duration (s) of the scene that is computed before the nodes start, so that the nodes' threads need not wait
+for the contact mechanics. The other time steps of the scene are computed on first use."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,8 +54,8 @@ class NodeReport:
 class Fleet:
     """Simulated patches of a hand, as CANopen nodes that each have their own scene.
 
-    A patch's scene begins when its node has sent the first scan, so bring-up may take any length of time, and
-    the patch is untouched during the tare at power-on. :meth:`start` opens the buses and powers the nodes on.
+    A patch's scene begins when its node has sent the first scan, so bring-up may take any time, and the patch
+    is untouched during the tare at power-on. :meth:`start` opens the buses and powers the nodes on.
     :meth:`stop` sets the nodes to pre-operational and closes the buses. A ``with`` block calls both methods.
 
     Args:
@@ -67,15 +67,15 @@ class Fleet:
             itself.
         unchecked: Names of patches with protocol revision 1.0, whose summaries carry no check.
         imperfections: Deviations from the layout, for all patches or by name of the patch. The random draws
-            differ from patch to patch. Default: those of the scene.
-        scene: Scene that replaces the random strokes of ``[simulation]``. Scene time starts on all patches at
-            once, when the first node has sent its first scan. The faults of the scene start and end at scene
-            times.
+            of the imperfections differ from patch to patch. Default: the scene's imperfections. scene: Scene
+            that replaces the random strokes of ``[simulation]``. Scene time starts on all patches
+            simultaneously, when the first node has sent its first scan. The faults of the scene start and end
+            at scene times.
 
     Raises:
         ConfigError: If a channel is given for a hand with several buses, imperfections name a patch that the
             hand does not have, the draws of a patch leave too small a gap between electrodes, a touch of
-            the scene is impossible on its patch, or a fault is impossible at its place.
+            the scene is impossible on its patch, or a patch or bus cannot have one of its faults.
     """
 
     def __init__(  # noqa: PLR0913 - keyword arguments, most of which are rarely used
@@ -153,7 +153,7 @@ class Fleet:
         """Compute the first two minutes of the scene, open the buses and power the nodes on.
 
         Raises:
-            BusError: If a bus cannot be opened. In this case no bus is left open.
+            BusError: If a bus cannot be opened. No bus is left open after this error.
         """
         for scene in self._scenes.values():
             scene.prepare(PREPARED_S)
@@ -203,8 +203,8 @@ class Fleet:
             patch: Name of the patch; None for all patches.
 
         Raises:
-            ConfigError: If the hand does not have this patch, or a patch does not have the wire that a fault
-                names.
+            ConfigError: If the hand does not have this patch, or a fault names a wire that a patch does not
+                have.
         """
         patches = self._stations if patch is None else (patch,)
         self.faults.set_patches(dict.fromkeys(patches, faults))
@@ -249,7 +249,7 @@ class Fleet:
         return self._ports[bus].passed
 
     def bus_off(self, bus: str, *, off: bool) -> None:
-        """Put the controller of a bus's nodes into the bus-off state, or end this state."""
+        """Put the controller of a bus's nodes into the bus-off state, or end the bus-off state."""
         self.faults.set_bus(bus, replace(self.faults.bus(bus), bus_off=off))
 
     def truth_m(self, patch: str, device_time_us: int) -> Float:
@@ -268,7 +268,7 @@ class Fleet:
         return self._at_scan(patch, device_time_us, SimulatedPatch.truth_m)
 
     def displacement_m(self, patch: str, device_time_us: int) -> Float:
-        """Return the true displacement of the upper electrodes in a scan, which a host estimates.
+        """Return the true displacement of the upper electrodes in a scan, which hosts estimate.
 
         Args:
             patch: Name of the patch.
@@ -323,7 +323,7 @@ class Fleet:
         return self._scenes[patch].truth(-1.0 if t_s is None else t_s)
 
     def scene_s(self, t_ns: int) -> float | None:
-        """Return the scene time, s, at a monotonic time; None before the scene has started on any patch.
+        """Return the scene time (s) at a monotonic time; None before the scene has started.
 
         Args:
             t_ns: Monotonic time, ns.

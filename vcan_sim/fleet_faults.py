@@ -1,7 +1,8 @@
 """State of the faults injected into a fleet, with a log of its changes.
 
-Faults are changed by :meth:`vcan_sim.fleet.Fleet.inject`, by texts (``vcan-sim inject``) and by a scene's
-schedule. Each change is checked before it takes effect, and each call applies all of its changes or none.
+Three sources change faults: :meth:`vcan_sim.fleet.Fleet.inject`, texts (``vcan-sim inject``) and a scene's
+schedule. Each change is checked before it takes effect, and each call applies either all of its changes or
+none.
 """
 
 from __future__ import annotations
@@ -39,7 +40,7 @@ class FaultEvent:
     value: Value
     """Value of the fault that starts or ends."""
     on: bool
-    """Whether the fault starts rather than ends."""
+    """True if the fault starts, False if it ends."""
     refused: str = ""
     """Reason why a scheduled change did not take effect; empty if the change took effect."""
 
@@ -109,14 +110,14 @@ class FleetFaults:
     # --- changes
 
     def inject(self, *texts: str, key: str = "--fault") -> None:
-        """Change faults as described by texts; faults that no text names do not change.
+        """Change the faults named in the given texts; all other faults remain unchanged.
 
         Args:
             *texts: Texts such as ``palm:unplugged`` or ``palm:none``; see :mod:`vcan_sim.fault_text`.
             key: Name of the command-line option, for error messages.
 
         Raises:
-            ConfigError: If a text is invalid. In this case no fault changes.
+            ConfigError: If a text is invalid. After this error, all faults are unchanged.
         """
         places = self._places
         self._change(parse_changes(texts, places.patches, places.buses, key))
@@ -208,7 +209,7 @@ class FleetFaults:
             self._places.set_bus(name, of_bus)
 
     def _note(self, place: str, before: Faults | BusFaults, after: Faults | BusFaults) -> None:
-        """Log the starts and ends of faults due to a replacement."""
+        """Log which faults start and end when one set of faults replaces another."""
         now_ns = clock.time_ns()
         on_bus = isinstance(after, BusFaults)
         for name in OF_BUSES if on_bus else OF_PATCHES:

@@ -15,7 +15,7 @@ class Injector:
 
     Args:
         faults: Initial faults; their seed remains in use when the faults are replaced.
-        node_id: Node-ID, so that nodes with the same seed draw different faults.
+        node_id: Node-ID, which makes nodes with the same seed draw different faults.
     """
 
     def __init__(self, faults: Faults, node_id: int) -> None:
@@ -28,7 +28,7 @@ class Injector:
         return share > 0.0 and bool(self.random.random() < share)
 
     def draw_one(self, names: tuple[str, ...]) -> str:
-        """Draw the name of one fault, each with its fraction as probability; an empty string for no fault."""
+        """Draw at most one fault, each with the probability given by its fraction; return its name, or ""."""
         faults = self.faults
         if faults is NO_FAULTS:
             return ""

@@ -40,10 +40,10 @@ BUSES: Final = {
     "udp_multicast": ("udp_multicast", ""),
     "vcan0": ("socketcan", "vcan{}"),
 }
-"""Interface and channel for each choice of ``--skin-bus``. The number of the bus replaces the braces; an
-empty channel is replaced by a unique channel."""
+"""Interface and channel for each choice of ``--skin-bus``. The bus number replaces the braces; a unique
+channel name replaces an empty channel."""
 TRUTH_READINGS: Final = 200
-"""Number of readings of each patch, newest last, whose ground truth is saved if a test fails."""
+"""Number of each patch's newest readings whose ground truth is saved if a test fails."""
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -86,7 +86,7 @@ class SkinTest:
 
     Args:
         bus: Value of the option ``--skin-bus``.
-        open_until_end: Stack of context managers that is closed at the end of the test.
+        open_until_end: Stack of context managers, closed at the end of the test.
     """
 
     def __init__(self, bus: str, open_until_end: ExitStack) -> None:
@@ -175,7 +175,7 @@ class SkinTest:
         return hand.model_copy(update={"buses": tuple(buses)})
 
     def _own(self, name: str) -> str:
-        """Return a unique channel, which no other test uses."""
+        """Return a channel that no other test uses."""
         if self.bus == "udp_multicast":
             return f"239.75.{random.randrange(256)}.{random.randrange(1, 255)}"
         return f"{name}-{uuid.uuid4().hex[:8]}"
@@ -290,7 +290,7 @@ def skin_hand(_skin_test: SkinTest) -> Callable[..., Fleet]:
 
 @pytest.fixture
 def skin_host(_skin_test: SkinTest) -> Callable[..., Host]:
-    """Function that brings up the hand: ``skin_host(**options) -> Host``, with options of ``from_config``."""
+    """Function that brings up the hand: ``skin_host(**options) -> Host``; options as for ``from_config``."""
     return lambda **options: _skin_test.bring_up(options)
 
 
@@ -298,8 +298,8 @@ def skin_host(_skin_test: SkinTest) -> Callable[..., Host]:
 def skin_can(_skin_test: SkinTest) -> Callable[..., Any]:
     """Function that opens a python-can bus for a user's own master: ``skin_can(bus=None) -> can.BusABC``.
 
-    ``bus`` is the name of a bus of the hand; by default, it is the first bus. The endpoint is closed at the
-    end of the test.
+    ``bus`` is the name of one of the hand's buses; the default is the first bus. The endpoint is closed at
+    the end of the test.
     """
     return _skin_test.connect
 

@@ -44,7 +44,7 @@ def channel_of(bus: str) -> str:
 class Recording:
     """Recording of a fleet during a ``with`` block, which must enclose the ``with`` block of the fleet.
 
-    Call :meth:`poll` at least every minute, because a patch remembers only its newest readings.
+    Call :meth:`poll` at least once a minute, because a patch stores only its newest readings.
 
     Args:
         folder: New folder for the files.
@@ -93,7 +93,7 @@ class Recording:
         np.savez_compressed(self._folder / TRUTH, **arrays)
 
     def poll(self) -> None:
-        """Record the ground truth of all scans, and all changes of faults, since the last call."""
+        """Record the ground truth of all new scans and all fault changes since the last call."""
         if self._failure is not None:
             raise self._failure
         wall_ns = clock.time_ns() - clock.monotonic_ns()

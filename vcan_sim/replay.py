@@ -26,9 +26,9 @@ FROM_NODES: Final = frozenset(
         Kind.LSS_RESPONSE,
     }
 )
-"""Kinds of frames that nodes send. A host sends all other kinds, and may also send a heartbeat."""
+"""Kinds of frames that nodes send. A host sends frames of all other kinds, and may also send heartbeats."""
 _DRAINED_EVERY: Final = 64
-"""Number of frames to send before the receive queues of the buses are emptied again."""
+"""Number of frames to send between two clearings of the buses' receive queues."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,9 +85,9 @@ def replay(
     """Send recorded frames with their original timing.
 
     Args:
-        frames: Frames with their times. Frames that are out of order are sent immediately.
-        ports: Open endpoint for each channel; frames of other channels are not sent.
-        wait: Function that waits for a given number of seconds, and returns True to end the replay.
+        frames: Frames with their times. A frame earlier than its predecessor is sent immediately.
+        ports: Open endpoint for each channel; frames of channels without an endpoint are not sent.
+        wait: Function that waits for a given number of seconds, and returns True if the replay must end.
         from_nodes: Whether to send only the frames that nodes send.
 
     Returns:

@@ -24,18 +24,21 @@ from skinnode.model.layout import Float, PatchLayout
 from vcan_sim.smooth import GLIDE_RAMP, ease, glide
 
 LEAD_S: Final = 0.8
-"""Duration of rest before the first press, s, for measuring the baseline and opening a viewer."""
+"""Rest time (s) before the first press, for measuring the baseline and opening a viewer."""
 
 PRESS, SLIDE, LIFT = 0.36, 0.40, 0.14
-"""Durations of press, slide and lift as fractions of a cycle; the skin is at rest for the remainder. In a 4 s
-cycle, a press takes 1.4 s."""
+"""Durations of press, slide and lift as fractions of a cycle; in the remaining time the skin is at rest. In a
+4 s cycle, a press takes 1.4 s."""
 
 _GOLDEN: Final = 0.5 * (math.sqrt(5.0) - 1.0)
 
 
 @dataclass(frozen=True, slots=True)
 class Stroke:
-    """Stroke of a sphere: press, slide and lift. ``heading`` is a unit vector; times start at contact, s."""
+    """Stroke of a sphere: press, slide and lift.
+
+    ``heading`` is a unit vector; all times are in seconds after first contact.
+    """
 
     radius_m: float
     depth_m: float
@@ -84,7 +87,7 @@ class Scene:
 
     @property
     def lead_s(self) -> float:
-        """Scene time of the first touch, s, which differs between patches by up to a quarter of a cycle."""
+        """Scene time (s) of the first touch; patches differ by up to a quarter of a cycle."""
         return LEAD_S + 0.25 * self.simulation.cycle_s * math.fmod(self.number * _GOLDEN, 1.0)
 
     def stroke(self, index: int) -> Stroke:
@@ -100,7 +103,7 @@ class Scene:
         slide_m = min(options.slide_speed_m_per_s * (1.0 - GLIDE_RAMP) * slide_s, room)
         way = slide_m * heading
         first, last = low - np.minimum(way, 0.0), high - np.maximum(way, 0.0)
-        start = random.uniform(first, np.maximum(first, last))  # rounding may make `first` exceed `last`
+        start = random.uniform(first, np.maximum(first, last))  # due to rounding, `first` may exceed `last`
         return Stroke(
             radius_m=options.indenter_radius_m,
             depth_m=options.depth * self.layout.height_m,
@@ -122,7 +125,7 @@ class Scene:
         return () if contact is None else (contact,)
 
     def upper_m(self, t_s: float) -> Float:
-        """Return the upper electrodes (U, N, 3), m, at a scene time; ``layout.upper_m`` itself at rest."""
+        """Return the upper electrodes (U, N, 3), in m, at a scene time; at rest: ``layout.upper_m``."""
         contacts = self.contacts(t_s)
         if not contacts:
             return self.layout.upper_m

@@ -25,7 +25,7 @@ class _Group(TyperGroup):
         return super().parse_args(ctx, args)
 
     def shell_complete(self, ctx: Any, incomplete: str) -> Any:
-        """Complete the first word: a command, or an option of the default command."""
+        """Offer shell completions of the first word: commands, and options of the default command."""
         own, of_default = (
             super().shell_complete(ctx, incomplete),
             self.commands[DEFAULT].shell_complete(ctx, incomplete),

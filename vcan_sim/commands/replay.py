@@ -30,8 +30,8 @@ def replay(
 ) -> None:
     """Replay a recorded bus trace on a bus, with its original timing.
 
-    With --hand, the frames of each bus are sent on the bus of the hand with that name. Without, all frames
-    are sent on one bus: --interface and --channel.
+    With --hand, the frames of each bus are sent on the bus of the hand with that name. Without --hand, all
+    frames are sent on the bus selected by --interface and --channel.
     """
     from contextlib import ExitStack
 
@@ -59,7 +59,7 @@ def _buses(
     """Return the bus on which to send the frames of each channel in a trace.
 
     Raises:
-        ConfigError: If there is no bus for a channel, or one bus is given for several channels.
+        ConfigError: If a channel has no bus, or several channels have the same bus.
     """
     from skinnode.config import BusConfig, load_hand
     from skinnode.errors import ConfigError

@@ -63,8 +63,9 @@ def run(  # noqa: PLR0913 - Typer derives a command's options from its arguments
 ) -> None:
     """Simulate a hand's patches as CANopen nodes on a bus; a sphere presses each patch and slides over it.
 
-    With a scene, its bodies touch the patches instead. Bring the nodes up by running `skinnode host` with the
-    same file in another terminal. `vcan-sim inject` changes the faults meanwhile.
+    With --scene, the bodies of the scene touch the patches instead of the sphere. Bring the nodes up by
+    running `skinnode host` with the same file in another terminal. While the simulator runs, `vcan-sim
+    inject` changes its faults.
     """
     from skinnode.config import load_hand
     from skinnode.process.garbage_collection import without_long_collections
@@ -204,7 +205,7 @@ def _recorded(fleet: Fleet, scene: SceneConfig | None, folder: Path | None) -> I
 
 @contextmanager
 def _controlled(fleet: Fleet) -> Iterator[None]:
-    """Open the socket by which `vcan-sim inject` controls the fleet; the simulator also runs without it."""
+    """Open the control socket for `vcan-sim inject`; if this fails, the simulator runs without the socket."""
     from vcan_sim.control import ControlError, ControlServer
 
     with ExitStack() as entered:

@@ -7,6 +7,6 @@
 
 This package shares no code with the solvers or their prior, so it provides an independent ground truth for
 testing solvers. Displacements are assumed to be small: the contact is computed for bodies and cells on the
-undeformed plane. The x and y axes are along the surface, and z points outwards. A traction is a force per
-area on the skin; its z component is negative under a body that presses on the skin.
+undeformed plane. The x and y axes are along the surface, and z points outwards. A traction is the force per
+unit area on the skin; its z component is negative under a body that presses on the skin.
 """

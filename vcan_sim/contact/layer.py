@@ -26,8 +26,7 @@ from scipy.special import j0, j1
 Float = NDArray[np.float64]
 
 DEEPEST: Final = 14.0
-"""Value of x = k h above which the responses of layer and half-space are equal; they differ by
-x² e^(−2x) < 2e-10."""
+"""Threshold of x = k h: above it, the layer is treated as a half-space (error x² e^(−2x) < 2e-10)."""
 STEPS: Final = 32
 """Number of points per layer thickness in a table of displacement versus distance."""
 NODES: Final = 16
@@ -118,7 +117,7 @@ class PointResponse:
             for own, other in zip(layer.response(k), half.response(np.full_like(k, np.inf)), strict=True)
         )
         tables = np.empty((4, len(r)))
-        for start in range(0, len(r), 64):  # in blocks of distances, to limit the memory
+        for start in range(0, len(r), 64):  # blocks of distances limit the memory use
             waves = np.outer(r[start : start + 64], k)
             zeroth, first = j0(waves), j1(waves)
             second = np.where(waves > 1e-4, 2.0 * first / np.maximum(waves, 1e-4) - zeroth, 0.0)
@@ -129,7 +128,9 @@ class PointResponse:
         self._splines = tuple(CubicSpline(r, table) for table in tables)
 
     def __call__(self, distance_m: Float) -> tuple[Float, Float, Float, Float]:
-        """Return Z, A, B and K, m/N: u_z = Z f_z; u_x = (A + B cos 2θ) f_x + B sin 2θ f_y + K cos θ f_z."""
+        """Return Z, A, B and K (m/N), where u_z = Z f_z; u_x = (A + B cos 2θ) f_x + B sin 2θ f_y + K cos θ
+        f_z.
+        """
         found = [np.asarray(spline(distance_m)) for spline in self._splines]
         return found[0], found[1], found[2], found[3]
 
@@ -137,10 +138,10 @@ class PointResponse:
 def cell_response(layer: Layer, offset_m: Float, size_m: float, reach_m: float) -> Float:
     """Return the surface displacement due to a uniform unit traction on a square cell at the origin.
 
-    For a half-space, the displacement has a closed form (Love, Phil. Trans. A 228, 377, 1929; Johnson,
-    eq. 3.25, for all directions), which contains the integrals of 1/R, x²/R³, y²/R³, xy/R³, x/R² and y/R²
-    over a rectangle. The difference between layer and half-space is smooth and is integrated over the cell by
-    Gauss-Legendre quadrature.
+    For a half-space, the displacement has a closed form (Love, Philosophical Transactions A 228, 377, 1929;
+    Johnson, eq. 3.25, for all directions). It contains the integrals of 1/R, x²/R³, y²/R³, xy/R³, x/R² and
+    y/R² over a rectangle. The difference between layer and half-space is smooth and is integrated over the
+    cell by Gauss-Legendre quadrature.
 
     Args:
         layer: Elastic layer.

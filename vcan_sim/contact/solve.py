@@ -31,7 +31,7 @@ with high friction on a thin layer."""
 
 
 class NoSolution(RuntimeError):
-    """Contact iteration did not reach its tolerance."""
+    """The contact iteration did not reach its tolerance."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,7 +91,7 @@ def press(grid: Grid, overlap_m: Float, start_pa: Float | None = None, *, close:
         active = pressure > 0.0
         if max(float(np.abs(gap[active]).max(initial=0.0)), -float(gap.min())) < close * largest:
             return pressure
-        if not active.any():  # a far too large initial guess has left no cell in contact
+        if not active.any():  # the initial guess was much too large and left no cell in contact
             pressure, conjugate = _steepest(grid, gap), 0.0
             continue
         square = float((gap[active] ** 2).sum())
@@ -109,7 +109,7 @@ def press(grid: Grid, overlap_m: Float, start_pa: Float | None = None, *, close:
 
 
 def _steepest(grid: Grid, gap_m: Float) -> Float:
-    """Return a pressure (X, Y), Pa, proportional to the overlaps and scaled to close them best."""
+    """Return a pressure (X, Y), Pa, proportional to the overlaps and scaled for the best overall closure."""
     direction = np.maximum(-gap_m, 0.0)
     return np.asarray(direction * ((direction**2).sum() / (grid.normal_m(direction) * direction).sum()))
 
@@ -145,7 +145,7 @@ def rub(grid: Grid, limit_pa: Float, target_m: Float, start_pa: Float, *, close:
         change = after - shear
         if float(np.abs(after - ahead).max()) < 0.1 * close * scale:
             return after
-        if float((change * (ahead - after)).sum()) > 0.0:  # restart (O'Donoghue and Candès, 2015)
+        if float((change * (ahead - after)).sum()) > 0.0:  # adaptive restart (O'Donoghue and Candès, 2015)
             weight = 1.0
         new = 0.5 * (1.0 + np.sqrt(1.0 + 4.0 * weight * weight))
         ahead = after + (weight - 1.0) / new * change
@@ -172,7 +172,7 @@ def advance(  # noqa: PLR0913 - the last two control the search
         slide_m: Displacement of the body's surface along the skin, metres: (2,) without rotation, (2, X, Y)
             with rotation of the body.
         friction: Coefficient of friction μ.
-        start: Initial guess of the contact; default: ``last``. The result does not depend on the guess.
+        start: Initial guess of the contact; default: ``last``. The result does not depend on this guess.
         close: Tolerance of :func:`press` and :func:`rub`.
 
     Raises:

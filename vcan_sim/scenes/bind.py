@@ -25,8 +25,8 @@ def load_scene(path: Path | str, hand: HandConfig) -> SceneConfig:
         hand: Hand whose patches the scene touches.
 
     Raises:
-        ConfigError: If the file cannot be read, is not a scene, or has a touch or a fault that is impossible
-            in the hand. The message is one line with file, line and column.
+        ConfigError: If the file cannot be read, is not a scene, or contains a touch or fault that is
+            impossible in the hand. The message is one line with file, line and column.
     """
     scene = read_scene(path)
     bind_scene(scene, hand)
@@ -55,7 +55,7 @@ def bind_scene(scene: SceneConfig, hand: HandConfig) -> dict[str, PatchScene]:
 
 
 def layer_of(skin: SkinConfig, patch: PatchConfig, layout: PatchLayout) -> Layer:
-    """Return the elastic layer of a patch, from the scene file or, where it has no value, from the hand file.
+    """Return the elastic layer of a patch, with the scene file's values, or else the hand file's values.
 
     Args:
         skin: The scene file's ``[skin]`` table.

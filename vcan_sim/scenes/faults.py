@@ -1,4 +1,4 @@
-"""Convert a scene's ``[[faults]]`` tables into a fault schedule, and check the faults with the hand."""
+"""Convert a scene's ``[[faults]]`` tables into a fault schedule, and check the faults for a hand."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def schedule_of(scene: SceneConfig, hand: HandConfig) -> FaultSchedule:
 
     Args:
         scene: Scene with faults.
-        hand: Hand whose patches and buses have the faults.
+        hand: Hand with the patches and buses named by the faults.
 
     Raises:
         ConfigError: If a fault names a patch, a wire or a bus that the hand does not have, is unknown or out
@@ -105,7 +105,7 @@ def _check_together(
 
 
 def _with_place(scene: SceneConfig, number: int, error: ConfigError) -> ConfigError:
-    """Return an error about a fault, extended by the fault's position in the scene file."""
+    """Return a fault's error with the fault's position in the scene file added."""
     key = f"faults[{number}].{'where' if error.key == 'where' else 'fault'}"
     shown = error.key.removeprefix("fault").strip()
     allowed = f"{shown}: {error.allowed}" if shown and error.key != "where" else error.allowed

@@ -1,7 +1,8 @@
 """History of one touch: the contact at fixed time steps, each computed from the preceding step.
 
 Friction depends on the past, so the time steps are computed in order and stored. The window of cells follows
-the body in whole cells of a lattice that is fixed to the patch; the tractions stay with the skin.
+the body in steps of whole cells on a lattice fixed to the patch; tractions remain at their points on the
+skin.
 """
 
 from __future__ import annotations
@@ -22,9 +23,10 @@ from vcan_sim.scenes.tables import TouchConfig
 from vcan_sim.scenes.window import CLOSE, Window, centred_m, overlap_m, solve_depth
 
 _LEAST: Final = 1e-5
-"""Fraction of a touch's maximum depth or force below which the body counts as lifted."""
+"""Threshold below which the body is considered lifted, as a fraction of the touch's maximum depth or
+force."""
 _LOOSER: Final = (1.0, 10.0, 100.0)
-"""Factors on the contact solver's tolerance, tried in this order until the contact converges."""
+"""Factors for the contact solver's tolerance, tried in this order until the solver converges."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,7 +57,7 @@ class History:
 
     Args:
         touch: Touch to compute.
-        shape: Shape of the body that touches.
+        shape: Shape of the body that touches the skin.
         friction: Coefficient of friction.
         window: Cells under the body.
         step_s: Time step, s.
@@ -189,10 +191,10 @@ class History:
 def _advance(  # noqa: PLR0913 - all inputs of a time step
     grid: Grid, last: Contact, start: Contact, overlap_m: Float, slide_m: Float, friction: float
 ) -> Contact:
-    """Return the contact after a move; if it does not converge, try looser tolerances.
+    """Return the contact after a move; if the solver does not converge, try looser tolerances.
 
-    If no tolerance in ``_LOOSER`` leads to convergence, compute the time step without friction. The state is
-    then still an equilibrium of the elastic layer.
+    If no tolerance in ``_LOOSER`` leads to convergence, compute the time step without friction. The
+    frictionless state is still an equilibrium of the elastic layer.
 
     Raises:
         NoSolution: If the pressure without friction does not converge either.

@@ -20,8 +20,8 @@ REMEMBERED_READINGS: Final = 4096
 """Number of readings whose times are stored: more than five minutes of scans at 12.5 per second."""
 
 Fault = Callable[[Float, int], Float]
-"""Function from the resistances (U, K), ohm, and the time, ns, to the resistances that the converter measures
-instead; inf means an open pair of wires, 0 a shorted pair."""
+"""Function of the true resistances (U, K) in ohm and the time in ns that returns the measured resistances;
+inf means an open pair of wires, 0 a shorted pair."""
 
 
 class SkinMotion(Protocol):
@@ -37,10 +37,10 @@ class SkinMotion(Protocol):
 
     @property
     def number(self) -> int:
-        """Number of the patch in the hand; each patch has different noise."""
+        """Number of the patch in the hand; the noise differs between patches."""
 
     def upper_m(self, t_s: float) -> Float:
-        """Return the upper electrodes (U, N, 3), m, at a scene time; ``layout.upper_m`` itself at rest."""
+        """Return the upper electrodes (U, N, 3), in m, at a scene time; at rest: ``layout.upper_m``."""
 
 
 class SimulatedPatch:
@@ -73,7 +73,7 @@ class SimulatedPatch:
         self.scene = scene
         self.fault = fault
         self.reads = 0
-        """Number of readings so far, including those for a tare."""
+        """Number of readings so far, including the readings for a tare."""
         self.last_read_ns = 0
         """Time of the newest reading, ns."""
         self._noise = scene.simulation.converter_noise if converter_noise is None else converter_noise
@@ -85,7 +85,7 @@ class SimulatedPatch:
 
     @property
     def conversions(self) -> int:
-        """Number of conversions of the whole matrix so far, one for each reading."""
+        """Number of conversions so far; each reading converts the whole matrix once."""
         return self.reads
 
     @property
@@ -119,7 +119,7 @@ class SimulatedPatch:
                 ignored, because a checked summary does not contain them.
 
         Raises:
-            LookupError: If there was no such reading, or the reading is too old.
+            LookupError: If no reading has this time, or the reading is too old.
         """
         try:
             return self._read_ns[(device_time_us & 0xFFFF_FFFF) // TIME_STEP_US]
@@ -153,7 +153,7 @@ class SimulatedPatch:
         return np.asarray(self.truth_m(t_ns) - self.skin.rest_m)
 
     def scene_s(self, t_ns: int) -> float | None:
-        """Return the scene time at ``t_ns``, s, or None if the scene has not begun."""
+        """Return the scene time (s) at ``t_ns``, or None if the scene has not begun."""
         return None if self._origin_ns is None else (t_ns - self._origin_ns) * 1e-9
 
     def _remember(self, t_ns: int) -> None:

@@ -127,7 +127,7 @@ class History:
         return self._summary(depth)
 
     def _solve(self, pose: Pose, offset_m: Float, slide_m: Float, start: Contact) -> tuple[float, Contact]:
-        """Return depth, metres, and contact after a move to a pose; ``start`` is the initial guess."""
+        """Return the depth (m) and the contact after a move to a pose; ``start`` is the initial guess."""
         grid = self.window.grid
 
         def at(depth_m: float) -> Contact:
@@ -152,7 +152,7 @@ class History:
         return depth, newest
 
     def _follow(self, pose: Pose) -> None:
-        """Move the window by whole cells to the body's pose; the tractions stay with the skin."""
+        """Move the window by whole cells to the body's pose; tractions remain at their points on the skin."""
         grid = self.window.grid
         way = (np.asarray(pose.place_m) - np.asarray(self.touch.at_m)) / grid.size_m
         first = (round(float(way[0])), round(float(way[1])))
@@ -197,7 +197,7 @@ def _advance(  # noqa: PLR0913 - all inputs of a time step
     frictionless state is still an equilibrium of the elastic layer.
 
     Raises:
-        NoSolution: If the pressure without friction does not converge either.
+        NoSolution: If the frictionless solution does not converge either.
     """
     for looser in _LOOSER:
         try:
@@ -208,7 +208,7 @@ def _advance(  # noqa: PLR0913 - all inputs of a time step
 
 
 def _shifted(traction_pa: Float, shift: tuple[int, int]) -> Float:
-    """Return the tractions (3, X, Y) in a window shifted by whole cells; tractions outside are dropped."""
+    """Return the tractions (3, X, Y) in a window shifted by whole cells, without those outside it."""
     moved = np.zeros_like(traction_pa)
     size = traction_pa.shape[1:]
     if abs(shift[0]) >= size[0] or abs(shift[1]) >= size[1]:

@@ -22,10 +22,10 @@ class Pose:
     Attributes:
         place_m: Position (x, y) of the body's lowest point in the patch frame, metres.
         slid_m: Distance (x, y) by which the body's surface has slid along the skin since the touch began,
-            metres. Rolling does not change it.
+            metres. Rolling does not change this distance.
         yaw_rad: Rotation about z, rad.
-        level: Depth, metres, of a touch controlled by depth, or normal force, N, of a touch controlled by
-            force; 0 without contact.
+        level: Depth (m) of a depth-controlled touch, or normal force (N) of a force-controlled touch; 0
+        without contact.
     """
 
     place_m: tuple[float, float]
@@ -63,14 +63,14 @@ def pose_at(touch: TouchConfig, t_s: float) -> Pose:
 
 
 def highest_level(touch: TouchConfig) -> float:
-    """Return a touch's maximum normal force, N, if it is force-controlled, else its maximum depth, metres."""
+    """Return the maximum normal force (N) of a force-controlled touch, else the maximum depth (m)."""
     levels = [touch.force_n if touch.by_force else touch.depth_m]
     levels += [motion.force_n if touch.by_force else motion.depth_m for motion in touch.motions]
     return max(level for level in levels if level is not None)
 
 
 def yaws_rad(touch: TouchConfig) -> tuple[float, ...]:
-    """Return yaw angles, rad, that cover a touch's rotation in steps of at most a quarter radian."""
+    """Return yaw angles (rad) that cover a touch's rotation in steps of at most 0.25 rad."""
     turned = sum(abs(motion.by_rad or 0.0) for motion in touch.motions)
     if not turned:
         return (touch.yaw_rad,)
@@ -88,7 +88,7 @@ def _way_m(motion: MotionConfig, share: float, t_s: float) -> tuple[float, float
 
 
 def _walked_m(motion: MotionConfig, t_s: float) -> tuple[float, float]:
-    """Return the displacement (x, y), metres, of a random walk with minimum jerk between targets."""
+    """Return the displacement (x, y) of a random walk in metres, with minimum jerk between its targets."""
     targets = _targets_m(motion)
     elapsed = min(max(t_s, motion.from_s), motion.to_s) - motion.from_s
     step_s = (motion.to_s - motion.from_s) / (len(targets) - 1)
@@ -100,7 +100,7 @@ def _walked_m(motion: MotionConfig, t_s: float) -> tuple[float, float]:
 
 @functools.lru_cache(maxsize=256)
 def _targets_m(motion: MotionConfig) -> tuple[tuple[float, float], ...]:
-    """Return a random walk's targets, metres, uniform in a disc of radius ``reach_m`` about the start."""
+    """Return a random walk's targets in metres, uniform in a disc of radius ``reach_m`` about the start."""
     count = max(1, round((motion.to_s - motion.from_s) / (motion.every_s or _EVERY_S)))
     random = np.random.default_rng(1 if motion.seed is None else motion.seed)
     r = (motion.reach_m or 0.0) * np.sqrt(random.uniform(0.0, 1.0, count))

@@ -1,11 +1,11 @@
 """Scene of one patch: state of the skin at any time, interpolated between the time steps of the touches.
 
 The state at a given time is the mean of the four nearest time steps, weighted by the uniform cubic B-spline
-(de Boor, A Practical Guide to Splines, 1978, chapter IX). The weights are positive and sum to 1, so the mean
-has the properties that every time step has: pressure is not negative, shear is at most friction times
-pressure, the force is the integral of the tractions, and the displacement is the layer's response to the
-tractions. All these quantities are twice continuously differentiable in time. A motion shorter than four time
-steps is smoothed.
+(de Boor, A Practical Guide to Splines, 1978, chapter IX). The weights are positive and sum to 1, so
+properties shared by all time steps also apply to the mean: pressure is not negative, shear is at most
+friction times pressure, the force is the integral of the tractions, and the displacement is the layer's
+response to the tractions. All these quantities are twice continuously differentiable in time. A motion
+shorter than four time steps is smoothed.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ class PatchScene:
         return max((history.touch.to_s for history in self.histories), default=0.0)
 
     def upper_m(self, t_s: float) -> Float:
-        """Return the upper electrodes' positions (U, N, 3), metres; ``layout.upper_m`` itself while at rest.
+        """Return the upper electrodes' positions (U, N, 3), metres; at rest: ``layout.upper_m`` itself.
 
         Args:
             t_s: Scene time, s.
@@ -81,7 +81,7 @@ class PatchScene:
         return PatchTruth(t_s, moved.reshape(self.layout.upper_m.shape), tuple(contacts), wrench)
 
     def prepare(self, until_s: float = math.inf) -> None:
-        """Compute the time steps of all touches in advance, instead of when they are first needed.
+        """Compute the time steps of all touches in advance instead of on first use.
 
         Args:
             until_s: Scene time up to which time steps are computed, s.
@@ -91,7 +91,7 @@ class PatchScene:
                 history.step(min(history.last, math.ceil(min(until_s / self.step_s, history.last))))
 
     def _touching(self, t_s: float) -> Iterator[tuple[History, Weighted]]:
-        """Yield each touch that contributes to the state at ``t_s``, with its weighted time steps."""
+        """Yield each touch that contributes to the state at ``t_s``, and its weighted time steps."""
         t_s = t_s if self.repeat_s is None or t_s < 0.0 else math.fmod(t_s, self.repeat_s)
         low = math.floor(t_s / self.step_s)
         weights = _spline(t_s / self.step_s - low)

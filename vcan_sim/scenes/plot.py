@@ -1,4 +1,4 @@
-"""Preview plot of a scene: force of each body over time, pressure at maximum depth. Needs matplotlib."""
+"""Preview plot of a scene: force of each body over time, and pressure at maximum depth."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def write_plot(scene: SceneConfig, hand: HandConfig, file: Path) -> None:
         file: Image file to write; its suffix determines the format.
 
     Raises:
-        ConfigError: If nothing touches a patch, a touch is impossible on its patch, or the file cannot be
+        ConfigError: If the scene has no touches, a touch is impossible on its patch, or the file cannot be
             written.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg

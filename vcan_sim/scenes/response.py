@@ -15,12 +15,13 @@ from vcan_sim.contact.solve import Contact
 from vcan_sim.scenes.shapes import Float
 
 BEYOND: Final = 20.0
-"""Distance from a point force, in layer thicknesses, beyond which the displacement is below ``FAR``."""
+"""Distance from a point force, in layer thicknesses; at larger distances the displacement is below
+``FAR``."""
 CLUSTER_CELLS: Final = 6.0
-"""Distance from the window, in cells, beyond which each group of 2 × 2 cells acts as one point force."""
+"""Distance from the window, in cells; for farther electrodes, 2 × 2 cells act as one point force."""
 FAR: Final = 1e-5
-"""Displacement due to a point force, relative to its maximum, below which it is treated as zero. The
-displacement of an elastic layer decays exponentially with the distance from the force."""
+"""Threshold for the displacement due to a point force, relative to its maximum; smaller values count as zero.
+The displacement of an elastic layer decays exponentially with the distance from the force."""
 POINTS: Final = 4096
 """Number of points in the table of displacement versus distance from a point force."""
 
@@ -41,7 +42,7 @@ class Electrodes:
     :class:`vcan_sim.contact.layer.PointResponse` for Z, A, B and K."""
     _step_m: float
     _far_m: float
-    """Distance from a point force beyond which the displacement is negligible, metres."""
+    """Maximum distance (m) from a point force at which the displacement is not negligible."""
 
     @classmethod
     def of(cls, layer: Layer, places_m: Float, surface_m: float) -> Electrodes:
@@ -62,8 +63,8 @@ class Electrodes:
 
         For electrodes inside the window, the displacement of the cells is interpolated by cubics. All other
         electrodes are at least two cells away from any loaded cell, so each cell's traction acts as a point
-        force at the cell's centre. Beyond ``CLUSTER_CELLS`` from the window, the forces of each group of
-        2 × 2 cells act at the centre of the group.
+        force at the cell's centre. For electrodes farther than ``CLUSTER_CELLS`` from the window, the forces
+        of each group of 2 × 2 cells act at the centre of the group.
 
         Args:
             grid: Cells of the window.
@@ -112,9 +113,9 @@ class Electrodes:
 
 @functools.lru_cache(maxsize=64)
 def _radial(layer: Layer, reach_m: float) -> tuple[Float, float]:
-    """Return the table of displacement versus distance from a point force, and the table's step, metres.
+    """Return the table of displacement versus distance from a point force, and the table's step in metres.
 
-    For a half-space, the table holds the solution of Boussinesq and Cerruti (Johnson, Contact Mechanics,
+    For a half-space, the table contains the solution of Boussinesq and Cerruti (Johnson, Contact Mechanics,
     1985, sections 3.2 and 3.6). For a layer, :class:`vcan_sim.contact.layer.PointResponse` adds the
     difference between layer and half-space.
     """
@@ -154,7 +155,7 @@ def _cubic(field: Float, index: Float) -> Float:
 
 
 def _lagrange(position: Float) -> Float:
-    """Return the cubic Lagrange weights (…, 4) at ``position`` (…) of the points 0, 1, 2 and 3."""
+    """Return the cubic Lagrange weights (…, 4) of the points 0, 1, 2 and 3 at ``position`` (…)."""
     points = np.arange(4.0)
     weights = np.ones((*position.shape, 4))
     for i in range(4):

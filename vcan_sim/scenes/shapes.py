@@ -90,7 +90,7 @@ def punch(radius_m: float, edge_radius_m: float) -> Shape:
 
 
 def box_edge(length_m: float, slope_rad: float, edge_radius_m: float) -> Shape:
-    """Return the shape of a box edge that runs along x and points down: two flanks that rise on both sides.
+    """Return the shape of a box edge that runs along x and points down, with a flank on each side.
 
     Args:
         length_m: Length of the edge along x, metres.
@@ -128,5 +128,5 @@ def ridge(radius_m: float, length_m: float) -> Shape:
 
 
 def _rounded(distance_m: Float, radius_m: float) -> Float:
-    """Return the height of a circle of ``radius_m`` at a horizontal distance from its lowest point."""
+    """Return a circle's height at a given horizontal distance from the circle's lowest point."""
     return np.asarray(radius_m - np.sqrt(np.maximum(radius_m**2 - distance_m**2, 0.0)))

@@ -84,8 +84,8 @@ class SkinConfig(Table):
     """Elastic layer of every patch in the scene, bonded to a rigid base."""
 
     thickness_m: Length | None = None
-    """Thickness of the elastic layer, metres; None: the height of the patch's upper electrodes above the
-    lower."""
+    """Thickness of the elastic layer, metres; None: the height of the upper electrodes above the lower
+    electrodes of the patch."""
     young_pa: _Modulus | None = None
     """Young's modulus, Pa; None: ``calibration.young_pa`` of the patch in the hand file."""
     poisson: _Poisson | None = None
@@ -170,18 +170,18 @@ class MotionConfig(Table):
 
 
 class TouchConfig(Table):
-    """One touch: a body comes down, moves, and lifts off."""
+    """One touch: a body presses on the skin, moves, and lifts off."""
 
     body: Name
-    """Name of the body that touches."""
+    """Name of the body that touches the patch."""
     patch: Name
     """Name of the touched patch, as in the hand file."""
     at_m: _Place
-    """Position [x, y] in the patch frame at which the body comes down, metres."""
+    """Position [x, y] of the first contact in the patch frame, metres."""
     from_s: _Time
     """Scene time of the first contact, s."""
     to_s: _Time
-    """Scene time at which the body has left the skin, s."""
+    """Scene time of the last contact, s."""
     ramp_s: _Duration = 0.3
     """Duration of the press at the start and of the lift at the end, s (minimum jerk)."""
     depth_m: Length | None = None
@@ -192,15 +192,15 @@ class TouchConfig(Table):
     yaw_rad: _Angle = 0.0
     """Rotation of the body about z, rad."""
     times: Annotated[int, Field(ge=1, le=1000), Allowed("an integer from 1 to 1000")] = 1
-    """Number of times that the touch is made, for example for a series of taps."""
+    """Number of repetitions of the touch including the first, for example in a series of taps."""
     every_s: _Duration | None = None
-    """Time from the start of one touch to the start of the next, s, if ``times`` is more than 1."""
+    """Time (s) between the starts of consecutive touches, if ``times`` is more than 1."""
     motions: Annotated[tuple[MotionConfig, ...], Field(strict=False)] = ()
     """Motions of the body during the touch."""
 
     @property
     def by_force(self) -> bool:
-        """Whether the touch is controlled by force rather than by depth."""
+        """True for a force-controlled touch, False for a depth-controlled touch."""
         return self.force_n is not None
 
     @property
@@ -211,7 +211,7 @@ class TouchConfig(Table):
         return tuple(self._after(number * (self.every_s or 0.0)) for number in range(self.times))
 
     def _after(self, delay_s: float) -> TouchConfig:
-        """Return a single touch, ``delay_s`` later."""
+        """Return a single copy of this touch, delayed by ``delay_s``."""
 
         def later(table: Any, **changes: Any) -> Any:
             times = {"from_s": table.from_s + delay_s, "to_s": table.to_s + delay_s}
@@ -307,7 +307,7 @@ class SceneConfig(Table):
     """Period after which the scene repeats, s; None: the scene plays once."""
     skin: SkinConfig = SkinConfig()
     imperfections: Annotated[
-        Any,  # a union would show its members in the messages
+        Any,  # with a union, messages would list its members
         Field(default_factory=dict),
         Allowed('"ordinary", or a table of imperfections'),
     ]
@@ -382,7 +382,7 @@ class SceneConfig(Table):
         return self
 
     def _check_motions(self, number: int, touch: TouchConfig) -> None:
-        """Check that only bodies that can roll do so: spheres, and ridges across their axis."""
+        """Check that only spheres roll, and ridges only across their axis."""
         body, key = self.body(touch.body), f"touches[{number}].motions"
         turns = any(motion.kind == "turn" for motion in touch.motions)
         for j, motion in enumerate(touch.motions):

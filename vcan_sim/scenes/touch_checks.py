@@ -18,11 +18,11 @@ from vcan_sim.scenes.tables import KEY_OF_TRAVEL, SceneConfig, TouchConfig
 from vcan_sim.scenes.window import FRICTION_MARGIN, MARGIN, BodyKey, TooMuch, Window, window_of
 
 DEEPEST: Final = 0.9
-"""Maximum depth of a body, as a fraction of the layer thickness or electrode height, whichever is smaller."""
+"""Maximum depth of a body, as a fraction of the smaller of layer thickness and electrode height."""
 APART: Final = 3.0
 """Minimum distance between the contacts of two bodies on a patch, as a multiple of the layer thickness or of
-the larger contact's half width, whichever is smaller. The simulator neglects the displacement that each
-contact causes at the other. At this distance, the neglected displacement is at most 3 % of the depth
+the larger contact's half width, whichever is smaller. The simulator neglects the displacement that one
+contact causes at another. At the minimum distance, the neglected displacement is at most 3 % of the depth
 (incompressible layer 2 mm thick, sphere of radius 40 mm)."""
 
 
@@ -101,7 +101,7 @@ def check_apart(
     early: tuple[int, TouchConfig, Window, dict[int, Pose]],
     layer: Layer,
 ) -> None:
-    """Raise ConfigError if two simultaneous contacts on a patch ever come closer than ``APART`` allows."""
+    """Raise ConfigError if simultaneous contacts on a patch are closer to each other than ``APART`` allows."""
     (i, touch, window, path), (j, _, other_window, other_path) = late, early
     both = np.array(window.half_m) + np.array(other_window.half_m)
     gap = APART * min(layer.thickness_m, max(*window.half_m, *other_window.half_m))

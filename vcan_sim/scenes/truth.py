@@ -61,7 +61,7 @@ class PatchTruth:
         t_s: Scene time, s.
         displacement_m: (U, N, 3) displacement of the upper electrodes, metres.
         contacts: Contacts, in the order of the touches in the scene.
-        wrench: (6,) force, N, on the patch, and moment, N m, about the origin of the patch frame.
+        wrench: (6,) force on the patch (N), and moment about the origin of the patch frame (N m).
     """
 
     t_s: float

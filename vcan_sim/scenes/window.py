@@ -16,8 +16,8 @@ from vcan_sim.contact.solve import press
 from vcan_sim.scenes.shapes import Float, Shape
 
 MOST_CELLS: Final = 1.4
-"""Maximum number of cells in a window, relative to the square of the number across its narrow side. A longer
-window has larger cells, up to twice as large, instead of more cells."""
+"""Maximum number of cells in a window, relative to the squared number of cells across its narrow side. A
+longer window uses cells of up to twice the size instead of more cells."""
 MARGIN: Final = 0.1
 """Margin of the window around the deepest contact, relative to the contact's half width; at least
 ``MARGIN_CELLS`` cells."""
@@ -34,11 +34,11 @@ _TURNS: Final = 12
 _SEARCHES: Final = 40
 """Maximum number of depths to try when searching for a force."""
 _NOWHERE_M: Final = -1.0
-"""Overlap of body and skin where there is no body, metres: any large negative length."""
+"""Overlap (m) of body and skin where there is no body: any large negative length."""
 
 
 class TooMuch(ValueError):
-    """Requested force exceeds the force at the maximum allowed depth, which is ``most_n``, N."""
+    """The requested force exceeds ``most_n`` (N), the force at the maximum allowed depth."""
 
     def __init__(self, most_n: float) -> None:
         self.most_n = most_n
@@ -100,7 +100,7 @@ def window_of(  # noqa: PLR0913 - all inputs of a contact
         layer: Elastic layer.
         body: Shape of the body.
         yaws_rad: Rotations of the body during the touch, rad.
-        level: Maximum depth, metres, or maximum normal force, N, of the touch.
+        level: Maximum depth (m) or maximum normal force (N) of the touch.
         by_force: Whether ``level`` is a force.
         most_m: Maximum allowed depth, metres.
         cells: Number of cells across the narrow side of the window.
@@ -142,16 +142,17 @@ def solve_depth(
     known: tuple[float, float],
     close: float = FORCE_CLOSE,
 ) -> float:
-    """Find the depth at which a force that increases with depth equals a target.
+    """Find the depth at which the contact force reaches a target.
 
     The search takes bracketed secant steps on logarithms, because the contact force is nearly a power of
-    depth. Every second step halves the bracket, because the force rises far more steeply while only a few
-    cells touch.
+    depth. Every second step halves the bracket, because the force increases more steeply while only a few
+    cells are in contact.
 
     Args:
-        force_n: Function from depth, metres, to force, N. The last call is at the returned depth.
+        force_n: Function from depth, metres, to force, N. The search calls this function last with the
+            returned depth.
         target_n: Target force, N, positive.
-        known: A depth, metres, and the force there, N; the first trial depth assumes F ∝ δ^1.5.
+        known: A depth (m) and the force (N) at this depth; the first trial depth assumes F ∝ δ^1.5.
         close: Tolerance of the force, relative to the target.
 
     Raises:
@@ -233,7 +234,7 @@ def _grid(layer: Layer, half_m: Float, across: int) -> Grid:
 
 
 def _extent_m(shape: Shape, yaw_rad: float, depth_m: float) -> Float:
-    """Return a rough upper bound of a body section's half width (2,) along x and y, metres, at a depth."""
+    """Return a rough upper bound (2,) of a body's half width along x and y, in metres, at a depth."""
     reach = 1e-5
     for _ in range(20):
         line = np.linspace(-reach, reach, 65)
@@ -243,7 +244,7 @@ def _extent_m(shape: Shape, yaw_rad: float, depth_m: float) -> Float:
         if extent.max() < reach * (1.0 - 1e-9):
             break
         reach *= 2.0
-    for axis in (0, 1):  # the samples above may miss a narrow body
+    for axis in (0, 1):  # the sampling above may miss a narrow body
         line = np.linspace(0.0, extent[axis] + 2.0 * reach / 64, 257)
         places = np.stack([line, 0.0 * line] if axis == 0 else [0.0 * line, line], axis=-1)
         inside = shape.over(places, yaw_rad) <= depth_m

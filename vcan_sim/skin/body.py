@@ -52,7 +52,7 @@ class Draws:
 def made(layout: PatchLayout, imperfections: Imperfections, draws: Draws) -> Body:
     """Return the electrode positions of a patch as manufactured.
 
-    Errors of thickness and tilt move each upper electrode along z by a fraction of its height above the
+    Thickness and tilt errors move each upper electrode along z by a fraction of its height above the
     nearest lower electrode, on flat and curved patches alike.
 
     Args:
@@ -96,7 +96,7 @@ def made(layout: PatchLayout, imperfections: Imperfections, draws: Draws) -> Bod
 
 
 def _from_middle(points_m: Float) -> Float:
-    """Scale x and y of points (U, N, 3) to range from −1 at one edge of the patch to 1 at the other."""
+    """Scale x and y of points (U, N, 3) so that they range from −1 to 1 across the patch."""
     plane = points_m[..., :2]
     low, high = plane.min(axis=(0, 1)), plane.max(axis=(0, 1))
     half = 0.5 * (high - low)

@@ -92,7 +92,7 @@ def grounded_ohm(conductance: Float, upper: Side, lower: Side) -> Float:
         lower: Lower wires.
     """
     above, below = conductance.sum(axis=1), conductance.sum(axis=0)
-    if lower.ideal:  # every lower wire is at ground, so the upper wires do not influence each other
+    if lower.ideal:  # all lower wires are grounded, so the upper wires do not influence each other
         return np.asarray(1.0 / (_driven(above, upper).T @ conductance))
     feed = 1.0 / lower.feed_ohm
     if upper.ideal:
@@ -106,7 +106,7 @@ def grounded_ohm(conductance: Float, upper: Side, lower: Side) -> Float:
 
 
 def floating_ohm(conductance: Float, upper: Side, lower: Side) -> Float:
-    """Return the resistances (U, K) in ohm of each pair of wires while all others float (``floating``).
+    """Return each wire pair's resistance (U, K) in ohm while all other wires float (``floating``).
 
     A reading is the effective resistance between two nodes of the network, Z_uu + Z_kk − 2 Z_uk, with the
     inverse Z of the nodes' conductance matrix (Klein and Randić, J. Math. Chem. 12, 1993), plus the

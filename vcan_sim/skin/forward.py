@@ -13,7 +13,7 @@ finite electrodes   A conducting disc of radius a has the potential arcsin(2a / 
                     (a/d)⁴.
 strain              ρ of a path becomes ρ (1 + β ε), with the path's strain ε = d/d₀ − 1 relative to rest: the
                     linear piezoresistive law (Smith, Phys. Rev. 94, 1954) for each path separately. This
-                    simplified model neglects strain across the path.
+                    simplified model neglects strain perpendicular to the path.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ class ExactForward:
 
 
 class Paths:
-    """Conductances of all paths between upper and lower electrodes, at unit resistivity.
+    """Conductances of all paths between upper and lower electrodes, for a resistivity of 1 ohm/m.
 
     Args:
         upper_m: (U, N, 3) float64, m: upper electrodes at rest.

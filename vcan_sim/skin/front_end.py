@@ -19,7 +19,7 @@ class FrontEnd:
     """Amplifier and converter of one patch.
 
     The amplifier is balanced at rest, so its gain error acts on the change in each resistance. A gain error
-    of the whole reading would have no effect, because nodes send R divided by the R of their baseline.
+    of the whole reading would have no effect, because nodes send R divided by the baseline R0.
 
     Args:
         imperfections: Sizes of the errors.

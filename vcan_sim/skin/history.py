@@ -4,16 +4,16 @@ Hysteresis and creep act on each coordinate of each electrode's displacement, hy
 
 hysteresis   the fraction w of the displacement passes through play operators in parallel, each of which
              follows its input only outside a band of ±r: p ← max(s − r, min(s + r, p)), p = 0 at first. The
-             loop does not depend on the rate (Prandtl-Ishlinskii operator; Brokate and Sprekels, Hysteresis
-             and Phase Transitions, 1996, section 2.3).
+             hysteresis loop does not depend on the rate of loading (Prandtl-Ishlinskii operator; Brokate and
+             Sprekels, Hysteresis and Phase Transitions, 1996, section 2.3).
 creep        d = s + c₁ q₁ + c₂ q₂ with τᵢ dqᵢ/dt = s − qᵢ: a Prony series, that of two Kelvin-Voigt elements
              (Findley, Lai and Onaran, Creep and Relaxation of Nonlinear Viscoelastic Materials, 1976,
              section 5.5). A step of s gives s (1 + Σ cᵢ (1 − exp(−t/τᵢ))).
 
-The result is the true displacement of the electrodes. The state advances in time steps of :data:`STEP_S` from
-time 0, and the output of the hysteresis is assumed to be linear within a step. A time within a step is
-reached by a partial step that is not stored. The result therefore depends only on the time, not on earlier
-requests.
+The output of the two stages is the true displacement of the electrodes. The state advances in time steps of
+:data:`STEP_S` from time 0, and the output of the hysteresis is assumed to be linear within a step. For a time
+within a step, a partial step is computed but not stored. The displacement therefore does not depend on which
+times were requested earlier.
 """
 
 from __future__ import annotations
@@ -36,15 +36,15 @@ THRESHOLDS: Final = (0.0025, 0.005, 0.01, 0.02)
 _RECENT: Final = 128
 """Number of most recent time steps whose states are stored."""
 _KEPT_EVERY: Final = 64
-"""Number of time steps between the states that are stored longer: 2 s."""
+"""Interval between the states in long-term storage, in time steps: 2 s."""
 _KEPT: Final = 300
-"""Number of states that are stored longer: ten minutes. From older states, only every ``_THINNED``-th is
+"""Number of states in long-term storage: ten minutes. Of the older states, only every ``_THINNED``-th is
 kept."""
 _THINNED: Final = 64
 
 Load = Callable[[float], "Float | None"]
-"""Function of the time, s, that returns the displacement (U, N, 3), m, of rubber without memory, or None at
-rest."""
+"""Function of the time (s) that returns the displacement (U, N, 3), in m, of rubber without memory, or None
+at rest."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -78,12 +78,12 @@ class History:
         self._lock = threading.Lock()  # a node takes readings while another thread requests the truth
 
     def displacement_m(self, t_s: float, load: Load) -> Float | None:
-        """Return the rubber's displacement (U, N, 3), m, at ``t_s``; None if it has not been loaded yet.
+        """Return the rubber's displacement (U, N, 3), in m, at ``t_s``; None before the first load.
 
         Args:
-            t_s: Time since the start, s. Before 0 there is no history.
-            load: Displacement without memory, as a pure function of time. A different function restarts the
-                history.
+            t_s: Time since the start, s. The history starts at time 0.
+            load: Displacement without memory, as a pure function of time. Passing a different function
+                restarts the history.
         """
         if t_s < 0.0:
             return load(t_s)

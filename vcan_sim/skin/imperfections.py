@@ -42,7 +42,7 @@ _OF_NETWORK: Final = (
     "multiplexer_ohm",
     "virtual_ground_ohm",
 )
-"""Resistances that exist only with the read-outs ``grounded`` and ``floating``."""
+"""Resistances that are modelled only with the read-outs ``grounded`` and ``floating``."""
 _WITHOUT_SIZE: Final = ("seed", "temperature_per_k", "warming_s", "creep_s")
 """Fields that have no effect while every size is zero."""
 _BITS: Final = (8, 32)
@@ -62,7 +62,8 @@ class Imperfections:
     """
 
     seed: int = 1
-    """Random seed of the imperfections. The patches of a hand differ although they share the seed."""
+    """Random seed of the imperfections. The patches of a hand share the seed but have different random
+    draws."""
 
     # --- geometry
     placement: float = 0.0
@@ -81,7 +82,8 @@ class Imperfections:
     strain: float = 0.0
     """Relative change in resistivity per unit strain of a path between two electrodes."""
     warming_k: float = 0.0
-    """Final rise in temperature after the scene starts, K; the temperature approaches it exponentially."""
+    """Final rise in temperature after the scene starts, K; the temperature approaches this value
+    exponentially."""
     temperature_per_k: float = 2e-3
     """Relative change in resistivity per kelvin; has an effect only with ``warming_k``."""
     warming_s: float = 300.0
@@ -96,7 +98,7 @@ class Imperfections:
 
     # --- read-out
     gain: float = 0.0
-    """Gain error of the amplifier, as a fraction of the change in each resistance since rest; drawn. Half of
+    """Gain error of the amplifier for the change in each resistance from rest; drawn. Half of
     the variance is common to the whole patch; the other half is independent for each upper wire."""
     offset: float = 0.0
     """Offset error of each upper wire's readings, as a fraction of the median resistance at rest; drawn."""
@@ -150,7 +152,7 @@ class Imperfections:
     def ordinary(cls, seed: int = 1) -> Self:
         """Return the sizes of a carefully manufactured patch, consistent with ``tolerances = "ordinary"``.
 
-        Gain, placement, thickness and electrode radius are the values of
+        Gain, placement, thickness and electrode radius have the values in
         :data:`skinnode.model.tolerances.ORDINARY`; the other sizes are assumptions. The temperature is
         constant and the read-out is ideal, because the tolerances do not cover their effects.
 
@@ -245,7 +247,7 @@ def _checked(name: str, value: object, least: float, greatest: float, unit: str)
 
 
 def _number(name: str, value: object, least: float, greatest: float, allowed: str) -> float:
-    """Return a number as a float. Raises ConfigError if the value is not from ``least`` to ``greatest``."""
+    """Return a number as a float. Raises ConfigError if it is not between ``least`` and ``greatest``."""
     if isinstance(value, bool) or not isinstance(value, int | float) or not least <= value <= greatest:
         raise ConfigError(name, value, allowed)
     return float(value)

@@ -1,4 +1,4 @@
-"""Preview plot of a scene: force of each body over time, and pressure at maximum depth."""
+"""Preview plot of a scene (needs matplotlib): force of each body over time, and pressure at maximum depth."""
 
 from __future__ import annotations
 

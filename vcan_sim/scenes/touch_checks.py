@@ -101,7 +101,7 @@ def check_apart(
     early: tuple[int, TouchConfig, Window, dict[int, Pose]],
     layer: Layer,
 ) -> None:
-    """Raise ConfigError if simultaneous contacts on a patch are closer to each other than ``APART`` allows."""
+    """Raise ConfigError if simultaneous contacts on a patch are closer than ``APART`` allows."""
     (i, touch, window, path), (j, _, other_window, other_path) = late, early
     both = np.array(window.half_m) + np.array(other_window.half_m)
     gap = APART * min(layer.thickness_m, max(*window.half_m, *other_window.half_m))

@@ -5,7 +5,8 @@ from __future__ import annotations
 from typing import Final
 
 GLIDE_RAMP: Final = 0.2
-"""Fraction of a glide's duration in which the speed rises; the speed falls in an equal fraction."""
+"""Duration of a glide's acceleration phase, and also of its deceleration phase, as a fraction of the
+glide."""
 
 
 def ease(share: float) -> float:

@@ -1,4 +1,4 @@
-"""Counts of frames by kind, for comparing what simulated nodes sent with what a host received."""
+"""Counts of frames by kind, for comparing a simulated node's frames with those received by a host."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ class Tally:
 
     def __init__(self) -> None:
         self.handed: Counter[Kind] = Counter()
-        """Frames to send, from the node itself or from a fault that adds frames."""
+        """Frames submitted for sending, by the node itself or by a fault that adds frames."""
         self.emitted: Counter[Kind] = Counter()
         """Frames put on the bus."""
         self.lost: Counter[Kind] = Counter()
@@ -83,7 +83,7 @@ class Tally:
         self.refused: Counter[Kind] = Counter()
         """Frames that the bus refused."""
         self.waiting: Counter[Kind] = Counter()
-        """Frames that wait to be sent later: late chunks, and chunks that swap places with the next frame."""
+        """Frames queued for later sending: late chunks, and chunks that swap places with the next frame."""
         self.heard: Counter[Kind] = Counter()
         """Frames that reached the node's controller."""
         self.taken: Counter[Kind] = Counter()
@@ -94,7 +94,10 @@ class Tally:
         """Frames missed while the node was deaf or unplugged."""
 
     def discrepancies(self) -> list[str]:
-        """Return one line per kind of frame with inconsistent counts. Call this when the node is idle."""
+        """Return one line per kind of frame with inconsistent counts.
+
+        Call this method when the node is idle.
+        """
         out = self.emitted + self.lost + self.silenced + self.refused + self.waiting
         into = self.taken + self.lost_in + self.unheard
         found = [

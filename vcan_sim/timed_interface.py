@@ -28,9 +28,9 @@ MOST_STATIONS: Final = 64
 class Inbox:
     """Queue of frames that a station has received but not read yet.
 
-    The first frame after a pause wakes the reader immediately. All frames of the following
-    :data:`COALESCED_NS` wake the reader only once, like coalesced interrupts of a busy controller. Each frame
-    keeps its own time stamp.
+    The first frame after a pause wakes the reader immediately. All frames in the next :data:`COALESCED_NS`
+    wake the reader only once, like the coalesced interrupts of a busy controller. Each frame keeps its own
+    time stamp.
 
     Args:
         clock: Virtual clock of the reader.
@@ -84,7 +84,7 @@ class Segment:
         self._connected: set[int] = set()
         self._due_ns: int | None = None
         self.cpu_ns: Counter[str] = Counter()
-        """CPU time spent on simulating the bus, by name of the thread that did so, ns."""
+        """CPU time (ns) spent on simulating the bus, by thread name."""
 
     def join(self) -> int:
         """Connect a new station and return its number."""
@@ -108,7 +108,7 @@ class Segment:
         self._plan()
 
     def inbox(self, station: int) -> Inbox:
-        """Return the queue of frames that a station has received."""
+        """Return a station's queue of received frames."""
         return self._inboxes[station]
 
     def _plan(self) -> None:
@@ -148,7 +148,7 @@ class Segment:
         self._plan()
 
     def _disconnect(self) -> None:
-        """Disconnect leaving stations that have no frames to send, or no other station to receive them."""
+        """Disconnect closing stations that have sent all frames, or all if no other station remains."""
         for station in sorted(self._leaving):
             if not self.bus.waiting(station) or self._connected <= self._leaving:
                 self.bus.clear(self.clock.now_ns, station)

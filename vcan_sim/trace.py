@@ -17,11 +17,11 @@ _POLL_S: Final = 0.05
 """Maximum time to wait for a frame, s; :meth:`Listener.__exit__` also waits at most this long."""
 
 _LAST_FRAMES: Final = 10_000
-"""Maximum number of frames that a listener still reads when it stops, in case frames keep arriving."""
+"""Maximum number of remaining frames that a listener reads before it stops, in case frames keep arriving."""
 
 
 class Trace:
-    """Record of every frame on a timed bus from now on, with the time at which the frame ended.
+    """Record of all further frames on a timed bus, each with the time at which the frame ended.
 
     Args:
         of: Bus to record.

@@ -10,8 +10,8 @@ of the speed of the machine, and a minute of waiting takes no real time::
         with Fleet(hand), skinnode.Host(hand) as host:  # host and nodes on a bus with interface "timed"
             field = host.next_field(timeout_s=5.0)
 
-Waiting by other means than :mod:`skinnode.process.clock`, such as on a socket, a subprocess or an event of
-``threading``, blocks the whole program.
+A thread that waits without :mod:`skinnode.process.clock`, for example on a socket, a subprocess or a
+``threading`` event, blocks the whole program.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ POLL_S: Final = 1e-4
 
 
 class Deadlock(RuntimeError):
-    """Deadlock: every thread waits for another thread, and no thread waits for a time."""
+    """Deadlock: every thread waits for another thread, and no timer is pending."""
 
 
 class VirtualClock:
@@ -59,7 +59,7 @@ class VirtualClock:
     def __init__(self) -> None:
         self.shared: dict[str, object] = {}
         self._now_ns = START_NS
-        self._readings = 0  # readings of the clock since the running thread was last suspended
+        self._readings = 0  # clock readings by the running thread since its last suspension
         self._ready: deque[_Turn] = deque()
         self._timers: list[tuple[int, int, int, _Turn | Callable[[], None]]] = []
         self._number = itertools.count()
@@ -84,7 +84,7 @@ class VirtualClock:
 
     @property
     def now_ns(self) -> int:
-        """Monotonic time, ns, for code that does not run in a thread of the program."""
+        """Monotonic time (ns), for code that does not run in a thread of the program."""
         return self._now_ns
 
     def monotonic_ns(self) -> int:
@@ -100,9 +100,10 @@ class VirtualClock:
         return self._now_ns
 
     def made_progress(self) -> None:
-        """Reset the number of clock readings of the current thread, as after a wait.
+        """Reset the current thread's number of clock readings, as after a wait.
 
-        A thread that takes items from a queue is not polling: it stops when the queue is empty.
+        A thread that takes items from a queue is not considered to poll the clock, because it stops when
+        the queue is empty.
         """
         self._readings = 0
 
@@ -117,7 +118,9 @@ class VirtualClock:
         self.wait(deque(), seconds)
 
     def call_at(self, t_ns: int, function: Callable[[], None]) -> None:
-        """Schedule a function call at a virtual time, while no thread runs. The function must not wait.
+        """Schedule a function call at a virtual time; the call is made while no thread runs.
+
+        The function must not wait.
 
         Args:
             t_ns: Monotonic time of the call, ns; a time in the past means now.
@@ -125,10 +128,10 @@ class VirtualClock:
         """
         heapq.heappush(self._timers, (t_ns, next(self._number), 0, function))
 
-    # --- what threads wait for
+    # --- synchronisation objects
 
     def event(self) -> threading.Event:
-        """Return an event in virtual time, which is not set."""
+        """Return an event in virtual time that is initially not set."""
         return _Event(self)
 
     def queue(self) -> queues.Queue[Any]:
@@ -157,11 +160,11 @@ class VirtualClock:
         """Suspend the current thread until :meth:`wake` is called with the same deque, or until a time-out.
 
         Args:
-            waiting: Turns of the threads that wait for the same condition.
+            waiting: Scheduling states of the threads that wait for the same condition.
             seconds: Maximum wait, s; None: no limit.
 
         Returns:
-            Whether :meth:`wake` woke the thread, rather than the time-out.
+            True if :meth:`wake` woke the thread, False after a time-out.
         """
         turn = self._running
         turn.woken, turn.waiting = False, waiting
@@ -204,7 +207,7 @@ class VirtualClock:
         turn.gate.release()
 
     def _next(self) -> _Turn:
-        """Return the turn of the next thread to run; advance the clock if no thread is ready."""
+        """Return the scheduling state of the next thread to run; advance the clock if no thread is ready."""
         while not self._ready:
             if not self._timers:
                 names = ", ".join(repr(turn.name) for turn in self._alive)
@@ -226,7 +229,7 @@ class VirtualClock:
 
 
 class _Turn:
-    """Scheduling state of one thread: its gate and its current wait."""
+    """Scheduling state of one thread: the gate that blocks the thread, and the current wait."""
 
     def __init__(self, name: str) -> None:
         self.name = name
@@ -237,7 +240,8 @@ class _Turn:
         self.waiting: deque[_Turn] = deque()
         """Turns of the threads that wait for the same condition."""
         self.waits = 0
-        """Number of completed waits, by which timers of earlier waits are recognised as invalid."""
+        """Number of completed waits; a timer with a smaller number belongs to an earlier wait and is
+        invalid."""
         self.error: Exception | None = None
 
 

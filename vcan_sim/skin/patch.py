@@ -20,21 +20,21 @@ ROW_STEP_S: Final = 1e-3
 """Maximum time over which the electrodes' motion during a scan is assumed to be linear, s."""
 
 Surface = Callable[[float], Float]
-"""Function of the time, s, that returns the upper electrodes (U, N, 3), m, of an exact patch. At rest it
-returns ``layout.upper_m`` itself, as :meth:`vcan_sim.scene.Scene.upper_m` does."""
+"""Function of the time (s) that returns the upper electrodes (U, N, 3), in m, of an exact patch. At rest, the
+function returns ``layout.upper_m`` itself, as :meth:`vcan_sim.scene.Scene.upper_m` does."""
 
 
 class PhysicalPatch:
     """Patch as manufactured, with its read-out.
 
-    Each electrode is displaced by as much as the same electrode of the exact patch, despite its placement
-    error; hysteresis and creep change this displacement. The same arguments produce the same bytes, in
-    whatever order times are requested. Without imperfections, the resistances are bit-identical to those of
+    Each electrode has the same displacement as in the exact patch, despite its placement error; hysteresis
+    and creep change this displacement. The same arguments produce the same bytes, regardless of the order in
+    which times are requested. Without imperfections, the resistances are bit-identical to those of
     :class:`ExactForward`, at the same cost.
 
-    With the read-outs ``grounded`` and ``floating``, the conductances of an upper wire's paths are taken at
-    the time when that wire is sampled, also while another upper wire is sampled. The error affects only sneak
-    currents.
+    With the read-outs ``grounded`` and ``floating``, the conductances of an upper wire's paths are always
+    those at the sampling time of this wire, even when another upper wire is sampled. This simplification
+    affects only sneak currents.
 
     Args:
         layout: Nominal layout of the patch, as in the hand file.
@@ -82,9 +82,9 @@ class PhysicalPatch:
 
         Returns:
             (U, N, 3) float64, m: upper wire u at ``t_s + u · row_time_s``; ``layout.upper_m`` itself if the
-            electrodes have no position errors and the patch is at rest. Subtract :attr:`rest_m` to obtain the
-            displacement, which solvers estimate. The positions also contain the placement errors, which are
-            unknown to solvers.
+            electrodes have no position errors and the patch is at rest. Subtract :attr:`rest_m` from these
+            positions to obtain the displacement that solvers estimate. The positions include the placement
+            errors, which are unknown to solvers.
         """
         if not self.imperfections.row_time_s:
             return self._upper_m(t_s, upper_m_at)
@@ -134,7 +134,7 @@ class PhysicalPatch:
         return self.converted_ohm(self.analogue_ohm(t_s, upper_m_at), abs(round(t_s * 1e9)))
 
     def _upper_m(self, t_s: float, upper_m_at: Surface) -> Float:
-        """Return the true positions (U, N, 3), m, of the upper electrodes; ``rest_m`` itself at rest."""
+        """Return the true positions (U, N, 3), in m, of the upper electrodes; at rest: ``rest_m`` itself."""
         layout_m = self.layout.upper_m
         if self._history is None:
             upper = upper_m_at(t_s)
@@ -145,7 +145,7 @@ class PhysicalPatch:
         return self.rest_m if moved is None else np.asarray(self.rest_m + moved)
 
     def _warmth(self, t_s: float) -> Float:
-        """Return the resistivity (U, 1), relative to time 0, at the time when each upper wire is sampled."""
+        """Return the resistivity (U, 1) at each upper wire's sampling time, relative to time 0."""
         sizes = self.imperfections
         since_s = np.maximum(t_s + self._row_s, 0.0)
         risen_k = -sizes.warming_k * np.expm1(-since_s / sizes.warming_s)

@@ -1,4 +1,4 @@
-"""Deterministic model of a CAN bus with exact times, without threads and without a clock.
+"""Deterministic model of a CAN bus with exact times; the model needs no threads or clock.
 
 ::
 
@@ -9,8 +9,8 @@
     confinement (error counters and states), bit_rates (exact times), occupancy (bus load) -> bus
 
 The caller controls the time. ``TimedBus.send`` queues a frame at a given time, ``TimedBus.advance`` returns
-all events up to a given time, and ``TimedBus.next_event_ns`` is the time to which the caller must advance
-next. The same calls produce the same events. The docstrings of the modules ``bus``, ``attempt`` and
+all events up to a given time, and ``TimedBus.next_event_ns`` is the time to pass to the next call of
+``advance``. The same calls produce the same events. The docstrings of the modules ``bus``, ``attempt`` and
 ``confinement`` list the simplifications of the model.
 """
 

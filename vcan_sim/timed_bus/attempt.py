@@ -1,4 +1,4 @@
-"""Course of one transmission attempt: when a frame is delivered, or destroyed by an error frame.
+"""Course of one transmission attempt: the time at which a frame is delivered or destroyed.
 
 :func:`undisturbed` covers the common case and needs only the number of bits; :func:`disturbed` examines the
 individual bits of the frame.
@@ -10,8 +10,8 @@ delimiter of 8 recessive bits and the intermission of 3 bits follow. Error flags
 delay of the second flag is counted at the bit rate of the phase in which the error occurs.
 
 Simplifications: A disturbance seen by all stations destroys the frame, even if it inverts a recessive bit of
-the arbitration field. Error flags and delimiters are never disturbed. Passive error flags end with the
-superposed flags. There are no overload frames.
+the arbitration field. Error flags and delimiters are never disturbed. A passive error flag ends at the same
+time as the superposed flags. Overload frames are not modelled.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ class Course:
     end: int
     """End of the last bit of the end of frame, or start of the first error flag, in ticks."""
     recessive: int
-    """Time after which the bus stays recessive, in ticks."""
+    """Time from which the bus remains recessive, in ticks."""
     free: int
     """End of the intermission, in ticks."""
     error: BitError | None = None
@@ -115,7 +115,7 @@ def disturbed(
             receiver = bus.receiving.get(hit.station)
             if receiver is not None and not receiver.passive:
                 return _destroyed_by_receiver(hit, wire, bus)
-            if receiver is not None:  # this receiver sees no valid frame and does not acknowledge
+            if receiver is not None:  # this receiver does not acknowledge an invalid frame
                 bus.side_errors.append(_bit_error(wire, hit.bit, Cause.DISTURBED, (hit.station,), rates))
                 del bus.receiving[hit.station]
             hit = None
@@ -217,7 +217,7 @@ def _lag_ticks(wire: WireFrame, bit: int, lag: int, rates: BitRates) -> int:
 
 
 def _sender_lag(wire: WireFrame, bit: int) -> int:
-    """Return how many bits of an active error flag pass before a sender sends a recessive bit, at most 6."""
+    """Return the number of error flag bits up to a sender's next recessive bit, at most 6."""
     later = wire.bits[bit + 1 : bit + 1 + FLAG_BITS]
     return later.index(1) + 1 if 1 in later else FLAG_BITS
 

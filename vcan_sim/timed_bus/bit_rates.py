@@ -20,8 +20,9 @@ class BitRates:
     """Bit rates of a bus.
 
     Time is counted in ticks of 1/``ticks_per_s`` s, the longest unit in which a nanosecond, a nominal bit and
-    a data bit are all whole numbers. Bit times are therefore exact, and time does not drift. A tick is 1 ns
-    if both bit times are whole nanoseconds. Only reported times are rounded, each independently.
+    a data bit are all whole numbers. Bit times in ticks are therefore exact, and rounding errors do not
+    accumulate. A tick is 1 ns if both bit times are whole nanoseconds. Only the times reported to callers are
+    rounded, each independently.
 
     Raises:
         ConfigError: if a bit rate is out of range.

@@ -130,7 +130,9 @@ class TimedBus:
         self._withdraw(sender)
 
     def disconnect(self, time_ns: int, station: int) -> None:
-        """Disconnect a station; its queue is kept. A frame that it is sending ends in an error frame.
+        """Disconnect a station; its queue is kept.
+
+        A frame that the station is sending ends in an error frame.
 
         Args:
             time_ns: current time, ns.
@@ -206,7 +208,9 @@ class TimedBus:
         self._disturbances.add(rule)
 
     def undisturb(self, rule: Disturbance) -> None:
-        """Remove a rule that :meth:`disturb` added. The transmission attempt in progress is not changed.
+        """Remove a rule that :meth:`disturb` added.
+
+        Removing a rule does not change the transmission attempt in progress.
 
         Args:
             rule: disturbance rule, the same object as in :meth:`disturb`.
@@ -220,16 +224,17 @@ class TimedBus:
 
     @property
     def next_event_ns(self) -> int | None:
-        """Time to which the caller must advance next, ns; None if no event is pending.
+        """Time (ns) to pass to the next call of :meth:`advance`; None if no event is pending.
 
-        Some of these times are internal decisions of the bus, for which :meth:`advance` returns no event.
+        At some of these times, the bus only makes an internal decision, and ``advance`` returns no event.
+
         """
         if self._events:
             return self._rates.ceil_ns(self._now)
         return None if self._next is None else self._rates.ceil_ns(self._next)
 
     def advance(self, time_ns: int) -> list[Event]:
-        """Return all events up to a given time that have not been returned yet, in order.
+        """Return all new events up to a given time, in chronological order.
 
         Args:
             time_ns: time up to which to return events, ns.
@@ -241,10 +246,10 @@ class TimedBus:
         events, self._events = self._events, []
         return events
 
-    # --- what can be read
+    # --- queries
 
     def counters(self, station: int) -> Counters:
-        """Return a station's error counters, which define its error state.
+        """Return a station's error counters, which determine the station's error state.
 
         Args:
             station: index of the station.
@@ -252,7 +257,7 @@ class TimedBus:
         return self._stations[station].counters
 
     def waiting(self, station: int) -> int:
-        """Return the number of frames that a station still has to send, including the frame being sent.
+        """Return the number of frames pending in a station, including the frame being sent.
 
         Args:
             station: index of the station.
@@ -266,7 +271,7 @@ class TimedBus:
         return MappingProxyType(self._frames)
 
     def busy_share(self, from_ns: int, to_ns: int) -> float:
-        """Return the fraction of time in which the bus was busy with frames, error frames and intermissions.
+        """Return the bus load: the fraction of time occupied by frames, error frames and intermissions.
 
         Args:
             from_ns: start of the interval, ns.
@@ -293,7 +298,7 @@ class TimedBus:
         """
         self._occupancy.forget(before_ns)
 
-    # --- the course of time inside
+    # --- internal steps of the bus
 
     def _at(self, time_ns: int, station: int) -> Station:
         if not 0 <= station < len(self._stations):
@@ -367,7 +372,7 @@ class TimedBus:
         start = now - self._rates.nominal_ticks
         self._start = None
         contenders = [station for station in self._pending.values() if station.ready <= start]
-        if not contenders:  # all frames have been withdrawn since the start of frame
+        if not contenders:  # all frames have been removed from the queues since the start of frame
             self._choose_start(now)
             return
         if len(contenders) == 1:
@@ -587,7 +592,7 @@ class TimedBus:
         return max(0, until - since) // (RECOVERY_RUN_BITS * self._rates.nominal_ticks)
 
     def _recovery_end(self, station: Station) -> int:
-        """Return the time, ticks, at which a station's recovery ends if the bus stays recessive."""
+        """Return the time in ticks at which a station's recovery ends if the bus stays recessive."""
         assert station.recovers_from is not None
         since = max(station.recovers_from, self._recessive_from)
         missing = (RECOVERY_RUNS - station.runs_seen) * RECOVERY_RUN_BITS

@@ -17,10 +17,11 @@ BUS_OFF_FROM: Final = 256
 """Minimum value of the transmit error counter at which a station goes bus-off."""
 
 MAX_RECEIVE_ERRORS: Final = 255
-"""Maximum receive error counter. The standard sets no limit; controllers count in 7 or 8 bits."""
+"""Maximum receive error counter. The standard sets no limit; controllers use 7-bit or 8-bit counters."""
 
 _BACK_TO_ACTIVE: Final = 119
-"""Receive error counter after a successful reception if it was above 127; the standard allows 119 to 127."""
+"""Receive error counter after a successful reception if the counter was above 127; the standard allows 119 to
+127."""
 
 RECOVERY_RUNS: Final = 128
 """Number of runs of recessive bits after which the bus-off state ends."""

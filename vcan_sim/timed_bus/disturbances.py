@@ -1,4 +1,4 @@
-"""Rules that inject bit errors, and the bits that the rules disturb.
+"""Rules that inject bit errors, and the disturbed bits.
 
 A disturbance inverts one bit of a frame, for all stations or for one station only. Rules count every
 transmission attempt, so a rule can also destroy retransmissions.
@@ -29,8 +29,8 @@ class NthFrame:
     attempts: int = 1
     """Number of disturbed attempts."""
     bit: int = 20
-    """Position of the disturbed bit, including stuff bits; the start of frame is 0. Larger positions than
-    that of the last but one bit of the end of frame refer to that bit."""
+    """Position of the disturbed bit, including stuff bits; the start of frame is 0. Larger positions are
+    limited to the last but one bit of the end of frame."""
     extended: bool = False
     station: int | None = None
     """Only station that sees the disturbance; None if all stations see it."""
@@ -43,7 +43,7 @@ class NthFrame:
 
 @dataclass(frozen=True, slots=True)
 class RandomShare:
-    """Rule that disturbs a random share of all transmission attempts.
+    """Rule that disturbs each transmission attempt with a given probability.
 
     Raises:
         ConfigError: if the share is not a probability, or the position is negative.
@@ -69,7 +69,7 @@ class RandomShare:
 
 @dataclass(frozen=True, slots=True)
 class AtTime:
-    """Rule that disturbs the bit on the bus at a given time; it has no effect if the bus is then idle.
+    """Rule that disturbs the bit on the bus at a given time; the rule has no effect on an idle bus.
 
     Raises:
         ConfigError: if the time is negative.
@@ -94,8 +94,8 @@ class Attempt(NamedTuple):
     n_bits: Callable[[], int]
     """Function that returns the number of bit positions at which the frame can be disturbed."""
     bit_at: Callable[[int], int | None]
-    """Function that returns the position of the bit on the bus at a time, ns, or None if the frame is not
-    then on the bus."""
+    """Function that returns the position of the bit on the bus at a given time (ns), or None if the frame is
+    not on the bus at that time."""
 
 
 class Hit(NamedTuple):

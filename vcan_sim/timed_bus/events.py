@@ -31,7 +31,7 @@ class Delivered(NamedTuple):
     frame: CanFrame
     receivers: tuple[int, ...]
     """Stations that received the frame. If several stations sent the same bits simultaneously, only the first
-    event lists the receivers; the tuple is empty in the others."""
+    event lists the receivers; the tuple of every further event is empty."""
     queued_ns: int
     """Time at which the station queued the frame, ns."""
     started_ns: int
@@ -45,12 +45,12 @@ class ErrorFrame(NamedTuple):
     stations: tuple[int, ...]
     """Stations whose frame failed and will be retransmitted; empty if only a receiver lost the frame."""
     frames: tuple[CanFrame, ...]
-    """Frame on the bus; if different frames collided, all these frames in the order of ``stations``."""
+    """Frame on the bus; if different frames collided, all colliding frames in the order of ``stations``."""
     bit: int
     """Position of the bit in which the error was detected, counted from the start of frame at 0."""
     cause: Cause
     detected_by: tuple[int, ...]
-    """Stations that detected the error in bit ``bit``; other stations are notified by the error flag."""
+    """Stations that detected the error in bit ``bit``; other stations detect the resulting error flag."""
     destroyed: bool
     """Whether the error flag destroyed the frame; passive error flags of receivers do not destroy frames."""
 

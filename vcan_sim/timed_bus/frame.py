@@ -77,7 +77,7 @@ def arbitration_key(frame: CanFrame) -> int:
 
 
 def frame_bits(frame: CanFrame, esi: bool = False) -> tuple[int, int]:
-    """Return the exact number of bits from a frame's start of frame to the end of the inter-frame space.
+    """Return the exact number of bits from the start of frame to the end of the inter-frame space.
 
     Args:
         frame: frame to measure.
@@ -85,8 +85,8 @@ def frame_bits(frame: CanFrame, esi: bool = False) -> tuple[int, int]:
 
     Returns:
         Number of bits at the nominal bit rate and at the data bit rate. The bit rate changes at the sample
-        points of the BRS bit and the CRC delimiter. Counting BRS as one nominal bit and the delimiter as one
-        data bit yields the same total duration.
+        points of the BRS bit and the CRC delimiter. Counting BRS as one nominal bit and the CRC delimiter as
+        one data bit yields the same total duration.
     """
     if frame.fd:
         return exact_fd_bits(frame.can_id, frame.data, extended=frame.extended, brs=frame.brs, esi=esi)

@@ -7,9 +7,10 @@ from array import array
 
 
 class Occupancy:
-    """Record of a bus's busy intervals. Adjacent intervals are merged, so a saturated bus needs one entry.
+    """Record of a bus's busy intervals.
 
-    An entry takes 24 bytes; :meth:`forget` limits the memory in long runs.
+    Adjacent intervals are merged, so a saturated bus needs only one entry. Each entry uses
+    24 bytes; :meth:`forget` limits the memory in long runs.
     """
 
     def __init__(self) -> None:
@@ -38,11 +39,11 @@ class Occupancy:
         self._ends[-1] = end_ns
 
     def busy_ns(self, from_ns: int, to_ns: int) -> int:
-        """Return how long the bus was busy between two times, ns."""
+        """Return the total busy time of the bus between two times, in ns."""
         return self._busy_until(to_ns) - self._busy_until(from_ns)
 
     def forget(self, before_ns: int) -> None:
-        """Drop all intervals that ended before ``before_ns``; later queries must not start before it."""
+        """Drop all intervals that ended before ``before_ns``; later queries must not start earlier."""
         n = bisect.bisect_left(self._ends, before_ns)
         for column in (self._starts, self._ends, self._busy_before):
             del column[:n]

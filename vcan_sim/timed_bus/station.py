@@ -91,7 +91,7 @@ class Flight:
         self.waiting = waiting
         """Frames being sent in the attempt, by station."""
         self.receivers = receivers
-        """Stations that were on the bus at the start of frame and do not send."""
+        """Stations that were on the bus at the start of frame and only receive."""
         self.side = 0
         """Number of side errors of the course that have already occurred."""
 

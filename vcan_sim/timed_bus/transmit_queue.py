@@ -21,7 +21,7 @@ class Waiting(NamedTuple):
 
 
 class TransmitQueue(Protocol):
-    """Transmit queue of one station, without the frame being sent."""
+    """Transmit queue of one station; excludes the frame being sent."""
 
     def push(self, waiting: Waiting) -> None:
         """Add a frame to the queue."""
@@ -42,7 +42,7 @@ class TransmitQueue(Protocol):
 
 
 class FifoQueue:
-    """Transmit queue that sends frames in the order of queueing, as a SocketCAN interface does."""
+    """First-in, first-out transmit queue, as in a SocketCAN interface."""
 
     def __init__(self) -> None:
         self._frames: deque[Waiting] = deque()
@@ -72,7 +72,7 @@ class FifoQueue:
 
 
 class PriorityQueue:
-    """Transmit queue that sends the frame with the highest priority first, and equal priorities in order."""
+    """Transmit queue ordered by priority; frames with equal priority keep their order."""
 
     def __init__(self) -> None:
         self._frames: list[Waiting] = []

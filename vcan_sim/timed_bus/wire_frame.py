@@ -1,7 +1,7 @@
 """Bits of CAN frames on the bus, for placing errors in individual bits (ISO 11898-1:2015).
 
-Building the bits of a frame is slow. :mod:`vcan_sim.timed_bus.bus` therefore does so only if a rule disturbs
-the frame, no station acknowledges it, or two stations send the same identifier.
+Building the bits of a frame is slow. :mod:`vcan_sim.timed_bus.bus` therefore builds them only if a rule
+disturbs the frame, no station acknowledges it, or two stations send the same identifier.
 """
 
 from __future__ import annotations
@@ -100,12 +100,12 @@ def wire_frame(frame: CanFrame, esi: bool = False) -> WireFrame:
 
 
 def receiver_lag(wire: WireFrame, position: int, seen: int, flag: int) -> int:
-    """Return how many bits of an error flag a receiver sees before it detects an error itself.
+    """Return the number of error flag bits that a receiver sees before it detects an error itself.
 
-    The error flag starts after ``position``. It violates the stuff rule, the rule for fixed stuff bits, or
-    the form of the delimiters and the end of frame. If it violates none of these, the CRC is wrong, which a
-    receiver reports after the ACK delimiter (ISO 11898-1:2015). The receiver removes stuff bits from the bits
-    it sees.
+    The error flag starts after ``position``. The flag violates the stuff rule, the rule for fixed stuff bits,
+    or the form of the delimiters and the end of frame. If the flag violates none of these, the CRC is wrong,
+    which a receiver reports after the ACK delimiter (ISO 11898-1:2015). The receiver removes stuff bits from
+    the bits it sees.
 
     Args:
         wire: bits of the frame on the bus.

@@ -137,7 +137,7 @@ class BusAttacker:
             self._thread.start()
 
     def stop(self) -> None:
-        """Stop the thread. This method can be called only once."""
+        """Stop the thread. Call this method only once."""
         self._stopping = True
         self._changed.set()
         if self._thread.ident is not None:

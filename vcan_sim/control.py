@@ -29,7 +29,7 @@ _LONGEST_LINE: Final = 1 << 16
 _ANSWER_S: Final = 10.0
 """Maximum time to wait for a simulator's answer, s."""
 _POLL_S: Final = 0.2
-"""Interval at which a server thread checks whether it must stop, s."""
+"""Interval (s) between a server thread's checks whether it must stop."""
 KEY: Final = "inject"
 """Name under which error messages refer to the faults."""
 

@@ -20,7 +20,7 @@ class FaultPlayer:
     def __init__(self, schedule: FaultSchedule, faults: FleetFaults) -> None:
         self._schedule, self._faults = schedule, faults
         self._inbox = clock.queue()
-        """Queue that receives the monotonic time at which the scene begins, ns, and None to stop."""
+        """Queue that receives the scene's monotonic start time (ns), and None to stop the thread."""
         self._active: tuple[TimedFault, ...] = ()
         self._thread = clock.thread(self._run, "faults of the scene")
 

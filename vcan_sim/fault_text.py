@@ -49,7 +49,7 @@ class FaultChange:
         Raises:
             ConfigError: If a value is out of range, or the values contradict each other.
         """
-        kept = type(faults)(seed=faults.seed) if self.clears else faults  # the seed is not a fault
+        kept = type(faults)(seed=faults.seed) if self.clears else faults  # the field `seed` is not a fault
         return dataclasses.replace(kept, **self.values)  # type: ignore[arg-type]  # types match
 
 

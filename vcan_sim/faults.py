@@ -311,6 +311,6 @@ def check_wires(faults: Faults, patch: str, shape: tuple[int, int]) -> None:
         ConfigError: If the patch does not have a named wire.
     """
     for number, name in enumerate(OF_WIRES):
-        wires = shape[number % 2] - name.startswith("crossed")  # the last wire has no successor
+        wires = shape[number % 2] - name.startswith("crossed")  # no wire follows the last one
         if (wire := getattr(faults, name)) is not None and wire >= wires:
             raise ConfigError(f"{patch}: {name}", wire, f"an integer from 0 to {wires - 1}")

@@ -1,4 +1,4 @@
-"""Bus with faults, from the nodes' side: port of the nodes, counts of frames, and faults of the bus."""
+"""Faulty bus as seen by the nodes: the nodes' port, frame counts, and faults of the bus."""
 
 from __future__ import annotations
 

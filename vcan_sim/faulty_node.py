@@ -182,7 +182,7 @@ class FaultyNode(PatchNode):
         return kind is not Kind.COMMAND or can_id == od.command_cob_id(self.node_id)
 
     def on_timer(self, t_ns: int) -> None:
-        """Run everything due at ``t_ns``: the node's own timers and periodic events."""
+        """Process all node timers and periodic events that are due at ``t_ns``."""
         self._meet_twin(t_ns)
         if self.faults.unplugged != self._unplugged:
             self._plug(t_ns)
@@ -266,7 +266,7 @@ class FaultyNode(PatchNode):
             if not period_ns:
                 self._due_ns[name] = 0
                 continue
-            if not self._due_ns[name]:  # the fault has just been set
+            if not self._due_ns[name]:  # the fault is new, so its period starts now
                 self._due_ns[name] = t_ns + period_ns
             for _ in range(_MOST_AT_ONCE):
                 if self._due_ns[name] > t_ns:
@@ -371,7 +371,7 @@ class FaultyNode(PatchNode):
 
 
 def _periods_ns(faults: Faults) -> dict[str, int]:
-    """Return the period of each kind of periodic event, ns; 0 for no events."""
+    """Return the period (ns) of each kind of periodic event; 0 for no events."""
     rates = {"emcy": faults.emcy_per_s, "babble": faults.babble_per_s}
     periods = {name: round(1e9 / rate) if rate else 0 for name, rate in rates.items()}
     return {"restart": round(faults.restart_every_s * 1e9), **periods}

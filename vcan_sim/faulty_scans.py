@@ -235,8 +235,8 @@ class FaultyScans:
     def _send(self, can_id: int, data: bytes, *, spoilt: bool = False) -> bool:
         """Send a chunk or summary, then the late chunks from earlier scans, and return whether it was sent.
 
-        A receiver cannot assign a ``spoilt`` frame to its scan, so late chunks stay queued after such a
-        frame.
+        A receiver cannot assign a ``spoilt`` frame to a scan, so a spoilt frame does not release the late
+        chunks.
         """
         if not self._put(can_id, data):
             return False

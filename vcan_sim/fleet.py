@@ -69,8 +69,8 @@ class Fleet:
         imperfections: Deviations from the layout, for all patches or by name of the patch. The random draws
             of the imperfections differ from patch to patch. Default: the scene's imperfections. scene: Scene
             that replaces the random strokes of ``[simulation]``. Scene time starts on all patches
-            simultaneously, when the first node has sent its first scan. The faults of the scene start and end
-            at scene times.
+            simultaneously, when the first node has sent its first scan. The scene's faults start and end at
+            the scheduled scene times.
 
     Raises:
         ConfigError: If a channel is given for a hand with several buses, imperfections name a patch that the
@@ -260,7 +260,8 @@ class Fleet:
             device_time_us: Device time in the scan's summary, µs.
 
         Returns:
-            (U, N, 3) float64, m: actual positions of the upper electrodes, with the patch's imperfections.
+            (U, N, 3) float64, m: actual positions of the upper electrodes, including the patch's
+            imperfections.
 
         Raises:
             LookupError: If the patch is not in the hand, or the scan was never sent or is too old.

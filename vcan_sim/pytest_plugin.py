@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import pytest
 
-if TYPE_CHECKING:  # numba and NumPy are imported only when a test needs them
+if TYPE_CHECKING:  # numba and NumPy are imported only on demand
     from skinnode.config import HandConfig
     from skinnode.host import Host
     from skinnode.model.frames import FieldFrame

@@ -37,8 +37,8 @@ class Replayed:
 
     sent: int
     left_out: int
-    """Number of frames excluded from the replay, or not supported by the endpoint (extended and error
-    frames)."""
+    """Number of frames not sent, because they were excluded or because the endpoint does not support them
+    (extended and error frames)."""
     refused: int
     """Number of frames that the bus refused."""
     seconds: float

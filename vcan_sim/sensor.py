@@ -136,8 +136,8 @@ class SimulatedPatch:
         """Return the true electrode positions in a reading at ``t_ns``.
 
         Returns:
-            (U, N, 3) float64, m: actual positions of the upper electrodes, each wire at the time of its
-            sample. With imperfections, these positions differ from ``layout.upper_m`` even at rest; see
+            (U, N, 3) float64, m: actual positions of the upper electrodes, each wire at its own sampling
+            time. With imperfections, these positions differ from ``layout.upper_m`` even at rest; see
             :meth:`displacement_m`.
         """
         t_s = self.scene_s(t_ns)

@@ -20,7 +20,7 @@ from vcan_sim.timed_bus import BitRates, CanFrame, Delivered, Event, StationOpti
 from vcan_sim.virtual_time import Mailbox, VirtualClock
 
 COALESCED_NS: Final = 1_000_000
-"""Minimum time between two wake-ups of a thread that reads frames, ns."""
+"""Minimum time (ns) between two wake-ups of a thread that reads frames."""
 MOST_STATIONS: Final = 64
 """Maximum total number of endpoints opened on a bus."""
 

@@ -36,7 +36,7 @@ START_WALL_NS: Final = 1_600_000_000_000_000_000
 READINGS: Final = 10_000
 """Maximum number of times that a thread may read the clock between two waits."""
 POLL_S: Final = 1e-4
-"""Duration for which a thread that polls the clock is suspended, s."""
+"""Suspension time (s) of a thread that polls the clock."""
 
 
 class Deadlock(RuntimeError):

@@ -49,23 +49,23 @@ class Grid:
         return cls(layer, shape, size_m, padded, fft.rfft2(turned))
 
     def centres_m(self, origin_m: Float) -> Float:
-        """Return the centres (X, Y, 2) of the cells, metres, with the first cell at ``origin_m`` (2,)."""
+        """Return the cell centres (X, Y, 2) in metres; ``origin_m`` (2,) is the centre of the first cell."""
         x, y = (np.arange(n) * self.size_m for n in self.shape)
         return np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1) + origin_m
 
     def displacement_m(self, traction_pa: Float) -> Float:
-        """Return the cells' displacement (3, X, Y), metres, under tractions (3, X, Y), Pa."""
+        """Return the cells' displacement (3, X, Y) in metres under tractions (3, X, Y) in Pa."""
         waves = fft.rfft2(traction_pa, self._padded)
         moved = fft.irfft2(np.einsum("ijxy,jxy->ixy", self._response, waves), self._padded)
         return np.asarray(moved[:, : self.shape[0], : self.shape[1]])
 
     def normal_m(self, pressure_pa: Float) -> Float:
-        """Return the indentation (X, Y) of the surface, metres, under a pressure (X, Y), Pa."""
+        """Return the surface indentation (X, Y) in metres under a pressure (X, Y) in Pa."""
         waves = self._response[2, 2] * fft.rfft2(pressure_pa, self._padded)
         return np.asarray(fft.irfft2(waves, self._padded)[: self.shape[0], : self.shape[1]])
 
     def shear_m(self, traction_pa: Float) -> Float:
-        """Return the tangential displacement (2, X, Y), metres, under shear tractions (2, X, Y), Pa."""
+        """Return the tangential displacement (2, X, Y) in metres under shear tractions (2, X, Y) in Pa."""
         waves = fft.rfft2(traction_pa, self._padded)
         moved = fft.irfft2(np.einsum("ijxy,jxy->ixy", self._response[:2, :2], waves), self._padded)
         return np.asarray(moved[:, : self.shape[0], : self.shape[1]])

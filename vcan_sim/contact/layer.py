@@ -73,7 +73,7 @@ class Layer:
     def response(self, wave_number_per_m: Float) -> tuple[Float, Float, Float, Float]:
         """Return the layer's four surface responses, as in the module's docstring, multiplied by k, 1/Pa.
 
-        The order is: normal, along from along, along from normal, across.
+        The order is: normal, along k from along k, along k from normal, across k.
 
         Args:
             wave_number_per_m: Wave numbers k > 0, 1/m, of any shape.
@@ -81,7 +81,7 @@ class Layer:
         nu, modulus = self.poisson, self.shear_modulus_pa
         kappa = 3.0 - 4.0 * nu
         x = np.minimum(wave_number_per_m * self.thickness_m, 300.0)
-        fall = np.exp(-2.0 * x)  # scales all terms by 2 e^(−2x), which avoids an overflow
+        fall = np.exp(-2.0 * x)  # the factor 2 e^(−2x) in all terms prevents overflow
         sinh, cosh = 1.0 - fall**2, 1.0 + fall**2
         below = 2.0 * kappa * cosh + 2.0 * fall * (4.0 * x**2 + 1.0 + kappa**2)
         scale = (1.0 - nu) / modulus
@@ -117,7 +117,7 @@ class PointResponse:
             for own, other in zip(layer.response(k), half.response(np.full_like(k, np.inf)), strict=True)
         )
         tables = np.empty((4, len(r)))
-        for start in range(0, len(r), 64):  # blocks of distances limit the memory use
+        for start in range(0, len(r), 64):  # processing in blocks limits the memory use
             waves = np.outer(r[start : start + 64], k)
             zeroth, first = j0(waves), j1(waves)
             second = np.where(waves > 1e-4, 2.0 * first / np.maximum(waves, 1e-4) - zeroth, 0.0)

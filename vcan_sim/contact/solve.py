@@ -60,7 +60,7 @@ def untouched(grid: Grid) -> Contact:
 
 
 def press(grid: Grid, overlap_m: Float, start_pa: Float | None = None, *, close: float = CLOSE) -> Float:
-    """Return the pressure (X, Y), Pa, under a frictionless body.
+    """Return the pressure (X, Y) in Pa under a frictionless body.
 
     Args:
         grid: Cells on the surface.
@@ -109,13 +109,13 @@ def press(grid: Grid, overlap_m: Float, start_pa: Float | None = None, *, close:
 
 
 def _steepest(grid: Grid, gap_m: Float) -> Float:
-    """Return a pressure (X, Y), Pa, proportional to the overlaps and scaled for the best overall closure."""
+    """Return a pressure (X, Y) in Pa, proportional to the overlaps and scaled by an exact line search."""
     direction = np.maximum(-gap_m, 0.0)
     return np.asarray(direction * ((direction**2).sum() / (grid.normal_m(direction) * direction).sum()))
 
 
 def rub(grid: Grid, limit_pa: Float, target_m: Float, start_pa: Float, *, close: float = CLOSE) -> Float:
-    """Return the shear (2, X, Y), Pa, limited to ``limit_pa``, that best produces a target displacement.
+    """Return the shear (2, X, Y) in Pa, limited to ``limit_pa``, for the best match of a target displacement.
 
     Args:
         grid: Cells on the surface.

@@ -77,7 +77,7 @@ class History:
         self.first = math.floor(touch.from_s / step_s)
         """Number of the first time step; the body does not touch the skin before this step."""
         self.last = math.ceil(touch.to_s / step_s)
-        """Number of the last time step; the body does not touch the skin after this step."""
+        """Number of the last time step, after which the body does not touch the skin."""
         self._shape, self._friction, self._electrodes = shape, friction, electrodes
         self._steps: list[Step | None] = []
         self._contact = untouched(window.grid)
@@ -102,7 +102,7 @@ class History:
             return self._steps[index]
 
     def cell_m(self, first: tuple[int, int]) -> Float:
-        """Return the centre (2,) of a lattice cell in the patch frame, metres."""
+        """Return a lattice cell's centre (2,) in the patch frame, in metres."""
         return np.asarray(self.touch.at_m) + centred_m(self.window.grid) + self.size_m * np.array(first)
 
     def _following(self, number: int) -> Step | None:

@@ -78,7 +78,7 @@ def yaws_rad(touch: TouchConfig) -> tuple[float, ...]:
 
 
 def _way_m(motion: MotionConfig, share: float, t_s: float) -> tuple[float, float]:
-    """Return the displacement (x, y) of a body along the skin since a motion began, metres."""
+    """Return a body's displacement (x, y) in metres along the skin since a motion began."""
     if motion.kind == "walk":
         return _walked_m(motion, t_s)
     way_x, way_y = motion.by_m or (0.0, 0.0)

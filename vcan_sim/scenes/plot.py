@@ -56,7 +56,7 @@ def write_plot(scene: SceneConfig, hand: HandConfig, file: Path) -> None:
 
 
 def _depth_m(truth: PatchTruth) -> float:
-    """Return the depth of the deepest contact on a patch, metres; 0 without contact."""
+    """Return the maximum contact depth (m) on a patch; 0 without contact."""
     return max((contact.depth_m for contact in truth.contacts), default=0.0)
 
 

@@ -130,13 +130,13 @@ def _radial(layer: Layer, reach_m: float) -> tuple[Float, float]:
 
 
 def _forces(force_n: Float, origin_m: Float, size_m: float) -> tuple[Float, Float]:
-    """Return the positions (F, 2), metres, and forces (3, F), N, of the loaded cells in a window."""
+    """Return the positions (F, 2) in metres and forces (3, F) in N of the loaded cells in a window."""
     loaded = np.argwhere(force_n.any(axis=0))
     return origin_m + size_m * loaded, force_n[:, loaded[:, 0], loaded[:, 1]]
 
 
 def _clustered(force_n: Float) -> Float:
-    """Sum the forces (3, X, Y) of cells over groups of 2 × 2 cells: (3, X/2, Y/2), N."""
+    """Sum cell forces (3, X, Y) over groups of 2 × 2 cells, and return the sums (3, X/2, Y/2) in N."""
     x, y = force_n.shape[1:]
     even = np.pad(force_n, ((0, 0), (0, x % 2), (0, y % 2)))
     return np.asarray(even.reshape(3, (x + 1) // 2, 2, (y + 1) // 2, 2).sum(axis=(2, 4)))

@@ -102,14 +102,14 @@ class BodyConfig(Table):
     radius_m: Length | None = None
     """Radius of the sphere, punch or ridge, metres."""
     edge_radius_m: Length | None = None
-    """Radius of the rounded rim of the punch (default: a tenth of its radius) or of the edge of the box
-    (default: 1 mm), metres."""
+    """Rounding radius (m) of the punch's rim (default: a tenth of the punch radius) or of the box's edge
+    (default: 1 mm)."""
     length_m: Length | None = None
-    """Length of the edge of the box, or of the ridge without its round ends, metres; along x at yaw 0."""
+    """Length (m) of the box's edge, or of the ridge without its round ends; along x at yaw 0."""
     slope_rad: _Slope | None = None
     """Angle between the skin and the faces of the box next to its edge, rad; default: π/4."""
     radii_m: _Radii | None = None
-    """Semi-axes of the fingertip, an ellipsoid, metres: along x and y at yaw 0, and along z."""
+    """Semi-axes (m) of the ellipsoidal fingertip along x, y (at yaw 0) and z."""
     friction: _Friction = 0.3
     """Coefficient of friction between the body and the skin."""
 
@@ -147,13 +147,13 @@ class MotionConfig(Table):
     to_s: _Time
     """Scene time at which the motion ends, s."""
     by_m: _Place | None = None
-    """Displacement [x, y] of ``slide`` and ``roll``, and of the outward half of ``shear``, metres."""
+    """Displacement [x, y] in metres of ``slide`` and ``roll``, and of the outward half of ``shear``."""
     by_rad: _Angle | None = None
     """Angle of the rotation ``turn``, rad, counterclockwise as seen from above the skin."""
     depth_m: Length | None = None
-    """Depth at the end of ``press``, metres, for a touch with ``depth_m``."""
+    """Depth (m) at the end of ``press``, for a touch with ``depth_m``."""
     force_n: _Force | None = None
-    """Force at the end of ``press``, N, for a touch with ``force_n``."""
+    """Force (N) at the end of ``press``, for a touch with ``force_n``."""
     reach_m: Length | None = None
     """Maximum distance of ``walk`` from its start, metres."""
     every_s: _Duration | None = None

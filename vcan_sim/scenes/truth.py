@@ -38,7 +38,7 @@ class BodyContact:
 
     @property
     def radius_m(self) -> float:
-        """Radius of a circle whose area is that of the contact, metres."""
+        """Radius (m) of a circle with the same area as the contact."""
         return math.sqrt(self.area_m2 / math.pi)
 
     @property

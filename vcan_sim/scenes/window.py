@@ -79,7 +79,7 @@ def overlap_m(grid: Grid, shape: Shape, offset_m: Float, yaw_rad: float, depth_m
 
 
 def centred_m(grid: Grid) -> Float:
-    """Return the centre (2,) of a grid's first cell relative to the middle of the grid, metres."""
+    """Return the centre (2,) of a grid's first cell in metres, relative to the middle of the grid."""
     return -0.5 * grid.size_m * (np.array(grid.shape, float) - 1.0)
 
 
@@ -222,7 +222,7 @@ def _grid_of(layer: Layer, shape: tuple[int, int], size_m: float) -> Grid:
 
 
 def _grid(layer: Layer, half_m: Float, across: int) -> Grid:
-    """Return a grid whose sides along x and y are at least twice ``half_m`` (2,), metres."""
+    """Return a grid with sides along x and y of at least twice ``half_m`` (2,), in metres."""
     wide = 2.0 * half_m
     narrow = float(wide.min())
     size = max(narrow / across, math.sqrt(float(wide.prod()) / MOST_CELLS) / across)

@@ -49,7 +49,7 @@ at rest."""
 
 @dataclass(frozen=True, slots=True, eq=False)
 class State:
-    """State of the rubber at one instant, in m, for each coordinate (U, N, 3) of the displacement."""
+    """State (m) of the rubber at one instant, for each coordinate (U, N, 3) of the displacement."""
 
     play: Float
     """(P, U, N, 3): outputs of the play operators."""

@@ -17,7 +17,7 @@ from vcan_sim.skin.history import History
 from vcan_sim.skin.imperfections import EXACT, Imperfections
 
 ROW_STEP_S: Final = 1e-3
-"""Maximum time over which the electrodes' motion during a scan is assumed to be linear, s."""
+"""Maximum time (s) for which the electrodes' motion during a scan is approximated as linear."""
 
 Surface = Callable[[float], Float]
 """Function of the time (s) that returns the upper electrodes (U, N, 3), in m, of an exact patch. At rest, the

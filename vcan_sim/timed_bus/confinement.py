@@ -27,7 +27,7 @@ RECOVERY_RUNS: Final = 128
 """Number of runs of recessive bits after which the bus-off state ends."""
 
 RECOVERY_RUN_BITS: Final = 11
-"""Length of a recessive run that counts towards recovery from bus-off, bits."""
+"""Length (bits) of a recessive run that counts towards recovery from bus-off."""
 
 SUSPEND_BITS: Final = 8
 """Additional pause of an error-passive station after its own frame and the intermission, bits."""

@@ -21,7 +21,7 @@ WIRE_NOISE: Final = 3e-3
 
 
 class FaultyConverter:
-    """Converter whose readings may be frozen, wrong, or taken through faulty wires.
+    """Converter with faults: its readings may be frozen or wrong, or the wires may be faulty.
 
     The wires are intact while the node boots, so that the tare at power-on is valid. Drift and temperature
     also affect the tare. Drift and temperature scale the readings; with an ideal read-out, this is equivalent

@@ -68,7 +68,7 @@ class FaultyScans:
 
     @property
     def needs_next_scan(self) -> bool:
-        """Whether this scan's fault also involves the next scan, so that the next SYNC must not be lost."""
+        """Whether this scan's fault also affects the next scan; if so, the next SYNC must not be lost."""
         return self._fate in ("torn", "displaced")
 
     def power_off(self) -> None:
@@ -78,7 +78,7 @@ class FaultyScans:
         self._swapped, self._late = None, []
 
     def send_chunk(self, data: bytes) -> None:
-        """Send a chunk, with a chunk fault or with the fault of its scan."""
+        """Send a chunk after applying a chunk fault or the scan's fault."""
         counter = data[_CHUNK_COUNTER_BYTE]
         if counter != self._counter:
             self._begin_scan(counter)
@@ -94,11 +94,11 @@ class FaultyScans:
         swapped, self._swapped = self._swapped, None
         try:
             self._suffer_chunk(fault, changed)
-        finally:  # the bus may refuse one of the frames and accept the other
+        finally:  # the bus may accept only one of the two frames
             self._release([] if swapped is None else [swapped])
 
     def send_summary(self, data: bytes) -> None:
-        """Send a summary, affected by the fault of its scan."""
+        """Send a summary after applying the scan's fault."""
         injected, tally = self._injector.injected, self._injector.tally
         if data[_SUMMARY_COUNTER_BYTE] != self._counter:  # a scan without chunks
             self._begin_scan(data[_SUMMARY_COUNTER_BYTE])
@@ -135,7 +135,7 @@ class FaultyScans:
             self._struck = int(self._injector.random.integers(chunks)) if struck is None else struck
 
     def _suffer_scan(self, data: bytes) -> bytes | None:
-        """Apply the fault of a scan to one of its chunks; return None if the chunk is lost."""
+        """Apply a scan's fault to one of the scan's chunks; return None if the chunk is lost."""
         injected = self._injector.injected
         if self._fate == "reset" and self._chunks > self._half and not self.reset_due:
             self.reset_due, self._fate = True, ""
@@ -233,7 +233,9 @@ class FaultyScans:
     # --- to the bus
 
     def _send(self, can_id: int, data: bytes, *, spoilt: bool = False) -> bool:
-        """Send a chunk or summary, then the late chunks from earlier scans, and return whether it was sent.
+        """Send a chunk or summary, then late chunks of earlier scans.
+
+        Return whether the chunk or summary was sent.
 
         A receiver cannot assign a ``spoilt`` frame to a scan, so a spoilt frame does not release the late
         chunks.

@@ -52,7 +52,7 @@ class NodeReport:
 
 
 class Fleet:
-    """Simulated patches of a hand, as CANopen nodes that each have their own scene.
+    """Simulated patches of a hand, each with a CANopen node and a scene.
 
     A patch's scene begins when its node has sent the first scan, so bring-up may take any time, and the patch
     is untouched during the tare at power-on. :meth:`start` opens the buses and powers the nodes on.
@@ -140,7 +140,7 @@ class Fleet:
         return Scene(patch.layout.build(), self.hand.simulation, number)
 
     def _begin(self, source: SimulatedPatch) -> None:
-        """Start a patch's strokes, or the scene on all patches, at the time of the patch's newest reading."""
+        """Start a patch's strokes or the scene of all patches, at the time of the patch's newest reading."""
         t_ns = source.last_read_ns
         with self._beginning:
             if self._player is not None and not source.started:
@@ -177,7 +177,7 @@ class Fleet:
     def stop(self) -> None:
         """Set the nodes to pre-operational, join the threads and close the buses. Can be called repeatedly.
 
-        Raises the error of a thread that ended early, if any.
+        Raises the error of any thread that ended early.
         """
         self._running.close()
 

@@ -40,7 +40,7 @@ class Injector:
         return ""
 
     def loses(self, fault: str | None) -> bool:
-        """Draw whether a fault drops a frame, and count the dropped frame."""
+        """Draw whether a fault drops a frame; if so, count the frame."""
         if fault is None or not self.draw(getattr(self.faults, fault)):
             return False
         self.count(fault)

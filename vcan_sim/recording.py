@@ -37,7 +37,7 @@ SCENE: Final = "scene.json"
 
 
 def channel_of(bus: str) -> str:
-    """Return the channel name of a bus in traces: the name of the bus with underscores instead of blanks."""
+    """Return the channel name of a bus in traces: the bus name with underscores in place of blanks."""
     return re.sub(r"\s", "_", bus)
 
 

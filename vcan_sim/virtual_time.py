@@ -30,9 +30,9 @@ from typing import Any, Final, Self, cast
 from skinnode.process import clock
 
 START_NS: Final = 1_000_000_000_000
-"""Monotonic time at which a virtual clock starts, ns."""
+"""Monotonic start time (ns) of a virtual clock."""
 START_WALL_NS: Final = 1_600_000_000_000_000_000
-"""Time since 1970 at which a virtual clock starts, ns: 2020-09-13 12:26:40 UTC."""
+"""Start time (ns since 1970) of a virtual clock: 2020-09-13 12:26:40 UTC."""
 READINGS: Final = 10_000
 """Maximum number of times that a thread may read the clock between two waits."""
 POLL_S: Final = 1e-4
@@ -176,7 +176,7 @@ class VirtualClock:
         return turn.woken
 
     def wake(self, waiting: deque[_Turn]) -> None:
-        """Make the thread in ``waiting`` that has waited longest ready to run."""
+        """Make the longest-waiting thread in ``waiting`` ready to run."""
         if waiting:
             turn = waiting.popleft()
             turn.woken = True

@@ -35,7 +35,7 @@ def load_scene(path: Path | str, hand: HandConfig) -> SceneConfig:
 
 
 def bind_scene(scene: SceneConfig, hand: HandConfig) -> dict[str, PatchScene]:
-    """Return the scene of each patch of a hand by patch name, including patches that no body touches.
+    """Return the scenes of all patches of a hand by patch name, including untouched patches.
 
     Args:
         scene: Scene to bind.

@@ -48,7 +48,7 @@ class PatchScene:
 
     @property
     def end_s(self) -> float:
-        """Scene time at which the last touch on this patch ends, s; 0 if no body touches the patch."""
+        """End time (s) of the last touch on this patch; 0 if no body touches the patch."""
         return max((history.touch.to_s for history in self.histories), default=0.0)
 
     def upper_m(self, t_s: float) -> Float:

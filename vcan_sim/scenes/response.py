@@ -28,7 +28,9 @@ POINTS: Final = 4096
 
 @dataclass(frozen=True, eq=False)
 class Electrodes:
-    """Electrodes at which the surface displacement is computed. Use :meth:`of` to create an instance.
+    """Electrodes on the skin's surface, with methods that compute their displacement.
+
+    Use :meth:`of` to create an instance.
 
     Attributes:
         places_m: (E, 2) electrode positions in the patch frame, metres.

@@ -97,9 +97,7 @@ def box_edge(length_m: float, slope_rad: float, edge_radius_m: float) -> Shape:
         slope_rad: Angle between each flank and the skin, rad.
         edge_radius_m: Rounding radius of the edge, metres.
     """
-    tangent_m = edge_radius_m * math.sin(
-        slope_rad
-    )  # distance from the edge at which the rounding meets the flank
+    tangent_m = edge_radius_m * math.sin(slope_rad)  # distance of the rounding's end from the edge
     tangent_height_m = edge_radius_m * (1.0 - math.cos(slope_rad))
 
     def height(places_m: Float) -> Float:

@@ -62,7 +62,7 @@ class Side:
         return found
 
     def diagonals(self, sums: Float, feed: Float | float) -> tuple[Float, Float]:
-        """Return diag(sums) + T as diagonal (n,) and upper off-diagonal (n,), whose first entry is unused.
+        """Return diag(sums) + T as diagonal (n,) and upper off-diagonal (n,); its first entry is unused.
 
         Args:
             sums: (n,) float64, S: conductances of the paths at each node.

@@ -34,7 +34,7 @@ STEP_S: Final = 1.0 / 32.0
 THRESHOLDS: Final = (0.0025, 0.005, 0.01, 0.02)
 """Thresholds r of the play operators, as fractions of the clearance; the operators have equal weights."""
 _RECENT: Final = 128
-"""Number of most recent time steps whose states are stored."""
+"""Number of recent time steps with stored states."""
 _KEPT_EVERY: Final = 64
 """Interval between the states in long-term storage, in time steps: 2 s."""
 _KEPT: Final = 300

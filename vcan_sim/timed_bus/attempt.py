@@ -145,7 +145,7 @@ def cut_off(
     receivers: Sequence[Participant],
     rates: BitRates,
 ) -> Course:
-    """Return the course of a transmission attempt whose only sender is disconnected.
+    """Return the course of a transmission attempt in which the only sender is disconnected.
 
     Args:
         frame: frame on the bus.
@@ -164,7 +164,7 @@ def cut_off(
 
 @dataclass(slots=True)
 class _OnBus:
-    """Stations that still send or receive during a transmission attempt, and side errors so far."""
+    """Active senders and receivers of a transmission attempt, and the non-destructive errors so far."""
 
     sending: dict[int, Participant]
     receiving: dict[int, Participant]

@@ -11,10 +11,10 @@ from dataclasses import dataclass
 from typing import Final
 
 PASSIVE_FROM: Final = 128
-"""Minimum value of an error counter at which a station becomes error-passive."""
+"""Error-passive limit: a station with a counter of at least this value is error-passive."""
 
 BUS_OFF_FROM: Final = 256
-"""Minimum value of the transmit error counter at which a station goes bus-off."""
+"""Bus-off limit: a station goes bus-off when its transmit error counter reaches this value."""
 
 MAX_RECEIVE_ERRORS: Final = 255
 """Maximum receive error counter. The standard sets no limit; controllers use 7-bit or 8-bit counters."""

@@ -92,7 +92,7 @@ class Attempt(NamedTuple):
 
     frame: CanFrame
     n_bits: Callable[[], int]
-    """Function that returns the number of bit positions at which the frame can be disturbed."""
+    """Function that returns the number of bit positions in the frame that can be disturbed."""
     bit_at: Callable[[int], int | None]
     """Function that returns the position of the bit on the bus at a given time (ns), or None if the frame is
     not on the bus at that time."""

@@ -33,7 +33,7 @@ class Delivered(NamedTuple):
     """Stations that received the frame. If several stations sent the same bits simultaneously, only the first
     event lists the receivers; the tuple of every further event is empty."""
     queued_ns: int
-    """Time at which the station queued the frame, ns."""
+    """Time (ns) when the station queued the frame."""
     started_ns: int
     """Start of frame of the successful attempt, ns."""
 

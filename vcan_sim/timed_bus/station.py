@@ -93,7 +93,7 @@ class Flight:
         self.receivers = receivers
         """Stations that were on the bus at the start of frame and only receive."""
         self.side = 0
-        """Number of side errors of the course that have already occurred."""
+        """Number of past errors in the course that do not destroy the frame."""
 
     @property
     def next(self) -> int:

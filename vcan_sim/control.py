@@ -206,7 +206,7 @@ def request(path: Path, faults: list[str]) -> Answer:
 
 
 def _running() -> Iterator[tuple[Path, str]]:
-    """Yield each running simulator's socket and hand; remove the sockets of processes that have ended."""
+    """Yield each running simulator's socket and hand; delete the sockets of ended processes."""
     for path in sorted(control_folder().glob("*.sock")):
         try:
             yield path, request(path, []).hand

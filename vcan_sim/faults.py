@@ -164,12 +164,13 @@ class Faults:
     noisy_lower: int | None = None
     """Number of a lower wire with a bad contact, which adds noise of 0.3 % to each of its resistances."""
     frozen_upper: int | None = None
-    """Number of an upper wire that keeps the resistances it has when the fault begins."""
+    """Number of an upper wire with frozen resistances, which keep their values from the start of the
+    fault."""
     frozen_lower: int | None = None
-    """Number of a lower wire that keeps the resistances it has when the fault begins."""
+    """Number of a lower wire with frozen resistances, which keep their values from the start of the fault."""
     stuck_upper: int | None = None
-    """Number of the upper wire of a stuck crossing, which keeps the resistance it has when the fault begins;
-    ``stuck_lower`` is the lower wire."""
+    """Number of the upper wire of a stuck crossing; ``stuck_lower`` is the lower wire. The crossing's
+    resistance keeps its value from the start of the fault."""
     stuck_lower: int | None = None
     """Number of the lower wire of the stuck crossing; see ``stuck_upper``."""
     crossed_upper: int | None = None

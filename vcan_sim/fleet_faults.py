@@ -157,7 +157,7 @@ class FleetFaults:
     def follow(self, ended: Iterable[TimedFault], started: Iterable[TimedFault]) -> None:
         """End and start scheduled faults.
 
-        A change that contradicts faults from another source is logged as refused.
+        A scheduled change that contradicts other faults is refused and logged.
 
         Args:
             ended: Scheduled faults that end; other faults of the same patch or bus do not change.

@@ -10,7 +10,7 @@ from typer.core import TyperGroup
 from vcan_sim.commands import inject, list_scenes, replay, run
 
 DEFAULT: Final = "run"
-"""Name of the command that runs if the user names no command."""
+"""Name of the default command."""
 _OF_GROUP: Final = ("-h", "--help", "--install-completion", "--show-completion")
 
 

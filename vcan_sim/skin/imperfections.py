@@ -98,7 +98,7 @@ class Imperfections:
 
     # --- read-out
     gain: float = 0.0
-    """Gain error of the amplifier for the change in each resistance from rest; drawn. Half of
+    """Gain error of the amplifier, as a fraction of each resistance change from rest; drawn. Half of
     the variance is common to the whole patch; the other half is independent for each upper wire."""
     offset: float = 0.0
     """Offset error of each upper wire's readings, as a fraction of the median resistance at rest; drawn."""

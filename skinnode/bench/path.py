@@ -444,7 +444,7 @@ def _print_operators(setting: dict[str, Any], paper: dict[str, Any], count: int,
                 f"  {_accuracy(own, count)}"
             )
     say(
-        f"cells in which our path solver solves all experiments more accurately than the paper: {better} of  "
+        f"cells in which our path solver solves all experiments more accurately than the paper: {better} of "
         f"{len(LABELS) * len(STEPS)}"
     )
 

@@ -421,7 +421,7 @@ SLIDE = '[[touches.motions]]\nkind = "slide"\nby_m = [0.001, 0.0]\nfrom_s = 1.3\
         (BODY + TOUCH + SLIDE.replace("to_s = 1.7", "to_s = 2.7"), "16:1", ["motions[0].to_s", "2.7"]),
         (BODY + TOUCH + "ramp_s = 0.8\n", "12:1", ["ramp_s", "0.8", "at most half"]),
         (BODY + TOUCH + "force_n = 1.0\n", "12:1", ["force_n", "either"]),
-        (BODY + TOUCH.replace("2e-4", "nan"), "11:1", ["depth_m", "nan", "metres"]),
+        (BODY + TOUCH.replace("2e-4", "nan"), "11:1", ["depth_m", "nan", "(m)"]),
         (BODY + TOUCH.replace("0.018]", "inf]"), "8:16", ["at_m[1]", "inf"]),
         (BODY.replace('"sphere"', '"cube"') + TOUCH, "3:1", ["bodies[0].shape", "'cube'", "sphere"]),
         (BODY + "length_m = 0.01\n" + TOUCH, "5:1", ["bodies[0].length_m", "only with shape"]),

@@ -15,10 +15,12 @@ from skinnode.text.json_values import plain
 RATIO_LIMIT: Final = 1.15
 COVERAGE_LIMITS: Final = (0.90, 0.98)
 ERROR_LIMITS: Final = {"staggered": 0.03, "aligned": 0.10}
-"""Maximum posterior error for each layout, with a 10 % press, h = 0.5 and a relative noise of 1e-5."""
+"""Maximum permissible error of the posterior for each layout, as a fraction of the RMS displacement. The
+limits apply to a 10 % press at h = 0.5 with a relative noise of 1e-5."""
 SCENES_A_CELL: Final = 25
-"""Ratio of the number of scenes per coverage row to the number of scenes per noise-table or code-table cell.
-Three scenes per cell are enough, because each scene contributes 300 coordinates to the RMS error."""
+"""Each row of the coverage table uses this many times the scenes of a cell of the noise and code tables.
+Three scenes per cell are enough, because each scene contributes 300 coordinates to the RMS error of a
+cell."""
 
 
 def run(scenes: int, rounds: int) -> dict[str, Any]:
@@ -120,7 +122,7 @@ def _print_front(panels: list[dict[str, Any]], echo: Callable[[str], object]) ->
 
 
 def best_of_each(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return each solver's fastest row with an error up to ACCURACY, or else its most accurate row."""
+    """Return the fastest row of each solver that meets ACCURACY, or its most accurate row if none does."""
 
     def rank(row: dict[str, Any]) -> tuple[bool, float]:
         error = float("inf") if row["error"] is None else row["error"]
@@ -134,7 +136,7 @@ def best_of_each(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def _print_noise(rows: list[dict[str, Any]], echo: Callable[[str], object]) -> None:
-    echo("\n10% press: error (reported standard deviation) / displacement; conv.: wires CONVERGED")
+    echo("\n10% press: error (reported std. dev.), divided by the displacement; conv.: fraction CONVERGED")
     echo(
         f"  {'layout':16}{'noise':>7}{'exact':>20}{'conv.':>7}{'posterior':>20}{'conv.':>7}"
         f"{'bound, no prior':>17}{'prototype: exact, posterior':>30}"
@@ -182,7 +184,9 @@ def _print_coverage(rows: list[dict[str, Any]], echo: Callable[[str], object]) -
             f"{row['scenes']:7}{row['converged']:7.0%}{_text(row['error']):>10}{_text(row['reported']):>10}"
             f"{ratio:>7}{covered:>9}"
         )
-    echo("  posterior's forces and contacts: RMS error (RMS reported), fraction inside the 95 % interval")
+    echo(
+        "  forces and contacts of the posterior: RMS error (RMS reported), fraction inside the 95 % interval"
+    )
     for row in rows:
         if row["method"] == "posterior":
             where = f"{row['layout']} h={row['height']:g}"
@@ -202,7 +206,7 @@ def _print_coverage(rows: list[dict[str, Any]], echo: Callable[[str], object]) -
 
 
 def _print_parts(rows: list[dict[str, Any]], echo: Callable[[str], object]) -> None:
-    echo("  posterior errors / √(n + b), with the variances n due to noise and b due to the prior")
+    echo("  errors of the posterior / √(n + b); n: variance due to noise, b: variance due to the prior")
     echo(
         f"  {'b / (n + b)':16}{'coordinates':>12}{'RMS':>7}{'by noise':>10}{'b in it':>9}{'95 %':>7}"
         f"{'99.9 %':>8}{'kurtosis':>10}"

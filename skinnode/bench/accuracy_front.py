@@ -1,10 +1,11 @@
-"""Measures error versus time for our solvers and other libraries, with the same compiled F and J.
+"""Measures the time and error of our solvers and of other libraries on the same problems.
 
-Only the patch's four middle wires, which are pressed most deeply, are solved. The simulated samples are
-noise-free. Every solver starts from rest. A solver solves either only the last sample or, as in the paper, a
-sequence of samples: the solution of each sample is the initial guess for the next sample. Each solver is run
-with several tolerances, and each run yields one data point. The time of ``solve_path`` includes work that the
-other solvers' times exclude: setting up the patch, following the branch, and estimating the error.
+All solvers use the same compiled functions for the potential F and its Jacobian J. Only the patch's four
+middle wires, which are pressed most deeply, are solved. The simulated samples are noise-free. Every solver
+starts from rest. In some runs, a solver solves only the last sample. In the others, it solves a sequence of
+samples as in the paper, and the solution of each sample is the initial guess for the next. Each solver is run
+with several tolerances, and each run yields one data point. Only the time of ``solve_path`` includes setting
+up the patch, following the path, and estimating the error.
 """
 
 from __future__ import annotations
@@ -28,15 +29,17 @@ from skinnode.solve.paths.step_control import Adaptive, Periodic, Schedule, Unif
 from skinnode.solve.wires.problem import PatchProblem
 
 SCENES: Final = (("staggered", 0.5, 0.3), ("staggered", 1.0, 0.3), ("aligned", 0.5, 0.1))
-"""Scenes as (preset, height in pitches, depth in heights): a press that every solver solves from rest, a
-press that requires intermediate samples, and a press on the paper's layout."""
+"""Scenes as (preset, layer height in pitches, press depth divided by the layer height). Every solver solves
+the first press from rest, the second press requires intermediate samples, and the third uses the paper's
+layout."""
 TOLERANCES: Final = (1e-4, 1e-7, 1e-10, 1e-13)
 SAMPLES: Final = (1, 5, 10, 20)
 SOLVED: Final = 0.01
-"""Maximum error, relative to the displacement, of a result that is classified as solved and plotted."""
+"""Maximum error of a solved sample, relative to the true displacement. Results with larger errors are not
+plotted."""
 ROUNDING: Final = 1e-11
-"""Error floor: smaller errors are treated as equal. The floor is the rounding error in F times the condition
-number of J."""
+"""Floor applied to all errors, because smaller differences are rounding errors. The floor is the rounding
+error in F times the condition number of J."""
 LOOSE: Final = 1e-6
 """Solver tolerance for all samples except the last, as in the paper."""
 REPEATS: Final = 7
@@ -66,7 +69,7 @@ class Scene:
 
 
 def scene_of(name: str, height: float, depth: float) -> Scene:
-    """Create a scene: a sphere presses a preset's four middle wires to ``depth`` times the layer height."""
+    """Create a scene in which a sphere presses on four wires; ``depth`` is relative to the layer height."""
     full = preset(name, height)
     layout = PatchLayout(full.upper_m[3:7], full.lower_m, full.resistivity_ohm_per_m)
     press = Press((18.3e-3, 17.1e-3), 10e-3, depth * full.height_m, (0.2, -0.1))
@@ -128,7 +131,7 @@ def pareto(rows: list[dict[str, Any]]) -> list[int]:
 
 
 def run() -> list[dict[str, Any]]:
-    """Measure all scenes; return rows that state time, error, and membership in the Pareto front."""
+    """Measure all scenes; each returned row states its time, its error, and whether it is Pareto-optimal."""
     panels = []
     for setting in SCENES:
         scene = scene_of(*setting)
@@ -161,7 +164,7 @@ def _rows(scene: Scene) -> list[dict[str, Any]]:
 
 
 def _schedules(tolerance: float) -> dict[str, tuple[Schedule, int]]:
-    """Return the step controls and their numbers of samples, by name."""
+    """Return a mapping from name to step control (see ``solve_path``) and number of samples."""
     loose = max(tolerance, LOOSE)
     uniform = Uniform(intermediate_tolerance=loose, final_tolerance=tolerance)
     found: dict[str, tuple[Schedule, int]] = {

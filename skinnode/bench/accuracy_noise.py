@@ -1,8 +1,8 @@
 """Measures the error versus noise, code width and layout, and checks the calibration of standard deviations.
 
-Every scene consists of four tracked frames, starting at rest; only the last frame is scored. The reported
-errors and standard deviations are RMS values over all scenes and all coordinates of converged wires, divided
-by the RMS displacement.
+A tracker solves the four frames of each scene in sequence, starting at rest; only the last frame is scored.
+Errors and standard deviations are RMS values over the coordinates of all converged wires in all scenes,
+divided by the RMS displacement.
 """
 
 from __future__ import annotations
@@ -46,7 +46,8 @@ PROTOTYPE: Final = {
     ("aligned", 0.5): {"exact": {1e-5: 2.71}, "posterior": {4e-6: 0.05, 1e-5: 0.06, 1e-4: 0.20, 1e-3: 0.38}},
     ("aligned", 1.0): {"exact": {1e-5: 73.0}, "posterior": {4e-6: 0.14, 1e-5: 0.18, 1e-4: 0.24, 1e-3: 0.38}},
 }
-"""The prototype's relative RMS errors for a 10 % press with shear by one Hertz-like indenter."""
+"""Relative RMS errors of the prototype for a 10 % press with shear by a single, approximately Hertzian
+indenter."""
 
 
 @dataclass
@@ -76,7 +77,7 @@ class Pool:
         self._size += float((truth_m[used] ** 2).sum())
 
     def row(self) -> dict[str, Any]:
-        """Return the statistics of all added scenes; errors are NaN if no wire converged."""
+        """Return the statistics of all added scenes; the errors in them are NaN if no wire converged."""
         size = self._size or math.nan
         return {
             "scenes": self.scenes,
@@ -90,14 +91,14 @@ class Pool:
 
 @dataclass
 class Parts:
-    """Compares the posterior's errors with its variance n + b; n is due to the noise, b to the prior."""
+    """Compares the posterior's errors with its variance n + b (n due to the noise, b due to the prior)."""
 
     _error: list[Float] = field(default_factory=list)
     _noise: list[Float] = field(default_factory=list)
     _left: list[Float] = field(default_factory=list)
 
     def add(self, frame: FieldFrame, truth_m: Float) -> None:
-        """Add a scene with true displacement (U, N, 3), metres; skip the scene if all wires are held."""
+        """Add a scene, unless all wires are held; ``truth_m`` is the true displacement (U, N, 3), metres."""
         if frame.core_std_m is None or (frame.held is not None and frame.held.all()):
             return
         used = np.array([status is Status.CONVERGED for status in frame.status])
@@ -108,10 +109,11 @@ class Parts:
         self._left.append(left.ravel())
 
     def rows(self) -> list[dict[str, Any]]:
-        """Return a row of statistics for each interval of b / (n + b), the prior's share of the variance.
+        """Return a row of statistics for each interval of b / (n + b).
 
-        Each row contains the RMS, quantiles and kurtosis of error / √(n + b), the RMS expected for b = 0, and
-        the ratio of the observed to the predicted variance due to the prior.
+        The quotient b / (n + b) is the fraction of the variance that is due to the prior. Each row contains
+        the RMS, quantiles and kurtosis of error / √(n + b), the RMS expected for b = 0, and the ratio of the
+        observed to the predicted variance due to the prior.
         """
         if not self._error:
             return []
@@ -210,7 +212,7 @@ class Forces:
 
 def _case(kind: str, height: float) -> Case:
     def never(rng: np.random.Generator) -> Stream:
-        raise RuntimeError("this case has no stream, only a skin")
+        raise RuntimeError("this case cannot generate a stream; use only its skin")
 
     return Case(0, f"{kind} h={height:g}", Skin(preset(kind, height)), never)
 
@@ -240,8 +242,8 @@ def _streams(case: Case, converter: Converter, scenes: int) -> Iterable[Stream]:
 def pad_press(rng: np.random.Generator, layout: PatchLayout, depth: float) -> Press:
     """Return a random press by a fingertip-sized body whose contact radius is 1.5 to 2.5 pitches.
 
-    The results are comparable with the prototype's (see PROTOTYPE), because both presses have the same
-    Cramér-Rao bounds.
+    The errors can be compared with :data:`PROTOTYPE`, because the prototype's presses had the same Cramér-Rao
+    bounds.
     """
     press = random_press(rng, layout, depth)
     contact = rng.uniform(1.5, 2.5) * layout.pitch_m
@@ -316,9 +318,9 @@ def _random_scene(rng: np.random.Generator, layout: PatchLayout) -> tuple[Press,
 def coverage(scenes: int) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
     """Solve random scenes with both methods.
 
-    Returns: Two lists. The first list has one row per layout, noise level and method; rows of the posterior
-    include force errors. The second list contains statistics of the posterior's errors in all scenes, grouped
-    by the prior's share of the variance.
+    Returns: Two lists. The first list has one row per layout, noise level and method. Rows for the method
+    ``posterior`` include force errors. The second list contains statistics of the posterior's errors in all
+    scenes, grouped by the fraction of the variance that is due to the prior.
     """
     rows, parts = [], Parts()
     for kind, height, sigma in COVERAGE:

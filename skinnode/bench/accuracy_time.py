@@ -22,9 +22,9 @@ LIMITS_US: Final = {"exact": 500.0, "posterior, full frame": 5000.0, f"posterior
 
 
 class Cycle:
-    """Solves the frames of a press and its release one after another.
+    """Solves the frames of one press, followed by the frames of its release.
 
-    Each call solves the whole cycle, so that every measurement includes both slow and fast frames.
+    Each call solves the whole cycle, because some frames take much longer to solve than others.
 
     Args:
         solver: Solver to measure.
@@ -39,7 +39,7 @@ class Cycle:
         self._solver, self._valid = solver, valid
         self.frames = np.concatenate([frames, frames[-2:0:-1]])
         self.active: list[int] = []
-        """Number of solved wires (wires that were not held), one entry per frame."""
+        """Number of wires that were solved rather than held, one entry per frame."""
 
     def __call__(self) -> None:
         """Solve all frames."""
@@ -59,9 +59,9 @@ def run(rounds: int) -> list[dict[str, Any]]:
     """Time each solver; return its time per frame (µs), its time limit, and its mean number of solved wires.
 
     The time per frame is averaged over a cycle; the median of all rounds is reported. A real press always
-    moves more than three wires, because it deforms the whole half-space. To measure only three active wires,
-    the benchmark therefore masks the resistances of all other wires. Holding is disabled, so every frame is
-    solved.
+    displaces more than three wires, because it deforms the whole half-space. To measure only three active
+    wires, the benchmark therefore masks the resistances of all other wires. The option ``hold`` of the
+    posterior is off, so wires with unchanged resistances are also solved.
     """
     skin = Skin(preset("staggered", 0.5))
     layout, rest = skin.layout, skin.rest_ohm

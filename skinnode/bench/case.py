@@ -16,14 +16,13 @@ PATHS: Final = ("path gauss_newton", "path levenberg_marquardt", "path dogleg", 
 TRACKERS: Final = ("exact", "posterior", "auto")
 PITCH_M: Final = 4e-3
 FINE: Final = Converter(sigma=1e-5)
-"""Converter with roughly the noise of a 16-bit converter."""
+"""Converter with a relative noise of 1e-5, which is typical of a 16-bit converter."""
 STRIDE: Final = 4
-"""Interval, in path samples, between the frames passed to a tracker."""
+"""Value of :attr:`Case.stride` for cases that are solved both by trackers and by path methods."""
 DRIFT: Final = 0.02
 MODEL_ERROR: Final = 0.05
-"""Relative error of ΔR as predicted by the wrong models of case 13. For a 30 % press on ``staggered`` at h =
-0.5, the measured error of ‖ΔR‖ is 2.2 to 5 %. For the ΔR of a single wire pair, the median error is 1 to 5 %
-and the maximum error is 7 %."""
+"""Model error assumed in case 13: relative error of the predicted resistance change ΔR. With the wrong models
+of case 13, the measured error of ‖ΔR‖ was 2.2 to 5 % (30 % press, ``staggered``, h = 0.5)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,12 +38,12 @@ class Case:
     """Converter that reads the resistances; the solver knows the converter's noise."""
     drift: str = "none"
     stride: int = 1
-    """Stride of the frames that a tracker solves; path methods solve every frame."""
+    """A tracker solves only every ``stride``-th frame; path methods solve every frame."""
     known_wrong: tuple[str, ...] = ()
-    """Methods that are known to produce wrong results in this case (see ``docs/limits.md``). Wrong results of
-    these methods are shown, but do not make the benchmark fail."""
+    """Methods known to fail in this case (see ``docs/limits.md``). Their wrong results are reported, but do
+    not make the benchmark fail."""
     model_error: float = 0.0
-    """Relative error of the predicted ΔR; passed to the solver as an option."""
+    """Relative error of the predicted resistance change ΔR; passed to the solver as an option."""
     tolerances: Tolerances | None = None
     """Manufacturing tolerances passed to the solver; None for the solver's default."""
 
@@ -80,8 +79,9 @@ def pressing(  # noqa: PLR0913 - one argument per way to change a stream
         skin: The patch.
         depth: Depth of the press divided by the layer height.
         converter: Converter that reads the resistances.
-        shares: Fractions (T,) of the full depth, one per frame.
-        spoil: Function that inserts errors into a stream and returns the result; default: no errors.
+        shares: Depth (T,) in each frame, as a fraction of the full depth.
+        spoil: Function that inserts faulty data into a stream and returns the result; default: no faulty
+            data.
         gain: Function that returns factors by which the resistances are multiplied; (T, U, K) or
             broadcastable to that shape; default: 1.
         presses: Function that returns the presses; default: one random press.

@@ -172,7 +172,7 @@ def _open_lower(rng: np.random.Generator, taken: Stream, skin: Skin) -> Stream:
 
 
 def _shorted_lower(rng: np.random.Generator, taken: Stream, skin: Skin) -> Stream:
-    """Short a lower wire to 0 ohm without marking its resistances invalid."""
+    """Set the resistances of a lower wire to 0 ohm for three frames, but leave them marked valid."""
     frames, k = taken.frames_ohm.copy(), rng.integers(skin.layout.shape[1])
     frames[2:5, :, k] = 0.0
     return _spoilt(taken, frames, taken.valid)
@@ -195,7 +195,7 @@ def _missing_chunks(rng: np.random.Generator, taken: Stream, skin: Skin) -> Stre
 
 
 def _impossible(rng: np.random.Generator, taken: Stream, skin: Skin) -> Stream:
-    """Insert zero, negative, infinite and NaN values during the press without marking them invalid."""
+    """Insert zero, negative, infinite and NaN resistances during the press, all marked valid."""
     frames = taken.frames_ohm.copy()
     for t in (2, 3, 4):
         where = rng.choice(frames[t].size, 4, replace=False)
@@ -204,7 +204,7 @@ def _impossible(rng: np.random.Generator, taken: Stream, skin: Skin) -> Stream:
 
 
 def _garbage(rng: np.random.Generator, taken: Stream, skin: Skin) -> Stream:
-    """Insert one frame that no deformation can explain."""
+    """Replace one frame with random resistances, which no deformation can produce."""
     frames = taken.frames_ohm.copy()
     frames[4] = skin.rest_ohm * rng.uniform(0.3, 1.2, skin.layout.shape)
     return _spoilt(taken, frames, taken.valid)
@@ -304,9 +304,9 @@ def _after_detour(
     detour: Callable[[np.random.Generator, PatchLayout, float], Float],
     converter: Converter,
 ) -> Callable[[np.random.Generator], Stream]:
-    """Return a generator of streams that begin with a physically impossible motion, followed by a real press.
+    """Return a generator of streams; each starts with a physically impossible motion and ends with a press.
 
-    The impossible motion ends with every resistance back at its rest value. The true displacement is
+    After the impossible motion, every resistance has returned to its rest value. The true displacement is
     undefined (NaN) during the motion, because swapping two electrodes of a wire or mirroring an electrode
     leaves F unchanged.
     """
@@ -418,7 +418,7 @@ def _shapes() -> Iterator[Case]:
 
     yield Case(12, "fingertip, 30%", tip, pressing(tip, 0.3, FINE, shares, presses=on_tip))
     for lower, depth in ((3, 0.1), (6, 0.3)):
-        # A patch with one electrode per wire is a narrow line.
+        # With one electrode per upper wire, the electrodes of the patch form a single line.
         layout = PatchLayout.preset("staggered", upper_electrodes=1, lower_wires=lower)
         skin = Skin(layout)
 

@@ -2,7 +2,7 @@
 
 After each call, LAPACK's worker threads keep spinning for a while. If a worker thread shares a core with the
 next kernel to be timed, that kernel takes up to three times as long. On a busy machine, the worker threads
-also have to wait for each other.
+also wait for each other.
 """
 
 from __future__ import annotations

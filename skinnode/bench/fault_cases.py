@@ -1,9 +1,9 @@
 """Hard cases 14 to 16 of ``skinnode bench stability``: wrong data, imperfect patches and wide touches.
 
-In case 14, the data are wrong but not marked invalid. A solver claims to be accurate only for wires that are
-CONVERGED and trusted. Only trackers check their input data, so case 14 does not use the posterior without a
-tracker. The host detects frozen wires from repeated codes (:mod:`skinnode.host.frozen_parts`); a tracker
-cannot, because it receives only resistances.
+In case 14, the data are wrong but not marked invalid. Only the results for wires that are CONVERGED and
+trusted have to be accurate. Case 14 uses only solvers with a tracker, because only a tracker checks its input
+data. The host detects frozen wires from repeated codes (:mod:`skinnode.host.frozen_parts`); a tracker cannot,
+because it receives only resistances.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ Spoil = Callable[[np.random.Generator, Stream, Skin], Stream]
 SHARES: Final = np.array([0.0, 0.0, 0.0, 0.0, 0.25, 0.5, 0.75, 1.0, 1.0, 1.0, 1.0, 0.6, 0.3, 0.0])
 """Press depth in each frame of case 14, as a fraction of the full depth."""
 FAILS: Final = 5
-"""Index of the first frame with wrong data in case 14; by then, the press has begun."""
+"""Index of the first frame with wrong data in case 14; the press begins one frame earlier."""
 TESTED: Final = ("exact", "auto")
 """Methods tested with wrong data in case 14."""
 KNOWN: Final = {
@@ -36,7 +36,8 @@ KNOWN: Final = {
     ("bits flipped", "1e-4"),
     ("lower wires crossed, tared", "1e-4"),
 }
-"""Faults and noise levels known to make a few trusted wires wrong; ``docs/limits.md`` explains why."""
+"""Combinations of fault and noise level for which the displacements of a few trusted wires are known to be
+wrong; ``docs/limits.md`` explains the reasons."""
 UPPER, LOWER = 1, 2
 """Axis indices of the upper and lower wires in an array (T, U, K)."""
 

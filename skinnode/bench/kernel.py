@@ -1,7 +1,8 @@
 """Compares the compiled kernels with NumPy and LAPACK.
 
-For one wire of the reference patch, the benchmark times F + J and one step of each operator. The dense
-kernels are timed with the matrix sizes of the reference patch's posterior.
+For one wire of the reference patch, the benchmark times the evaluation of the potential F with its Jacobian
+J, and one step of each operator (Gauss-Newton, Levenberg-Marquardt and dogleg). The dense kernels are timed
+with the matrix sizes of the reference patch's posterior.
 """
 
 from __future__ import annotations
@@ -23,15 +24,14 @@ from skinnode.solve.operators.work import LIMIT, Work, workspace
 from skinnode.solve.wires.problem import PatchProblem
 
 SHORT: Final = 1e-3
-"""Trust radius (pitches per coordinate), much shorter than a Newton step, so that every operator must shorten
-its step."""
+"""Trust radius, pitches per coordinate. It is much smaller than a Newton step, so that the benchmark also
+times the shortening of steps."""
 
 
 class NumpyWire:
     """Computes F and Jᵀ of one wire with fast NumPy code (structure of arrays, preallocated buffers).
 
-    Several axis orders and summation methods were compared; the fastest combination, used here, takes 85 % of
-    the time of the most obvious one.
+    The axis order and the summation method are the fastest of several that were compared.
     """
 
     def __init__(self, lower: Float, electrodes: int) -> None:
@@ -64,9 +64,9 @@ class NumpyWire:
 
 
 def numpy_step(operator: str, wire: NumpyWire, x: Float, a: Float) -> Float:
-    """Evaluate r, take one step and evaluate r again, like :func:`compiled_steps`; return the final r.
+    """Do the same work as :func:`compiled_steps` for one wire; return the relative residual after the step.
 
-    The Levenberg-Marquardt parameter is fixed in the NumPy step; the compiled step has to search for it.
+    The Levenberg-Marquardt step uses a fixed parameter, although the compiled step also searches for it.
     """
     f, jt = wire(x)
     r, j = relative_residual(a, f), (jt * a).T
@@ -91,7 +91,8 @@ def numpy_step(operator: str, wire: NumpyWire, x: Float, a: Float) -> Float:
                 )
         else:
             n = x.size
-            augmented = np.zeros((r.size + n, n + 1))  # computes Qᵀr 30 % faster than with Q
+            # With r as the last column of the matrix, qr also returns Qᵀr and need not compute Q.
+            augmented = np.zeros((r.size + n, n + 1))
             augmented[: r.size, :n] = j
             augmented[: r.size, n] = r
             np.fill_diagonal(augmented[r.size :], 0.1 * scale)
@@ -119,8 +120,7 @@ def compiled_steps(  # noqa: PLR0913 - a kernel takes its buffers
 ) -> None:
     """Take one step for every wire from ``start`` (U, n), with the compiled functions of the solver loop.
 
-    The complete solver loop cannot be timed instead: it computes a second step before it checks its step
-    limit.
+    The complete solver loop is not timed, because it computes a second step before it checks its step limit.
     """
     for u in range(start.shape[0]):
         for j in range(w.x.size):

@@ -1,4 +1,4 @@
-"""Sets up the solvers for a hard case as an informed user would, and solves the case's streams."""
+"""Sets up the solvers with the best options for a hard case, and solves the streams of the case."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def last_only(name: str) -> bool:
 
 
 def _path(case: Case, how: str, stream: Stream) -> Solved:
-    """Solve a stream as a path; ``how`` is ``adaptive`` or the name of the operator for all samples."""
+    """Solve a stream with :func:`solve_path`; ``how`` is ``adaptive`` or the name of the operator to use."""
     adaptive = how == "adaptive"
     path = solve_path(
         case.skin.layout,
@@ -46,7 +46,7 @@ def _path(case: Case, how: str, stream: Stream) -> Solved:
         schedule=Adaptive() if adaptive else Uniform(),
         baseline_ohm=case.skin.rest_ohm,
     )
-    # The error estimate is an upper bound, and errors up to LIMIT standard deviations are accepted.
+    # The error estimate is an upper bound. Dividing it by LIMIT accepts errors up to this bound.
     std = np.broadcast_to(path.error_estimate_m[:, None, None] / LIMIT, path.displacement_m.shape)
     return Solved(path.displacement_m[None], std[None], _converged(path.status)[None])
 

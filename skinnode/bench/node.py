@@ -27,12 +27,12 @@ from skinnode.transport import CanPort
 
 NODE_ID: Final = 4
 FULL_BUS_HZ: Final = 8_000
-"""Rate of frames with eight data bytes that fully loads a 1 Mbit/s bus, Hz."""
+"""Frame rate that fully loads a 1 Mbit/s bus with frames of eight data bytes, Hz."""
 SCAN_PERIOD_S: Final = 0.1
 BEAT_MS: Final = 10
-_BURST_S: Final = 1e-3  # time between bursts: a thread cannot wake 8000 times per second
+_BURST_S: Final = 1e-3  # time between bursts; a thread cannot wake up 8000 times per second
 _MOST_S: Final = (
-    5e-3  # maximum backlog; older frames are dropped, because a fully loaded bus could not catch up
+    5e-3  # maximum backlog; older frames are dropped, because a fully loaded bus cannot send a longer backlog
 )
 
 Row = dict[str, Any]
@@ -168,7 +168,7 @@ def _load(rig: _Rig, rate_hz: int, stop: threading.Event) -> None:
 
 
 def handlers() -> dict[str, Callable[[], object]]:
-    """Return a function for each kind of frame; each call passes such a frame to a node without a bus.
+    """Return one function per kind of frame; each function passes a frame of its kind directly to a node.
 
     Each function also queries the node's next deadline, like the thread of a :class:`NodeRunner`.
     """

@@ -1,25 +1,24 @@
-"""Repeats the paper's path experiments, and compares the results with the published values (``paper.toml``).
+"""Repeats the path experiments of Xu et al. (2018) and compares the results with the paper's values.
 
 Each experiment uses one upper wire of 10 electrodes (30 unknowns), without the other wires of the patch. A
-sphere with a radius of 6 to 12 mm is pressed into rubber at a random point near the middle of the patch; the
-displacement is Hertz's closed form with friction. The wire nearest to that point is solved. The downward
-motion consists of 1000 samples; a path of n steps uses n evenly spaced samples.
+sphere with a radius of 6 to 12 mm presses into the rubber at a random point near the middle of the patch. The
+displacement is computed from Hertz's closed-form solution with friction. The wire nearest to that point is
+solved. The press consists of 1000 samples; a path of n steps uses n evenly spaced samples.
 
-Counts: The paper counts calls of F. Its Jacobians are finite differences, so each Jacobian requires 30
-additional calls. Our code evaluates F and an analytic J together, at about twice the cost of F alone. One
-such evaluation replaces 31 calls, so our counts are multiplied by 31 for comparison with the paper. Like in
-the paper, the number of calls per step is averaged over all samples except the last. The accuracy is the
-relative error ‖X − X*‖ / ‖X* − X(0)‖, averaged over the experiments that converged. The first-order
-optimality is that of the dimensionless residual r = a F − 1, with lengths in pitches. MATLAB's optimality is
-that of F: larger by a factor of F² and dependent on the unit of length, which the paper does not state.
+The paper counts the calls of the potential function F. Its Jacobians are finite differences, so each Jacobian
+requires 30 additional calls. Our code evaluates F and an analytic Jacobian J together, at about twice the
+cost of F alone. One such evaluation replaces 31 calls, so our counts are multiplied by 31 for comparison with
+the paper. As in the paper, the number of calls per step is averaged over all samples except the last. The
+accuracy is the relative error ‖X − X*‖ / ‖X* − X(0)‖, averaged over the experiments that converged. The
+first-order optimality ‖Jᵀr‖∞ is computed from the dimensionless residual r = a F − 1, with lengths in
+pitches. The paper's values, computed by MATLAB, are larger by a factor of F². They depend on the unit of
+length, which the paper does not state.
 
-Settings: At the paper's press depth of 10 %, our Gauss-Newton never fails: on ``aligned`` with h = 0.3, 0.4 …
-1, all 10 experiments are solved with any number of steps. For a depth of 10 %, the benchmark therefore uses
-the hardest ``aligned`` setting, h = 1. With h = 0.7 and a depth of 30 %, Gauss-Newton fails as often as in
-the paper: in 6 of 10 experiments with 5 steps, in 2 of 10 with 10 steps, and in none with 20 or more steps.
-The setting h = 0.7 and 30 % was found by a search over h = 0.3 … 1 and depths of 15 … 30 %. With h = 1 and a
-depth of 25 %, Gauss-Newton fails in 5 experiments with 5 steps and in 3 with 10 steps, but
-Levenberg-Marquardt also fails with more steps.
+At the paper's press depth of 10 %, our Gauss-Newton solved all experiments on ``aligned``, with layer heights
+h of 0.3 to 1 pitches and any number of steps. For a depth of 10 %, the benchmark therefore uses the hardest
+``aligned`` setting, h = 1. In a search over h = 0.3 to 1 and depths of 15 to 30 %, Gauss-Newton failed as
+often as in the paper with h = 0.7 and a depth of 30 %. It failed in 6 of 10 experiments with 5 steps, in 2 of
+10 with 10 steps, and in none with 20 or more steps.
 """
 
 from __future__ import annotations
@@ -213,7 +212,7 @@ def _mean(values: Sequence[float]) -> float | None:
 
 
 def _path_rows(path: PathResult) -> slice:
-    """Return the slice of the path's own rows, which excludes cycle search, second attempts and checks."""
+    """Return the rows of the path itself, without the rows of cycle search, second attempts and checks."""
     at = path.position[path.searched :, 0]
     return slice(path.searched, path.searched + int(np.argmax(at == np.nanmax(at))) + 1)
 
@@ -235,7 +234,7 @@ def _optimality(one: Experiment, samples: int, tolerance: float) -> list[float]:
 
 
 def _cycle(made: list[Experiment], samples: int, tolerance: float) -> float | None:
-    """Return the median length of the cycles found in the experiments; None if none has a cycle."""
+    """Return the median length of the cycles found in the experiments; None if no cycle was found."""
     cycles = []
     for one in made:
         path = one.solve(Uniform(plain=True, intermediate_tolerance=tolerance), samples=samples)
@@ -333,7 +332,7 @@ def _ten_steps() -> list[dict[str, Any]]:
 
 
 def _surface() -> dict[str, Any]:
-    """Return the data of figure 13: surface of the whole patch in the hardest setting, µm.
+    """Return the data of figure 13: z-displacement of the whole patch in the hardest setting, µm.
 
     The patch is solved in 5 and in 20 steps as in the paper, and with our adaptive step control.
     """
@@ -378,7 +377,7 @@ def print_all(figures: dict[str, Any], say: Say) -> None:
     """Print the tables and the figure data, with the paper's values for comparison."""
     paper, count = figures["paper"], figures["experiments"]
     say(f"Means of {count} experiments; one wire, {UNKNOWNS} unknowns; tolerances 1e-6 and 1e-12.")
-    say("As in the paper: Uniform(plain=True). Ours: Uniform(), adding extrapolation and a second attempt.")
+    say("As in the paper: Uniform(plain=True). Ours: Uniform(), with extrapolation and a second attempt.")
     say("Tol_X: largest component of the next correction, in pitches. Times: median for one wire.")
     say("Ten-step path of one wire (paper: 2.03 s)")
     for row in figures["ten_steps"]:
@@ -444,7 +443,7 @@ def _print_operators(setting: dict[str, Any], paper: dict[str, Any], count: int,
                 f"  {_accuracy(own, count)}"
             )
     say(
-        f"cells in which our path solver solves all experiments more accurately than the paper: {better} of "
+        f"cells in which our path solver always converges, more accurately than the paper: {better} of "
         f"{len(LABELS) * len(STEPS)}"
     )
 
@@ -481,13 +480,13 @@ def _print_figures(setting: dict[str, Any], paper: dict[str, Any], say: Say) -> 
         shown = calls if len(calls) <= 19 else calls[:19]
         dots = "" if len(calls) <= 19 else " …"
         say(f"  {n:>3} steps  " + " ".join(f"{each:.1f}" for each in shown) + dots)
-    say("figures 9 and 10, first-order optimality: cycle T, the number of samples between solves")
+    say("figures 9 and 10, first-order optimality: cycle length T in samples, by tolerance")
     say(f"  {'tolerance':>10}" + "".join(f"{n + ' samples':>13}" for n in ("20", "50", "100")))
     for tolerance, cycles in setting["cycles"].items():
         say(f"  {tolerance:>10}" + "".join(f"{_figure(cycles[n], 'g'):>13}" for n in ("20", "50", "100")))
     section = paper["section5"]
     say(
-        f"  the paper's T at 1e-4 and 50 samples: {section['cycle_at_50_steps_tol_1e-4']}. The paper's "
+        f"  paper's T (tolerance 1e-4, 50 samples): {section['cycle_at_50_steps_tol_1e-4']}. The paper's "
         f"optimality refers to F; with lengths in pitches, it is {setting['unscaled']:.0f} times ours."
     )
     totals, printed_totals = setting["figure11"], paper["figure11_iterations"]

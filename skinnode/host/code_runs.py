@@ -1,11 +1,10 @@
 """Track how often each crossing's code has repeated, and how far the neighbours' codes changed in that time.
 
-A crossing's *run* is the number of consecutive scans that have repeated its code. A crossing's
-*lead* measures how far the codes of its neighbours have changed since the run began. The lead along the upper
-wire is the smaller of the changes of the two neighbours on the same upper wire, or 0 if the changes have
-different signs. The lead along the lower wire (``ACROSS``) is defined in the same way for the two neighbours
-on the same lower wire. For a crossing at the edge, the two nearest crossings on the same wire serve as the
-neighbours.
+A crossing's *run* is the number of consecutive scans that have repeated its code. A crossing's *lead* is the
+amount by which its neighbours' codes have changed during the run. The lead along the upper wire is the
+smaller change of the two neighbours on the same upper wire, or 0 if the two codes have changed in opposite
+directions. The lead along the lower wire is defined in the same way. A crossing at the edge has only one
+neighbour on a wire; the next crossing on the wire is used as the second neighbour.
 """
 
 from __future__ import annotations
@@ -19,33 +18,34 @@ from skinnode.compiled.jit import njit_brief, njit_part
 from skinnode.protocol.codes import MISSING as _MISSING
 
 LAST, BEFORE, RUN, NAMED, ALONG, ACROSS, _ANCHORS = range(7)
-"""Planes of the state array: last code (-1 before the first code), previous code, run, flag of a crossing in
-a part already detected as frozen, lead along the upper wire, lead along the lower wire. Four further planes
-store the neighbours' codes from the scan in which the run began.
+"""Planes of the state array. ``LAST``: last code; -1 before the first code. ``BEFORE``: previous code.
+``RUN``: run. ``NAMED``: nonzero if the crossing or its wire has already been detected as frozen. ``ALONG``
+and ``ACROSS``: lead along the upper wire and along the lower wire. ``_ANCHORS``: first of four planes that
+store the neighbours' codes from the start of the run.
 """
 _PLANES: Final = 10
 
 UPPER, LOWER, CROSSING, WIRE_LEAD, CROSSING_LEAD, STEPS, FRESH = range(7)
-"""Indices of the limits. ``UPPER``, ``LOWER`` and ``CROSSING``: minimum runs for which an upper wire, a lower
-wire and a crossing are considered frozen. ``WIRE_LEAD`` and ``CROSSING_LEAD``: minimum leads for a repeated
-code to be evidence of a frozen wire and of a frozen crossing. ``STEPS``: highest code that represents a
-measurement. ``FRESH``: 1 if the node sent every code of the scan; 0 if the node omitted unchanged codes, so
-that a repeated code is no evidence of a frozen part.
+"""Indices of the limits. ``UPPER``, ``LOWER`` and ``CROSSING``: run at which an upper wire, a lower wire or a
+crossing is considered frozen. ``WIRE_LEAD`` and ``CROSSING_LEAD``: lead at which a wire or a crossing with
+repeated codes is considered frozen. ``STEPS``: highest code that represents a measurement. ``FRESH``: 1 if
+the node sent every code of the scan, 0 if the node omitted unchanged codes. Runs do not grow while ``FRESH``
+is 0.
 """
 MEASURED, CHANGED, RETURNED, LARGEST, RESERVED, LEAST, RELEASED, SUSPECT = range(8)
 """Indices of the results. ``MEASURED``: number of crossings with a measurement. ``CHANGED``: number of
 crossings whose code changed. ``RETURNED``: number of crossings whose code returned to its previous value.
 ``LARGEST``: largest change of a code. ``RESERVED``: number of crossings whose last code is reserved.
-``LEAST``: smallest code. ``RELEASED``: number of changed crossings in parts detected as frozen. ``SUSPECT``:
-1 if another part may be frozen, otherwise 0.
+``LEAST``: smallest code. ``RELEASED``: number of crossings detected as frozen whose code has changed since.
+``SUSPECT``: 1 if a wire or crossing not detected yet may be frozen, otherwise 0.
 """
 
 LEAST_RUN: Final = 5
-"""Minimum number of repeated scans after which a crossing, a noise-free part or a patch is considered frozen.
-A wire whose neighbours have changed is considered frozen after a single repeated scan.
+"""Minimum run (scans) at which a crossing, wire or patch is considered frozen. A wire is considered frozen at
+a run of 1 if the codes of its neighbours have changed.
 """
 LEADS: Final = 3
-"""Minimum number of a wire's crossings whose neighbours must have changed before the wire is considered
+"""Number of crossings on a wire whose neighbours' codes must have changed before the wire is considered
 frozen.
 """
 
@@ -61,7 +61,7 @@ def new_runs(shape: tuple[int, int]) -> _Int:
 
 @njit_brief
 def follow(codes: NDArray[np.uint32], state: _Int, limits: _Int, found: _Int) -> None:
-    """Update the runs and leads with the codes of a scan.
+    """Update all runs and leads from the codes of a new scan.
 
     Args:
         codes: (U, K) codes; missing codes are ignored.
@@ -102,7 +102,7 @@ def follow(codes: NDArray[np.uint32], state: _Int, limits: _Int, found: _Int) ->
 
 @njit_part
 def _update_leads(state: _Int, steps: int) -> None:
-    """Update all leads; for each run that begins, store the neighbours' current codes."""
+    """Update the leads; at the start of a run, store the neighbours' codes."""
     rows, columns = state.shape[1], state.shape[2]
     for u in range(rows):
         for k in range(columns):
@@ -118,13 +118,13 @@ def _update_leads(state: _Int, steps: int) -> None:
 
 @njit_part
 def _one(here: int) -> int:
-    """Return the index of a wire's first neighbour."""
+    """Return the index of the first neighbour of wire number ``here``."""
     return 1 if here == 0 else here - 1
 
 
 @njit_part
 def _two(here: int, size: int) -> int:
-    """Return the index of a wire's second neighbour on a side with ``size`` wires."""
+    """Return the index of the second neighbour of wire number ``here`` out of ``size`` parallel wires."""
     if here == 0:
         return 2
     return size - 3 if here == size - 1 else here + 1
@@ -132,7 +132,7 @@ def _two(here: int, size: int) -> int:
 
 @njit_part
 def _set_lead(state: _Int, u: int, k: int, axis: int, a: int, b: int, steps: int) -> None:  # noqa: PLR0913
-    """Set the lead of a crossing whose neighbours along an axis have the codes ``a`` and ``b``."""
+    """Set a crossing's lead along one axis, where its two neighbours have the codes ``a`` and ``b``."""
     plane = _ANCHORS + 2 * axis
     lead = 0
     if state[RUN, u, k] == 0:
@@ -155,10 +155,10 @@ def _counts(state: _Int, u: int, k: int, steps: int) -> bool:
 
 @njit_part
 def _any_crossing(state: _Int, limits: _Int) -> bool:
-    """Return whether a crossing's code is suspiciously constant.
+    """Return whether the code of any crossing is suspiciously constant.
 
-    The code is suspicious if the neighbours' codes change in the meantime, or if most other crossings have
-    shorter runs.
+    A constant code is suspicious if the neighbours' codes have changed during the run, or if most other
+    crossings have shorter runs.
     """
     known = still = longest = 0
     lead = limits[CROSSING_LEAD]
@@ -177,10 +177,10 @@ def _any_crossing(state: _Int, limits: _Int) -> bool:
 
 @njit_part
 def _any_wire(state: _Int, limits: _Int) -> bool:
-    """Return whether a wire's codes are suspiciously constant.
+    """Return whether the codes of any wire are suspiciously constant.
 
-    The codes are suspicious if the neighbours' codes change in the meantime, or if most crossings have
-    shorter runs.
+    Constant codes are suspicious if the neighbours' codes have changed during the run, or if most other
+    crossings have shorter runs.
     """
     for side in range(2):
         wires, others = state.shape[1 + side], state.shape[2 - side]
@@ -206,7 +206,7 @@ def _any_wire(state: _Int, limits: _Int) -> bool:
 
 
 def compile_kernels() -> None:
-    """Compile the kernel, or load it from the cache, before the first scan arrives."""
+    """Compile :func:`follow` or load its compiled code from the cache, before the first scan arrives."""
     codes = np.zeros((1, 1), np.uint32)
     codes.setflags(write=False)
     follow(codes, new_runs((1, 1)), np.zeros(7, np.int64), np.zeros(8, np.int64))

@@ -1,11 +1,14 @@
 """Check the codes of each scan to detect a stopped converter and faulty parts of the patch.
 
-Before a scan is solved, :meth:`CodeWatch.judge` compares the scan's codes with the previous codes; the
-comparison takes about 5 µs. The resulting :class:`Verdict` states whether the field can be trusted
-(:mod:`skinnode.host.converter_liveness`), which frozen crossings are left out of the field
-(:mod:`skinnode.host.frozen_parts`), and which wires are open or shorted according to their codes. After the
-fields of all patches have been published, :meth:`CodeWatch.on_scan` searches for noisy and drifting wires
-(:mod:`skinnode.host.wire_windows`).
+Before a scan is solved, :meth:`CodeWatch.judge` compares the scan's codes with the previous codes in about 5
+µs and returns a :class:`Verdict`. The verdict states:
+
+- whether the scan's field can be trusted (:mod:`skinnode.host.converter_liveness`),
+- which crossings are frozen and therefore left out of the solve (:mod:`skinnode.host.frozen_parts`),
+- which wires are open or shorted.
+
+After the fields of all patches have been published, :meth:`CodeWatch.on_scan` searches for noisy and drifting
+wires (:mod:`skinnode.host.wire_windows`).
 """
 
 from __future__ import annotations
@@ -166,6 +169,9 @@ class CodeWatch:
         return Verdict(distrust, (*faults, *parts.faults), parts.left_out)
 
     def on_scan(self, scan: Scan) -> None:
-        """Add a scan to the search for noisy and drifting wires. Call :meth:`judge` with the scan first."""
+        """Add a scan to the statistics that reveal noisy and drifting wires.
+
+        Call :meth:`judge` with the same scan first.
+        """
         if scan.complete and not scan.flags & _CHANGED_ONLY:
             self._windows.on_scan(scan)

@@ -74,8 +74,9 @@ class Configurator:
 
         Raises:
             NodeTimeout: if the node does not respond before the timeout.
-            NodeError: if the node is not the patch in the hand file, or does not keep its configuration.
-            SdoAbort: if the node refuses a transfer.
+            NodeError: if the node does not match the hand file, or a parameter read back from the node
+                differs from the value written.
+            SdoAbort: if the node aborts an SDO transfer.
             ConfigError: if the baseline file does not match the patch.
             Abandoned: if ``abandoned`` returned True.
         """
@@ -189,7 +190,7 @@ class Configurator:
         _watch_master(remote, watched)
 
     def _configure_heartbeat(self, remote: RemoteOd, *, master: bool) -> float:
-        """Set the heartbeat period, unless another master has already set it. Returns the period, s."""
+        """Set the node's heartbeat period unless another master has set the period. Returns the period, s."""
         heartbeat_ms = self.hand.bring_up.heartbeat_ms
         if not master:
             present_ms = int(remote.read(od.HEARTBEAT_PRODUCER, 0, "u16"))
@@ -245,15 +246,17 @@ class Configurator:
                     raise _mismatch(patch, what, f"0x{mapped:08X}", f"0x{entry:08X}")
 
     def settle_baseline(self, patch: PatchConfig, profile: PatchProfile, remote: RemoteOd) -> Float:
-        """Return the node's baseline, after writing the values of the hand's baseline file if they differ.
+        """Return the node's baseline.
 
-        A node returns zeros while it tares itself; the tare must finish before the boot deadline.
+        If the hand file names a baseline file, the values of that file are first written to the node, unless
+        the node already has them. A node returns zeros while it tares itself; the tare must finish before the
+        boot deadline.
 
         Returns:
             (U, K) ohm: resistances at rest.
 
         Raises:
-            NodeError: if the node does not keep the baseline, or a value is not positive.
+            NodeError: if the node does not store the baseline written to it, or a value is not positive.
             SkinError: for the reasons listed under :meth:`configure`.
         """
         expected = None if patch.baseline is None else load_baseline(patch.baseline, profile)
@@ -282,9 +285,9 @@ class Configurator:
     def _read_baseline(self, patch: PatchConfig, profile: PatchProfile, remote: RemoteOd) -> Float:
         """Read the baseline as one block, or value by value if the node does not support block transfer.
 
-        For 300 values, a block transfer requires 176 frames, and single reads require 600 frames. At 1
-        Mbit/s, the block transfer takes 86 ms because the node sends its segments at a limited rate; the
-        single reads take 75 ms plus 300 response times. Single reads never saturate the bus.
+        A block transfer of 300 values requires 176 frames and takes 86 ms at 1 Mbit/s, because the node
+        limits the rate of its segments. Reading value by value requires 600 frames and takes 75 ms plus the
+        node's response times, but never saturates the bus.
         """
         try:
             data = remote.read_block(od.BASELINE_DOMAIN, 4 * profile.n_codes)
@@ -310,11 +313,11 @@ class Configurator:
 def is_configured(patch: PatchConfig, hand: HandConfig, remote: RemoteOd) -> bool:
     """Return whether a node still has the parameter values that it needs to send scans.
 
-    The parameters are wrong if the node was reset unnoticed during bring-up, or if another master configured
-    the node.
+    The values may be wrong if the host did not notice a reset of the node during bring-up, or if another
+    master has configured the node.
 
     Returns:
-        Whether the node has the values that the host writes as a master.
+        True if the node has the values that the host would write to it.
 
     Raises:
         NodeError: if reading fails; see :class:`RemoteOd`.
@@ -328,7 +331,7 @@ def is_configured(patch: PatchConfig, hand: HandConfig, remote: RemoteOd) -> boo
 
 
 def _open_window(remote: RemoteOd) -> None:
-    """Disable the synchronous window (0x1007), which might end before the summary is sent.
+    """Disable the synchronous window (0x1007), which might end before the node has sent the whole scan.
 
     A node without object 0x1007 has no synchronous window.
     """
@@ -342,8 +345,8 @@ def _open_window(remote: RemoteOd) -> None:
 def _watch_master(remote: RemoteOd, watched: int) -> None:
     """Make the node monitor the host's heartbeat, using entry 1 of object 0x1016.
 
-    If another entry contains the host's node-ID, that entry is cleared, because a node-ID may occur only
-    once. All other entries stay unchanged.
+    If another entry contains the host's node-ID, that entry is cleared, because two entries must
+    not contain the same node-ID. All other entries stay unchanged.
     """
     try:
         remote.write_checked(od.HEARTBEAT_CONSUMER, 1, "u32", watched)

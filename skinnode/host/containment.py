@@ -1,8 +1,8 @@
 """Contain exceptions in the host's threads.
 
-An exception raised while serving one subject (a patch, a bus or a subscriber) is reported to that subject's
-:class:`Defects` and does not affect other subjects. The failed operation is then retried. The table in
-:mod:`skinnode.host` lists the effects of an exception in each thread.
+Exceptions are recorded in :class:`Defects`; each patch and each bus has its own record. An exception that
+concerns one patch, bus or subscriber does not affect the others. The failed operation is retried. The table
+in :mod:`skinnode.host` lists the effects of an exception in each thread.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ _log = logging.getLogger(__name__)
 
 _BRIEF_S: Final = 0.001
 _LONGEST_BRIEF_S: Final = 0.02
-"""First and longest pause (s) after an exception in a loop that serves several subjects. The pauses are short
-because a failure in one subject must not delay the others.
+"""First and longest pause (s) after an exception in a loop that serves several patches or buses. The pauses
+are short because a failure of one patch or bus must not delay the others.
 """
 
 _COMPLAINTS: Final = 64
-"""Maximum number of logged messages remembered per subject. After this number of distinct messages, an
+"""Maximum number of logged messages that a record remembers. After this number of distinct messages, an
 earlier message may be logged again.
 """
 
@@ -39,18 +39,18 @@ def one_line(error: BaseException | None) -> str:
 
 @dataclass(frozen=True, slots=True)
 class DefectStats:
-    """Statistics of the exceptions raised while serving one subject."""
+    """Statistics of the exceptions in a :class:`Defects` record."""
 
     count: int
     newest: str | None
-    """Most recently failed operation and its exception, in one line; None before the first exception."""
+    """Operation that failed most recently and its exception, in one line; None before the first exception."""
 
 
 class Defects:
-    """Thread-safe record of the exceptions raised while serving ``subject``.
+    """Thread-safe record of the exceptions that concern ``subject``, for example a patch or a bus.
 
-    When a distinct message first occurs, the message is passed to ``on_new``, logged as one line at level
-    WARNING, and logged with the traceback at level DEBUG.
+    The first exception with a given message is passed to ``on_new``, logged as one line at level WARNING, and
+    logged with its traceback at level DEBUG.
     """
 
     def __init__(self, subject: str, on_new: Callable[[SkinError], object] = lambda error: None) -> None:
@@ -67,7 +67,7 @@ class Defects:
 
     @property
     def newest(self) -> str | None:
-        """Most recently failed operation and its exception, in one line; None before the first exception."""
+        """Operation that failed most recently and its exception, in one line; None if nothing has failed."""
         return self._newest
 
     def stats(self) -> DefectStats:
@@ -98,7 +98,7 @@ class Defects:
 def keep_on(turn: Callable[[], bool], defects: Defects, doing: str) -> None:
     """Call ``turn`` repeatedly until it returns False.
 
-    If a call raises an exception, the next call follows after a pause of 1 to 20 ms.
+    After a call that raises an exception, the function pauses for 1 to 20 ms.
     """
     pause = Pause(_BRIEF_S, _LONGEST_BRIEF_S)
     while True:

@@ -3,25 +3,30 @@
 **Phase.** Some patches count their conversions and send the conversion phase
 (:attr:`~skinnode.protocol.summary.SummaryFlag.CONVERSIONS`). If two successive scans of a patch have the same
 phase and the same codes, both scans contain the same conversion. If scans were missed or a summary was lost,
-an equal phase proves nothing. A changed phase always proves that a conversion took place.
+an unchanged phase is inconclusive. A changed phase always proves that a conversion took place.
 
 **Repeats.** If a patch sends no phase, only its codes show whether the converter is running. A run is a
-sequence of scans in which no code changes. A run is considered frozen if, at the noise stated in the hand
-file, a live converter would produce the run with a probability below ``FALSE_ALARM``. The run must also be
-improbable for a quieter converter: its probability must be below ``FALSE_ALARM_QUIET`` at the stated noise
-divided by ``QUIETER``, or at half of the noise measured by :mod:`skinnode.host.wire_windows`, whichever is
-higher. In addition, a code must have returned to its previous value in at least ``FLICKERS`` earlier scans,
-which proves that the codes are noisy. Finally, the run must be at least ``LONGER`` times as long as the
-longest run of the live converter so far. Runs at rest and runs under a press are compared separately, because
-the same converter repeats its codes for minutes at rest, but only for two or three scans under a press.
+sequence of scans in which no code changes. A converter is considered stopped if all of
+these conditions are met:
 
-**Doubt.** A few repeated scans do not prove that a patch is frozen, but its fields may already show an
-outdated press. If the codes of a patch suddenly stop changing in mid-movement, the next ``DOUBT_RUN`` fields
-are therefore not trusted. This rule applies only to patches that send no phase, have noisy codes and have
-never repeated all their codes before.
+- At the noise stated in the hand file, the probability of such a long run is at most ``FALSE_ALARM`` for a
+  running converter.
+- At a lower noise, the probability is at most ``FALSE_ALARM_QUIET``. The lower noise is the larger of two
+  values: the stated noise divided by ``QUIETER``, and half of the noise measured by
+  :mod:`skinnode.host.wire_windows`.
+- In at least ``FLICKERS`` earlier scans, a code has returned to its previous value. Such a return proves that
+  the codes are noisy.
+- The run is at least ``LONGER`` times as long as any earlier run in which the converter was running. Runs at
+  rest and runs under a press are compared separately, because the same converter repeats its codes for
+  minutes at rest, but only for two or three scans under a press.
 
-If the phase and the codes are inconclusive and no code has changed for a second, the converter's state is
-*cannot tell*.
+**Doubt.** A few repeated scans do not prove that a converter has stopped, but the fields may already show a
+press that has ended. If the codes of a patch suddenly stop changing in mid-movement, the next ``DOUBT_RUN``
+fields are therefore not trusted. This rule applies only to patches that send no phase, have noisy codes and
+have never repeated all their codes before.
+
+If the phase and the codes are inconclusive and no code has changed for a second, the state of the converter
+is unknown (:attr:`Alive.CANNOT_TELL`).
 """
 
 from __future__ import annotations
@@ -43,25 +48,23 @@ from skinnode.text.words import counted
 _SOURCE_FAILED: Final = int(SummaryFlag.SOURCE_FAILED)
 
 FALSE_ALARM: Final = 1e-12
-"""Significance level of the test for frozen parts: maximum probability that a live crossing, wire or patch
-repeats its codes as often as observed. A patch of 10 × 30 wires has 341 parts. At 100 scans/s, these parts
-undergo 1.2e9 tests in ten hours, so 0.001 false alarms are expected; at most one false alarm is permitted.
+"""Significance level of the tests for frozen crossings, wires and patches. A patch of 10 × 30 wires is tested
+341 times per scan: 300 crossings, 40 wires and the whole patch. Ten hours at 100 scans/s comprise 1.2e9
+tests, so about 0.001 false alarms are expected.
 """
 FALSE_ALARM_QUIET: Final = 1e-8
-"""Maximum probability that a live patch repeats its codes as often as observed if its noise is lower than
-stated by the factor ``QUIETER``. In ten hours (3.6e6 scans), a patch with so little noise would cause 0.04
-false alarms; few converters are so quiet.
+"""Significance level of the same test for a patch whose noise is only 1/``QUIETER`` of the stated noise. In
+ten hours (3.6e6 scans), about 0.04 false alarms are expected for such a patch.
 """
 QUIETER: Final = 10.0
-"""Maximum ratio of the noise stated in the hand file to a converter's actual noise."""
+"""Factor by which the noise stated in the hand file may exceed the actual noise of a converter."""
 ABRUPT: Final = 16
-"""Threshold (codes) for an abrupt stop of a movement: at least one code must have changed by this amount in
-the last scan before the stop. The value has not been tuned.
+"""Minimum change (codes) of at least one code in the last scan before a run, for the run to be considered an
+abrupt end of a movement. The value has not been tuned.
 """
 DOUBT_RUN: Final = 64
-"""Number of scans after an abrupt stop whose fields are not trusted; later fields are distrusted only if the
-repeats are improbable. Most simulated patches that froze in mid-press were detected within 11 scans; some
-took more than 16 scans.
+"""Number of scans for which fields are not trusted after a movement has ended abruptly. In simulations, most
+converters that stopped in mid-press were detected within 11 scans, and a few after more than 16 scans.
 """
 FLICKERS: Final = 5
 """Minimum number of scans in which a code must have returned to its previous value before a patch's codes are
@@ -72,17 +75,17 @@ LONGER: Final = 4
 PROOF_NS: Final = 1_000_000_000
 """Time (ns) for which a converter is considered running after a code or the phase has changed."""
 PHASES_REPEATED: Final = 3
-"""Number of scans without a new conversion after which a patch is reported as frozen. Fields are not trusted
-from the first such scan. The value equals the number of missed scans after which a patch is reported as
+"""Number of scans without a new conversion after which a patch is reported as frozen. Even the field of the
+first such scan is not trusted. The value equals the number of missed scans after which a patch is reported as
 stale.
 """
 _MOVED: Final = 16
-"""Minimum distance (codes) of a code from its rest value for its quantization error to be considered
-random.
+"""Minimum difference (codes) between a code and the rest code for the resistance to be considered randomly
+distributed within its quantization step.
 """
 _SPREAD: Final = 30
-"""Minimum number of distinct codes at least ``_MOVED`` from the rest code for a patch to be considered
-pressed.
+"""Minimum number of distinct codes that differ from the rest code by at least ``_MOVED``, for a patch to be
+considered pressed.
 """
 
 
@@ -92,9 +95,10 @@ class Alive(enum.StrEnum):
     YES = "yes"
     NO = "no"
     CANNOT_TELL = "cannot tell"
-    """No scan has been received yet, or no code has changed for a second for an unknown reason.
-    Repeated codes prove nothing if the patch does not count its conversions and its converter has very little
-    noise.
+    """No scan has been received yet, or no code has changed for a second and the reason is unknown.
+
+    The reason is unknown, for example, if the patch does not count its conversions and its converter has so
+    little noise that a running converter would also repeat its codes.
     """
 
 
@@ -111,9 +115,9 @@ class ConverterLiveness:
         self._rest = round((1.0 - scale.lo) / scale.step)
         self.measured_noise = 0.0
         """Noise (codes) measured over recent windows of scans; 0 if no noise could be measured."""
-        self._log_p = 0.0  # log probability of a frozen current run, else 0
-        self._abrupt = False  # whether the current run began with an abrupt stop
-        self._improbable = False  # whether a live converter is very unlikely to produce the run
+        self._log_p = 0.0  # log probability of the current run if the run is improbable, else 0
+        self._abrupt = False  # whether the current run abruptly ended a movement
+        self._improbable = False  # whether a running converter would hardly repeat its codes for so long
         self._largest = 0  # largest change (codes) in the last scan that changed
         self._run = self._codes = self._flickers = self._check_at = 0
         self._pressed = False
@@ -131,7 +135,9 @@ class ConverterLiveness:
 
     @property
     def doubtful(self) -> bool:
-        """Whether a movement ended abruptly within the last ``DOUBT_RUN`` scans."""
+        """Whether a movement ended abruptly and all codes have repeated since, for at most ``DOUBT_RUN``
+        scans.
+        """
         return self._abrupt and self._run <= DOUBT_RUN
 
     @property
@@ -174,8 +180,9 @@ class ConverterLiveness:
 
         Args:
             scan: Scan to evaluate.
-            counts: Number of crossings measured, changed, and returned to the previous code; largest change
-                of a code; smallest code.
+            counts: Results of :func:`~skinnode.host.code_runs.follow`: number of codes that are measurements,
+                number of changed codes, number of codes that returned to their previous value, largest change
+                of a code, smallest code.
             last: (U, K) last code of each crossing.
             run: (U, K) number of scans since each crossing's code last changed.
         """
@@ -183,7 +190,7 @@ class ConverterLiveness:
         self._t_ns = scan.t_last_ns
         if changed:
             self._end_run(returned, largest)
-        # up to `_missing` codes may differ only because the previous scan did not contain them
+        # the changed codes may be those that the previous scan did not contain
         self._compare_phase(scan, unchanged=measured > 0 and changed <= self._missing)
         self._missing = 0 if scan.flags & SummaryFlag.CHANGED_ONLY else scan.codes.size - measured
         if changed or not measured or scan.flags & SummaryFlag.CHANGED_ONLY:
@@ -217,7 +224,7 @@ class ConverterLiveness:
     def _end_run(self, returned: int, largest: int) -> None:
         self._t_proof_ns = self._t_ns
         self._flickers += returned > 0
-        if self._run and (not self._repeats_frozen() or largest <= 1):  # the converter was live in this run
+        if self._run and (not self._repeats_frozen() or largest <= 1):  # the converter was running
             self._longest[self._pressed] = max(self._longest[self._pressed], self._run)
         self._run = self._codes = self._check_at = self._same_phase = 0
         self._pressed = self._abrupt = self._improbable = False

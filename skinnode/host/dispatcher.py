@@ -31,8 +31,8 @@ _MARKS: Final = 10
 """Number of summing intervals in the moving average of the bus load."""
 
 _POLL_NS: Final = 2_000_000
-"""Minimum interval (ns) between calls to the pollers. Although a batch of frames arrives about every
-millisecond, the pollers' timeouts are at least 5 ms and need no finer resolution.
+"""Minimum interval (ns) between calls to the pollers. Polling after every batch of frames, about once a
+millisecond, is unnecessary because the shortest timeout of a poller is 5 ms.
 """
 
 
@@ -56,7 +56,7 @@ class BusStats:
     controller: BusState | None
     """Most recently reported state of the CAN controller; None if no state has been reported."""
     foreign_ids: Mapping[int, int]
-    """Number of frames for each foreign COB-ID."""
+    """Number of data frames with each COB-ID that the host does not expect on this bus."""
     read: int
     """Number of frames of all types read from the interface."""
     waiting: int
@@ -71,9 +71,7 @@ class BusStats:
     outages: int
     """Number of times the CAN interface has failed and been reopened."""
     bits: int
-    """Total length (bits, including stuff bits) of all data frames received and sent, as of at most 0.1 s
-    ago.
-    """
+    """Total length (bits, including stuff bits) of all data frames received and sent; updated every 0.1 s."""
     load: float
     """Bus load over the last second, as a fraction of the capacity."""
 
@@ -131,7 +129,9 @@ class Dispatcher:
         self._handlers[cob_id] = handler
 
     def listen(self, listener: Callable[[Sequence[Frame]], None]) -> None:
-        """Pass each batch of frames of all types to ``listener`` before the handlers. Mainline only."""
+        """Pass each batch of frames of all types to ``listener`` before calling the handlers. Mainline
+        only.
+        """
         self._listeners = (*self._listeners, listener)
 
     def unlisten(self, listener: Callable[[Sequence[Frame]], None]) -> None:
@@ -151,7 +151,7 @@ class Dispatcher:
         """Handle ``error``, which was raised by the operation ``doing``.
 
         Raises:
-            Exception: always ``error``; unlike a live bus, a replay may stop at an exception.
+            Exception: always ``error``, so that a replay stops. On a live bus, the method is overridden.
         """
         raise error
 
@@ -227,8 +227,8 @@ class Dispatcher:
     def measure(self, now_ns: int) -> None:
         """Compute the bus load if a summing interval has passed.
 
-        Computing the bus load takes as long as handling forty frames. A mainline that serves several buses
-        therefore calls this method for only one bus per iteration.
+        Because computing the bus load is slow, a mainline that serves several buses calls this method for
+        only one bus per iteration.
         """
         if now_ns >= self._marks[-1][0] + _MARK_NS:
             self._mark(now_ns)
@@ -269,7 +269,7 @@ class Dispatcher:
 
     def _on_error_frame(self, frame: Frame) -> None:
         self._error_frames += 1
-        if self.config.interface == "socketcan":  # other interfaces encode error frames differently
+        if self.config.interface == "socketcan":  # only SocketCAN encodes the controller state in this way
             state, before = bus_state(frame), self._bus_state
             if state is not None:
                 self._bus_state = state

@@ -1,4 +1,4 @@
-"""Provide a bounded queue whose slow reader loses the oldest items instead of delaying the writer.
+"""Provide a bounded queue that drops its oldest items if the reader is slow, so that the writer never waits.
 
 The standard library has no such queue: a full ``queue.Queue`` blocks or rejects a new item;
 ``collections.deque(maxlen=…)`` drops items without counting them, and its reader cannot wait for an item.

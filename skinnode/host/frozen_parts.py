@@ -1,23 +1,23 @@
-"""Detect frozen wires and crossings of a live patch, so that they can be left out of the solve.
+"""Detect frozen wires and crossings on a patch whose converter is running, and leave them out of the solve.
 
-**Movement.** A crossing is frozen if its code repeats exactly while the codes of all four neighbours change
-in the same direction by at least ``CROSSING_LEAD`` codes. A wire is frozen if all its codes repeat while, for
-at least ``LEADS`` of its crossings, the codes of the neighbours on the adjacent wires change by at least
-``WIRE_LEAD`` codes. The movement criteria do not depend on the converter's noise.
+**Movement.** A crossing is considered frozen if its code stays constant while the codes of its four
+neighbours all rise or all fall by at least ``CROSSING_LEAD``. A wire is considered frozen if all its codes
+stay constant while the codes of both adjacent wires rise or fall by at least ``WIRE_LEAD`` at ``LEADS`` or
+more crossings. These criteria do not depend on the converter's noise. :mod:`skinnode.host.code_runs` defines
+how far the neighbours' codes have changed (the *lead*).
 
-The limits of these criteria were verified with simulated presses on live patches. The term *lead* is defined
-in :mod:`skinnode.host.code_runs`. In 696 presses (two layouts, layers of 0.3 to 1 pitch, depths of 2 to 50 %,
-friction of 0 to 0.8, noise of 0 to 3e-6, 16-bit codes), the maximum lead of a crossing whose code stayed
-constant for five scans was 75 codes. In 1,800 presses without noise (depths from 0.2 %), the maximum lead of
-a wire whose codes stayed constant for at least one scan was 25 codes. For comparison, an indentation of 10 %
-changes codes by thousands of codes.
+The limits were verified by simulating presses on patches without faults:
 
-**Noise.** A wire or crossing is also frozen if the probability that a live converter would repeat its codes
-as often as observed is :data:`~skinnode.host.converter_liveness.FALSE_ALARM` or less. The probability of the
-repeats is computed for a tenth of the stated noise, or for half of the recently measured noise if that is
-larger. In addition, at least three quarters of the other crossings must have runs less than a quarter as long
-as that of the suspected part. This condition prevents false alarms if the converter has less noise than
-assumed: in that case, all crossings repeat their codes.
+- In 696 presses, no crossing whose code was constant for five scans had a lead of more than 75 codes.
+- In 1,800 presses without converter noise, no wire whose codes were constant for one scan had a lead of more
+  than 25 codes.
+
+**Noise.** A wire or crossing is also considered frozen if its run would be very improbable for a running
+converter, that is, if the probability is at most :data:`~skinnode.host.converter_liveness.FALSE_ALARM`. The
+noise assumed for this probability is a tenth of the stated noise, or half of the recently measured noise if
+the latter is larger. In addition, at least three quarters of the other crossings must have runs shorter than
+a quarter of this run. If the converter has less noise than assumed, all crossings repeat their codes, and the
+second condition prevents a false alarm.
 
 A frozen wire or crossing is used in the solve again as soon as one of its codes changes.
 """
@@ -52,17 +52,17 @@ from skinnode.model.data_fault import DataFault, FaultKind, FaultyPart
 from skinnode.protocol.codes import CodeScale
 
 CROSSING_LEAD: Final = 512
-"""Minimum lead (codes) at which a crossing is considered frozen: seven times the maximum lead of the live
-crossings in 696 simulated presses.
+"""Minimum lead (codes) of a frozen crossing. The value is seven times the largest lead in 696 simulated
+presses without a frozen crossing.
 """
 WIRE_LEAD: Final = 64
-"""Minimum lead (codes) that ``LEADS`` crossings of a wire must have before the wire is considered frozen: 2.5
-times the maximum lead of live wires in 1,800 simulated presses.
+"""Minimum lead (codes) at ``LEADS`` crossings of a frozen wire. The value is 2.5 times the largest lead in
+1,800 simulated presses without a frozen wire.
 """
 _NEVER: Final = 2**62
 _OTHERS: Final = 0.75
-"""Minimum fraction of the other crossings that must have runs shorter than a quarter of the frozen part's
-run.
+"""Minimum fraction of the other crossings whose runs are shorter than a quarter of the run of a frozen wire
+or crossing.
 """
 
 
@@ -90,12 +90,12 @@ class FrozenParts:
         self.assume_noise(0.0, 0)
 
     def assume_noise(self, measured: float, least: int) -> None:
-        """Set the minimum runs of frozen wires and crossings from the assumed noise.
+        """Compute the run at which a wire or crossing is considered frozen, from the assumed noise.
 
         Args:
             measured: Noise (codes) measured over recent windows of scans; 0 if no noise could be measured.
-            least: Smallest code of a scan. The smallest code has the lowest noise, because noise is
-                proportional to the resistance.
+            least: Smallest code of a scan. This code has the lowest noise, because the noise is proportional
+                to the resistance.
         """
         ratio = max(self._scale.lo + least * self._scale.step, self._scale.step)
         self._log_stay = log_stay(ratio * max(self._stated / QUIETER, 0.5 * measured))
@@ -135,7 +135,9 @@ class FrozenParts:
     def _wire(
         self, known: NDArray[np.bool_], run: NDArray[np.int64], lead: NDArray[np.int64], at: Any, limit: int
     ) -> float | None:
-        """Return the log probability of a wire's run if the wire were live; None if not frozen."""
+        """Return the log probability of a frozen wire's run without a fault; None if the wire is not
+        frozen.
+        """
         here = known[at]
         if not here.any() or (least := int(run[at][here].min())) < 1:
             return None

@@ -135,9 +135,7 @@ class ConverterLiveness:
 
     @property
     def doubtful(self) -> bool:
-        """Whether a movement ended abruptly and all codes have repeated since, for at most ``DOUBT_RUN``
-        scans.
-        """
+        """Whether all codes stopped changing abruptly, at most ``DOUBT_RUN`` scans ago."""
         return self._abrupt and self._run <= DOUBT_RUN
 
     @property

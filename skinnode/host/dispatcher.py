@@ -129,9 +129,7 @@ class Dispatcher:
         self._handlers[cob_id] = handler
 
     def listen(self, listener: Callable[[Sequence[Frame]], None]) -> None:
-        """Pass each batch of frames of all types to ``listener`` before calling the handlers. Mainline
-        only.
-        """
+        """Pass each batch of frames of all types to ``listener``, then to the handlers. Mainline only."""
         self._listeners = (*self._listeners, listener)
 
     def unlisten(self, listener: Callable[[Sequence[Frame]], None]) -> None:

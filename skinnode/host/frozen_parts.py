@@ -135,9 +135,7 @@ class FrozenParts:
     def _wire(
         self, known: NDArray[np.bool_], run: NDArray[np.int64], lead: NDArray[np.int64], at: Any, limit: int
     ) -> float | None:
-        """Return the log probability of a frozen wire's run without a fault; None if the wire is not
-        frozen.
-        """
+        """Return the log probability of a frozen wire's run; None if the wire is not frozen."""
         here = known[at]
         if not here.any() or (least := int(run[at][here].min())) < 1:
             return None

@@ -1,18 +1,19 @@
-"""Upper bound on the force of a contact on an uncalibrated layer.
+"""Upper bound on a contact's normal force if the forces are not calibrated.
 
 The solver computes forces from the displacement of an elastic half-space, but real skin is a layer on a
 support. The stiffest case is a layer of incompressible rubber bonded to a rigid support. For the same
-displacement, such a layer carries more force than the half-space, and the ratio grows with the width of the
-contact relative to the layer's thickness. Under Hertz's pressure over a circle of radius a, a layer of
-thickness t is indented by
+displacement, such a layer carries more force than the half-space; the ratio of the forces grows with the
+ratio of contact radius to layer thickness. A Hertz pressure p over a circle of radius a indents a layer of
+thickness t and shear modulus G by
 
     δ = (1/2πG) ∫ p̂(k) f(k t) dk,   f(x) = (sinh 2x − 2x) / (cosh 2x + 1 + 2x²),   p̂(k) = ∫ p e^(ikx) d²x
 
 where f = 1 for the half-space (Johnson, Contact Mechanics, 1985, 5.8; the thin-layer limit F ∝ G a⁴ δ / t³ is
 from Barber, International Journal of Mechanical Sciences 32, 129, 1990). At the same δ, the ratio of the
 bonded layer's force to the half-space's force is a function of a/t. The force on any real layer is between
-these two limits. The sum of the half-space's pressing loads is a second bound: on thicker layers, pulling
-loads cancel part of this sum.
+the force on the half-space and the force on the bonded layer. On thick layers, the half-space model needs
+negative loads that cancel part of the positive loads; the sum of the positive loads is therefore a second
+bound.
 """
 
 from __future__ import annotations
@@ -31,10 +32,9 @@ most 12 %.
 CUBIC: Final = 0.51
 """Coefficient of (a/t)³ in the ratio of the bonded layer's force to the half-space's force."""
 SPAN: Final = 2.5
-"""Difference between the half-space's force and the bonded layer's force, in standard deviations. This
-standard deviation represents a bound on the model error rather than noise. At a value of 3, force errors
-reached 4.3 standard deviations (layers of 2, 4, 8 and 16 mm, contact radii from 1.6 to 10 mm, clearance of
-2 mm). A value of 2.5 keeps force errors below 5 standard deviations with some margin."""
+"""Ratio of the difference between the two forces (bonded layer and half-space) to the reported standard
+deviation. With a ratio of 3, force errors reached 4.3 standard deviations in tests; with 2.5, they remained
+below 5."""
 
 
 def stiffening(radius_m: float, thickness_m: float) -> float:
@@ -62,5 +62,5 @@ def bonded_force_n(rubber: Rubber, depth_m: float, radius_m: float, thickness_m:
 
 
 def layer_std_n(bonded_n: float, force_n: float) -> float:
-    """Return the force difference between bonded layer and half-space as a standard deviation, N."""
+    """Return the standard deviation, N, that covers the difference between bonded layer and half-space."""
     return math.fabs(max(bonded_n - force_n, 0.0)) / SPAN

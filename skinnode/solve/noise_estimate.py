@@ -1,23 +1,22 @@
-"""Estimate of a stream's actual noise relative to the stated noise, computed without a solve.
+"""Estimate of the ratio of a stream's actual noise to its stated noise, computed from the readings alone.
 
-The estimator groups frames into blocks of four. The four values of a reading yield two contrasts that do not
-depend on the reading's level or slope. If the noise of the four frames is independent, the contrasts are
-independent and have the same variance:
+The estimator groups frames into blocks of four. The four resistances of each crossing yield two contrasts,
+which are not affected by the mean or a linear trend of the resistance. If the noise of the four frames is
+independent, the contrasts are independent and have the same variance:
 
 quadratic  (r₀ − r₁ − r₂ + r₃) / 2
 cubic      (r₀ − 3 r₁ + 3 r₂ − r₃) / √20
 
-A block is used only if the two contrasts indicate pure noise. Motion of the skin is slow, so its quadratic
-contrast is larger than its cubic contrast; a step or a lost scan also makes the two contrasts unequal. Motion
-also shifts neighbouring readings in the same direction, whereas the signs of their noise are independent. A
-robust mean over the readings (Huber, Robust Statistics, 1981, proposal 2) prevents a few bad readings, or a
-touch on a few wires, from raising a block's noise level. The median over the last blocks prevents a bad block
-from distorting the estimate.
+A block is rejected if its contrasts show that the skin moved. Slow motion makes the quadratic contrast larger
+than the cubic contrast; a step or a lost scan also makes them unequal. In addition, motion shifts the
+readings of neighbouring crossings in the same direction, whereas noise does not. A robust mean over the
+readings (Huber, Robust Statistics, 1981, proposal 2) limits the effect of a few bad readings, or of a touch
+on a few wires, on the estimate of a block. The median over the last blocks limits the effect of a bad block.
 
-Exactly repeated readings carry no information about the noise, because the converter may be noiseless or
-frozen. If the rounding to codes is known, the estimate applies only to the noise before the converter, not to
-the rounding error. If most codes repeat and the others change by only one code, the estimator assumes a noise
-of half a code, the maximum.
+Readings that repeat exactly are not used, because they do not show whether the converter has little noise or
+is frozen. If the rounding error is known, the ratio applies only to the noise before the converter. If most
+codes repeat and the others change by only one code, the noise is at most half a code; the estimator then
+assumes half a code.
 """
 
 from __future__ import annotations
@@ -36,61 +35,59 @@ BLOCK: Final = 4
 WINDOW: Final = 11
 """Maximum number of blocks in the estimate (44 frames).
 
-The number is odd, so that the median of a full window is one block's noise level, and never the mean of an
-old and a new level.
+The number is odd, so that the median is the noise of a single block; the mean of two blocks could mix old and
+new noise.
 """
 LEAST_BLOCKS: Final = 5
 """Minimum number of blocks in the estimate (20 frames)."""
 PAUSE: Final = 12
 """Number of frames skipped after several rejected blocks, or after a block that agrees with a full window.
 
-Evaluating every frame would take 8 % of the computing time of a patch at rest.
+Without this pause, the noise estimate would take 8 % of the computing time of a patch at rest.
 """
 REPEATED: Final = 0.15
-"""Maximum share of repeated readings in a usable block.
+"""Maximum fraction of readings that repeat exactly in a usable block.
 
-If the noise is half a code, a tenth of the readings repeat in all four frames. At lower noise, the variance
-of the codes no longer equals the noise variance plus the rounding variance.
+With a noise of half a code, a tenth of the readings repeat in all four frames. With less noise, the variance
+of the codes is not the sum of the noise variance and the rounding variance.
 """
 ALIVE: Final = 4
 """Minimum number of changed readings in a block of mostly repeated readings; 0 for a frozen converter."""
 SAME: Final = 1e-14
 """Maximum contrast of a repeated reading, as a fraction of the reading; allows for float64 rounding."""
 DEVIATIONS: Final = 4.0
-"""Margin of each threshold, in standard deviations of the scatter.
+"""Margin added to each threshold, in standard deviations of the tested statistic.
 
-By chance, one block in 16,000 exceeds a threshold.
+A normal variable exceeds this margin once in 16,000 cases.
 """
 DEPARTED: Final = math.log(1.5)
 """Logarithm of the noise ratio (estimated to stated) above which the estimate replaces the stated noise.
-Below this threshold, the results are bit-identical to results with the stated noise."""
+Below this threshold, the solver uses the stated noise unchanged."""
 RETURNED: Final = math.log(1.25)
 """Logarithm of the noise ratio (estimated to stated) below which the stated noise is used again."""
 STEP: Final = math.log(1.05)
-"""Minimum change in the logarithm of the noise, in addition to the scatter margin, that updates an
-estimate in use. Smaller changes are ignored because every update requires another solve of the frame."""
+"""Minimum change in the logarithm of the noise factor, in addition to the margin, for updating a factor other
+than 1. Each update requires another solve of the frame."""
 UNEQUAL: Final = 0.3
-"""Maximum mean logarithm of the power ratio of the two contrasts. Motion that reaches this limit raises the
-estimate by 8 %. Noise of half a code, whose contrasts have few possible values, stays below 0.15."""
+"""Maximum mean logarithm of the ratio of the quadratic to the cubic contrast's variance. Motion at this limit
+raises the noise estimate by 8 %."""
 LEAST: Final = 1.0 / 30.0
 """Minimum ratio of estimated to stated noise."""
 
 _CLIP: Final = 1.0
-"""Clipping limit for squared values in Huber's proposal 2, in units of the variance. At this limit, one
-noisy lower wire and one noisy upper wire (13 % of the readings) raise the estimate by 20 %."""
+"""Clipping limit for squared values in Huber's proposal 2, in units of the variance. With this value, noise
+on one upper and one lower wire (13 % of the readings) raises the estimate by 20 %."""
 _CLIPPED_MEAN: Final = 0.5160585
 """Mean of min(z², 1) for a normal z: 1 − 2 φ(1)."""
 _STD: Final = 2.03
-"""Standard deviation of ln(variance) for a single value, derived from the robust mean's influence function.
-
-For an ordinary mean square, the corresponding value is 1.41.
+"""Standard deviation of ln(variance) for the robust mean of n readings, times √n; 1.41 for an ordinary mean.
 """
 _ITERATIONS: Final = 30
 """Maximum number of Newton steps; convergence takes 4 to 8 steps."""
 _ONE_CODE: Final = 12.5
-"""Squared contrast of readings that differ by one code, plus a margin, in units of the rounding variance."""
+"""Limit of the squared contrast of readings that change by one code, in units of the rounding variance."""
 _HALF_A_CODE: Final = 4.0
-"""Total variance due to rounding and half a code of noise, in units of the rounding variance."""
+"""Variance of rounding and a noise of half a code together, in units of the rounding variance."""
 _CUBIC: Final = 1.0 / math.sqrt(20.0)
 
 
@@ -123,12 +120,12 @@ def _variance(squares: Float, count: int) -> float:
 def _contrasts(
     frames: Float, noise: Float, rounding_ohm: Float, quadratic: Float, cubic: Float
 ) -> tuple[int, int, int, float, float, float]:
-    """Write the squared contrasts of the readings that changed, relative to their stated variances.
+    """Write the squared contrasts of the readings that changed, divided by the stated variances.
 
-    The arguments are the same as for :func:`assess_block`. Returns six values: the number of changed
-    readings, the number of repeated readings, the number of pairs of neighbouring readings, the sum of the
-    products of their signs, the share of the stated variance that is not due to rounding, and the largest
-    squared contrast in units of the rounding variance.
+    The arguments are those of :func:`assess_block`. Returns the number of changed readings, the number of
+    repeated readings, the number of compared pairs of neighbouring contrasts, the number of pairs with equal
+    signs minus the number with opposite signs, the fraction of the stated variance that is not due to
+    rounding, and the largest squared contrast in units of the rounding variance.
     """
     count, silent, pairs, signs, share, largest = 0, 0, 0, 0.0, 0.0, 0.0
     for u in range(frames.shape[1]):
@@ -168,9 +165,9 @@ def assess_block(
         cubic: (U K,) workspace.
 
     Returns:
-        The number of readings, or 0 if the block is rejected; the variances of the quadratic and the cubic
-        contrast, relative to the stated variance; and the share of the stated variance that is not due to
-        rounding.
+        The number of changed readings, or 0 if the block is rejected; the variances of the quadratic and of
+        the cubic contrast, divided by the stated variance; and the fraction of the stated variance that is
+        not due to rounding.
     """
     none = 0, 0.0, 0.0, 0.0
     count, silent, pairs, signs, share, largest = _contrasts(frames, noise, rounding_ohm, quadratic, cubic)
@@ -272,7 +269,7 @@ class NoiseEstimate:
         level = 0.5 * (levels[(len(levels) - 1) // 2] + levels[len(levels) // 2])
         agrees = abs(blocks[-1][1] - level) < RETURNED + DEVIATIONS * _STD / math.sqrt(8.0 * blocks[-1][0])
         self._pause = PAUSE if agrees and len(blocks) == WINDOW else 0
-        # standard error of the mean logarithm of the noise; 1.25 is the loss of precision due to the median
+        # standard error of the median logarithm of the noise: 1.25 times that of the mean
         std = 1.25 * 0.5 * _STD / math.sqrt(2.0 * values)
         self.relative_std = std
         unequal = math.fsum(block[2] for block in blocks) / len(blocks)

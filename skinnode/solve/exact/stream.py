@@ -1,8 +1,8 @@
-"""State shared by the parts of the exact tracker: solver, arrays and rest position of one patch.
+"""Solver, arrays and rest position of one patch, shared by the modules of the exact tracker.
 
-A root is accepted only on the branch that the skin can reach. On this branch, the determinant of J has the
-same sign as at rest, and no electrode moves farther than its clearance from the lower layer. A system with
-more equations than unknowns has no determinant; instead, χ² of the residual must be compatible with noise.
+A root of F = b is accepted only if the determinant of J has the same sign as at rest, and no electrode has
+moved farther than its clearance (its distance from the lower layer at rest). If a wire has more equations
+than unknowns, J has no determinant; instead, a χ² test compares the residual with the noise.
 """
 
 from __future__ import annotations
@@ -26,25 +26,25 @@ from skinnode.solve.wires.patch_solver import PatchSolver
 from skinnode.solve.wires.problem import PatchProblem
 
 TOLERANCE: Final = 1e-9
-"""Tolerance for r, and for x in pitches.
+"""Tolerance of a solve for the residual r, and for the positions x in pitches.
 
-The tolerance is four orders of magnitude below the noise of a 24-bit converter. A single Newton step reduces
-an error of 1e-5 to less than this tolerance.
+The value is four orders of magnitude below the relative noise of a 24-bit converter. One Newton step from an
+error of 1e-5 reaches this tolerance.
 """
 FRAME_STEPS: Final = 12
 """Maximum number of steps per solve; Newton's method takes 3 to 6 steps within the trust region."""
 TASKS: Final = wires.COVARIANCE | wires.REUSE
-"""Additional tasks for solves whose result can become the frame's result."""
+"""Tasks added to each solve: compute the covariance, and reuse the last J⁻¹ where possible."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Frame:
-    """Noise, order and deadline of the current frame."""
+    """Noise and deadline of the current frame, and the order in which its wires are solved."""
 
     sigma: float
     """Smallest relative standard deviation of the resistances."""
     order: Index
-    """(U,) indices of the wires, in processing order."""
+    """(U,) indices of the upper wires, in the order in which they are solved."""
     until: float
     """Deadline on the ``perf_counter`` clock, s; inf if there is none."""
 
@@ -63,7 +63,7 @@ class StreamState:
         problem: The patch in solver units.
         operator: Operator code.
         normal_only: Whether only z is unknown.
-        first: HOLD or PREDICT, the action for a wire that can be predicted.
+        first: HOLD or PREDICT: action for the wires whose J⁻¹ is known.
     """
 
     def __init__(self, problem: PatchProblem, operator: int, normal_only: bool, first: int) -> None:
@@ -100,10 +100,10 @@ class StreamState:
         options: SolveOptions | None = None,
         units: float = math.inf,
     ) -> None:
-        """Solve the wires in ``todo`` (U,) in one call.
+        """Solve the wires selected by ``todo`` (U,).
 
         Args:
-            todo: (U,) LEAVE, SOLVE, PREDICT or HOLD.
+            todo: (U,) action for each wire: LEAVE, SOLVE, PREDICT or HOLD.
             frame: Frame with σ and the order of the wires.
             a: (U, K) resistances; the frame's resistances by default.
             options: Solver options; the stream's options by default.
@@ -120,13 +120,13 @@ class StreamState:
         )
 
     def only(self, u: int) -> NDArray[np.uint8]:
-        """Return actions (U,) that solve wire u and skip all other wires."""
+        """Return the actions (U,) for a solve of wire u alone."""
         todo = np.full(len(self.solver.x), wires.LEAVE, np.uint8)
         todo[u] = wires.SOLVE
         return todo
 
     def roots(self) -> NDArray[np.bool_]:
-        """Return a mask (U,) of wires at a root that is within reach and on the rest position's branch."""
+        """Return a mask (U,) of the wires at a root that the skin can reach from the rest position."""
         solver = self.solver
         report, out_of_reach = solver.report, self.problem.out_of_reach(solver.x)
         return on_rest_branch(
@@ -139,10 +139,10 @@ class StreamState:
         return np.asarray((count > 0) & (count >= self.unknowns))
 
     def relative_residual(self, x: Float, a: Float) -> Float:
-        """Return a F − 1 (K,) of a wire at ``x`` (3N,), pitches."""
+        """Return the residuals a F(x) − 1 (K,) of a wire with its electrodes at ``x`` (3N,), pitches."""
         gaps = x.reshape(-1, 1, 3, 1) - self.problem.lower.transpose(1, 0, 2)[None]
         return np.asarray(relative_residual(a, (1.0 / np.sqrt((gaps**2).sum(axis=2))).sum(axis=(0, 1))))
 
     def a_at(self, x: Float) -> Float:
-        """Return the ``a`` (K,) for which a wire has its root at ``x`` (3N,), pitches."""
+        """Return the ``a`` (K,) for which a F(x) = 1 at the electrode positions ``x`` (3N,), pitches."""
         return np.asarray(1.0 / (1.0 + self.relative_residual(x, np.ones(self.problem.layout.shape[1]))))

@@ -1,13 +1,13 @@
 """Exact tracker: solves each frame of a live stream from the solution of the previous frame.
 
-Each wire passes through these stages until one of them yields a root:
+The tracker applies these stages to each wire until one of them finds a root of F = b:
 
-- hold: keep the position of a wire whose resistances changed no more than their noise (see ``hold``);
-- predict: move the wire by (∂x/∂R) ΔR, using the J⁻¹ stored with an earlier frame's covariance;
+- hold: keep the last position if the wire's resistances changed by no more than their noise (see ``hold``);
+- predict: move the wire by (∂x/∂R) ΔR, using the J⁻¹ of an earlier frame;
 - follow: take simplified Newton steps with the same J⁻¹ while it is accurate enough;
 - correct: iterate the operator to a tolerance far below any noise;
 - widen: add an omitted electrode to the unknowns if it seems to move (see ``leave_out``);
-- recover: bridge a wire that fails, or give up on the wire (see ``recover``).
+- recover: make further attempts if the solve of a wire fails (see ``recover``).
 
 The rules for acceptable roots are in :mod:`skinnode.solve.roots`.
 """
@@ -41,15 +41,15 @@ from skinnode.solve.wires.stages import DEADLINE
 UNIT_S: Final = 10e-6
 """Upper bound on the time for one evaluation of F and J and one step, s.
 
-Each call includes all wires that are certain to finish in the remaining time: splitting one call into ten
-costs as much extra time as solving ten wires.
+Each call of the solver includes all wires that are certain to finish before the deadline. Ten calls instead
+of one would take as much additional time as solving ten more wires.
 """
 WIRE_UNITS: Final = FRAME_STEPS + 1 + COVARIANCE_UNITS
-"""Maximum cost of a wire per frame, in evaluations of F and J."""
+"""Maximum computing time for one wire in one frame, as a number of evaluations of F and J."""
 
 
 class ExactTracker:
-    """Tracker for one patch, using the exact inverse of each wire.
+    """Tracker for one patch that solves each upper wire alone (exact inverse).
 
     Each patch needs its own tracker. The tracker's compiled code runs without the GIL.
 
@@ -58,16 +58,18 @@ class ExactTracker:
         operator: ``levenberg_marquardt``, ``dogleg`` or ``gauss_newton``.
         relative_noise: Relative standard deviation of R, a number or (U, K).
         baseline_ohm: (U, K) resistances measured at rest, ohm; if given, resistivity and gain cancel.
-        stiffness_n_per_m: Stiffness k of the paper's law F = k Δs, N/m; if given, fields contain forces.
-        hold: Whether to keep the position of a wire whose resistances changed no more than their noise.
-        deadline_us: Time limit of an update, µs; the update may exceed it by one solve of a wire. Wires not
-            processed by the deadline have the status DEADLINE and an infinite standard deviation; the next
-            frame starts with these wires.
+        stiffness_n_per_m: Stiffness k of the paper's law F = k Δs, N/m; if given, each field contains the
+            forces F.
+        hold: Whether to keep the last position of a wire if its resistances changed by no more than their
+            noise.
+        deadline_us: Time limit of an update, µs; an update can exceed the limit by the time to solve one
+            wire. Wires not processed by the deadline have the status DEADLINE and an infinite standard
+            deviation; the next frame starts with these wires.
         normal_only: Whether only z is unknown.
-        active_only: Whether to solve only for electrodes that contacts move.
+        active_only: Whether to fix electrodes at rest unless a contact moves them.
         codes: Mapping from the codes passed to :meth:`update_codes` to resistances.
-        noise_estimate: Estimate of the stream's noise, which scales the stated noise; the caller must reset
-            the estimate.
+        noise_estimate: Estimate of the stream's noise, which scales the stated noise. :meth:`reset` does not
+            reset this estimate.
 
     The constructor compiles the kernels. Raises ValueError if an argument has the wrong shape or is out of
     range.
@@ -101,7 +103,7 @@ class ExactTracker:
         problem = PatchProblem.of(layout, baseline_ohm)
         self.stiffness_n_per_m = stiffness_n_per_m
         self.untouched_force_n: Float | None = None
-        """(U, N, 3) forces on an untouched patch, N; used for all fields if no stiffness is given."""
+        """(U, N, 3) forces to report if no stiffness is given, N: the forces on an untouched patch."""
         self._noise = checked_noise(relative_noise, layout)
         self._sigma = float(self._noise.min())
         self._seconds = math.inf if deadline_us is None else deadline_us * 1e-6
@@ -154,12 +156,12 @@ class ExactTracker:
         No resistance value raises an exception. A wire with fewer usable resistances than unknowns is
         ILL_CONDITIONED, or NON_FINITE if resistances not marked as missing were unusable. Such a wire, and
         any wire for which no solve finds a root, keeps its last trusted position with an infinite standard
-        deviation. The residual of an unsolved wire is computed at its last trusted position, or is inf if no
-        time remains before the deadline. Raises ValueError if a shape is wrong.
+        deviation. The residual of an unsolved wire is computed at its last trusted position; after the
+        deadline, the residual is set to inf. Raises ValueError if a shape is wrong.
         """
         start = perf_counter()
         arrays = self.arrays
-        # copy into existing arrays, because the kernel stores their addresses
+        # the kernel stores the addresses of these arrays, so write into them
         arrays.ohm[:] = require_array("frame_ohm", frame_ohm, self.layout.shape, finite=False)
         arrays.noise[:] = (
             self._noise if relative_noise is None else broadcast_noise(relative_noise, self.layout)
@@ -193,7 +195,7 @@ class ExactTracker:
         return field
 
     def update_again(self, left_out: NDArray[np.bool_]) -> FieldFrame:
-        """Return the field of the last frame, solved from rest without the readings ``left_out`` (U, K)."""
+        """Solve the last frame again without the readings ``left_out`` (U, K), and return its field."""
         start = perf_counter()
         self.distrust(np.asarray(left_out.any(axis=1)))
         self.arrays.valid[left_out] = False
@@ -246,7 +248,7 @@ class ExactTracker:
         )
 
     def _call_stages(self, stages: int, sigma: float, units: float) -> tuple[float, int]:
-        """Run ``stages`` of the frame with :meth:`PatchSolver.advance`; return σ and the flags found."""
+        """Run ``stages`` with :meth:`PatchSolver.advance`; return σ and the flags of the outcome."""
         sigma, invalid, found = self._stream.solver.advance(
             stages, self.arrays, self._stream.options, sigma, units
         )
@@ -276,7 +278,7 @@ class ExactTracker:
         return residual
 
     def _complete(self) -> None:
-        """Write ``a`` for the missing equations of solved wires, as computed from the solution."""
+        """For solved wires with missing readings, write the values of ``a`` that the solution predicts."""
         stream, arrays = self._stream, self.arrays
         solved = arrays.good & (stream.solver.report[:, wires.HELD] == 0)
         for u in np.flatnonzero(solved & (arrays.used == 0).any(axis=1)).tolist():
@@ -284,10 +286,10 @@ class ExactTracker:
             arrays.a_solved[u, missing] = stream.a_at(arrays.x[u])[missing]
 
     def adopt(self, wires_: NDArray[np.bool_], displacement_m: Float) -> None:
-        """Replace the displacements (U, N, 3) of the given wires (U,), as if these were solutions."""
+        """Use the given displacements (U, N, 3) as the last solutions of the given wires (U,)."""
         stream, arrays = self._stream, self.arrays
         moved = (displacement_m / self.layout.pitch_m).reshape(arrays.x.shape)
-        if self._active_only:  # make every electrode an unknown again
+        if self._active_only:  # solve for all electrodes of these wires again
             self._left_out.take_in(wires_)
         for u in np.flatnonzero(wires_).tolist():
             arrays.x[u] = stream.problem.rest[u] + moved[u]
@@ -301,7 +303,7 @@ class ExactTracker:
         arrays.predictable[wires_] = False
 
     def _solve(self, frame: Frame) -> None:
-        """Solve as many wires as time allows, but at least one, so that the stream always makes progress."""
+        """Solve as many wires as time allows, but at least one."""
         units = math.inf
         if frame.until < math.inf:
             units = max(WIRE_UNITS, (frame.until - perf_counter()) / UNIT_S)
@@ -320,7 +322,7 @@ class ExactTracker:
             self._stream.solve(todo, frame, units=units)
 
     def _held_residual(self, u: int) -> float:
-        """Return the RMS of F/b − 1 for wire u at its held position; inf if no resistance is usable."""
+        """Return the RMS residual of wire u at its current position; inf if no resistance is usable."""
         arrays = self.arrays
         used = arrays.used[u] > 0
         if not used.any():

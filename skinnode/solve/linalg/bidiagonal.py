@@ -1,7 +1,7 @@
 """Bidiagonal form of a small matrix, from which a damped step can be computed in O(n) operations.
 
-Levenberg-Marquardt tries several damping parameters per Jacobian. Each trial costs O(n) operations with the
-bidiagonal form, but O(n³) with J itself.
+Levenberg-Marquardt tries several damping parameters per Jacobian. With the bidiagonal form, each trial takes
+O(n) operations; with J itself, it would take O(n³).
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ def bidiagonalise(  # noqa: C901, PLR0913 - four rows at a time; every result of
 
     ``a`` (n + 3, whole lanes of m) contains A padded with zeros, so that loops over four rows and whole
     vectors need no special cases. Writes B to ``diagonal`` (n,) and ``upper`` (n,), whose last element is 0.
-    Writes the reflectors I − β v vᵀ of Q to the rows of ``a``, with β in ``across`` (n,). Writes the
-    reflectors of P to the rows of ``left`` (n, whole lanes of n + 3), with β in ``down`` (n,). ``w`` is a
-    scratch array as long as a row of ``a``. The squares of A's elements must not overflow (algorithm: Golub &
-    Van Loan, 5.4.8, rows and columns swapped).
+    For the reflectors I − β v vᵀ of Q, writes v to the rows of ``a`` and β to ``across`` (n,). For the
+    reflectors of P, writes v to the rows of ``left`` (n, whole lanes of n + 3) and β to ``down`` (n,). ``w``
+    is a scratch array as long as a row of ``a``. The squares of A's elements must not overflow (algorithm:
+    Golub & Van Loan, 5.4.8, rows and columns swapped).
     """
     n, end = diagonal.size, a.shape[1]
     for k in range(n):
@@ -48,7 +48,7 @@ def bidiagonalise(  # noqa: C901, PLR0913 - four rows at a time; every result of
         for j in range(0, column.size, LANES):
             store(column, j, LANES, splat(0.0))
         square = 0.0
-        for i in range(k + 1, n, 4):  # reflects the rows, and accumulates the reflector of the column
+        for i in range(k + 1, n, 4):  # apply the row's reflector and accumulate the column's reflector
             t0, t1, t2, t3 = a[i], a[i + 1], a[i + 2], a[i + 3]
             s0, s1, s2, s3 = splat(0.0), splat(0.0), splat(0.0), splat(0.0)
             for j in range(first, end, LANES):

@@ -1,11 +1,11 @@
 """Dense kernels for a few hundred unknowns: Cholesky factorisation, triangular solves, products.
 
 LAPACK is not used because the last bits of an OpenBLAS result depend on the number of threads, and equal
-frames must give equal fields. These kernels compute each element of a result as a single sum in index order,
-for any number of threads and any split of the columns.
+frames must give equal fields. These kernels always add the terms of an element in the same order, regardless
+of the number of threads and of how the columns are split.
 
-All kernels share one loop: a tile of 6 rows and 2 vectors of the result stays in registers while k runs, so
-that 12 multiply-adds require only 8 loads (Goto & van de Geijn, Anatomy of high-performance matrix
+All kernels share one loop, which keeps a tile of the result (6 rows of 2 vectors) in registers. Each group of
+12 multiply-adds therefore requires only 8 loads (Goto & van de Geijn, Anatomy of high-performance matrix
 multiplication, 2008). Arrays are C-ordered float64. A buffer may be larger than the problem; the kernels then
 use its leading n rows and columns. No kernel allocates memory.
 """
@@ -24,7 +24,8 @@ from skinnode.model.layout import Float
 ROWS: Final = 6
 """Number of rows in a tile.
 
-The 12 sums (2 vectors per row), 2 loads and one factor of a tile fit into the 16 registers of AVX2.
+A tile needs 15 of the 16 AVX2 registers: 12 for sums (2 vectors per row), 2 for loaded vectors and 1 for a
+factor.
 """
 TILE: Final = 2 * LANES
 """Number of columns in a tile."""
@@ -95,7 +96,7 @@ def _tile(  # noqa: PLR0913 - the bounds of a tile
 def _forward(  # noqa: PLR0913 - the bounds of a tile
     l: Float, b: Float, r: int, rows: int, low: int, col: int, count: int
 ) -> None:
-    """Replace rows r to r + rows of a tile of ``b`` with the same rows of L⁻¹ B, given rows low to r."""
+    """Replace rows r to r + rows of a tile of ``b`` with those of L⁻¹ B; rows low to r must be complete."""
     _tile(b, r, rows, l, b, low, r, col, count, True)
     right = col + LANES
     more = count - LANES
@@ -159,7 +160,7 @@ def solve_lower(l: Float, b: Float, n: int, cols: int) -> None:
 def _backward(  # noqa: PLR0913 - the bounds of a tile
     l: Float, b: Float, r: int, rows: int, n: int, col: int, count: int
 ) -> None:
-    """Replace rows r to r + rows of a tile of ``b`` with these rows of L⁻ᵀ B, given rows r + rows to n."""
+    """Replace rows r to r + rows of a tile of ``b`` with those of L⁻ᵀ B; all later rows must be complete."""
     _tile(b, r, rows, l, b, r + rows, n, col, count, True)
     right = col + LANES
     more = count - LANES

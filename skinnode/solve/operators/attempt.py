@@ -1,4 +1,4 @@
-"""One attempt of ``solve_system``: an operator and its trust region, run until a point can be classified.
+"""One attempt of ``solve_system``: runs one operator with one trust region, and classifies the point reached.
 
 The compiled loop stops at roots and near stationary points of ‖r‖. If the loop reports CONVERGED, this module
 decides whether the equations determine x, and whether a stationary point with r ≠ 0 is a minimum.
@@ -22,15 +22,15 @@ from skinnode.solve.operators.result import PointKind
 from skinnode.solve.operators.work import LIMIT, NORM, workspace
 
 NEAR: Final = 1e-2
-"""Maximum cosine between r and a column of J for trying Newton's method before the operator has converged
-to a minimum. If r is large, the operators' own steps converge only linearly (454 steps on the problem of
-Brown & Dennis)."""
+"""Maximum cosine between r and any column of J at which an attempt switches to Newton's method for a minimum.
+Near a minimum with a large residual, the operators themselves converge only linearly: on the problem of Brown
+& Dennis, they take 454 steps."""
 
 
 class System:
     """Wrapper of the caller's functions that counts their calls and checks their arrays.
 
-    A method may return the caller's own array, which the caller's function may overwrite in the next call.
+    The methods may return the caller's array without copying it; the next call may overwrite this array.
     """
 
     def __init__(
@@ -41,7 +41,7 @@ class System:
         first = residual(x0.copy())
         shape: tuple[int | str, ...] = ("m",)
         if type(first) is np.ndarray and first.ndim == 1 and first.size > 0:
-            shape = first.shape  # an array of the exact shape is checked on a fast path
+            shape = first.shape  # for an array of known shape, require_array uses a fast path
         self.first = require_array("residual(x0)", first, shape, finite=False).copy()
         self.m = self.first.size
 
@@ -67,7 +67,8 @@ class System:
 class Attempt:
     """One attempt to solve a system; an attempt can be paused after any number of steps.
 
-    ``limit`` is the initial trust radius: 0 for Moré's column scaling and radius, −radius for D = I.
+    If ``limit`` is 0, the attempt uses Moré's column scaling and initial trust radius. If ``limit`` is
+    negative, the attempt uses D = I and an initial trust radius of −``limit``.
     """
 
     def __init__(self, code: int, system: System, start: Point, limit: float) -> None:
@@ -97,11 +98,11 @@ class Attempt:
 
     @property
     def decided(self) -> bool:
-        """True if no other attempt is needed, because x is a root, a minimum, or undetermined."""
+        """True if no other attempt is needed: x is a root or minimum, or the equations do not determine x."""
         return self.went in (op.CONVERGED, op.INVALID_START) or self.kind in (PointKind.ROOT, PointKind.FLAT)
 
     def run(self, steps: int, tol_f: float, tol_x: float) -> None:
-        """Take at most ``steps`` steps; classify the point at the end of the solve or near a minimum."""
+        """Take at most ``steps`` steps; if the solve ends or approaches a minimum, classify the point."""
         code, w, system, went, left = self._code, self._w, self._system, self.went, steps
         while went < 0:
             if went == op.TRY:
@@ -121,7 +122,10 @@ class Attempt:
             self.settle(tol_x, left)
 
     def _is_root(self, tol_f: float) -> bool:
-        """Return whether the solve ended at r = 0; estimate the error, and reject an undetermined x."""
+        """Return whether the solve ended at a root.
+
+        Sets the error estimate, and sets the status to ILL_CONDITIONED if x is too inaccurate.
+        """
         w, system = self._w, self._system
         square = system.m == system.n
         if self.went == op.CONVERGED:
@@ -146,7 +150,7 @@ class Attempt:
         if minimum:
             self.error = settled.error
         elif converged and settled.at is at:
-            # Rounding hides the curvature along a very flat valley, but J has full rank there
+            # In a very flat valley, rounding errors exceed the curvature, but J has full rank
             minimum = abs(settled.lowest) <= CURVED
         if minimum:
             self._settled, self.kind = settled.at, PointKind.MINIMUM

@@ -12,7 +12,7 @@ OPERATORS: Final = {"gauss_newton": 0, "levenberg_marquardt": 1, "dogleg": 2}
 GAUSS_NEWTON: Final = OPERATORS["gauss_newton"]
 LEVENBERG_MARQUARDT: Final = OPERATORS["levenberg_marquardt"]
 
-# Negative results of a step, after which the solve continues; a Status that ends the solve is ≥ 0
+# A step returns one of these negative numbers if the solve continues, or a Status (≥ 0) if the solve ends
 TRY: Final = -1
 ACCEPTED: Final = -2
 REJECTED: Final = -3
@@ -28,15 +28,15 @@ INVALID_START: Final = int(Status.INVALID_START)
 
 EPS: Final = float(np.finfo(np.float64).eps)
 ROOT_SHARE: Final = EPS ** (1 / 2)
-"""Maximum error estimate of a root, relative to max(1, ‖x‖∞); at this limit, half of the digits are
-determined."""
+"""Maximum estimated error of a root x, relative to max(1, ‖x‖∞). At this limit, half of the digits of x are
+correct."""
 MINIMUM_SHARE: Final = EPS ** (1 / 3)
-"""Maximum error estimate of a minimum, relative to max(1, ‖x‖∞). The limit is larger than for a root, because
-‖r‖² determines x only to √eps."""
+"""Maximum estimated error of a minimum x of ‖r‖, relative to max(1, ‖x‖∞). The limit is larger than for a
+root, because rounding of ‖r‖² hides relative changes of √eps in x."""
 STATIONARY: Final = 1e-6
-"""Maximum gradient, relative to ‖J_j‖ ‖r‖, that is treated as zero.
-
-Because of rounding, a smaller gradient cannot be distinguished from zero.
+"""Component j of the gradient Jᵀr is treated as zero below this fraction of ‖J_j‖ ‖r‖, because of rounding
+errors.
 """
 STALL_LIMIT: Final = 30
-"""Maximum number of steps for refining x in a tall system while ‖r‖² changes only by rounding."""
+"""Maximum number of steps in which ‖r‖² changes only by rounding errors; used if there are more equations
+than unknowns."""

@@ -1,7 +1,7 @@
-"""Newton step −J⁺ r, which Gauss-Newton takes in full, as in the paper, and other operators shorten.
+"""Newton step −J⁺ r, which Gauss-Newton takes in full (Xu et al. 2018, eq. 8).
 
-The correction −J⁺ r₊ with the current factors is also the error estimate (Deuflhard, Newton methods for
-nonlinear problems, 2004). Source: Xu et al. 2018, eq. 8.
+After a step, −J⁺ r₊ with the residual r₊ at the new point and the factors of the previous J estimates the
+error of x (Deuflhard, Newton methods for nonlinear problems, 2004).
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ def finite_jacobian(w: Work) -> bool:
 
 @njit_part
 def settled(w: Work, tol_f: float, tol_x: float) -> bool:
-    """Return whether x is a root or minimum, based on the current factors; set ANGLE for a tall system."""
+    """Return whether x is a root or a minimum; set ANGLE if there are more equations than unknowns."""
     s = w.s
     small = largest(w.r) <= tol_f
     if w.r.size != w.x.size:
@@ -93,7 +93,7 @@ def correction(w: Work, r: Float, out: Float) -> float:
 
 @njit_part
 def rounding(w: Work, x: Float) -> float:
-    """Write the effect on r of rounding x, eps Σ_j |J_kj x_j|, into ``e``; return max |x|."""
+    """Write each residual's rounding error eps Σ_j |J_kj x_j| due to x into ``e``; return max |x|."""
     top = 0.0
     for k in range(w.e.size):
         w.e[k] = 0.0
@@ -110,8 +110,8 @@ def rounding(w: Work, x: Float) -> float:
 def estimate_error(w: Work, inverse: Float) -> float:
     """Write J⁺ into ``inverse`` (n, m), using the last factors; return a converged solve's error estimate.
 
-    The estimate is relative to max(1, ‖x‖∞). It is the sum of the remaining correction and the effect of
-    rounding x, amplified by the condition number of J; inf if J is singular.
+    The estimate is relative to max(1, ‖x‖∞). It is the sum of the last Newton correction and the error due to
+    rounding of x, which grows with the condition number of J. The estimate is inf if J is singular.
     """
     n, m = w.jt.shape
     if w.flag[SINGULAR] == 1:

@@ -21,8 +21,8 @@ from skinnode.solve.operators.work import LAM, NEWTON_LENGTH, RADIUS, REDUCED, S
 def marquardt_step(w: Work) -> None:  # noqa: C901 - Moré's iteration in one piece
     """Set the step so that ‖D s‖ is within 10 % of the radius; find lam by Newton's method (Moré, § 5).
 
-    Uses the bidiagonal form of J D⁻¹, computed once per Jacobian: s = D⁻¹ P t and ‖D s‖ = ‖t‖, so each value
-    of lam costs O(n) operations.
+    The bidiagonal form of J D⁻¹ is computed once per Jacobian. With s = D⁻¹ P t and ‖D s‖ = ‖t‖, each value
+    of lam then takes O(n) operations.
     """
     (n, m), s, t = w.jt.shape, w.s, w.step
     radius = s[RADIUS]

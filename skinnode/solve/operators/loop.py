@@ -5,16 +5,16 @@
 - ``shorten`` replaces a trial outside the trust region with a trial inside it.
 - ``assess`` accepts or rejects the step, given r at ``trial`` in ``r_trial``, and updates the radius.
 
-Solves of skin wires in compiled code, and solves with arbitrary Python functions, therefore run the same
+The solver for the wires of a skin (compiled code) and ``solve_system`` (Python functions) thus use the same
 compiled steps. Gauss-Newton accepts every step in full; Levenberg-Marquardt and dogleg accept a step only if
 it reduces r.
 
 For a square system, CONVERGED means a root: max|r| ≤ tol_f *and* a simplified Newton correction
-‖J⁻¹ r₊‖∞ ≤ tol_x · max(1, ‖x‖∞) with the current factors. If rounding keeps r above tol_f, any r within the
-rounding error of J·x is treated as zero. For a tall system, CONVERGED means a minimum: ‖P r‖ ≤ tol_f ‖r‖,
-where P projects onto the range of J, and the correction meets the same condition as for a root. The module
-``minimum`` distinguishes minima from saddles. A stationary point of a square system with r ≠ 0 is
-ILL_CONDITIONED, because J is singular there.
+‖J⁻¹ r₊‖∞ ≤ tol_x · max(1, ‖x‖∞) with the current factors. If rounding errors prevent r from falling below
+tol_f, any r within the rounding error of J·x is treated as zero. For a tall system, CONVERGED means a
+minimum: ‖P r‖ ≤ tol_f ‖r‖, where P projects onto the range of J, and the correction meets the same condition
+as for a root. The module ``minimum`` distinguishes minima from saddles. A stationary point of a square system
+with r ≠ 0 is ILL_CONDITIONED, because J is singular there.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ def begin(w: Work) -> int:
     s, flag = w.s, w.flag
     for k in range(flag.size):
         flag[k] = 0
-    s[RADIUS] = -1.0  # the first call of propose sets the radius, once D is known
+    s[RADIUS] = -1.0  # a negative value makes the first call of propose set the radius
     s[LAM] = 0.0
     s[ERROR] = math.inf
     s[ANGLE] = 1.0
@@ -136,7 +136,7 @@ def shorten(operator: int, w: Work) -> int:
 
 @njit_part
 def _within_rounding(w: Work, norm: float) -> bool:
-    """Return whether rounding of x explains ``r_trial``, whose norm is ``norm``."""
+    """Return whether ``r_trial``, with the norm ``norm``, is within the error due to rounding of x."""
     if not (norm < math.inf and norm > 0.25 * w.s[NORM] and w.flag[SINGULAR] == 0):
         return False
     rounding(w, w.trial)
@@ -181,10 +181,10 @@ def start(w: Work) -> int:
 
 @njit
 def advance(operator: int, w: Work, went: int, tol_f: float, tol_x: float) -> int:
-    """Call :func:`assess` for the last trial, then :func:`propose`, for a Python caller.
+    """Assess the last trial point; if it is not accepted, propose the next (called from Python).
 
-    ``went`` is the previous call's return value, or ``REJECTED`` for the first call. Returns TRY (evaluate r
-    at ``trial`` into ``r_trial``), ACCEPTED (evaluate J at ``x`` into ``jt``) or a Status.
+    ``went`` is the return value of the previous call, or ``REJECTED`` for the first call. Returns TRY
+    (evaluate r at ``trial`` into ``r_trial``), ACCEPTED (evaluate J at ``x`` into ``jt``) or a Status.
     """
     if went == TRY:
         went = assess(operator, w, tol_f, tol_x)

@@ -26,11 +26,12 @@ NOISE: Final = EPS ** (2 / 3)
 CURVED: Final = 0.05
 """Smallest scaled eigenvalue of the Hessian that is treated as positive. On the problems of Moré, Garbow &
 Hillstrom, this eigenvalue is at most 2e-6 at flat points and at least 0.38 at isolated minima. On Watson's
-problem with n = 12, where rounding hides the curvature, the eigenvalue is only 0.003."""
+problem with n = 12, the eigenvalue at the minimum is only 0.003, because of rounding errors."""
 CONTRACTION: Final = 0.5
 """Maximum ratio of successive Newton steps during convergence."""
 NEWTON_STEPS: Final = 8
-"""Maximum number of Newton steps to a minimum; quadratic convergence from a 1 % error takes half as many."""
+"""Maximum number of Newton steps to a minimum. Newton's method needs 4 steps from an error of 1 % if it
+converges quadratically."""
 
 
 @dataclass(frozen=True)
@@ -56,11 +57,11 @@ class Point:
 
     @property
     def rounding(self) -> Float:
-        """(m,) effect on r of rounding x."""
+        """(m,) error of each residual due to rounding of x."""
         return np.asarray(EPS * (np.abs(self.j) @ np.abs(self.x)))
 
     def is_root(self, tol_f: float) -> bool:
-        """Return whether every |r_k| is at most ``tol_f`` or four times the effect of rounding x."""
+        """Return whether every |r_k| is at most ``tol_f`` or four times the error due to rounding of x."""
         return bool((np.abs(self.r) <= np.maximum(tol_f, 4.0 * self.rounding)).all())
 
 
@@ -69,11 +70,12 @@ class Curvature:
     """Curvature at a point: smallest eigenvalue of the Hessian, Newton step and error estimate."""
 
     lowest: float
-    """Smallest scaled eigenvalue; about 0 if a direction is flat, NaN if a number overflowed."""
+    """Smallest scaled eigenvalue; about 0 if ‖r‖ is constant in some direction, NaN if a number
+    overflowed."""
     step: Float
     """(n,) Newton step for Jᵀr = 0."""
     error: float
-    """Shift max |δx| of the minimum due to rounding of r, J and x."""
+    """Largest shift of a coordinate of the minimum due to rounding of r, J and x."""
 
     @property
     def positive(self) -> bool:
@@ -91,7 +93,7 @@ def curvature(jacobian: Callable[[Float], Float], at: Point) -> Curvature:
     n = at.x.size
     d = column_norms(at.j)
     d[d == 0.0] = 1.0
-    reach = at.norm / d  # length by which a coordinate must change to change r by ‖r‖
+    reach = at.norm / d  # change in each coordinate that changes r by ‖r‖
     size = np.maximum(np.abs(at.x), np.minimum(reach, 1.0))
     s = np.empty((n, n))
     for k in range(n):
@@ -149,6 +151,6 @@ def settle(
         if not float(np.linalg.norm(r)) <= at.norm * (1.0 + STATIONARY):
             break
         before, at = size, Point(x, r, jacobian(x))
-    # A step that no longer contracts is a rounding error if Jᵀr is as small as rounding permits
+    # If Jᵀr is as small as rounding permits, the steps stop contracting because of rounding errors
     known = bent.positive and (reached or at.cosine <= STATIONARY)
     return Settled(at, bent.lowest, size + bent.error if known else math.inf)

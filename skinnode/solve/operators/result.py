@@ -13,16 +13,16 @@ __all__ = ["PointKind", "Solution", "SolveStats", "Status"]
 
 
 class PointKind(enum.Enum):
-    """Kind of the point at which ``solve_system`` stopped."""
+    """Type of the point at which ``solve_system`` stopped."""
 
     ROOT = "root"
-    """The residual r is zero to within ``tol_f`` or the rounding of x."""
+    """The residual r is zero within ``tol_f`` or within the error due to rounding of x."""
     MINIMUM = "minimum"
     """‖r‖ has an isolated minimum above zero: Jᵀr is zero, and the Hessian of ½ ‖r‖² is positive definite."""
     FLAT = "flat"
-    """Jᵀr is zero, r is not zero, and x is not determined: ‖r‖ does not change in some direction."""
+    """Jᵀr is zero, but r is not zero, and ‖r‖ is constant in some direction."""
     SADDLE = "saddle"
-    """Jᵀr is zero and r is not zero, but ‖r‖ decreases in some direction."""
+    """Jᵀr is zero, but r is not zero, and ‖r‖ decreases in some direction (a saddle point)."""
     UNFINISHED = "unfinished"
     """Neither r nor Jᵀr is zero at this point."""
 
@@ -38,7 +38,7 @@ class Solution:
     minimum. ILL_CONDITIONED at a minimum of a square system that is not a root, and at any point that the
     equations do not determine."""
     kind: PointKind
-    """Kind of the point: root, minimum or neither."""
+    """Type of the point: root, minimum or neither."""
     residual_norm: float
     """‖r‖₂ at ``x``."""
     optimality: float
@@ -46,7 +46,7 @@ class Solution:
     error_estimate: float
     """Estimate of max |x − x*|; inf unless CONVERGED.
 
-    Sum of the remaining Newton correction and the effect of rounding x, amplified by the condition number of
-    J or, at a minimum, of the Hessian.
+    The estimate is the sum of the last Newton correction and the error due to rounding of x, which grows with
+    the condition number of J or, at a minimum, of the Hessian.
     """
     stats: SolveStats

@@ -38,7 +38,8 @@ from skinnode.solve.operators.work import (
 SHRINK_BELOW: Final = 0.25
 ENLARGE_ABOVE: Final = 0.75
 REJECT_BELOW: Final = 1e-4
-"""Ratios of actual to predicted decrease at which the radius changes or a step is rejected (Moré 1978)."""
+"""Thresholds of the ratio of actual to predicted decrease in ‖r‖², for changing the radius and rejecting a
+step (Moré 1978)."""
 
 
 @njit_part
@@ -89,7 +90,7 @@ def _gain_noise(w: Work) -> float:
 
 @njit_part
 def _stalled(w: Work) -> int:
-    """Return ACCEPTED or a Status for a step whose effect on ‖r‖ is lost in rounding."""
+    """Return ACCEPTED or a Status for a step that changes ‖r‖ by less than its rounding error."""
     square = w.r.size == w.x.size
     w.flag[STALLED] += 1
     if square or w.flag[STALLED] > STALL_LIMIT:
@@ -107,7 +108,7 @@ def _resize(w: Work, norm: float, gain: float, slope: float, ratio: float) -> No
         shrink = 0.1
         if gain >= 0.0:
             shrink = 0.5
-        elif norm < 10.0 * s[NORM]:  # step length that minimises the parabola through both residuals
+        elif norm < 10.0 * s[NORM]:  # minimise the parabola fitted to ‖r‖²
             shrink = 0.5 * slope / (slope + 0.5 * gain)
             shrink = 0.1 if shrink < 0.1 else (0.5 if shrink > 0.5 else shrink)
         reach = 10.0 * s[LENGTH]
@@ -122,9 +123,9 @@ def _resize(w: Work, norm: float, gain: float, slope: float, ratio: float) -> No
 
 @njit_part
 def assess_decrease(w: Work, norm: float) -> int:
-    """Compare the actual decrease in ‖r‖, to ``norm``, with the predicted decrease; update the radius.
+    """Compare the actual and the predicted decrease in ‖r‖², and update the radius.
 
-    Returns ACCEPTED, REJECTED or a Status.
+    ``norm`` is ‖r‖ at the trial point. Returns ACCEPTED, REJECTED or a Status.
     """
     s, before = w.s, w.s[NORM]
     finite = norm < math.inf

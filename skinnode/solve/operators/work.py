@@ -2,8 +2,8 @@
 
 The symbols are those of the paper: r is the residual (m,), J its Jacobian (m, n), stored transposed, and lam
 the Levenberg-Marquardt parameter. The trust region is ‖D s‖ ≤ radius. D is the running maximum of the column
-norms of J (Moré 1978), so that the units of the unknowns do not matter. After the first attempt of
-``solve_system``, D is the identity.
+norms of J (Moré 1978), so that the solve does not depend on the units of the unknowns. In the second and
+third attempt of ``solve_system``, D is the identity.
 """
 
 from __future__ import annotations

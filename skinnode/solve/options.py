@@ -30,27 +30,31 @@ class EstimateOptions:
         baseline_ohm: (U, K) resistances measured at rest, ohm; if given, resistivity and gain cancel.
         rubber: Material of the skin. Forces are proportional to the rubber's modulus; the displacement does
             not depend on the modulus.
-        estimate_noise: Whether to estimate a scale factor for ``relative_noise`` from the data.
-        follow_noise: Whether to scale ``relative_noise`` if the stream's noise differs by a factor of more
-            than 1.5 (:mod:`skinnode.solve.noise_estimate`); ignored if ``estimate_noise`` is set.
+        estimate_noise: Whether to estimate, from the residuals, a factor that scales ``relative_noise``.
+        follow_noise: Whether to scale ``relative_noise`` if the noise of the stream differs from it by a
+            factor of more than 1.5 (:mod:`skinnode.solve.noise_estimate`). Ignored if ``estimate_noise`` is
+            set.
         drift: Gain errors to estimate: ``patch`` for one gain common to all resistances, ``wire`` for one
             gain per upper wire, or ``none``.
-        drift_std: Prior standard deviation of a gain error, as a fraction.
+        drift_std: Expected (prior) standard deviation of a gain error; 0.02 is 2 %.
         model_error: Standard error of the forward model (due to thickness, electrode size and conductivity
-            under strain), as a fraction of each resistance's change. The full value applies to an error
-            common to all resistances; 0.7 times this value applies to each resistance's independent error.
-        tolerances: Manufacturing tolerances of the patch, to be included in the standard deviations; the
-            default None means an exact patch. The solver assumes that the resistances at rest were measured
-            on the patch itself.
+            under strain), as a fraction of each resistance's change. An error common to all resistances has
+            this standard deviation; an additional, independent error of each resistance has 0.7 times this
+            standard deviation.
+        tolerances: Manufacturing tolerances of the patch, which increase the standard deviations; None
+            (default) means an exact patch. The solver assumes that the resistances at rest were measured on
+            the patch itself.
         contacts: Whether to estimate contacts and forces.
         force_calibrated: Whether ``rubber`` reproduces known forces on this patch, for instance from presses
-            with a load cell. A data sheet's modulus is not a calibration: forces are computed for a
-            half-space, but a layer on a support, like the skin, may carry fifty times as much force. If
-            ``force_calibrated`` is False, each normal force's standard deviation covers this difference.
+            with a load cell. A modulus from a data sheet is not a calibration, because forces are computed
+            for a half-space. A thin layer on a support can carry fifty times as much force at the same
+            displacement. If ``force_calibrated`` is False, the standard deviation of each normal force covers
+            this difference.
         normal_only: Whether only z is unknown, which reduces the number of unknowns to a third.
-        hold: Whether to keep the last solution of wires whose resistances changed no more than their noise.
-        deadline_us: Time limit of an update, µs; the update may exceed it by one step. Wires still unsolved
-            at the deadline have the status DEADLINE.
+        hold: Whether to keep the last solution of a wire if its resistances changed by no more than their
+            noise.
+        deadline_us: Time limit of an update, µs; an update can exceed the limit by the time for one solver
+            step. Wires still unsolved at the deadline have the status DEADLINE.
 
     Raises:
         ValueError: If an option is out of range.
@@ -90,7 +94,7 @@ class EstimateOptions:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PosteriorOptions(EstimateOptions):
-    """Options of :class:`skinnode.Posterior`: all options of :class:`EstimateOptions`, and ``scale_m``.
+    """Options of :class:`skinnode.Posterior`: ``scale_m``, and those of :class:`EstimateOptions`.
 
     Args:
         scale_m: RMS normal displacement expected by the prior, metres; by default estimated from the data.
@@ -109,7 +113,7 @@ class PosteriorOptions(EstimateOptions):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class TrackerOptions(EstimateOptions):
-    """Options of :class:`skinnode.Tracker`: all options of :class:`EstimateOptions`, and seven others.
+    """Options of :class:`skinnode.Tracker`: the following, and those of :class:`EstimateOptions`.
 
     The method ``auto`` chooses the posterior if ``drift``, ``model_error``, ``tolerances`` or
     ``estimate_noise`` is set, since only the posterior supports these options.
@@ -117,15 +121,15 @@ class TrackerOptions(EstimateOptions):
     Args:
         method: ``exact``, ``posterior`` or ``auto``.
         operator: ``levenberg_marquardt``, ``dogleg`` or ``gauss_newton``; exact inverse only.
-        stiffness_n_per_m: Stiffness k in the paper's law F = k Δs, N/m; if given, this law determines
-            ``force_n`` of exact fields. All other forces, including contact forces, are computed from
-            ``rubber``.
-        active_only: Whether to solve only for electrodes that contacts move; exact inverse only.
+        stiffness_n_per_m: Stiffness k in the paper's law F = k Δs, N/m; if given, the exact inverse computes
+            ``force_n`` by this law. All other forces, including contact forces, are computed from ``rubber``.
+        active_only: Whether to fix electrodes at rest unless a contact moves them; exact inverse only.
         codes: Mapping from the codes passed to :meth:`skinnode.Tracker.update_codes` to resistances.
-        max_std_m: Maximum standard deviation of the coordinates of a precise field, metres; the default
-            depends on the layout and the noise (:mod:`skinnode.solve.precision`).
-        max_force_std_n: Maximum standard deviation of a contact's normal force in a precise field, N; the
-            default depends on the layout and the rubber, and applies to calibrated forces only.
+        max_std_m: A field is precise only if no coordinate has a larger standard deviation, metres; the
+            default depends on the layout and the noise (:mod:`skinnode.solve.precision`).
+        max_force_std_n: A field is precise only if no normal force of a contact has a larger standard
+            deviation, N. The default depends on the layout and the rubber, and applies only to calibrated
+            forces.
 
     Raises:
         ValueError: If an option is out of range.

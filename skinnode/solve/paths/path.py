@@ -1,4 +1,4 @@
-"""Path following as in the paper: solves a press's last sample by way of the earlier samples.
+"""Path following as in the paper: solves a recorded press sample by sample, up to the last sample.
 
 The path is the solution of H(X, t) = F(X) − ρ / R(t) = 0, where X(0) is the grid at rest. Each sample is
 solved from the solution of the previous sample (Lahaye; Xu et al. 2018, section 3.2). Step control
@@ -38,11 +38,11 @@ from skinnode.solve.wires.problem import PatchProblem
 SELECTION: Final = Accuracy(tolerance=1e-12, max_steps=100)
 """Accuracy of a solve that starts from the posterior.
 
-The tolerance is the paper's final tolerance; the maximum number of steps is the paper's limit for
-intermediate samples.
+The values are those of the paper: the tolerance for the last sample, and the maximum number of steps for
+earlier samples.
 """
 STARTS: Final = 12
-"""Number of random starting points for finding other roots on a layout with folds.
+"""Number of random starting points in the search for other roots of F = b.
 
 The points are drawn from the posterior with a fixed random seed.
 """
@@ -50,11 +50,11 @@ The points are drawn from the posterior with a fixed random seed.
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PathResult:
-    """Solution at the end of a path, and cost of each point on the path.
+    """Solution at the end of a path, and a log of the solver calls on the path.
 
     Row s of ``position``, ``steps``, ``evaluations`` and ``optimality`` describes solver call s. If the call
-    skipped a wire, the wire's position and optimality are NaN. After the first row for the last sample,
-    further rows describe second attempts and checks.
+    skipped a wire, the position and the optimality of this wire are NaN. Calls after the first solve of the
+    last sample are second attempts and checks.
     """
 
     upper_m: Float
@@ -69,14 +69,14 @@ class PathResult:
     Assumes exact samples.
     """
     residual: Float
-    """(U,) RMS of F/b − 1 at the end."""
+    """(U,) RMS of the relative residual F/b − 1 at the last sample."""
     cycle: int | None
-    """Number of samples from one solve to the next; None if step control uses no cycle."""
+    """Number of samples from one solve to the next in periodic step control; None in all other cases."""
     searched: int
-    """Number of rows at the start that describe the search for the cycle; the path's rows follow."""
+    """Number of initial rows of the log that belong to the search for the cycle."""
     position: Float
-    """(S, U) number of the sample solved, counted from 0; 1.5 is halfway between samples 1 and 2, and −1
-    is the rest position."""
+    """(S, U) sample numbers, counted from 0; 1.5 is halfway between samples 1 and 2, and −1 is the patch at
+    rest."""
     steps: NDArray[np.int64]
     """(S, U) number of operator steps; 0 if the sample was skipped."""
     evaluations: NDArray[np.int64]
@@ -84,7 +84,7 @@ class PathResult:
     optimality: Float
     """(S, U) first-order optimality ‖Jᵀr‖∞ of the dimensionless problem at the end of the call."""
     stats: SolveStats
-    """Cost of the path, including the search for a cycle."""
+    """Solver steps, evaluations and computing time of the path, including the search for a cycle."""
 
 
 def solve_path(
@@ -97,12 +97,16 @@ def solve_path(
 ) -> PathResult:
     """Follow a press from the rest position to its last sample.
 
-    A wire is ILL_CONDITIONED instead of CONVERGED if it may have ended on a branch of F = b other than the
-    skin's. There are four possible reasons: the determinant of its Jacobian changed sign on the way; its
-    electrodes crossed to the other side of the lower layer; an equally smooth root is across a nearby fold;
-    or the samples led smoothly to another root. If the samples led smoothly to another root, the wire is left
-    at that root. Since the skin itself can cross a fold, a root across a fold is accepted if the path led
-    there and the posterior of the patch finds the same root.
+    F = b has several roots, separated by folds (det J = 0). A wire is ILL_CONDITIONED instead of CONVERGED if
+    its root may be wrong, for one of four reasons:
+
+    - the determinant of its Jacobian changed sign on the path;
+    - an electrode crossed the lower layer;
+    - there is an equally smooth root on the other side of a nearby fold;
+    - the path ended smoothly at another root; this root is then reported.
+
+    The skin itself can cross a fold. A root across a fold is therefore accepted if both the path and the
+    posterior of the patch lead to this root.
 
     Args:
         layout: The patch, with at least as many lower wires as unknowns per wire (K ≥ 3N).
@@ -112,7 +116,7 @@ def solve_path(
         baseline_ohm: (U, K) resistances measured at rest, ohm; if given, resistivity and gain cancel.
 
     Returns:
-        Positions at the last sample, a status for each wire, and the cost.
+        Positions at the last sample, a status for each wire, and the log of the solver calls.
 
     Raises:
         ValueError: If a shape is wrong, a value is not positive and finite, or the operator is unknown.
@@ -162,7 +166,7 @@ def solve_path(
 def _ask_posterior(
     tracker: PathTracker, layout: PatchLayout, last_ohm: Float, baseline_ohm: ArrayLike | None
 ) -> PatchEstimate | None:
-    """Select the last sample's roots using the posterior; return its estimate, or None if untrusted."""
+    """Select roots with the posterior; return its estimate of the patch, or None if it is not trusted."""
     options = PosteriorOptions(
         relative_noise=roots.REFEREE_NOISE, baseline_ohm=baseline_ohm, hold=False, contacts=False,
         follow_noise=False,

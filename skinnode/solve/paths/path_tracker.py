@@ -1,7 +1,7 @@
 """Path tracker: stores each wire's position along a press and moves it with a predictor and a corrector.
 
-Lahaye's method solves all wires sample by sample (:meth:`PathTracker.solve`); adaptive step control advances
-each wire separately (:meth:`PathTracker.step`). The schedule (:mod:`skinnode.solve.paths.step_control`)
+Lahaye's method solves each sample for all wires (:meth:`PathTracker.solve`). Adaptive step control moves each
+wire in steps of its own (:meth:`PathTracker.step`). The schedule (:mod:`skinnode.solve.paths.step_control`)
 chooses one of these two modes. Roots at the last sample are checked by
 :mod:`skinnode.solve.paths.root_selection`.
 """
@@ -74,12 +74,12 @@ class PathTracker:
 
     Attributes:
         end: Outcome at the last sample, after :meth:`finish`.
-        cycle: Number of samples from one solve to the next; None if step control uses no cycle.
-        searched: Number of leading log rows that describe the search for the cycle.
-        second_tries: Whether a wire may move away from the end of its path; if not, only its status may
-            change.
-        stumbled: (U,) wires on which at least one step was undone.
-        reached: (U,) wires for which the end of the path is a root.
+        cycle: Number of samples from one solve to the next in periodic step control; None in all other cases.
+        searched: Number of initial rows of the log that belong to the search for the cycle.
+        second_tries: Whether a wire may be solved again after the end of its path; if not, only its status
+            may change.
+        stumbled: (U,) mask of the wires for which at least one step failed and was undone.
+        reached: (U,) mask of the wires whose path ended at a root.
     """
 
     def __init__(self, problem: PatchProblem, a: Float, operator: int) -> None:
@@ -134,7 +134,7 @@ class PathTracker:
     # -- sample by sample, as in the paper -------------------------------------------------------------
 
     def extrapolate(self, sample: int) -> None:
-        """Move every wire along the secant towards a sample, by at most the trust radius."""
+        """Move every wire along the secant to its predicted position, by at most the trust radius."""
         (x_before, a_before), (x, a) = self._points[-2:]
         a_next = self.corrector.sample_a(sample)
         secant(x_before, a_before, x, a, a_next, self.problem.step_limit, self.solver.x)
@@ -161,7 +161,7 @@ class PathTracker:
         self.end.doubt(self._crossed)
 
     def walk(self, todo: Mask, samples: list[int], accuracy: Accuracy) -> None:
-        """Follow the given wires (U,) from rest along ``samples``, only to find where their paths end.
+        """Follow the given wires (U,) from rest along ``samples``, and store where their paths end.
 
         The samples are in time order and include the last sample of the press. The method does not change the
         positions of the wires or :attr:`end`.
@@ -220,7 +220,7 @@ class PathTracker:
     ) -> None:
         """Solve the last sample for the wires in ``todo`` (U,), and store the outcome in :attr:`end`.
 
-        A wire at a root across a fold is ILL_CONDITIONED unless ``also`` returns True for the wire.
+        A root across a fold is ILL_CONDITIONED, except for the wires in the mask (U,) returned by ``also``.
         """
         call = np.where(todo, wires.SOLVE, wires.LEAVE).astype(np.uint8)
         self.corrector.correct(call, self.corrector.last, accuracy, tasks=wires.COVARIANCE, operator=operator)
@@ -252,11 +252,11 @@ class PathTracker:
         return np.asarray((apart <= roots.SAME_ROOT * size) & ~self.out_of_reach())
 
     def led_elsewhere(self) -> Mask:
-        """Return a mask (U,) of the wires that left the root at the end of a smooth path.
+        """Return a mask (U,) of the wires that are no longer at the root to which a smooth path led.
 
-        On a smooth path, the secant through two solutions predicts the next solution, and the first solution
-        is close to rest (:data:`skinnode.solve.roots.SMOOTH_PATH`). On a long path, only the second half must
-        be smooth.
+        A path is smooth if the secant through any two successive solutions predicts the next solution, and if
+        the first solution is close to the rest position (:data:`skinnode.solve.roots.SMOOTH_PATH`). For a
+        long path, only the second half is tested.
         """
         size = roots.distance(self._path_end, self.problem.rest)
         elsewhere = roots.distance(self.solver.x, self._path_end) > roots.SAME_ROOT * size

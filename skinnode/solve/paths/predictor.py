@@ -11,7 +11,7 @@ from skinnode.compiled.jit import njit
 from skinnode.model.layout import Float
 
 SQUARE_FLOOR: Final = 1e-300
-"""Smallest squared change used as a divisor."""
+"""Lower limit of squared changes, so that no division is by zero."""
 
 
 def euler(x: Float, inverse: Float, a_solved: Float, a: Float) -> Float:
@@ -36,8 +36,9 @@ def secant(  # noqa: PLR0913 - a kernel: two points, the next resistances, the l
 ) -> None:
     """Predict positions along the secant through the last two solved points.
 
-    The previous step is scaled by the projection of the next relative change in ``a`` onto the previous
-    change. A wire whose prediction is not finite stays at ``x``.
+    The step from ``x_before`` to ``x`` is multiplied by the ratio of two relative changes in ``a``: the next
+    change, projected onto the last change, and the last change itself. A wire whose prediction is not finite
+    stays at ``x``.
 
     Args:
         x_before: (U, n) position at the second-to-last point, pitches.

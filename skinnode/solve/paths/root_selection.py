@@ -1,7 +1,8 @@
-"""Root selection at the end of a path: second attempts, and the choice of the root to accept.
+"""Root selection at the last sample of a path: second attempts, and rules for accepting a root.
 
-The thresholds for this choice are defined in :mod:`skinnode.solve.roots`. All functions change
-:attr:`PathTracker.end` and the solver's positions in place. A rejected root becomes ILL_CONDITIONED.
+The thresholds are defined in :mod:`skinnode.solve.roots`. A fold is a surface where det J = 0, and the twin
+of a root is the other root near the same fold. All functions change :attr:`PathTracker.end` and the solver's
+positions in place. A wire with a rejected root gets the status ILL_CONDITIONED.
 """
 
 from __future__ import annotations
@@ -23,8 +24,8 @@ from skinnode.solve.starts import guided_start, near_twin
 from skinnode.solve.wires import arrays as wires
 
 GUIDED_STEPS: Final = 100
-"""Maximum number of steps from a guided start. A solve that starts near a root takes 1 to 20 steps; a solve
-that starts elsewhere never converges."""
+"""Maximum number of steps of a solve that starts at the smoothest displacement (:func:`guide`). Solves near a
+root take 1 to 20 steps; the others do not converge at all."""
 TWIN: Final = Accuracy(tolerance=1e-9, max_steps=30)
 """Accuracy of roots that are only compared with other roots.
 
@@ -47,15 +48,15 @@ class PatchEstimate:
 
 
 def doubtful(tracker: PathTracker) -> Mask:
-    """Return a mask (U,) of wires with no root, a root too rough to be a press, or an undone step."""
+    """Return a mask (U,) of wires that have no root, have an implausibly rough root, or had a step undone."""
     return np.asarray(~tracker.end.converged | _rough(tracker) | tracker.stumbled)
 
 
 def guide(tracker: PathTracker, todo: Mask, accuracy: Accuracy) -> None:
-    """Solve the last sample again, from the smoothest displacement that explains it; keep the smoother root.
+    """Solve the last sample from the smoothest displacement that explains it; keep the smoother root.
 
-    If the new root is across a fold, also solves for the twin root on the near side. If neither solve finds a
-    root for a wire, the wire's status is not CONVERGED.
+    If the new root is across a fold, this function also solves for its twin on the same side as the rest
+    position. If neither solve finds a root for a wire, the wire's status is not CONVERGED.
 
     Args:
         tracker: Tracker at the end of its path.
@@ -88,7 +89,7 @@ def guide(tracker: PathTracker, todo: Mask, accuracy: Accuracy) -> None:
 
 
 def doubt_rough(tracker: PathTracker, accuracy: Accuracy) -> None:
-    """Reject each rough root for which :func:`guide` finds a smoother root, without moving any wire."""
+    """Reject each rough root if :func:`guide` finds a smoother root; the positions stay unchanged."""
     end = tracker.end
     todo = _rough(tracker) & end.converged
     x, kept = tracker.solver.x.copy(), end.copy()
@@ -104,8 +105,9 @@ def doubt_rough(tracker: PathTracker, accuracy: Accuracy) -> None:
 def compare_with_estimate(tracker: PathTracker, estimate: PatchEstimate, accuracy: Accuracy) -> None:
     """Compare every root with an estimate of the whole patch.
 
-    A wire that has no root, or a root that the estimate does not confirm, is solved from the estimate. The
-    new root may be across a fold if the path led to the same root, because the skin itself can cross a fold.
+    If a wire has no root, or its root contradicts the estimate, it is solved again, starting from the
+    estimate. A new root across a fold is accepted only if the path led to the same root; the skin itself can
+    cross a fold.
     """
     solver, end = tracker.solver, tracker.end
     todo = ~(estimate.agrees(solver.x) & end.converged)
@@ -133,14 +135,15 @@ def keep_likeliest(
 ) -> None:
     """Search for other roots, starting from twin roots and from ``starts``; keep the likeliest root.
 
-    A wire is CONVERGED only if the energies of all its other roots differ by at least ``unlikely``.
+    A wire remains CONVERGED only if the energy of each other root differs from the likeliest by at least
+    ``unlikely``.
 
     Args:
         tracker: Tracker at the end of its path.
         starts: (S, U, n) starting positions, pitches.
         energy: Function that returns −2 log of the density of a displacement field (U, n) in pitches, up to a
             constant.
-        unlikely: (U,) energy difference above which a less likely root is ruled out.
+        unlikely: (U,) minimum energy difference at which the less likely root is excluded.
         accuracy: Accuracy of the root that is kept.
     """
     solver, end, rest = tracker.solver, tracker.end, tracker.problem.rest
@@ -174,13 +177,13 @@ def keep_likeliest(
 
 
 def doubt_twins(tracker: PathTracker, estimate: PatchEstimate | None) -> None:
-    """Reject roots that have an equally smooth twin on the other side of a fold.
+    """Reject roots that have an equally smooth twin across a fold.
 
     If an ``estimate`` of the patch is given, a twin that the estimate does not confirm is ignored.
     """
     layout = tracker.problem.layout
     if layout.shape[1] != layout.unknowns:
-        return  # with more equations than unknowns, a fold has no second root
+        return  # a system with more equations than unknowns has no twin roots
     solver, end, smoothness = tracker.solver, tracker.end, tracker.smoothness
     root, twins = solver.x.copy(), _twins(tracker)
     size = roots.distance(root, tracker.problem.rest)
@@ -198,15 +201,15 @@ def doubt_twins(tracker: PathTracker, estimate: PatchEstimate | None) -> None:
 
 
 def heed_samples(tracker: PathTracker, accuracy: Accuracy) -> None:
-    """Reject roots to which the samples do not lead; return their wires to the end of their paths.
+    """Reject roots that differ from the end of a smooth path; move their wires back to that end.
 
-    If the skin itself crosses a fold, the root on the branch of the rest position can be wrong although it is
-    smoother and likelier than the true root. A start from the smoothest displacement and the posterior then
-    both find the wrong root, and only the samples contradict it. If the samples refute the patch estimate on
-    one wire, other wires' roots that came from the estimate are rejected too.
+    If the skin itself crosses a fold, a root on the near side of the fold can be smoother and likelier than
+    the true root. :func:`guide` and the posterior then both find the wrong root; only the path leads to the
+    true root. If the posterior is wrong on one wire, the roots of all other wires that moved away from the
+    end of their paths are rejected too.
     """
     if not tracker.second_tries:
-        return  # on a plain path, every wire is already at the end of its path
+        return  # without second tries, every wire is already at the end of its path
     todo = tracker.led_elsewhere()
     if todo.any():
         moved = ~tracker.at_path_end()

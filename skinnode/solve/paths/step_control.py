@@ -29,18 +29,19 @@ SHRINK: Final = 0.5
 GROW: Final = 4.0
 """Largest growth factor of the step length per step (Allgower & Georg 1990, section 6.1, use 2 to 4)."""
 SHORTEST: Final = 1 / 64
-"""Minimum step as a fraction of the path; without a minimum, steps at a fold would be halved forever."""
+"""Minimum step length as a fraction of the path. Near a fold, steps are halved until they reach this
+minimum."""
 ADAPTIVE_POINT: Final = Accuracy(tolerance=1e-9, max_steps=6)
 """Accuracy of an intermediate point.
 
-A root with a tolerance below √eps is accurate enough to keep its ∂X/∂R. Starting at a contraction ratio of
-1/2, Newton's method reaches 1e-9 in 5 steps.
+With a tolerance below √eps, ∂X/∂R at the root is accurate enough for the next prediction. Newton's method
+reaches a tolerance of 1e-9 in 5 steps if its first contraction ratio is 1/2.
 """
 
 ADAPTIVE_WALK: Final = Accuracy(tolerance=1e-9, max_steps=100)
-"""Accuracy of samples that are solved only to find the root to which they lead.
+"""Accuracy of the samples on a path that is followed again to check its end.
 
-The maximum number of steps is the same as in the paper.
+The maximum number of steps is that of the paper.
 """
 
 
@@ -62,10 +63,10 @@ class Uniform:
         steps: Number of samples to solve; by default, or if there are fewer samples, all samples are solved.
         plain: Whether to start each sample at the last solution, as the paper does (Lahaye), and to leave
             each wire at the outcome of the last sample. Otherwise, each sample starts on the secant through
-            the last two solutions. A wire with no root or a rough root is then solved again from the
-            smoothest displacement that explains the last sample. In 21 presses of 50 % with 10 samples each
-            (staggered layout, h = 1), starting on the secant alone reduces the number of lost wires from 7 of
-            197 to none. The secant also reduces the number of evaluations per sample from 4 to 2.9.
+            the last two solutions, and a wire without a plausible root at the last sample is solved again,
+            starting from the smoothest displacement. In tests with presses of 50 %, starting on the secant
+            reduced the number of unsolved wires from 7 of 197 to 0, and the number of evaluations per sample
+            from 4 to 2.9.
         intermediate_tolerance: Tolerance of r, and of x in pitches, at all samples except the last.
         final_tolerance: Tolerance at the last sample.
         intermediate_steps: Maximum operator steps at all samples except the last.
@@ -103,19 +104,19 @@ class Uniform:
 class Periodic:
     """Schedule that solves one sample per cycle of T samples (section 5.2 of the paper).
 
-    Between two solves, the tracked point stays within the relaxed tolerance, so the skipped samples add no
-    information.
+    The samples between two solves are skipped, because the last solution satisfies their equations within the
+    tolerance.
 
-    The cycle is determined from the samples themselves. The samples are followed from the rest position with
-    a tolerance of 1e-6, 1e-5, …, skipping each sample whose first-order optimality is below the tolerance. If
-    the solves have a period, T is the median number of samples from one solve to the next, on the wire that
-    needs the most solves. The path then restarts from rest and solves every T-th sample with this tolerance.
-    The last sample is always solved. A cycle must have at least two samples and occur at least twice. If no
-    tolerance yields a cycle, every sample is solved with a tolerance of 1e-6.
+    The cycle is determined from the samples themselves. The path is followed from the rest position with a
+    tolerance of 1e-6, then 1e-5, and so on. Samples are skipped while their first-order optimality is below
+    the tolerance. T is the median number of samples from one solve to the next, for the wire that is solved
+    most often. With the first tolerance for which T is at least 2, the path then restarts from rest and
+    solves every T-th sample. The last sample is always solved. A cycle must have at least two samples and
+    occur at least twice. If no tolerance yields a cycle, every sample is solved with a tolerance of 1e-6.
 
-    The paper's tolerance applies to MATLAB's unscaled problem, in which ‖Jᵀr‖∞ is F² times its value in this
-    project, where r = a F − 1 and lengths are in pitches. The value of F depends on the unit of length, which
-    the paper does not state.
+    The tolerances of the paper are not directly comparable. The paper solves an unscaled problem, in which
+    ‖Jᵀr‖∞ is larger by a factor of F² than here, where r = a F − 1 and lengths are in pitches. The value of F
+    depends on the unit of length, which the paper does not state.
 
     Args:
         cycle: Cycle T in samples, if known from an earlier press of the same size and rate; None to search
@@ -159,27 +160,27 @@ class Periodic:
         _finish(tracker, self)
 
     def _search(self, tracker: PathTracker) -> tuple[int | None, float]:
-        """Return the cycle, or None if there is none, and the tolerance at which it occurs."""
+        """Return the cycle and the tolerance for which it was found; the cycle is None if there is none."""
         for tolerance in RELAXED_TOLERANCES:
             tracker.restart()
             accuracy = Accuracy(tolerance, self.intermediate_steps)
             solved = [tracker.solve(sample, accuracy) > 0 for sample in range(tracker.samples - 1)]
             cycle = shortest_cycle(np.array(solved).reshape(-1, tracker.wires))
             if cycle is None:
-                break  # a looser tolerance would not yield a second cycle either
+                break  # with a larger tolerance, there would be even fewer solves
             if cycle > 1:
                 return cycle, tolerance
         return None, RELAXED_TOLERANCES[0]
 
 
 def shortest_cycle(solved: NDArray[np.bool_]) -> int | None:
-    """Return the median number of samples between solves of the wire that is solved most often.
+    """Return the median number of samples from one solve to the next, for the wire that is solved most often.
 
     Args:
         solved: (T, U) bool, True where a wire was solved at a sample.
 
     Returns:
-        The cycle, in samples; None if no wire has two cycles.
+        The cycle, in samples; None if no wire was solved at least three times.
     """
     cycles = [
         np.median(gaps) for gaps in (np.diff(np.flatnonzero(wire)) for wire in solved.T) if gaps.size > 1
@@ -197,15 +198,16 @@ class Adaptive:
     (Deuflhard 2004, section 5.1.3), and F is smooth on the scale of the clearance between the layers. A step
     that does not reach a root on the branch of the rest position is undone and halved.
 
-    A straight line in R is not a deformation of rubber and can meet a fold that the press itself does not
-    meet. If a wire gets stuck at such a fold, or its root is too rough to be a press, the wire is solved
-    again by Levenberg-Marquardt, regardless of the operator. That solve starts from the smoothest
-    displacement that explains the last sample (:func:`skinnode.solve.starts.guided_start`). If this solve
-    yields a second root, the smoother root is kept.
+    The interpolated resistances do not belong to a real deformation, so the path can reach a fold (det J = 0)
+    even if the press does not. If a wire cannot pass such a fold, or if its root is implausibly rough, the
+    wire is solved again by Levenberg-Marquardt, starting from the smoothest displacement that explains the
+    last sample (:func:`skinnode.solve.starts.guided_start`). If this solve finds another root, the smoother
+    root is kept.
 
-    Two samples are enough: the patch at rest and the frame to solve. If there are more samples, they are
-    solved one by one for each doubtful wire, and for each wire of a folded layout that moved far enough to
-    have crossed a fold. For such a wire, the smooth root can be wrong, and only the samples reveal the error.
+    The path leads from the patch at rest to the frame to solve, so one sample is enough. If there are more
+    samples, each wire with a doubtful root is also followed sample by sample, and so is each wire that moved
+    far enough to have crossed a fold. The smoother root of such a wire can be wrong, and only the samples
+    show this.
 
     Args:
         points: Maximum number of path points to attempt per wire.
@@ -225,7 +227,7 @@ class Adaptive:
         _require(self, "final_tolerance", "final_steps")
 
     def follow(self, tracker: PathTracker) -> None:
-        """Step all wires to the last sample; then solve the last sample, and guide doubtful wires."""
+        """Advance all wires to the last sample, solve the last sample, and solve doubtful wires again."""
         end = tracker.samples - 1.0
         reach = tracker.problem.step_limit
         position = np.full(tracker.wires, REST)
@@ -269,7 +271,7 @@ def _finish(tracker: PathTracker, how: Uniform | Periodic) -> None:
 
 
 def _far_and_folded(tracker: PathTracker) -> Mask:
-    """Return a mask (U,) of wires on folded layouts that moved far enough to have crossed a fold."""
+    """Return a mask (U,) of the wires that moved far enough to have crossed a fold."""
     problem = tracker.problem
     moved = roots.distance(tracker.solver.x, problem.rest)
     far = np.asarray(moved > roots.JUMP * problem.clearance.min())

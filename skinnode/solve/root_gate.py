@@ -1,10 +1,11 @@
-"""Gate for the exact inverse: finds doubtful wires and checks them with the posterior.
+"""Check the roots found by the exact inverse, and correct them with the posterior.
 
-A wire is doubtful if it has no root, if it moved a long way between two frames, or if its displacement is too
-rough to be a press. If presses can reach folds of a layout, every solved wire is doubtful, because the
-inverse alone cannot distinguish nearby roots of F = b. The posterior, which uses the neighbouring wires,
-confirms the root of a doubtful wire, replaces it, or leaves the wire without a root. The thresholds for these
-decisions are defined in :mod:`skinnode.solve.roots`.
+The solution of a wire is doubtful if the solver found no root, if an electrode moved too far between two
+frames, or if the displacement is too rough to be caused by a press. On some layouts, a press can move a wire
+past a fold, where two roots of F = b merge. On such a layout, all solutions are doubtful, because the exact
+inverse cannot tell which of two nearby roots is right. The posterior estimates the positions from all wires
+of the patch. It confirms each doubtful root, replaces the root, or rejects the root. The thresholds are
+defined in :mod:`skinnode.solve.roots`.
 """
 
 from __future__ import annotations
@@ -28,32 +29,30 @@ from skinnode.solve.wires.problem import PatchProblem
 from skinnode.solve.wires.root_check import SOME_ROUGH, SOME_SUSPECT, RootCheck, check_roots
 
 PAUSE: Final = 16
-"""Number of frames to skip posterior solves after one has missed its deadline.
+"""Number of frames without a posterior solve after a posterior solve has missed its deadline.
 
-If every frame's solve missed its deadline, other patches on the same thread would be delayed by 2 ms per
-frame.
+Without this pause, late solves would delay other patches on the same thread by 2 ms per frame.
 """
 APART: Final = 3.0
-"""Factor for the distance between a root near a fold and the posterior estimate that confirms the root.
+"""Weight of the distance between a root near a fold and the posterior estimate.
 
-The distance times this factor is added in quadrature to the standard deviation, because the posterior cannot
-distinguish roots that are very close.
+If the posterior confirms the root, the weighted distance is added in quadrature to the root's standard
+deviation, because the posterior cannot distinguish two very close roots.
 """
 NEAR_FOLD: Final = 2.0
-"""Factor for the standard deviation of a posterior estimate that replaces a root near a fold; the reason
-is the same as for :data:`APART`."""
+"""Factor by which the standard deviation is enlarged if a posterior estimate replaces a root near a fold."""
 
 Mask = NDArray[np.bool_]
 
 
 class RootGate:
-    """Gate that checks each field of an exact tracker, using the posterior of the same patch.
+    """Checks each field of an exact tracker against the posterior estimate of the same patch.
 
     Each exact tracker needs its own gate.
 
     Args:
         exact: Tracker whose fields are checked.
-        posterior: Posterior of the same patch.
+        posterior: Posterior estimator of the same patch.
         options: Options of both estimators.
     """
 
@@ -67,9 +66,9 @@ class RootGate:
         self._lost, self._unsure, self._rough = np.zeros((3, layout.shape[0]), np.bool_)
         self._pause = 0  # number of frames until the next posterior solve
         self.hurried = False
-        """True if there was not enough time to check all doubtful wires of the last field."""
-        self._confirmed: Float | None = None  # displacement at which a rough wire was last confirmed
-        self._apart = np.zeros((len(problem.rest), 1, 1))  # m; see APART
+        """Whether there was too little time to check all doubtful roots in the last field."""
+        self._confirmed: Float | None = None  # last displacements confirmed despite their roughness
+        self._apart = np.zeros((len(problem.rest), 1, 1))  # additional standard deviation, m; see APART
         self._any_apart = False
         self._blind = roots.blind_wires(layout, options.normal_only)
         self._options = options
@@ -91,10 +90,10 @@ class RootGate:
             pitch_m=layout.pitch_m,
             rough_limit=roots.ROUGH_IN_STREAM / problem.step_limit,
         )
-        self._doubtful()  # compiles the kernel before a stream starts
+        self._doubtful()  # called once here to compile the kernel before a stream starts
 
     def _folded_with(self, noise_factor: float) -> Mask:
-        """Return a mask (U,) of the wires whose roots are doubtful at a multiple of the stated noise."""
+        """Return a mask (U,) of the wires to check if the stated noise is scaled by ``noise_factor``."""
         layout, normal_only = self._exact.layout, self._options.normal_only
         noise = np.multiply(noise_factor, self._options.relative_noise)
         if roots.nonlinear_in_noise(layout, noise, normal_only):
@@ -102,7 +101,7 @@ class RootGate:
         return roots.folded_wires(layout, normal_only)
 
     def set_noise(self, factor: float) -> None:
-        """Assume ``factor`` times the stated noise from the next frame on."""
+        """Scale the stated noise by ``factor``, starting with the next frame."""
         self._folded[:] = self._folded_with(factor)
         self._root_check.folded[:] = self._folded
 
@@ -118,8 +117,10 @@ class RootGate:
 
         Args:
             field: Field of the exact tracker.
-            start: Value of :func:`skinnode.process.clock.perf_counter` when the update began, s.
-            again: True if the same frame has already been checked with a different selection of readings.
+            start: Time at which the tracker's update of this frame began, from
+                :func:`skinnode.process.clock.perf_counter`, s.
+            again: Whether this frame has already been checked and was solved again without some of its
+                readings.
         """
         doubtful: Mask | None = None
         self.hurried = False
@@ -130,10 +131,10 @@ class RootGate:
                 field, self.hurried = self._give_up(field, doubtful), True
             else:
                 if anew:
-                    self._posterior.reset()  # anneal from rest: tracking would confirm a wrong root
+                    self._posterior.reset()  # start at rest: if started at a wrong root, it would confirm it
                 its = self._exact.arrays
                 self._posterior.stop_at(until)
-                # keep non-positive noise, which marks resistances that the posterior cannot use either
+                # Non-positive noise marks unusable resistances, so it is passed on unchanged.
                 noise = np.where(its.noise > 0.0, np.maximum(its.noise, roots.REFEREE_NOISE), its.noise)
                 estimate = self._posterior.estimate(its.ohm.copy(), its.valid.copy(), noise)
                 if Status.DEADLINE in estimate.status:
@@ -148,7 +149,7 @@ class RootGate:
         return field
 
     def _doubtful(self) -> bool:
-        """Return whether any wire has no root (``_lost``), or a root that may be wrong (``_unsure``)."""
+        """Update ``_lost``, ``_unsure`` and ``_rough``; return whether any root is missing or doubtful."""
         found = check_roots(self._root_check.table)
         if found & SOME_ROUGH:
             if self._confirmed is not None:
@@ -157,7 +158,7 @@ class RootGate:
         return found & SOME_SUSPECT != 0 or bool(found & SOME_ROUGH and self._rough.any())
 
     def _keep_apart(self, field: FieldFrame, unasked: Mask) -> FieldFrame:
-        """Restore held wires' standard deviations from the time when the posterior confirmed these wires."""
+        """Enlarge the standard deviations of held wires as when the posterior confirmed their roots."""
         if field.held is None:
             return field
         self._apart[unasked & ~field.held] = 0.0
@@ -175,7 +176,7 @@ class RootGate:
         )
 
     def _give_up(self, field: FieldFrame, doubtful: Mask) -> FieldFrame:
-        """Reject the roots of the doubtful wires, because there is no time for a posterior solve."""
+        """Reject all doubtful roots; called if there is no time for a posterior solve."""
         std = field.displacement_std_m.copy()
         std[doubtful] = np.inf
         self._apart[doubtful] = 0.0
@@ -216,7 +217,7 @@ class RootGate:
 
         self._apart[doubtful] = 0.0
         self._apart[agreed & self._folded] = apart[agreed & self._folded]
-        self._any_apart = True  # recomputed when the next frame is checked
+        self._any_apart = True  # provisional; the check of the next frame recomputes it
 
         assert estimate.core_std_m is not None
         self._exact.adopt(replaced, moved)
@@ -246,14 +247,14 @@ class RootGate:
 
 
 def _mixed_share(estimate: FieldFrame, replaced: Mask) -> Float | None:
-    """Return the data share: the posterior's value for ``replaced`` wires (U,), 1 for all other wires."""
+    """Return the data share of each coordinate: the posterior's for ``replaced`` wires (U,), otherwise 1."""
     if estimate.data_share is None or not replaced.any():
         return None
     return np.where(replaced[:, None, None], estimate.data_share, 1.0)
 
 
 def _selected(status: tuple[Status, ...], changed: Mask, replaced: Mask) -> tuple[Status, ...]:
-    """Return the statuses: CONVERGED for ``replaced`` wires, not CONVERGED for other ``changed`` wires."""
+    """Return ``status`` with ``replaced`` wires CONVERGED and no other ``changed`` wire CONVERGED."""
     found = list(status)
     for u in np.flatnonzero(changed).tolist():
         if replaced[u]:

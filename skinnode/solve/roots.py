@@ -1,36 +1,38 @@
 """Rules and thresholds that decide which root of F = b is the true position of the skin.
 
-A zero residual does not identify the true position, because F = b has several roots. The rules are based on
-four criteria: the layout at rest, the properties of a root, the relative likelihood of two roots of the same
-wire, and the posterior of the whole patch. A layout's relevant properties are its folds, and how sensitive
-its resistances are to electrode positions. A root's relevant properties are its branch, distance from rest
-and roughness. All functions of this module are pure; their callers store the state.
+A zero residual does not identify the true position, because F = b has several roots. Two roots merge at a
+fold, where det J = 0. The roots on either side of a fold are called twins. A root is judged by the sign of
+det J, its distance from the rest position, its roughness, its likelihood relative to other roots of the same
+wire, and the posterior estimate of the whole patch. The roughness of a displacement u is √(uᵀ C⁻¹ u), with C
+from :mod:`skinnode.solve.smoothness`. The conditioning of a wire is the RMS of ∂x/∂(ln R) at rest. Several
+constants are in clearances; the clearance is the smallest distance at rest between an upper and a lower
+electrode. The energy of a displacement is −2 times the logarithm of its probability density.
 
 =================  =====  ================================================  ================================
 constant           value  meaning                                           measured on
 =================  =====  ================================================  ================================
-FOLDED             250    conditioning above which presses meet folds       6000 wires of three layouts
+FOLDED             250    conditioning above which presses can pass folds   6000 wires of three layouts
 BLIND              1e7    conditioning above which a root is meaningless    symmetric; aligned, h ≥ 1.5
-NEARLY_BLIND       1e5    conditioning above which UNLIKELY_BLIND applies   aligned from h = 1
-NONLINEAR          0.003  std, clearances, above which noise hides folds    not measured
-JUMP               0.2    move between frames, clearances, to be checked    folds crossed from 0.24
-LARGE              0.03   displacement, clearances, that must be smooth     folds lie farther out
-ROUGH_IN_STREAM    1.2    roughness / size, checked with the posterior      presses 0.5 to 1.7, wrong 1 to 2
+NEARLY_BLIND       1e5    conditioning above which UNLIKELY_BLIND applies   aligned, h ≥ 1
+NONLINEAR          0.003  std, clearances, above which roots are checked    not measured
+JUMP               0.2    movement, clearances, that triggers a check       folds passed at 0.24 or more
+LARGE              0.03   minimum displacement for a check of roughness     no fold this close to rest
+ROUGH_IN_STREAM    1.2    roughness / size that triggers a check            presses 0.5 to 1.7, wrong 1 to 2
 ROUGH_AT_PATH_END  0.8    roughness / size that triggers a second attempt   presses 0.67, wrong 0.7 to 2
-SMOOTH_PATH        0.2    largest miss of a secant / size on smooth paths   right paths 0.2, wrong from 0.24
-LONG_PATH          20     samples from which only the second half counts    one path that jumped and returned
-ROOT_RESIDUAL      1e-9   RMS of F/b − 1 up to which a path ends at a root  not measured
-STILL_CONFIRMED    0.2    relative change up to which a check stays valid   not measured
-SAME_ROOT          0.001  relative distance up to which roots are equal     not measured
-TWIN_REACH         2      largest relative distance of a twin               staggered, h = 0.3 to 1
-TWIN_ROUGHNESS     1.05   ratio of roughness that decides between twins     82 + 60 + 40 presses, staggered
-UNLIKELY           4      energy margin over other roots                    1530 pairs of roots
-UNLIKELY_BLIND     16     energy margin for nearly blind wires              not measured
-REFEREE_NOISE      1e-5   minimum noise for a posterior that checks roots   not measured
-AGREE              6      standard deviations up to which roots agree       not measured
-NEAR               0.25   first correction, clearances, when tracking       not measured
-FAR                0.1    move, clearances, before annealing is compared    folds crossed from 0.3
-LIKELIER           4      energy margin of a second annealing               a wrong maximum lost by 23
+SMOOTH_PATH        0.2    maximum secant error / size on a smooth path      right ≤ 0.2, wrong ≥ 0.24
+LONG_PATH          20     minimum number of samples of a long path          one path that left and returned
+ROOT_RESIDUAL      1e-9   maximum RMS of F/b − 1 at a root                  not measured
+STILL_CONFIRMED    0.2    maximum relative change of a confirmed root       not measured
+SAME_ROOT          0.001  maximum relative distance of equal roots          not measured
+TWIN_REACH         2      maximum relative distance of a twin               staggered, h = 0.3 to 1
+TWIN_ROUGHNESS     1.05   minimum ratio of roughness, twin to root          82 + 60 + 40 presses, staggered
+UNLIKELY           4      minimum energy margin over other roots            1530 pairs of roots
+UNLIKELY_BLIND     16     minimum energy margin for nearly blind wires      not measured
+REFEREE_NOISE      1e-5   minimum noise of a posterior that checks roots    not measured
+AGREE              6      maximum standard deviations between equal roots   not measured
+NEAR               0.25   first correction, clearances, before annealing    not measured
+FAR                0.1    movement, clearances, before annealing            folds passed at 0.3 or more
+LIKELIER           4      minimum energy decrease by annealing              23 for a wrong maximum
 SUSPICIOUS         3      nuisance, prior std, that triggers a check        not measured
 BELIEVABLE         5      nuisance, prior std, that rejects a frame         not measured
 IMPOSSIBLE_CHANCE  1e-9   probability of the χ² that rejects a wire         by definition
@@ -55,128 +57,115 @@ Mask = NDArray[np.bool_]
 # -- the layout ---------------------------------------------------------------------------------------------
 
 FOLDED: Final = 250.0
-"""Threshold of the RMS of ∂x/∂(ln R) at rest, in clearances; on layouts above this threshold, presses run
-into folds. The RMS is 70 for the staggered layout at h = 0.5, where none of 6000 wires ran into a fold.
-The RMS is at least 1200 for staggered layouts with h ≥ 1 and for all aligned and symmetric layouts; on
-these layouts, one wire in 30 ends at a wrong root."""
+"""RMS of ∂x/∂(ln R) at rest, in clearances, above which a press can move a wire past a fold. The RMS is 70 on
+the staggered layout with h = 0.5, where no folds were found. It is at least 1200 on staggered layouts with h
+of 1 or more and on all aligned and symmetric layouts, where the solver found the wrong root for one wire in
+30."""
 BLIND: Final = 1e7
-"""RMS of ∂x/∂(ln R), in clearances, above which a root is meaningless: R changes only in the seventh digit
-while electrodes move through the whole layer. Wires on a symmetry line of the layout are blind, because
-each of their roots has a mirror image. The only other blind wires are wires at least 1.5 pitches above
-aligned lower wires."""
+"""RMS of ∂x/∂(ln R) at rest, in clearances, above which the resistances do not determine the positions. Only
+wires on a symmetry line of the layout and wires at least 1.5 pitches above aligned lower wires exceed this
+limit."""
 NEARLY_BLIND: Final = 1e5
-"""RMS of ∂x/∂(ln R), in clearances, above which a root must be clearly likelier than all other roots.
+"""RMS of ∂x/∂(ln R) at rest, in clearances, above which :data:`UNLIKELY_BLIND` replaces :data:`UNLIKELY`.
 
-Aligned layouts with h ≥ 1 exceed this value.
+Wires of aligned layouts with h ≥ 1 exceed this limit.
 """
 NONLINEAR: Final = 0.003
-"""Standard deviation of the exact inverse, in clearances, above which F is nonlinear within the range of
-the noise. Above this value, all roots are as doubtful as roots near a fold."""
+"""Standard deviation of the exact inverse, in clearances, above which every root must be checked like a root
+near a fold. With so much noise, a linear error estimate is not valid."""
 
 # -- one root -----------------------------------------------------------------------------------------------
 
 JUMP: Final = 0.2
-"""Movement of an electrode between two frames, in clearances, above which the new root may be wrong.
+"""Movement of an electrode between two frames, in clearances, above which the new root must be checked.
 
-Some movements of 0.24 or more have been observed to cross folds.
+The smallest observed movement across a fold was 0.24.
 """
 LARGE: Final = 0.03
-"""Displacement, in clearances, above which roughness is checked; no fold is closer to the rest position."""
+"""Displacement, in clearances, above which the roughness of a root is checked. The distance from the rest
+position to the nearest fold is larger."""
 ROUGH_IN_STREAM: Final = 1.2
-"""Ratio of a displacement's roughness to its size above which a live stream checks the displacement with
-the posterior. The ratio is 0.5 to 1 for most presses, up to 1.7 for presses that move a single electrode,
-and 1 to 2 for wrong roots."""
+"""Ratio of roughness to size above which a displacement in a live stream is checked with the posterior. The
+ratio was 0.5 to 1 for most presses, up to 1.7 for presses that moved a single electrode, and 1 to 2 for wrong
+roots."""
 ROUGH_AT_PATH_END: Final = 0.8
-"""Ratio of a displacement's roughness to its size above which the end of a path is solved again from the
-smoothest displacement. For presses, the ratio is 0.67 on average, below 0.9 for nine in ten, and up to 1.9
-for presses that move a single electrode. For wrong roots, the ratio is 0.7 to 2."""
+"""Ratio of roughness to size above which the displacement at the end of a path is solved again from the
+guided start. The mean ratio was 0.67 for presses, and the ratio was 0.7 to 2 for wrong roots."""
 SMOOTH_PATH: Final = 0.2
-"""Maximum distance of a sample's solution from the secant through the previous two solutions, relative to
-the final displacement, on a smooth path. For the first sample of a path, the distance is measured from the
-rest position. The value was measured on 3500 wires of aligned and staggered layouts, h = 0.3 to 1, under
-presses of 30 to 70 % with shears of 0.3 to 0.8. On 59 of these wires, paths of 5 to 100 samples led across
-a fold to a root other than the accepted root. On 37 of the 59 wires, the accepted root was wrong; the
-largest distance was at most 0.2, except on 2 wires (0.27 and 0.67). On the other 22 wires, whose paths had
-only 5 widely spaced samples, the accepted root was right; the largest distance was at least 0.24."""
+"""Maximum error of a secant prediction on a smooth path, relative to the final displacement. The secant
+passes through the solutions of the previous two samples; for the first sample, the prediction is the rest
+position. Of 59 simulated paths that ended at a root other than the accepted root, 35 of the 37 correct paths
+stayed within 0.2, and the 22 wrong paths reached at least 0.24."""
 LONG_PATH: Final = 20
-"""Minimum number of samples of a long path; only the second half of a long path must be smooth.
-
-On one of 720 wires, the first of 20 samples led to a wrong root, and the third sample led back to the true
-root, 0.21 from the secant. The other 17 samples were within 0.06 of the secant, and the accepted root was
-wrong by 69 %.
-"""
+"""Minimum number of samples in a long path. Only the second half of a long path must be smooth, because a
+path that jumps to a wrong root early on may return to the correct root."""
 ROOT_RESIDUAL: Final = 1e-9
-"""Maximum RMS of F/b − 1 for accepting the end of a path as a root.
+"""Maximum RMS of F/b − 1 at the end of a path that has reached a root.
 
-J may be too close to singular for the status CONVERGED.
+The solver's status may be other than CONVERGED there, because J can be nearly singular at a root.
 """
 STILL_CONFIRMED: Final = 0.2
-"""Maximum relative change of a confirmed rough displacement; after a larger change, the displacement is
-checked again."""
+"""Maximum change of a confirmed displacement, relative to its size, for which the confirmation remains
+valid."""
 
 # -- two roots of one wire ----------------------------------------------------------------------------------
 
 SAME_ROOT: Final = 1e-3
-"""Maximum distance between two solutions that are considered the same root, relative to the displacement."""
+"""Maximum distance between two solutions that count as the same root, relative to the displacement."""
 TWIN_REACH: Final = 2.0
-"""Maximum distance of a twin root that is solved for, relative to the wire's largest displacement. On the
-staggered layout, h = 0.3 to 1, more distant twins were at least 1.3 times as rough as the root."""
+"""Maximum distance between a root and its twin across a fold, relative to the wire's largest displacement.
+More distant twins need not be considered, because they are at least 1.3 times as rough as the root."""
 TWIN_ROUGHNESS: Final = 1.05
-"""Minimum roughness ratio of two roots at a fold for accepting the smoother root. In 82 random presses of
-50 % on the staggered layout, h = 1, the twins of wrong roots were at most 1.044 times as rough as the
-wrong roots themselves. Of 100 correct roots, 4 have a twin within this ratio and lose the status
-CONVERGED. In 60 further presses of each depth and height (6710 wires, h = 0.3 to 1), no wrong root was
-reported as CONVERGED. In another 40 presses (4510 wires), one wrong root was reported as CONVERGED."""
+"""Ratio of a twin's roughness to a root's roughness, below which the root is rejected as ambiguous. In 82
+simulated presses, the ratio was at most 1.044 for wrong roots. The limit also rejects 4 % of the correct
+roots."""
 UNLIKELY: Final = 4.0
-"""Minimum difference in energy between the accepted root and every other root. In 1530 pairs of roots from
-presses of 30 to 70 % (staggered layout, h = 1; aligned layout, h = 0.5), the wrong root was likelier in 19
-pairs, by an energy of at most 1.4. In a second set of the same size, the wrong root was likelier by at
-most 2.6. Roots at the end of a path are not more reliable: on paths of 5 samples, the wrong root was
-    likelier by up to 2.5."""
+"""Minimum difference in energy (−2 log probability density) between an accepted root and any other root of
+the wire. In 3060 simulated pairs of roots, the energy of a wrong root was at most 2.6 below that of the
+correct root."""
 UNLIKELY_BLIND: Final = 16.0
-"""Minimum difference in energy between the accepted root of a nearly blind wire and every other root.
+"""Minimum difference in energy (−2 log probability density) between two roots of a nearly blind wire.
 
-A nearly blind wire may also have undiscovered roots.
+The margin is larger than :data:`UNLIKELY`, because the search may miss some roots of such a wire.
 """
 
 # -- the posterior of the patch -----------------------------------------------------------------------------
 
 REFEREE_NOISE: Final = 1e-5
-"""Minimum relative noise assumed by a posterior that checks roots.
+"""Minimum relative noise that the posterior assumes when it checks a root.
 
-If the assumed noise were lower, the posterior itself would be forced onto a root of F = b.
+With less noise, the posterior would have to reproduce the resistances exactly and might converge to the same
+wrong root.
 """
 AGREE: Final = 6.0
-"""Number of standard deviations within which the posterior confirms a root."""
+"""Maximum distance between a root and the posterior estimate that confirms the root, in standard
+deviations."""
 NEAR: Final = 0.25
-"""Maximum first correction of an electrode, in clearances; a larger first correction is followed by
-annealing."""
+"""Size of an electrode's first correction, in clearances, above which the posterior restarts by annealing."""
 FAR: Final = 0.1
-"""Movement of an electrode, in clearances, after which the estimate is compared with an estimate annealed
-from rest. Without this comparison, presses of 0.3 or more clearances crossed folds unnoticed in small
-steps."""
+"""Movement of an electrode, in clearances, after which the posterior estimate is compared with a new estimate
+annealed from the rest position. Without this comparison, slow presses could pass a fold unnoticed."""
 LIKELIER: Final = 4.0
-"""Minimum difference in energy for the estimate of a second annealing to replace the first estimate.
+"""Minimum decrease in energy (−2 log posterior density) for which a second annealed estimate replaces the
+first.
 
-A smaller difference indicates that both annealings found the same maximum, shifted towards the estimated
-loads. For the only wrong maximum observed, the difference was 23.
+If the decrease is smaller, both estimates belong to the same maximum of the posterior density.
 """
 SUSPICIOUS: Final = 3.0
-"""Value of a nuisance parameter, in prior standard deviations, above which the estimate is not held, but
-compared with an annealed estimate. A wrong drift or model error can mimic a displacement, and a stream
-that held such an estimate would not recover."""
+"""Estimate of a nuisance parameter, in prior standard deviations, above which the frame is also solved by
+annealing. Otherwise, a wrong drift estimate that mimics a displacement might persist throughout a stream."""
 BELIEVABLE: Final = 5.0
-"""Value of a nuisance parameter, in prior standard deviations, above which the frame is INCONSISTENT."""
+"""Estimate of a nuisance parameter, in prior standard deviations, above which a frame is INCONSISTENT."""
 IMPOSSIBLE_CHANCE: Final = 1e-9
-"""Probability per frame that the χ² test reports a correctly modelled wire as INCONSISTENT."""
+"""Probability that the χ² test reports a wire as INCONSISTENT in a frame although the model is correct."""
 Z_REFUSE: Final = 5.998
-"""Normal quantile of 1 − 1e-9; the corresponding χ² is the limit above which the root of a tall system is
-rejected. At 100 frames/s, noise alone exceeds this χ² limit once in four months. Wrong roots and wrong
-resistances cause values of χ² above the limit."""
+"""Normal quantile for the probability 1 − 1e-9. The root of a wire with more equations than unknowns is
+rejected if the χ² of its residual exceeds the corresponding χ² quantile. At 100 frames/s, noise alone causes
+one rejection per wire in four months."""
 
 
 def folded_wires(layout: PatchLayout, normal_only: bool = False) -> Mask:
-    """Return a mask (U,) of the wires on which presses run into folds of F = b."""
+    """Return a mask (U,) of the wires that a press can move past a fold of F = b."""
     return np.asarray(wire_std(layout, 1.0, normal_only) > FOLDED)
 
 
@@ -186,22 +175,23 @@ def blind_wires(layout: PatchLayout, normal_only: bool = False) -> Mask:
 
 
 def nonlinear_in_noise(layout: PatchLayout, relative_noise: ArrayLike, normal_only: bool = False) -> bool:
-    """Return whether F is nonlinear within the range of the exact inverse's noise."""
+    """Return whether the noise is too large for a linear error estimate of the exact inverse."""
     return patch_std(layout, relative_noise, normal_only) > NONLINEAR
 
 
 def on_rest_branch(status: Index, branch: Index, rest_branch: Index, out_of_reach: Mask) -> Mask:
-    """Return a mask (U,) of the wires solved to a root within reach, on the rest position's branch.
+    """Return a mask (U,) of the wires at a plausible root on the same branch as the rest position.
 
-    On this branch, the determinant of J has the same sign as at rest. For a system with more equations than
-    unknowns, which has no determinant, the sign is 0. A root is within reach if no electrode moves farther
-    than its clearance from the lower layer (:meth:`skinnode.solve.wires.problem.PatchProblem.out_of_reach`).
+    Two positions are on the same branch if det J has the same sign at both positions. With more equations
+    than unknowns, det J does not exist, and this condition is ignored. A root is plausible if no electrode
+    moves farther than its distance at rest from the nearest lower electrode
+    (:meth:`skinnode.solve.wires.problem.PatchProblem.out_of_reach`).
 
     Args:
         status: (U,) statuses of the solves.
         branch: (U,) sign of det J at the solution, 0 if unknown.
         rest_branch: (U,) sign of det J at rest, 0 if unknown.
-        out_of_reach: (U,) wires with an electrode farther from rest than its clearance.
+        out_of_reach: (U,) mask of the wires whose roots are implausibly far from rest.
     """
     return np.asarray((status == Status.CONVERGED) & (branch * rest_branch >= 0) & ~out_of_reach)
 
@@ -212,12 +202,12 @@ def crossed_fold(branch: Index, before: Index) -> Mask:
 
 
 def rough_at_path_end(roughness: Float, displacement: Float, step_limit: float) -> Mask:
-    """Return a mask (U,) of the wires whose displacement is too rough to be a press.
+    """Return a mask (U,) of the wires whose displacement is too rough to be caused by a press.
 
     Args:
         roughness: (U,) √(uᵀ C⁻¹ u).
         displacement: (U, n) displacement, pitches.
-        step_limit: Initial trust radius of the patch, pitches; the displacement size that C assumes.
+        step_limit: Standard deviation of a coordinate in C, pitches.
     """
     size = np.sqrt((displacement**2).sum(axis=1)) / step_limit
     return np.asarray(roughness > ROUGH_AT_PATH_END * size)
@@ -229,27 +219,27 @@ def distance(x: Float, other: Float) -> Float:
 
 
 def agrees(gap: Float, reach: Float) -> Mask:
-    """Return a mask (U,) of the wires whose coordinates all differ from an estimate by at most ``reach``.
+    """Return a mask (U,) of the wires with every coordinate within ``reach`` of an estimate.
 
     Args:
         gap: (U, ...) absolute differences from the estimate.
-        reach: Limits of the same shape, :data:`AGREE` standard deviations.
+        reach: Maximum difference, same shape as ``gap``.
     """
     return np.asarray((gap <= reach).all(axis=tuple(range(1, gap.ndim))))
 
 
 def still_confirmed(displacement: Float, confirmed: Float) -> Mask:
-    """Return a mask (U,) of wires whose displacement (U, N, 3) has changed little since confirmation."""
+    """Return a mask (U,) of the wires whose displacement (U, N, 3) is still close to ``confirmed``."""
     change = np.abs(displacement - confirmed).max(axis=(1, 2))
     return ~np.asarray(change > STILL_CONFIRMED * np.abs(displacement).max(axis=(1, 2)))
 
 
 def beyond_prior(nuisances: Float, variance: Float, deviations: float) -> bool:
-    """Return whether any nuisance parameter is implausibly large.
+    """Return whether the estimate of any nuisance parameter is implausibly large.
 
     Args:
-        nuisances: (p,) estimates of the nuisances.
-        variance: (p,) prior variances of the nuisances.
+        nuisances: (p,) estimates of the nuisance parameters.
+        variance: (p,) prior variances of the nuisance parameters.
         deviations: Largest plausible estimate, in prior standard deviations.
     """
     return bool((np.abs(nuisances) > deviations * np.sqrt(variance)).any())

@@ -1,10 +1,11 @@
-"""Starting points for samples or frames that cannot be solved from an earlier solution.
+"""Starting points for the solver if no earlier solution is close enough.
 
-- ``guided_start`` finds the smooth displacement that explains the resistances (the maximum a posteriori
-  estimate), while lowering the assumed noise in steps (data-space Gauss-Newton, Tarantola 2005, section 3.4).
-- ``near_twin`` estimates the second root across a fold, which is nearby if J is nearly singular. Along the
-  direction v of the smallest singular value σ, the equation σ α + ½ α² wᵀF″[v, v] = 0 holds to second order.
-  Its solution α = −2σ / wᵀF″[v, v] is the position of the twin (Golubitsky & Schaeffer 1985, chapter I.3).
+- ``guided_start`` computes the maximum a posteriori estimate of a displacement with a smoothness prior. It
+  takes Gauss-Newton steps and reduces the assumed noise after each step (Tarantola 2005, section 3.4).
+- ``near_twin`` estimates the position of a root's twin, the root on the other side of the nearest fold. Let σ
+  be the smallest singular value of J, with left vector w and right vector v. To second order, the distance α
+  between the roots along v satisfies σ α + ½ α² wᵀF″[v, v] = 0. The twin is therefore at α = −2σ / wᵀF″[v, v]
+  (Golubitsky & Schaeffer 1985, chapter I.3).
 """
 
 from __future__ import annotations
@@ -22,17 +23,17 @@ from skinnode.solve.linalg.vectors import Index, dot, largest, padded
 from skinnode.solve.wires.problem import PatchProblem
 
 NOISE_LEVELS: Final[Float] = np.power(10.0, -0.5 * np.arange(2.0, 16.0))
-"""Noise levels of r in the guided start: two per decade from 0.1 to 3e-8, with one step per level.
+"""Standard deviations of r assumed in the successive steps of the guided start: two per decade from 0.1 to
+3e-8.
 
-If there were only one level per decade, the guided start would fail on one more wire in a hundred (presses of
-50 % at h = 1).
+With one level per decade, the guided start failed on an additional 1 % of the wires in simulations.
 """
 POWER_STEPS: Final = 8
-"""Number of inverse iterations, which is sufficient because the second-smallest singular value is about 3
-times the smallest."""
+"""Number of inverse iterations for the smallest singular value of J. The iteration converges quickly, because
+the second-smallest singular value is about three times as large."""
 DIFFERENCE: Final = 1e-4
-"""Step of the central difference of Jacobians, pitches. The step exceeds eps^(1/3) = 6e-6, at which rounding
-and truncation errors are equal, and is far below any clearance."""
+"""Half-width of the central difference of two Jacobians, pitches. Rounding errors are negligible, because the
+step is much larger than eps^(1/3) = 6e-6."""
 
 
 def guided_start(problem: PatchProblem, wire: int, a: Float, covariance: Float) -> tuple[Float, int]:
@@ -41,13 +42,12 @@ def guided_start(problem: PatchProblem, wire: int, a: Float, covariance: Float) 
     Args:
         problem: The patch.
         wire: Index of the upper wire.
-        a: (K,) R · gain of the wire.
-        covariance: (n, n) prior covariance of the displacement, pitches². Any covariance works; the
-            covariance of elastic rubber would also involve the neighbouring wires.
+        a: (K,) scaled resistances R · gain of the wire.
+        covariance: (n, n) prior covariance of the wire's displacement, pitches².
 
     Returns:
-        (n,) position, pitches, and the number of evaluations of F and J. The rest position is returned if the
-        iteration runs into an electrode.
+        (n,) position, pitches, and the number of evaluations of F and J. If the iteration fails, the position
+        is the rest position.
     """
     n, equations = problem.rest.shape[1], a.size
     x = problem.rest[wire].copy()
@@ -73,10 +73,10 @@ def _follow_noise(  # noqa: PLR0913, C901 - a kernel: arrays and scratch by name
     inner: Float,
     pivot: Index,
 ) -> int:
-    """Take one Gauss-Newton step per noise level, in place: x = rest + C Jᵀ (J C Jᵀ + σ²)⁻¹ y.
+    """Update ``x`` by one Gauss-Newton step per noise level: x = rest + C Jᵀ (J C Jᵀ + σ²)⁻¹ y.
 
-    In this formula, y = J (x − rest) − r. All arguments after ``noises`` are scratch; ``inner`` is padded
-    with zeros for :func:`lu_factor`. Returns the number of evaluations.
+    Here, y = J (x − rest) − r, and σ is the noise level. The arrays after ``noises`` are workspace. Returns
+    the number of evaluations of F and J.
     """
     n, equations = jt.shape
     for level in range(noises.size):
@@ -117,16 +117,16 @@ def _follow_noise(  # noqa: PLR0913, C901 - a kernel: arrays and scratch by name
 
 
 def near_twin(problem: PatchProblem, x: Float, a: Float, inverse: Float) -> Float:
-    """Estimate the root on the other side of the nearest fold, using two Jacobians.
+    """Estimate the position of the root on the other side of the nearest fold.
 
     Args:
         problem: The patch.
         x: (n,) root of a wire, pitches.
-        a: (K,) R · gain of the wire.
+        a: (K,) scaled resistances R · gain of the wire.
         inverse: (n, K) ∂x/∂r at ``x``.
 
     Returns:
-        (n,) position, pitches; not finite if there is no fold to second order.
+        (n,) position, pitches; not finite if the second-order approximation has no second root.
     """
     w = np.ones(a.size)
     for _ in range(POWER_STEPS):

@@ -1,13 +1,14 @@
-"""Tracker for a live stream: computes one field per frame with the method that suits the patch.
+"""Tracker that estimates the displacement field of a patch for each frame of a live stream.
 
-``exact`` inverts each wire separately, as the paper does; ``posterior`` estimates the whole patch with an
-elastic prior. ``auto`` chooses the exact inverse if this method is accurate enough at the converter's noise.
-Wires with a doubtful exact inverse are checked with the posterior (:mod:`skinnode.solve.root_gate`).
+The method ``exact`` solves for each upper wire separately. The method ``posterior`` estimates the whole patch
+with an elastic prior. The default, ``auto``, selects ``exact`` if the converter's noise is low enough for
+this method, otherwise ``posterior``. Doubtful solutions of the exact method are checked with the posterior
+(:mod:`skinnode.solve.root_gate`).
 
-If the stream shows that its noise differs from the stated noise, the tracker scales the stated noise
-(:mod:`skinnode.solve.noise_estimate`). With ``auto``, the tracker switches to the posterior if the noise is
-too large for the exact inverse, and back to the exact inverse when the noise falls again. After a switch, the
-new method starts from the rest position.
+The tracker estimates the noise of the stream and scales the stated noise accordingly
+(:mod:`skinnode.solve.noise_estimate`). With ``auto``, the tracker switches between the methods if the
+estimated noise crosses the limit for the exact method. After a switch, the new method starts from the rest
+position.
 """
 
 from __future__ import annotations
@@ -35,29 +36,28 @@ from skinnode.solve.root_gate import RootGate
 from skinnode.solve.wires.problem import PatchProblem
 
 NO_CODE: Final = np.uint32(0xFFFF_FFFF)
-"""Placeholder code for readings that are left out; no converter sends this code."""
+"""Invalid code that marks a reading to be ignored; no converter sends this code."""
 EXACT_STD: Final = 0.0025
-"""Maximum standard deviation at rest, in clearances, for ``auto`` to choose the exact inverse. The limit
-is 2.5 % of the depth of a press that indents the layer by a tenth of its thickness. For 16-bit codes, the
-standard deviation is 0.0005 on the staggered layout, h = 0.5, and 0.05 on the aligned layout."""
+"""Maximum standard deviation of an electrode position at rest, in clearances, for which ``auto`` selects the
+exact method. With 16-bit codes, the standard deviation is 0.0005 on the staggered layout with h = 0.5, and
+0.05 on the aligned layout."""
 
 
 class Tracker:
-    """Tracker that follows one patch through a stream of frames.
+    """Estimates the displacement field of one patch for each frame of a stream.
 
-    Each patch needs its own tracker. The tracker's compiled code runs without the GIL. The constructor
-    compiles the kernels.
+    Each patch needs its own tracker. The constructor compiles the kernels, which run without the GIL.
 
     Args:
         layout: The patch.
-        options: Options of the tracker; the default is :class:`skinnode.solve.options.TrackerOptions()`.
-        **arguments: Options by name, which override ``options``.
+        options: Options of the tracker; default: ``TrackerOptions()``.
+        **arguments: Individual options, which override the same options in ``options``.
 
     Attributes:
         layout: The patch.
         options: Options in effect.
         method: Method in use, ``exact`` or ``posterior``; ``auto`` may change it during a stream.
-        reason: Short reason for the choice of method.
+        reason: Why this method is in use, as a short text.
 
     Raises:
         ValueError: If an option has the wrong shape or is out of range.
@@ -78,11 +78,11 @@ class Tracker:
         if self.method == "posterior":
             self._posterior = Posterior(layout, options.of_posterior())
             return
-        # the posterior that checks roots receives only some of the frames, with the exact tracker's noise
-        # estimate
+        # This posterior checks roots in some of the frames only, so it uses the exact tracker's noise
+        # estimate.
         self._posterior = Posterior(layout, dataclasses.replace(options.of_posterior(), follow_noise=False))
         self._noise = NoiseEstimate(layout.shape) if options.follow_noise else None
-        self._factor = 1.0  # noise factor for which the method and the gate are set
+        self._factor = 1.0  # noise factor that the method and the root check currently assume
         self._exact = ExactTracker(
             layout,
             operator=options.operator,
@@ -106,10 +106,10 @@ class Tracker:
         self.reset()
 
     def prepare(self) -> None:
-        """Compute tables in advance; otherwise, the first frames of a touch would be delayed by up to 0.1 s.
+        """Compute tables in advance, so that they do not delay the first frames of a touch by up to 0.1 s.
 
-        For the reference patch, computing the tables takes 0.25 s and 85 MB; trackers of the same layout
-        share them. The host calls this method before starting the nodes.
+        For the reference patch, this takes 0.25 s and 85 MB. Trackers of the same layout share the tables.
+        The host calls this method before it starts the nodes.
         """
         self._posterior.check.prepare()
 
@@ -132,20 +132,20 @@ class Tracker:
     ) -> FieldFrame:
         """Compute the displacement field of one frame.
 
-        No resistance value raises an exception. A wire that could not be solved keeps its last trusted
-        position, with an infinite standard deviation and a status other than CONVERGED.
+        Invalid resistances do not raise an exception. If a wire cannot be solved, the field contains the
+        wire's last trusted position, an infinite standard deviation and a status other than CONVERGED.
 
         Args:
             frame_ohm: (U, K) resistances, ohm; values that are not positive and finite are ignored.
-            valid: (U, K) bool, False if a chunk or wire is missing; default all True.
-            relative_noise: Noise of this frame only, a number or (U, K). Resistances whose noise is not
-                positive and finite are ignored.
+            valid: (U, K) bool, False for missing readings; default: all True.
+            relative_noise: Relative standard deviation of the resistances in this frame, a number or (U, K).
+                A resistance is ignored if its noise is not positive and finite.
 
         Returns:
             The field, with one status per wire.
 
         Raises:
-            ValueError: If a shape is wrong.
+            ValueError: If an argument has the wrong shape.
         """
         start = perf_counter()
         if self._exact is None or self.method == "posterior":
@@ -158,16 +158,16 @@ class Tracker:
         return self._judged(field)
 
     def update_codes(self, codes: NDArray[np.uint32]) -> tuple[FieldFrame, int]:
-        """Compute the field of a scan from its codes; much faster than decoding followed by :meth:`update`.
+        """Compute the displacement field of a scan from its codes; faster than decoding and :meth:`update`.
 
         Args:
-            codes: (U, K) uint32, converted by the mapping that the constructor received as ``codes``.
+            codes: (U, K) uint32 codes, which the option ``codes`` maps to resistances.
 
         Returns:
-            The field, computed from the decoded resistances and their noise; and the number of invalid codes.
+            The field, and the number of invalid codes.
 
         Raises:
-            ValueError: If the shape or type is wrong, or the tracker was created without ``codes``.
+            ValueError: If ``codes`` has the wrong shape or type, or the option ``codes`` is not set.
         """
         start, meaning = perf_counter(), self.options.codes
         if meaning is None:
@@ -194,7 +194,7 @@ class Tracker:
 
     @property
     def scan(self) -> int | None:
-        """Scan number of the next frame, for ``DataFault.since``; if None, the tracker counts frames."""
+        """Scan number of the next frame, used in ``DataFault.since``; if None, frames are counted instead."""
         return self._posterior.check.scan
 
     @scan.setter
@@ -204,7 +204,7 @@ class Tracker:
             self._check.scan = number
 
     def _checked(self, field: FieldFrame, ohm: Float, start: float) -> FieldFrame:
-        """Return the exact tracker's field after adding its data faults and whether it is trusted."""
+        """Test the data of an exact field; return the field with its data faults and trust added."""
         exact = self._exact
         assert exact is not None
         its = exact.arrays
@@ -220,18 +220,18 @@ class Tracker:
         return self._check.check(solved(field), solve_without, until)
 
     def _judged(self, field: FieldFrame) -> FieldFrame:
-        """Return the field after adding whether it is precise and, for an exact field, its contacts."""
+        """Return the field with the attribute ``precise`` and, for the exact method, the contacts added."""
         if field.method == "exact" and self._contacts is not None:
             field = self._contacts.add(field)
         return field if is_precise(field, self._limits) else amended(field, precise=False)
 
     def _follow_noise(self) -> None:
-        """Adapt the method and the gate of an exact tracker if the estimated noise has changed."""
+        """Call :meth:`_adapt` if the noise estimate has changed."""
         if self._exact is not None and self._noise is not None and self._noise.factor != self._factor:
             self._adapt(self._noise)
 
     def _adapt(self, noise: NoiseEstimate) -> None:
-        """Choose the method and set the gate for the estimated noise."""
+        """Select the method and the limits of the root check for the estimated noise."""
         assert self._exact is not None
         self._factor = noise.factor
         self._gate.set_noise(noise.factor)
@@ -255,10 +255,10 @@ class Tracker:
 
 
 def choose_method(layout: PatchLayout, options: TrackerOptions) -> tuple[str, str]:
-    """Return the method of a tracker, ``exact`` or ``posterior``, and the reason for it.
+    """Select ``exact`` or ``posterior`` for a tracker; return the method and the reason for the choice.
 
     Raises:
-        ValueError: If the method requested does not support an option.
+        ValueError: If the requested method does not support one of the options.
     """
     nuisances, normal_only = options.nuisances, options.normal_only
     if options.method != "auto":

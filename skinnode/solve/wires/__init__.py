@@ -1,7 +1,8 @@
-"""Compiled solver for the upper wires of a patch, shared by the exact tracker and path following.
+"""Compiled solver for the upper wires of a patch; used by the exact tracker and the path tracker.
 
-``problem`` converts a patch to dimensionless systems of equations, and ``arrays`` declares the arrays that
-kernels read and write. ``decode`` converts a frame's codes to resistances. ``solve_wires`` solves the wires
-one by one, using ``hold``, ``follow`` and ``correct``; ``stages`` contains the steps before and after the
-solve. ``patch_solver`` combines all these steps in one call. ``root_check`` finds roots that may be wrong.
+The module ``problem`` derives dimensionless equations from a patch, and ``arrays`` declares the arrays that
+the kernels read and write. ``decode`` converts codes to resistances. ``solve_wires`` solves one wire after
+another with the functions in ``hold``, ``follow`` and ``correct``. ``stages`` contains the computations
+before and after the solve. ``patch_solver`` performs all of these computations in one compiled call.
+``root_check`` finds roots that may be wrong.
 """

@@ -1,7 +1,7 @@
-"""Declarations (name, element type and axes) of the arrays of a patch that kernels read and write.
+"""Names, element types and axes of the arrays that the compiled kernels read and write.
 
-A patch has U upper wires with N electrodes each and K lower wires with M electrodes each. An upper wire has n
-unknowns, which belong to E of its electrodes. Lengths are in pitches (see ``problem``).
+A patch has U upper wires with N electrodes each and K lower wires with M electrodes each. The n unknowns of
+an upper wire are coordinates of E of its electrodes. Lengths are in pitches (see ``problem``).
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ Mask = NDArray[np.bool_]
 
 # Columns of a wire's integer report
 STATUS, EVALUATIONS, STEPS, BRANCH, HELD, SPARE, TURN, REPORT = range(8)
-# Columns of a wire's floating-point report: RESIDUAL is the weighted RMS over the equations in use; CHI2 is
-# the χ² of the residual at the end of a solve, with SPARE (equations minus unknowns) degrees of freedom.
+# Columns of a wire's floating-point report: RESIDUAL is the weighted RMS residual of the equations in use.
+# CHI2 is the χ² of the final residual, which has SPARE degrees of freedom.
 RESIDUAL, OPTIMALITY, ERROR_ESTIMATE, CHI2, MEASURES = range(5)
 
-# Index in a code map: relative noise before the converter
+# Index of the front end's relative noise in a code map
 NOISE: Final = 3
 
 # Actions for a wire
@@ -38,15 +38,15 @@ SOLVE: Final = 1
 PREDICT: Final = 2
 """Solve the wire, starting at x + (∂x/∂a) (a − a of the last solve)."""
 HOLD: Final = 3
-"""Like PREDICT, but keep x unchanged if the residual at x is within noise."""
+"""Like PREDICT, but do not solve a wire whose residual at its present x is within noise."""
 
-# Additional tasks of a solve, combined with bitwise or
+# Optional tasks of a solve, combined with bitwise or
 COVARIANCE: Final = 1
-"""Compute J⁻¹, and use it to compute the standard deviation and the rounding error of x."""
+"""Compute J⁻¹, the standard deviation of x and the rounding error of x."""
 SKIP: Final = 2
 """Skip a wire whose first-order optimality ‖Jᵀr‖∞ is below tol_f (Xu et al. 2018, section 5.2)."""
 REUSE: Final = 4
-"""If a wire has moved only a little, follow it using its stored inverse, and keep this inverse."""
+"""If a wire has moved only slightly, solve it with the J⁻¹ of an earlier solve."""
 
 
 class SolveOptions(ArrayTable):
@@ -55,8 +55,8 @@ class SolveOptions(ArrayTable):
     Args:
         operator: Operator code, from :data:`skinnode.solve.operators.codes.OPERATORS`.
         tasks: COVARIANCE, SKIP and REUSE, combined with bitwise or.
-        tol_f: Largest |r| at a root.
-        tol_x: Largest remaining correction, relative to max(1, max|x|).
+        tol_f: Maximum |r| at a root.
+        tol_x: Maximum estimated error of x at a root, relative to max(1, max|x|).
         max_steps: Maximum number of trial steps per wire.
 
     Raises TypeError if a value has the wrong type, and ValueError if a tolerance or ``max_steps`` is not
@@ -80,83 +80,83 @@ class SolveOptions(ArrayTable):
 def solve_options(
     operator: int, tasks: int = 0, tol_f: float = 1e-9, tol_x: float = 1e-9, max_steps: int = 12
 ) -> SolveOptions:
-    """Return :class:`SolveOptions` with these values, from a cache if possible."""
+    """Return cached :class:`SolveOptions` with the given values."""
     return SolveOptions(int(operator), int(tasks), float(tol_f), float(tol_x), int(max_steps))
 
 
 class SolverArrays(ArrayTable):
-    """State, results and workspace of a patch's solver, for wires that have unknowns on E electrodes."""
+    """State, results and workspace of a patch's solver. Each wire has unknowns on E electrodes."""
 
     x: Annotated[Float, "U 3N"]
-    """Starting point, then solution."""
+    """Starting point before a solve, solution after the solve."""
     inverse: Annotated[Float, "U 3N K"]
-    """∂x/∂r of the last converged solve of each wire."""
+    """∂x/∂r at each wire's last converged solution."""
     a_solved: Annotated[Float, "U K"]
-    """Value 1/F at the last converged solution; 1 if the equation was missing."""
+    """1/F at the last converged solution; 1 for an equation that was not used."""
     noise: Annotated[Float, "U K"]
-    """Variance of a at the last converged solution; inf if the equation was missing."""
+    """Relative variance of a in the last converged solve; inf for an equation that was not used."""
     std: Annotated[Float, "U 3N"]
     """Standard deviation of x; inf if unknown."""
     report: Annotated[Index, "U report"]
     measure: Annotated[Float, "U measures"]
     tally: Annotated[Index, "3"]
-    """Total numbers of evaluations of F, evaluations of J, and steps, over all calls."""
+    """Numbers of evaluations of F, evaluations of J, and steps since the last reset."""
     lower: Annotated[Float, "3 M K", READONLY]
     electrodes: Annotated[Index, "U N"]
-    """Indices of each wire's electrodes; electrodes with unknowns come first."""
+    """Indices of each wire's electrodes, beginning with the electrodes that have unknowns."""
     still: Annotated[Float, "U K"]
-    """Contribution to F from the electrodes without unknowns."""
+    """Contribution of the electrodes without unknowns to F."""
     still_std: Annotated[Float, "U 3N"]
-    """Standard deviation of the coordinates that are not unknowns."""
+    """Standard deviations of the coordinates that are not unknowns."""
     turn: Annotated[Index, "1"]
-    """Frame number, which determines the wires whose inverse is recomputed if inverses are reused."""
+    """Frame number. With REUSE, this number determines which wires recompute their inverses."""
     step_limit: float
     """Initial trust radius, pitches per coordinate."""
     point: Annotated[Float, "3E"]
-    """Coordinates of the electrodes with unknowns."""
+    """Positions of the electrodes that have unknowns."""
     raw: Annotated[Float, "3E K"]
     """Jacobian of F at ``point``, transposed."""
     work: Work
 
 
 class FrameArrays(ArrayTable):
-    """Arrays of a patch's stream and of its current frame."""
+    """Data of a patch's current frame and of its last trusted solution."""
 
     codes: Annotated[NDArray[np.uint32], "U K"]
     baseline_ohm: Annotated[Float, "U K"]
     code_gain: Annotated[Float, "U K"]
     rounding_ohm: Annotated[Float, "U K"]
     code_map: Annotated[Float, "4"]
-    """Four entries: R/R0 at code 0, change in R/R0 per code, largest valid code, and relative noise before
-    the converter."""
+    """Four values: R/R0 at code 0, change in R/R0 per code, largest valid code, and relative noise of the
+    front end."""
     ohm: Annotated[Float, "U K"]
     noise: Annotated[Float, "U K"]
-    """Relative standard deviation of the resistance."""
+    """Relative standard deviation of each resistance."""
     valid: Annotated[Mask, "U K"]
     gain: Annotated[Float, "U K"]
     """a / R."""
     a: Annotated[Float, "U K"]
-    """Resistance in the units of the problem."""
+    """Resistance in solver units."""
     weight: Annotated[Float, "U K"]
-    """Ratio of σ to the standard deviation; 0 if the standard deviation is unknown or the resistance
-    invalid."""
+    """Minimum standard deviation of the frame's resistances, divided by the standard deviation of each
+    resistance. The weight is 0 if the resistance is invalid or its standard deviation is unknown."""
     used: Annotated[Float, "U K"]
-    """Same as ``weight``, but also 0 if a is out of range."""
+    """Like ``weight``, but also 0 if ``a`` is out of range."""
     todo: Annotated[Bytes, "U"]
-    """LEAVE, SOLVE, PREDICT or HOLD."""
+    """Action for each wire: LEAVE, SOLVE, PREDICT or HOLD."""
     order: Annotated[Index, "U"]
-    """Indices of the wires, in processing order."""
+    """Indices of the wires in the order in which they are solved."""
     first: int
-    """HOLD or PREDICT, the action for a wire that can be predicted."""
+    """Action for a wire that has a usable inverse: HOLD or PREDICT."""
     pitch_m: float
     x: Annotated[Float, "U 3N"]
     """Last trusted position."""
     a_solved: Annotated[Float, "U K"]
-    """Value of a at the last trusted position."""
+    """1/F at the last trusted position."""
     weight_solved: Annotated[Float, "U K"]
-    """Weights that were used to compute each wire's inverse."""
+    """Weights of the equations in each wire's last trusted solution."""
     predictable: Annotated[Mask, "U"]
-    """Whether the solver's inverse of each wire was computed at the wire's x."""
+    """Whether each wire has an inverse that belongs to its last trusted position."""
     unknowns: Annotated[Index, "U"]
     """Number of unknowns of each wire."""
     rest: Annotated[Float, "U 3N"]
@@ -164,19 +164,19 @@ class FrameArrays(ArrayTable):
     """Sign of det J at rest."""
     clearance: Annotated[Float, "U N"]
     good: Annotated[Mask, "U"]
-    """Whether the solver found an acceptable root for each wire."""
+    """Whether an acceptable root was found for each wire."""
     status: Annotated[Index, "U"]
     moved_m: Annotated[Float, "U 3N"]
-    """Displacement."""
+    """Displacement of the electrodes."""
     std_m: Annotated[Float, "U 3N"]
-    """Standard deviation of the displacement."""
+    """Standard deviation of ``moved_m``."""
     held: Annotated[Mask, "U"]
 
     def __init__(self, problem: PatchProblem, rest_branch: Index, unknowns: Index, first: int) -> None:
         shape, rest = problem.layout.shape, problem.rest
         upper = shape[0]
         self.outcome_m = np.empty((2, *problem.layout.upper_m.shape))
-        """(2, U, N, 3) displacement and its standard deviation."""
+        """(2, U, N, 3) displacement of the electrodes, and its standard deviation, m."""
         moved_m, std_m = self.outcome_m.reshape(2, *rest.shape)
         baseline_ohm, code_gain, rounding_ohm = np.ones((3, *shape))
         ohm, noise, a, weight, used = np.empty((5, *shape))
@@ -213,11 +213,11 @@ class FrameArrays(ArrayTable):
         )
 
     def set_codes(self, codes: CodeMap) -> None:
-        """Set the mapping from codes to resistances."""
+        """Use ``codes`` to convert codes to resistances."""
         self.baseline_ohm[:], self.rounding_ohm[:] = codes.baseline_ohm, codes.rounding_ohm
         self.code_gain[:] = 1.0 if codes.gain is None else codes.gain
         self.code_map[:] = codes.lo, codes.step, codes.steps, codes.relative_noise
 
 
 read_options, read_solver, read_frame = reader(SolveOptions), reader(SolverArrays), reader(FrameArrays)
-"""Functions with which kernels read the fields of a table."""
+"""Functions that kernels use to access the arrays in a table."""

@@ -1,11 +1,11 @@
-"""Compiled corrector: solves r = w (a F − 1) = 0 for one wire with an operator.
+"""Compiled corrector: solves r = w (a F − 1) = 0 for one wire by Newton-like iteration.
 
-A wire's unknowns are all or some of its electrodes' coordinates: some electrodes may be fixed at rest, and x
-and y may be fixed (``normal_only``). A system with fewer unknowns than equations is tall; χ² = Σ (ρ_k/σ_k)²
-at the minimum is used to test the fit. If χ² is above the 1 − 1e-9 quantile, no position explains the frame,
-and the wire is ILL_CONDITIONED. If χ² is above the 95 % quantile, the standard deviations are multiplied by
-√(χ²/dof) (Birge, Physical Review 40, 207, 1932). The χ² test replaces the test of the sign of det J, which is
-defined only for a square system.
+The unknowns are the coordinates of a wire's electrodes. Some electrodes may be fixed at rest, and x and y may
+be fixed (``normal_only``). A system with more equations than unknowns is called tall. The solution of a tall
+system minimises χ² = Σ (ρ_k/σ_k)², where ρ_k = a_k F_k − 1 is a relative residual and σ_k is its standard
+deviation. If the minimum exceeds the 1 − 1e-9 quantile, the frame is inconsistent with the model, and the
+wire is ILL_CONDITIONED. If it exceeds the 95 % quantile, the standard deviations are multiplied by √(χ²/dof)
+(Birge, Physical Review 40, 207, 1932). For square systems, the sign of det J is tested instead of χ².
 """
 
 from __future__ import annotations
@@ -45,16 +45,16 @@ from skinnode.solve.wires.arrays import (
 from skinnode.solve.wires.hold import chi2_quantile_part
 
 DATA_ROUNDING: Final = 2.0
-"""Relative rounding error of a F, in eps. R, gain, their product and F each have a rounding error of half an
-eps."""
+"""Relative rounding error of a F, in eps. The error is the sum of four errors of eps/2, in R, in the gain, in
+their product and in F."""
 
 Z_95_ONE_SIDED: Final = 1.645
-"""Normal quantile for a probability of 95 %."""
+"""95 % quantile of the standard normal distribution."""
 
 
 @njit_part
 def _data_rounding(inverse: Float, weight: Float) -> float:
-    """Return the largest coordinate error due to rounding of the resistances; ``inverse`` (n, K) is ∂x/∂r."""
+    """Return the maximum error of a coordinate due to rounding errors in a F."""
     top = 0.0
     for j in range(inverse.shape[0]):
         row, total = inverse[j], 0.0
@@ -68,9 +68,9 @@ def _data_rounding(inverse: Float, weight: Float) -> float:
 def _evaluate(  # noqa: PLR0913 - arrays of one wire
     x: Float, point: Float, still: Float, lower: Float, a: Float, weight: Float, r: Float, raw: Float
 ) -> None:
-    """Copy the unknowns ``x`` into ``point``; evaluate r = w (a F − 1) and the Jacobian of F at ``point``.
+    """Copy the unknowns ``x`` to ``point``; compute r = w (a F − 1) and the Jacobian ``raw`` of F there.
 
-    ``still`` (K,) is the contribution to F from electrodes that are not in ``point``.
+    ``still`` (K,) is the contribution of the fixed electrodes to F.
     """
     if x.size == point.size:
         for j in range(x.size):
@@ -85,7 +85,7 @@ def _evaluate(  # noqa: PLR0913 - arrays of one wire
 
 @njit_part
 def _take_jacobian(raw: Float, a: Float, weight: Float, jt: Float) -> None:
-    """Write the Jacobian of r with respect to the unknowns into ``jt``, given ∂F/∂x for all coordinates."""
+    """Compute ``jt``, the Jacobian of r with respect to the unknowns, from the Jacobian ``raw`` of F."""
     normal_only = jt.shape[0] != raw.shape[0]
     for j in range(jt.shape[0]):
         target, source = jt[j], raw[3 * j + 2 if normal_only else j]
@@ -95,7 +95,7 @@ def _take_jacobian(raw: Float, a: Float, weight: Float, jt: Float) -> None:
 
 @njit_part
 def coordinate(electrodes: Index, j: int, each: int) -> int:
-    """Return the coordinate index (< 3N) of unknown ``j``; ``each`` is 3, or 1 if z is the only unknown."""
+    """Return the index of unknown ``j`` among 3N coordinates; ``each`` is the unknowns per electrode."""
     if each == 3:
         return int(3 * electrodes[j // 3] + j % 3)
     return int(3 * electrodes[j] + 2)
@@ -113,10 +113,10 @@ def _optimality(jt: Float, r: Float) -> float:
 def correct(  # noqa: PLR0913 - one wire of a call
     u: int, solver: SolverArrays, options: SolveOptions, a_u: Float, w_u: Float, sigma: float, steps: int,
 ) -> tuple[int, int, int, int, bool]:  # fmt: skip
-    """Iterate from ``x`` in the workspace until wire ``u`` converges or fails.
+    """Solve wire ``u``, starting at ``x`` in the workspace, until the iteration converges or fails.
 
-    ``steps`` is the number of steps already taken. Returns the status, the number of evaluations of F, the
-    number of evaluations of J, the total number of steps, and whether the wire was skipped (see SKIP).
+    ``steps`` is the number of steps taken before the call. Returns the status, the numbers of evaluations of
+    F and of J, the total number of steps, and whether the wire was skipped (see SKIP).
     """
     w: Any = solver.work
     operator, tasks, tol_f, tol_x = options.operator, options.tasks, options.tol_f, options.tol_x
@@ -131,7 +131,8 @@ def correct(  # noqa: PLR0913 - one wire of a call
         w.s[ERROR] = 0.0
         return CONVERGED, evaluations, jacobians, steps, True
     while status < 0:
-        # if the noise is known, x is a minimum when the component of r in the range of J is below tol_f
+        # A tall system's residual does not vanish at the solution, so tol_f limits only the component in the
+        # range of J.
         tol_r = tol_f
         if tall and sigma > 0.0:
             tol_r = min(0.1, tol_f / max(tol_f, w.s[NORM]))
@@ -158,11 +159,11 @@ def report_correction(  # noqa: C901, PLR0913 - one wire of a call; its results 
     u: int, solver: SolverArrays, options: SolveOptions, a_u: Float, w_u: Float, sigma: float, count: int,
     status: int, skipped: bool,
 ) -> int:  # fmt: skip
-    """Write x, report and measures of wire ``u``, after :func:`correct` returned ``status`` for this wire.
+    """Store the solution and the reports of wire ``u`` after :func:`correct` has returned ``status``.
 
-    ``count`` is the number of equations. If the tasks include COVARIANCE, also writes the inverse and the
-    arrays that depend on the inverse. Returns ILL_CONDITIONED if the root is poorly determined or fails the
-    χ² test, otherwise ``status``.
+    ``count`` is the number of equations in use. With COVARIANCE, the inverse and the standard deviations are
+    stored as well. Returns ILL_CONDITIONED if the root is poorly determined or fails the χ² test, otherwise
+    ``status``.
     """
     w: Any = solver.work
     unknowns, tol_f = w.x.size, options.tol_f
@@ -171,7 +172,7 @@ def report_correction(  # noqa: C901, PLR0913 - one wire of a call; its results 
     x_u, electrodes, measure = solver.x[u], solver.electrodes[u], solver.measure[u]
     for j in range(unknowns):
         value = w.x[j]
-        if status == CONVERGED and not skipped:  # add the Newton correction computed by the convergence test
+        if status == CONVERGED and not skipped:  # apply the correction that the convergence test computed
             value += w.newton[j]
         x_u[coordinate(electrodes, j, each)] = value
     measure[RESIDUAL] = math.sqrt(dot(w.r, w.r) / count)

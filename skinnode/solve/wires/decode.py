@@ -1,7 +1,8 @@
-"""Compiled conversion of a scan's codes to the quantities that the solver uses.
+"""Compiled conversion of a scan's codes to resistances in solver units.
 
-``decode`` converts codes to resistances, by the formula of :mod:`skinnode.protocol.codes`, and to their
-standard deviations; ``scale`` converts resistances to a and weights (see ``problem``).
+``decode`` computes the resistances and their standard deviations with the formula in
+:mod:`skinnode.protocol.codes`. ``scale`` computes the scaled resistances a and the weights of the equations
+(see ``problem``).
 """
 
 from __future__ import annotations
@@ -15,15 +16,16 @@ from skinnode.solve.wires.arrays import FrameArrays
 
 A_MIN: Final = 1e-12
 A_MAX: Final = 1e12
-"""Range of usable a. At rest, a is about 1 / (N M); all plausible resistances are within this range."""
+"""Valid range of the scaled resistance a. All plausible values are within this range; at rest, a is about 1 /
+(N M)."""
 
 
 @njit_part
 def decode(frame: FrameArrays) -> int:
-    """Convert ``codes`` to ``ohm``, ``noise`` and ``valid``; an invalid code yields NaN.
+    """Convert ``codes`` to ``ohm``, ``noise`` and ``valid``. The resistance of an invalid code is NaN.
 
-    ``noise`` combines the noise of the front end with the error due to rounding to codes. Returns the number
-    of invalid codes.
+    ``noise`` combines the noise of the front end with the rounding error of the codes. Returns the number of
+    invalid codes.
     """
     codes, baseline, gain = frame.codes, frame.baseline_ohm, frame.code_gain
     rounding, code_map = frame.rounding_ohm, frame.code_map
@@ -46,9 +48,9 @@ def decode(frame: FrameArrays) -> int:
 
 @njit_part
 def scale(frame: FrameArrays, sigma: float) -> float:
-    """Compute ``a``, ``weight`` and ``used`` from ``ohm``, ``noise`` and ``valid``.
+    """Compute the arrays ``a``, ``weight`` and ``used`` from ``ohm``, ``noise`` and ``valid``.
 
-    Returns σ, the smallest known standard deviation, or ``sigma`` if no standard deviation is known.
+    Returns the minimum relative standard deviation of the resistances, or ``sigma`` if none is known.
     """
     frame_ohm, gain, noise, valid = frame.ohm, frame.gain, frame.noise, frame.valid
     a, weight, used = frame.a, frame.weight, frame.used

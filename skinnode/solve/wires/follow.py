@@ -1,9 +1,8 @@
-"""Compiled solver for a wire that moved only a little; uses the inverse from an earlier position.
+"""Compiled solver for a wire that moved only slightly, so that the J⁻¹ of an earlier solve can be used.
 
-Simplified Newton steps with the old inverse require only F, not J, and use the same convergence test as
-Newton's method (Deuflhard, Newton methods for nonlinear problems, 2004, 2.1). The contraction ratio of the
-steps shows how much the inverse has changed along the path. While the change is small, the old inverse is
-also used for the standard deviations.
+A simplified Newton step uses the inverse from an earlier position and does not evaluate J (Deuflhard, Newton
+methods for nonlinear problems, 2004, section 2.1). If successive steps shrink quickly, the inverse is still
+accurate, and the standard deviations are computed from the same inverse.
 """
 
 from __future__ import annotations
@@ -18,16 +17,18 @@ from skinnode.model.layout import Float
 from skinnode.solve.linalg.vectors import largest
 
 FOLLOW_STEPS: Final = 4
-"""Maximum number of simplified steps; each step takes a fifth of the time of a new inverse."""
+"""Maximum number of simplified Newton steps. A step takes a fifth of the time of computing a new inverse."""
 CONTRACTION: Final = 0.1
-"""Maximum size of a step, relative to the previous step. If a step is larger, a new Jacobian is required."""
+"""Maximum size of a simplified Newton step, relative to the previous step. After a larger step, the wire is
+solved with a new Jacobian."""
 FRESH: Final = 0.01
-"""Maximum size of the first step, relative to the predicted step, for keeping the inverse."""
+"""Maximum size of the first simplified Newton step, relative to the predicted step, for which the old inverse
+is kept."""
 
 
 @njit_part
 def newton_step(inverse: Float, rho: Float, step: Float) -> float:
-    """Write −Σ_k (∂x_j/∂r_k) ρ_k into ``step`` (n,); return its largest absolute value."""
+    """Compute ``step`` (n,), −Σ_k (∂x_j/∂r_k) ρ_k; return the maximum of its absolute values."""
     for j in range(step.size):
         row, along = inverse[j], splat(0.0)
         for k in range(0, rho.size, LANES):
@@ -38,7 +39,7 @@ def newton_step(inverse: Float, rho: Float, step: Float) -> float:
 
 @njit_part
 def standard_deviations(inverse: Float, variance: Float, std: Float) -> None:
-    """Write √Σ_k (∂x_j/∂r_k)² σ_k² into ``std`` (n,)."""
+    """Compute ``std`` (n,), √Σ_k (∂x_j/∂r_k)² σ_k²."""
     for j in range(std.size):
         row, square = inverse[j], splat(0.0)
         for k in range(0, variance.size, LANES):
@@ -52,12 +53,12 @@ def follow(  # noqa: PLR0913 - arrays of one wire
     x: Float, lower: Float, a: Float, inverse: Float, moved: float, tol_f: float, tol_x: float,
     rho: Float, step: Float,
 ) -> tuple[int, int, float]:  # fmt: skip
-    """Take simplified Newton steps for a square system in which all coordinates ``x`` (3N,) are unknowns.
+    """Solve for all coordinates ``x`` (3N,) of a wire by simplified Newton steps; the system must be square.
 
-    ``moved`` is the size of the predicted step that led to ``x``. Returns the number of evaluations of F
-    (negative if no root was found), the number of steps added to ``x``, and the size of the first step
-    relative to the prediction. If a root was found, the root is ``x`` + ``step``, and ``rho`` (K,) is the
-    residual at ``x``. Otherwise, ``x`` is the best iterate.
+    ``moved`` is the size of the predicted step, which has already been added to ``x``. Returns the number of
+    evaluations of F (negative if no root was found), the number of steps taken, and the ratio of the first
+    step to the predicted step. If a root was found, it is at ``x`` + ``step``, and ``rho`` (K,) contains the
+    residual at ``x``. Otherwise, ``x`` is the last iterate.
     """
     before, first = moved, math.inf
     for evaluations in range(1, FOLLOW_STEPS + 1):

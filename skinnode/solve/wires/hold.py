@@ -1,21 +1,18 @@
-"""Compiled test for holding a wire whose resistances changed no more than their noise.
+"""Compiled test whether a wire's resistances have changed by more than their noise.
 
-The residual ρ_k = a_k F_k(x) − 1 at the last position is known from the last solve, without evaluating F
-again. The residual is within noise if the sum Σ (ρ_k/σ_k)² is below its 99 % quantile. Two errors contribute
-to ρ. The first is the noise of the new frame, with variance σ². The second is the error of x, which results
-from the noise of the frame used to solve for x; its variance is s² in the n directions of the range of J.
-With t = s²/σ², the mean of the sum is K + n t, and half its variance is K + 2 n t + n t². (At rest, t = 0 and
-the sum is χ²_K; in a square system with t = 1, the sum is 2 χ²_K.) The quantile is that of the scaled
+A wire whose resistances have not changed significantly is held: its last position x is kept, and the wire is
+not solved again. The test uses the residual ρ_k = a_k F_k(x) − 1, where F_k(x) is known from the last solve.
+A wire is held if the sum Σ (ρ_k/σ_k)² is below its 99 % quantile. Two errors contribute to ρ. The first is
+the noise of the new frame, with variance σ². The second is the error of x, due to the noise of the frame for
+which x was solved. This error has variance s² in the n directions of the range of J. With t = s²/σ², the mean
+of the sum is K + n t, and half of its variance is K + 2 n t + n t². The quantile is taken from a scaled
 distribution c χ²_ν with the same mean and variance (Satterthwaite 1946).
 
-A slow movement may leave Σ (ρ_k/σ_k)² below the quantile, especially a movement along the worst-determined of
-a wire's K directions. The variance of a held coordinate allows for such a movement. The coordinate's
-correction c = Σ_k (∂x_j/∂r_k) ρ_k contains the movement and the noise of both frames, so c² minus the noise
-variance is used as a lower bound on the coordinate's variance. The coverage of the 95 % intervals was
-measured on the staggered layout, h = 0.5, with noise 1e-5. For motionless wires, which are held in 99 % of
-the frames, the coverage is 98 %. For a press that grows by 5 % of h in 100 to 1600 frames, the coverage is 97
-%. For a movement of 40 standard deviations along the worst-determined direction within 200 or 800 frames, the
-coverage is 96 %; without the allowance, it would be only 86 %.
+The test may miss a slow movement, so the variance of a held coordinate includes an estimate of the movement.
+The correction c = Σ_k (∂x_j/∂r_k) ρ_k of a coordinate is caused by the movement and by the noise of both
+frames. The variance is therefore at least c² minus the variance due to noise. In simulations of the staggered
+layout (h = 0.5, noise 1e-5), the 95 % intervals of held coordinates contained the true position in 98 % of
+the frames without movement, and in 96 to 97 % of the frames with slow movements.
 """
 
 from __future__ import annotations
@@ -28,17 +25,17 @@ from skinnode.compiled.simd import LANES, fma, load, splat, total
 from skinnode.model.layout import Float
 
 Z_HOLD: Final = 2.326
-"""Normal quantile for 99 %, at which a motionless wire is solved unnecessarily in one frame of a hundred."""
+"""99 % quantile of the standard normal distribution. A wire at rest fails the test in 1 % of the frames."""
 FRESHER: Final = 2.0
-"""Maximum ratio of noise variances for holding a wire: the frame used to solve for x, relative to the
-current frame."""
+"""Maximum ratio of noise variances for which a wire is held. The ratio compares the frame for which x was
+solved with the current frame."""
 
 
 def chi2_quantile(dof: float, z: float) -> float:
-    """Return the χ² quantile that corresponds to the normal quantile ``z`` (Wilson & Hilferty 1931).
+    """Return the χ² quantile that has the same probability as the normal quantile ``z``.
 
-    At the 99 % quantile, the error is below 1 % for 3 or more degrees of freedom; the result is never too
-    small in the far tail.
+    The approximation is that of Wilson & Hilferty (1931). At 99 %, its error is below 1 % for 3 or more
+    degrees of freedom. At very high probabilities, it never underestimates the quantile.
     """
     spread = 2.0 / (9.0 * dof)
     root = 1.0 - spread + z * math.sqrt(spread)
@@ -53,12 +50,12 @@ def within_noise(  # noqa: PLR0913 - arrays of one wire
     a: Float, weight: Float, sigma: float, tol: float, a_solved: Float, noise: Float, inverse: Float,
     unknowns: int, rho: Float, variance: Float, before: Float, std: Float,
 ) -> float:  # fmt: skip
-    """Return the RMS of w ρ if the wire can be held, else −1; if held, write ``std`` (n,) of its unknowns.
+    """Return the RMS of w ρ and compute ``std`` (n,) if the wire can be held; otherwise return −1.
 
-    ``noise`` (K,) is the noise variance of the frame used to solve for x; ``rho``, ``variance`` and
-    ``before`` (K,) are scratch. The variance of a held coordinate is the largest of three values: the
+    ``noise`` (K,) is the noise variance of the frame for which x was solved. ``rho``, ``variance`` and
+    ``before`` (K,) are workspace. The variance of a held coordinate is the maximum of three values: the
     variance due to ``noise``, the variance due to the noise of the current frame, and the squared correction
-    minus these two variances.
+    minus both of these variances.
     """
     count, square, weighted, ratios, squares = 0, 0.0, 0.0, 0.0, 0.0
     for k in range(a.size):

@@ -1,8 +1,7 @@
-"""Buffers of one patch, and the single compiled call that reads and writes them.
+"""Buffers of one patch, and the compiled function that computes all wires of a frame in one call.
 
-Each frame requires computations before and after its solve (see ``decode`` and ``stages``). A single compiled
-call performs all of these computations, because checking and unpacking the arguments of a call from Python
-takes longer than any of the steps, especially if caches are cold.
+The computations of a frame run in a single call, because passing arguments from Python to compiled code takes
+longer than most of the computations themselves.
 """
 
 from __future__ import annotations
@@ -36,22 +35,23 @@ from skinnode.solve.wires.stages import accept_roots, choose, start, store
 DECODE: Final = 1
 """Convert codes to resistances."""
 SCALE: Final = 2
-"""Convert resistances to the units of the problem, and start the solver at the last trusted positions."""
+"""Convert resistances to solver units, and start at the last trusted positions."""
 CHOOSE: Final = 4
-"""Choose the action for each wire."""
+"""Choose an action for each wire, such as SOLVE or HOLD."""
 SOLVE: Final = 8
 ACCEPT: Final = 16
-"""Determine which wires reached an acceptable root."""
+"""Determine which wires have an acceptable root."""
 STORE: Final = 32
-"""Store the outcome. If ACCEPT runs in the same call, the outcome is stored only if all wires are good."""
+"""Store the results. If ACCEPT runs in the same call, store them only if all wires have an acceptable
+root."""
 
-# Findings of a call, combined with bitwise or
+# Flags returned by a call, combined with bitwise or
 ALL_GOOD: Final = 1
 INCOMPLETE: Final = 2
 """See :func:`skinnode.solve.wires.stages.store`."""
 
 REST_TOLERANCE: Final = 1e-9
-"""Tolerance for the solve at the rest position, which is a root by construction, apart from rounding."""
+"""Tolerance of the solve at the rest position, where the residual is zero apart from rounding errors."""
 _NO_FRAME: Final = np.zeros((1, 4), np.int64)
 
 
@@ -68,9 +68,9 @@ def solve_patch(  # noqa: PLR0913 - numba unpacks a tuple of arguments eight tim
     sigma: float,
     units: float,
 ) -> tuple[float, float, int, int]:
-    """Run ``stages`` of a frame; the other arguments are the same as for :func:`solve_wires`.
+    """Run the given ``stages`` of a frame. See :func:`solve_wires` for the other arguments.
 
-    Returns the cost of the solve, σ, the number of invalid codes, and the findings.
+    Returns the time spent as in :func:`solve_wires`, ``sigma``, the number of invalid codes, and the flags.
     """
     solver: SolverArrays = read_solver(solver_table)
     spent, invalid, found = 0.0, 0, 0
@@ -96,11 +96,11 @@ def solve_patch(  # noqa: PLR0913 - numba unpacks a tuple of arguments eight tim
 
 
 class PatchSolver:
-    """Buffers of one patch for :func:`solve_patch`; each tracker and each thread needs its own instance.
+    """Buffers of one patch for :func:`solve_patch`. Each tracker and each thread needs its own instance.
 
     Args:
         problem: The patch in solver units.
-        operator: Operator code, for the rest position and for frames.
+        operator: Operator code for all solves.
         normal_only: Whether only z is unknown.
     """
 
@@ -110,7 +110,7 @@ class PatchSolver:
         self.problem = problem
         self.operator = operator
         self.x = problem.rest.copy()
-        """(U, 3N) iterate of each wire, pitches."""
+        """(U, 3N) starting point or solution of each wire, pitches."""
         self.inverse = np.zeros((upper, unknowns, lower))
         self.a_solved = np.ones((upper, lower))
         self.noise = np.zeros((upper, lower))
@@ -119,21 +119,20 @@ class PatchSolver:
         self.report = np.zeros((upper, wires.REPORT), np.int64)
         self.measure = np.zeros((upper, wires.MEASURES))
         self.tally = np.zeros(3, np.int64)
-        """Numbers of evaluations of F, evaluations of J, and steps since this array was last reset to
-        zero."""
+        """Numbers of evaluations of F, evaluations of J, and steps since the last reset of this array."""
         self.turn = np.zeros(1, np.int64)
-        """(1,) frame number, incremented by SCALE.
+        """(1,) frame number, which SCALE increments.
 
-        It determines the wires whose inverse is recomputed if inverses are reused.
+        With REUSE, this number determines which wires recompute their inverses.
         """
         self.still_std = np.full((upper, unknowns), np.inf)
-        """(U, 3N) standard deviation of the coordinates that are not unknowns, pitches."""
+        """(U, 3N) standard deviations of the coordinates that are not unknowns, pitches."""
         self.each = 1 if normal_only else 3
         """Number of unknowns per electrode."""
         most = unknowns // 3
         self.free = np.full(upper, most)
         """(U,) number of electrodes with unknowns."""
-        self._sizes: list[int] | None = [most]  # distinct values of ``free``; None if they must be recomputed
+        self._sizes: list[int] | None = [most]  # distinct values of ``free``; None if outdated
         self._in_turn = np.arange(upper)
         self._electrodes = np.tile(np.arange(most), (upper, 1))
         self._still = np.zeros((upper, lower))
@@ -145,9 +144,9 @@ class PatchSolver:
         return self._electrodes[u, : self.free[u]]
 
     def set_electrodes(self, u: int, electrodes: Index) -> None:
-        """Make only the given electrodes of wire u unknowns, and move all others to rest.
+        """Solve wire u for the given electrodes only, and fix all its other electrodes at rest.
 
-        Until the next converged solve, ``inverse`` and the arrays that depend on ``inverse`` are invalid.
+        ``inverse`` and the standard deviations of the wire are invalid until the next converged solve.
         """
         n = self.problem.layout.unknowns // 3
         rest = np.setdiff1d(np.arange(n), electrodes)
@@ -157,7 +156,7 @@ class PatchSolver:
         self._still[u] = self.problem.share_at_rest[u, rest].sum(axis=0)
 
     def solve_rest(self) -> Index:
-        """Compute J⁻¹ at the rest position; return the sign of det J (U,), or 0 if it is undefined."""
+        """Compute J⁻¹ at the rest position; return the sign of det J (U,), 0 where J is not square."""
         todo, weight = np.full(len(self.x), wires.SOLVE, np.uint8), np.ones_like(self.a_solved)
         self.x[:] = self.problem.rest
         options = solve_options(self.operator, wires.COVARIANCE, REST_TOLERANCE, REST_TOLERANCE, 1)
@@ -176,17 +175,17 @@ class PatchSolver:
         order: Index | None = None,
         units: float = math.inf,
     ) -> None:
-        """Solve the wires in ``todo``, starting at :attr:`x`; write x, std, report and measure.
+        """Solve the wires selected by ``todo``, starting at :attr:`x`, and store the results in this object.
 
         Args:
             todo: (U,) uint8, action for each wire: LEAVE, SOLVE, PREDICT or HOLD.
-            a: (U, K) resistances in the units of the problem; may be overwritten.
+            a: (U, K) resistances in solver units; may be overwritten.
             weight: (U, K) weights of the equations; may be overwritten.
             options: Operator, tasks and tolerances.
             sigma: Standard deviation of a residual of weight 1; 0 if unknown.
-            order: (U,) wires in processing order; the default is 0, 1, 2, …
-            units: Time allowed, as in :func:`skinnode.solve.wires.solve_wires.solve_wires`. In the report of
-                each processed wire, TURN is 1.
+            order: (U,) order in which the wires are solved; default: 0, 1, 2, …
+            units: Time limit, as in :func:`skinnode.solve.wires.solve_wires.solve_wires`. TURN is 1 in the
+                report of each wire that was processed in time.
 
         Raises TypeError if ``todo``, ``a`` or ``weight`` has the wrong element type or shape.
         """
@@ -203,7 +202,7 @@ class PatchSolver:
                     f"{np.dtype(dtype)} array of shape {due}"
                 )
         sizes = self._sizes or sorted(set(self.free[todo != wires.LEAVE].tolist()))
-        for size in sizes:  # there is more than one size only if electrodes are omitted
+        for size in sizes:  # several sizes occur only after set_electrodes()
             chosen = todo if len(sizes) == 1 else np.where(self.free == size, todo, wires.LEAVE)
             spent, _, _, _ = solve_patch(
                 SOLVE,
@@ -222,9 +221,10 @@ class PatchSolver:
     def advance(
         self, stages: int, frame: FrameArrays, options: SolveOptions, sigma: float, units: float
     ) -> tuple[float, int, int]:
-        """Run ``stages`` of a frame in one call; SOLVE requires the same number of unknowns on all wires.
+        """Run the given ``stages`` of a frame. For SOLVE, all wires must have the same number of unknowns.
 
-        Returns σ, the number of invalid codes, and the findings (ALL_GOOD, INCOMPLETE).
+        Returns the standard deviation of a residual of weight 1, the number of invalid codes, and the flags
+        (ALL_GOOD, INCOMPLETE).
         """
         _, sigma, invalid, found = solve_patch(
             stages,
@@ -241,7 +241,7 @@ class PatchSolver:
         return sigma, invalid, found
 
     def _table(self, size: int) -> NDArray[np.int64]:
-        """Return the table of all arrays; its workspace is for wires with unknowns on ``size`` electrodes."""
+        """Return the array table for solving wires that have unknowns on ``size`` electrodes."""
         if size not in self._arrays:
             lower = self.problem.layout.shape[1]
             self._arrays[size] = SolverArrays(

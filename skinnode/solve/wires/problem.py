@@ -1,10 +1,10 @@
-"""Dimensionless form of a patch: one system of equations per upper wire.
+"""Dimensionless equations of a patch, as one system of equations for each upper wire.
 
-Lengths are in pitches, and residuals are relative: r_k = w_k (a_k F_k − 1) with a_k = R_k / (R₀ F₀)_k. A
-residual is therefore a fraction of a resistance, regardless of the rubber and the size of the patch. If the
-rest resistances R₀ have been measured, the resistivity and the front end's gain cancel; otherwise, R₀ F₀ is
-the layout's resistivity. The weights w_k = σ_min / σ_k account for different noise in different equations, so
-that solving a tall system minimises χ². A weight of 0 drops an equation.
+Lengths are in pitches. The residuals are r_k = w_k (a_k F_k − 1) with the scaled resistances a_k = R_k / (R₀
+F₀)_k, where R₀ and F₀ are the values of R and F at rest. If R₀ has been measured, errors of the resistivity
+and of the front end's gain cancel; otherwise, R₀ F₀ is computed from the layout's resistivity. The weights
+w_k = σ_min / σ_k account for the noise of each resistance, so that the least-squares solution minimises χ².
+An equation with weight 0 is ignored.
 """
 
 from __future__ import annotations
@@ -21,36 +21,36 @@ from skinnode.model.kernels import lower_rows
 from skinnode.model.layout import Float, PatchLayout, require_array
 
 TRUST_SHARE: Final = 0.25
-"""Initial trust radius as a fraction of the electrodes' clearance at rest.
+"""Ratio of the initial trust radius to the smallest clearance between the layers at rest.
 
-F is smooth on the scale of the distance to the nearest charge. In a live stream, the skin moves less than the
-trust radius between two frames.
+F is nearly linear within a fraction of the clearance. In a live stream, the skin moves less than the trust
+radius from frame to frame.
 """
 
 
 @dataclass(frozen=True, eq=False)
 class PatchProblem:
-    """Constants of a patch in solver units."""
+    """Geometry and rest resistances of a patch in solver units."""
 
     layout: PatchLayout
     rest: Float
-    """(U, 3N) electrodes at rest, pitches."""
+    """(U, 3N) positions of the upper electrodes at rest, pitches."""
     lower: Float
-    """(3, M, K) lower electrodes, pitches."""
+    """(3, M, K) positions of the lower electrodes, pitches."""
     gain: Float
-    """(U, K) 1 / (R₀ F₀): a = R · gain."""
+    """(U, K) factors 1 / (R₀ F₀) that convert resistances to solver units."""
     a_rest: Float
-    """(U, K) value of a at rest, 1 / F."""
+    """(U, K) scaled resistances at rest, 1 / F₀."""
     share_at_rest: Float
-    """(U, N, K) contribution of each electrode at rest to F."""
+    """(U, N, K) contribution of each upper electrode to F at rest."""
     clearance: Float
-    """(U, N) distance of each electrode at rest from the nearest lower electrode, pitches."""
+    """(U, N) distance of each upper electrode from the nearest lower electrode at rest, pitches."""
 
     @classmethod
     def of(cls, layout: PatchLayout, baseline_ohm: ArrayLike | None = None) -> PatchProblem:
-        """Convert a patch to solver units; ``baseline_ohm`` (U, K) are measured rest resistances, ohm.
+        """Convert a patch to solver units; ``baseline_ohm`` (U, K) was measured at rest, ohm.
 
-        Raises ValueError if a rest resistance is not positive.
+        Raises ValueError if any of these resistances is not positive.
         """
         pitch = layout.pitch_m
         rest, lower, potential, share, clearance = _at_rest(layout)
@@ -73,11 +73,11 @@ class PatchProblem:
         return np.asarray((x - self.rest) * self.layout.pitch_m).reshape(self.layout.upper_m.shape)
 
     def out_of_reach(self, x: Float) -> NDArray[np.bool_]:
-        """Return a mask (U,) of the wires with an electrode farther from rest than its clearance at rest.
+        """Return a mask (U,) of the wires with an implausibly large displacement.
 
-        F does not change if electrodes are reflected in the lower layer, or if two electrodes swap places.
-        Roots created by these symmetries are out of reach, because rubber that is pressed from outside does
-        not move farther than its own thickness.
+        A displacement is implausible if an electrode moves farther than its clearance at rest. F does not
+        change if an electrode is mirrored at the lower layer, or if two electrodes of a wire are exchanged.
+        The roots that result from these symmetries have implausible displacements.
         """
         moved = (x - self.rest).reshape(self.layout.upper_m.shape)
         with np.errstate(over="ignore"):
@@ -86,7 +86,7 @@ class PatchProblem:
 
 @functools.lru_cache(maxsize=64)  # cached, because the computation takes 2 ms per layout
 def _at_rest(layout: PatchLayout) -> tuple[Float, Float, Float, Float, Float]:
-    """Return read-only arrays for a :class:`PatchProblem`: rest, lower, F, share_at_rest and clearance."""
+    """Return the read-only arrays rest, lower, F₀, share_at_rest and clearance of a :class:`PatchProblem`."""
     pitch = layout.pitch_m
     rest = layout.upper_m.reshape(layout.shape[0], -1) / pitch
     gaps = layout.upper_m[:, :, None, :] - layout.lower_m.reshape(1, 1, -1, 3)

@@ -1,4 +1,4 @@
-"""Compiled check of a new field for roots that may be wrong."""
+"""Compiled check that finds roots that may be wrong in a new displacement field."""
 
 from __future__ import annotations
 
@@ -16,35 +16,36 @@ from skinnode.solve.wires.stages import DEADLINE
 
 Mask = NDArray[np.bool_]
 
-# Findings of the check, combined with bitwise or
+# Flags returned by the check, combined with bitwise or
 SOME_SUSPECT: Final = 1
 SOME_ROUGH: Final = 2
 
 
 class RootCheck(ArrayTable):
-    """Arrays of a root check: the field to check, the limits, and the findings."""
+    """Arrays of a root check: the field to check, the limits, and the results."""
 
     moved_m: Annotated[Float, "U N 3"]
-    """Displacement."""
+    """Displacement in the frame to check."""
     last_m: Annotated[Float, "U N 3"]
     """Displacement in the previous frame."""
     status: Annotated[Index, "U"]
     held: Annotated[Mask, "U"]
     folded: Annotated[Mask, "U"]
-    """Wires on which presses run into folds of F."""
+    """Wires that a press can move past a fold of F, where two roots merge."""
     whitening: Annotated[Float, "U N N"]
-    """Inverse of the Cholesky factor of one coordinate's C (see ``Smoothness``)."""
+    """Whitening matrix of each wire (see ``Smoothness``)."""
     lost: Annotated[Mask, "U"]
-    """Output of the check: wires without a root."""
+    """Output: wires for which no root was found."""
     unsure: Annotated[Mask, "U"]
-    """Output of the check: solved wires that have folds or moved by more than ``jump_m``."""
+    """Output: solved wires in ``folded``, and solved wires that moved by more than ``jump_m`` since the
+    previous frame."""
     rough: Annotated[Mask, "U"]
-    """Output of the check: solved wires farther than ``far_m`` from rest and rougher than ``rough_limit``."""
+    """Output: solved wires that moved by more than ``far_m`` from rest and exceed ``rough_limit``."""
     jump_m: float
     far_m: float
     pitch_m: float
     rough_limit: float
-    """Maximum ratio of a displacement's roughness to its length."""
+    """Maximum ratio of the roughness of a displacement to its Euclidean norm in pitches."""
 
 
 _read = reader(RootCheck)
@@ -52,7 +53,7 @@ _read = reader(RootCheck)
 
 @njit_part
 def _rougher(moved_m: Float, pitch_m: float, whitening: Float, limit: float) -> bool:
-    """Return whether √(uᵀ C⁻¹ u) of a displacement (N, 3) exceeds ``limit`` times its length."""
+    """Return whether the roughness of a displacement (N, 3) exceeds ``limit`` times its norm in pitches."""
     rough, size = 0.0, 0.0
     for j in range(3):
         for i in range(moved_m.shape[0]):
@@ -66,9 +67,9 @@ def _rougher(moved_m: Float, pitch_m: float, whitening: Float, limit: float) -> 
 
 @njit_brief
 def check_roots(table: Index) -> int:
-    """Compute ``lost``, ``unsure`` and ``rough`` of a :class:`RootCheck` from the other fields.
+    """Compute the arrays ``lost``, ``unsure`` and ``rough`` of a :class:`RootCheck`.
 
-    Returns a combination of SOME_SUSPECT (a wire is lost or unsure) and SOME_ROUGH (a wire is rough), or 0.
+    Returns the flags SOME_SUSPECT (if any wire is lost or unsure) and SOME_ROUGH (if any wire is rough).
     """
     check = _read(table)
     moved_m, last_m, status = check.moved_m, check.last_m, check.status

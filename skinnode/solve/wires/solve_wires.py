@@ -1,7 +1,7 @@
-"""Solver for all upper wires of a patch in one compiled call, without the GIL or memory allocation.
+"""Compiled solver for all upper wires of a patch. It needs no GIL and allocates no memory.
 
-Each wire is held in place (``hold``), followed with its stored inverse (``follow``), or corrected with an
-operator (``correct``). The three methods are tried in this order until one yields a root.
+Three methods are tried for each wire until one of them succeeds: keep the last position (``hold``), take
+Newton steps with the inverse from an earlier solve (``follow``), or iterate with new Jacobians (``correct``).
 """
 
 from __future__ import annotations
@@ -24,18 +24,19 @@ from skinnode.solve.wires.follow import FRESH, follow, newton_step, standard_dev
 from skinnode.solve.wires.hold import within_noise
 
 REFRESH: Final = 8
-"""Maximum number of consecutive frames for which a followed wire keeps its inverse. The wires take turns in
-renewing their inverses."""
+"""Maximum number of successive frames in which a wire is solved with the same inverse. The inverses of
+different wires are recomputed in different frames."""
 COVARIANCE_UNITS: Final = 3.0
-"""Cost of the covariance of a square system with 30 unknowns, in units of one evaluation of F and J plus one
-step."""
+"""Time to compute the covariance of a square system with 30 unknowns. The unit is the time of one evaluation
+of F and J plus one step."""
 HELD_UNITS: Final = 0.25
-"""Cost of testing whether a wire can be held, in units of one evaluation of F and J plus one step."""
+"""Time to test whether a wire can be held. The unit is the time of one evaluation of F and J plus one
+step."""
 
 
 @njit_part
 def _drop_unusable(a: Float, weight: Float) -> tuple[int, int]:
-    """Set a to 1 and weight to 0 if either is unusable; return the numbers of kept and dropped equations."""
+    """Set a = 1 and weight = 0 in unusable equations; return the numbers of usable and dropped equations."""
     count, lost = 0, 0
     for k in range(a.size):
         if weight[k] > 0.0:
@@ -50,7 +51,7 @@ def _drop_unusable(a: Float, weight: Float) -> tuple[int, int]:
 
 @njit_part
 def _hold(u: int, solver: SolverArrays, a: Float, weight: Float, sigma: float, tol_f: float) -> bool:  # noqa: PLR0913 - one wire of a call
-    """Hold wire ``u`` if its residual is within noise; write its RESIDUAL and standard deviations."""
+    """Hold wire ``u`` if its residual is within noise, and store its residual and standard deviations."""
     w: Any = solver.work
     held = within_noise(
         a, weight, sigma, tol_f, solver.a_solved[u], solver.noise[u], solver.inverse[u], w.x.size,
@@ -70,7 +71,7 @@ def _hold(u: int, solver: SolverArrays, a: Float, weight: Float, sigma: float, t
 
 @njit_part
 def _predict(u: int, solver: SolverArrays, a: Float, weight: Float) -> float:
-    """Move ``x`` in the workspace by (∂x/∂a) (a − a of the last solve); return the largest movement."""
+    """Extrapolate ``x`` in the workspace to the new resistances; return the largest movement."""
     w: Any = solver.work
     a_solved = solver.a_solved[u]
     for k in range(a.size):
@@ -85,9 +86,9 @@ def _predict(u: int, solver: SolverArrays, a: Float, weight: Float) -> float:
 def _follow(  # noqa: PLR0913 - one wire of a call
     u: int, solver: SolverArrays, options: SolveOptions, a: Float, weight: Float, moved: float
 ) -> tuple[int, int, bool]:
-    """Follow wire ``u`` after a predicted step of size ``moved``.
+    """Solve wire ``u`` with its old inverse, after a predicted step of size ``moved``.
 
-    Returns the number of evaluations of F, the number of steps, and whether the wire keeps its inverse.
+    Returns the number of evaluations of F, the number of steps, and whether the inverse can still be used.
     """
     w: Any = solver.work
     evaluations, steps, first = follow(
@@ -103,7 +104,7 @@ def _follow(  # noqa: PLR0913 - one wire of a call
 
 @njit_part
 def _report_followed(u: int, solver: SolverArrays, a: Float, weight: Float, sigma: float, count: int) -> None:  # noqa: PLR0913 - one wire of a call
-    """Write x, measures and standard deviations of wire ``u``, which was followed to a root."""
+    """Store the solution and the reports of wire ``u`` after :func:`_follow` has found a root."""
     w: Any = solver.work
     x_u, measure, a_solved, noise = solver.x[u], solver.measure[u], solver.a_solved[u], solver.noise[u]
     for j in range(w.x.size):
@@ -122,7 +123,7 @@ def _report_followed(u: int, solver: SolverArrays, a: Float, weight: Float, sigm
 def _solve_wire(  # noqa: C901, PLR0913 - one wire of a call, from start to report
     u: int, todo: int, solver: SolverArrays, options: SolveOptions, a: Float, weight: Float, sigma: float
 ) -> float:
-    """Solve wire ``u``; return the cost, in units of one evaluation of F and J plus one step."""
+    """Solve wire ``u``; return the time spent, in the same unit as ``COVARIANCE_UNITS``."""
     w: Any = solver.work
     point, x_u, electrodes = solver.point, solver.x[u], solver.electrodes[u]
     report, measure, std = solver.report[u], solver.measure[u], solver.std[u]
@@ -189,21 +190,23 @@ def solve_wires(  # noqa: PLR0913 - what changes from call to call
     sigma: float,
     units: float,
 ) -> float:
-    """Solve r_k = w_k (a_k F_k(x) − 1) = 0 for every upper wire in ``todo``, starting at x in ``solver``.
+    """Solve r_k = w_k (a_k F_k(x) − 1) = 0 for each upper wire selected by ``todo``.
 
     Args:
-        solver: Starting points and results; ``x`` and ``inverse`` are those of the last converged solve.
+        solver: Starting points and results. On entry, ``x`` and ``inverse`` belong to the last converged
+            solve.
         options: Operator, tasks and tolerances.
         todo: (U,) action for each wire: LEAVE, SOLVE, PREDICT or HOLD.
-        a: (U, K) resistances; a value out of range is replaced with 1 and its weight with 0.
-        weight: (U, K) weights; 0 drops an equation.
-        order: (U,) wires in processing order.
+        a: (U, K) resistances in solver units. If a value is out of range, it is set to 1, and its weight to
+            0.
+        weight: (U, K) weights of the equations; an equation with weight 0 is ignored.
+        order: (U,) order in which the wires are solved.
         sigma: Standard deviation of a residual of weight 1; 0 if unknown.
-        units: Time allowed, in units of one evaluation of F and J plus one step. The call returns before the
-            first wire that may take longer than the remaining time.
+        units: Time limit, in units of the time of one evaluation of F and J plus one step. The call returns
+            if the next wire might exceed this limit.
 
-    Returns the estimated time spent, in the same unit as ``units``. A wire with fewer equations than unknowns
-    keeps its x and is ILL_CONDITIONED, or NON_FINITE if a weight was set to 0.
+    Returns the estimated time spent, in the same unit as ``units``. A wire with fewer usable equations than
+    unknowns is not solved. Its status is NON_FINITE if a value was out of range, otherwise ILL_CONDITIONED.
     """
     spent, worst = 0.0, options.max_steps + 1 + COVARIANCE_UNITS
     for u in order:

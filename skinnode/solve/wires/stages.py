@@ -1,7 +1,7 @@
-"""Compiled computations that precede and follow the solve of a frame.
+"""Compiled computations before and after solving a frame.
 
-``start`` and ``choose`` run before the solve, ``accept_roots`` and ``store`` after it. These kernels replace
-about thirty NumPy calls on arrays of 300 numbers; the calls would take longer than solving a patch at rest.
+``start`` and ``choose`` run before the solve, ``accept_roots`` and ``store`` after it. The equivalent NumPy
+calls would take longer than solving a patch at rest.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ from skinnode.solve.wires import arrays as wires
 from skinnode.solve.wires.arrays import FrameArrays, SolverArrays
 
 STALE: Final = 2.0
-"""Maximum factor by which an equation's weight may change before J⁺ of a tall system is recomputed."""
+"""Factor of change in any weight of a tall system, above which the pseudoinverse J⁺ is recomputed."""
 DEADLINE: Final = int(Status.DEADLINE)
 
 
 @njit_part
 def start(solver: SolverArrays, frame: FrameArrays) -> None:
-    """Start the solver at the last trusted positions, and mark every wire as unprocessed."""
+    """Set the starting points to the last trusted positions, and mark all wires as not yet processed."""
     x, start_x, std = frame.x, solver.x, solver.std
     report, measure = solver.report, solver.measure
     for u in range(x.shape[0]):
@@ -51,10 +51,9 @@ def _stale(weight: Float, before: Float) -> bool:
 
 @njit_part
 def choose(frame: FrameArrays) -> None:
-    """Write the action for each wire into ``todo``: ``first`` if the wire can be predicted, else SOLVE.
+    """Choose the action for each wire: ``first`` if the wire has a usable inverse, otherwise SOLVE.
 
-    If a tall system's J⁺ was computed for different weights, the action is also SOLVE, because resistances
-    that this J⁺ relies on may have become noisy.
+    The pseudoinverse J⁺ of a tall system is unusable if the weights have changed since it was computed.
     """
     predictable, unknowns, todo = frame.predictable, frame.unknowns, frame.todo
     used, weight, first = frame.used, frame.weight_solved, frame.first
@@ -66,7 +65,7 @@ def choose(frame: FrameArrays) -> None:
 
 @njit_part
 def _within_reach(x: Float, rest: Float, clearance: Float) -> bool:
-    """Return whether no electrode is farther from rest than its ``clearance`` (N,)."""
+    """Return whether every electrode is within its ``clearance`` (N,) of its rest position."""
     for i in range(clearance.size):
         square = 0.0
         for j in range(3 * i, 3 * i + 3):
@@ -78,9 +77,10 @@ def _within_reach(x: Float, rest: Float, clearance: Float) -> bool:
 
 @njit_part
 def accept_roots(solver: SolverArrays, frame: FrameArrays) -> bool:
-    """Write into ``good`` whether each wire is at a root within reach, on the branch of the rest position.
+    """Determine for each wire whether it has an acceptable root, and store the result in ``good``.
 
-    Also copies the solver's status of each wire to ``status``. Returns whether all wires are good.
+    A root is acceptable if its displacement is plausible and det J has the same sign as at rest. The solver's
+    statuses are copied to ``status``. Returns whether all wires are good.
     """
     report, x, rest = solver.report, solver.x, frame.rest
     branch, clearance = frame.rest_branch, frame.clearance
@@ -100,11 +100,10 @@ def accept_roots(solver: SolverArrays, frame: FrameArrays) -> bool:
 
 @njit_part
 def store(solver: SolverArrays, frame: FrameArrays) -> bool:
-    """Store the position, a and weights of each solved wire; write the outcome of all wires.
+    """Store each good solution as the last trusted solution, and the displacements of all wires.
 
-    A wire's outcome consists of its displacement and standard deviation, and whether the wire was held.
-    Returns whether any solved wire had an equation of zero weight, for which the value of ``a`` is still
-    unknown.
+    The standard deviations of all wires are stored as well. Returns whether any new trusted solution was
+    computed without one of its equations, whose ``a`` is then unknown.
     """
     report, good = solver.report, frame.good
     solved_x, solved_a, solved_std = solver.x, solver.a_solved, solver.std

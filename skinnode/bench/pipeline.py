@@ -1,4 +1,4 @@
-"""Measures a host's throughput, latency and CPU time per thread group, for several numbers of buses.
+"""Measures the throughput, latency and CPU time of a host, for hands with different numbers of buses.
 
 The host is configured as a guest, so it does not manage the buses. A child process replays the frames of the
 robot's master and nodes (:mod:`skinnode.bench.load`). The frames are transferred over a CAN interface or over
@@ -33,7 +33,8 @@ from skinnode.transport.datagram import DatagramPort, free_channel
 
 PATCHES_A_BUS: Final = 4
 CLASSIC_MS: Final = 50
-"""SYNC period with classic CAN, ms; four patches of 101 frames send 8,080 frames/s plus heartbeats."""
+"""SYNC period with classic CAN, ms. In each period, four patches send 101 frames each; that is 8,080
+frames/s."""
 FD_MS: Final = 25
 STAGGER_MS: Final = 3.0
 """Offset between the SYNCs of successive buses in scenes with staggered SYNCs, ms. The offset is long enough
@@ -48,8 +49,8 @@ SCENES: Final = (
 )
 """Scenes as (CAN FD or not, patches touched or not, offset between SYNCs in ms)."""
 DEADLINE_US: Final = 1000
-"""Deadline for solving a scan, µs. An exact inverse takes 200 µs; if the posterior has to verify the result,
-it takes 13 ms."""
+"""Deadline for solving a scan, µs. An exact inverse took 200 µs, and a verification by the posterior took 13
+ms."""
 RECEIVE_US: Final = 5.0
 LATENCY_MS: Final = 5.0
 SETTLE_S: Final = 5.0
@@ -152,7 +153,7 @@ def _hand(  # noqa: PLR0913 - the properties in which hands differ
             "stream": {"capacity_fields": 100_000},
         }
     )
-    # Skip validation: it would reject this bus load, because it assumes frames of maximum length.
+    # Skip validation, which would reject this bus load because it assumes frames of maximum length.
     full = tuple(bus.model_copy(update={"max_load": 2.0}) for bus in hand.buses)
     return hand.model_copy(update={"buses": full})
 
@@ -218,7 +219,7 @@ def _spread(late_ms: list[float]) -> dict[str, float | None]:
 
 
 def lost(row: Row) -> int:
-    """Return the total number of frames, chunks and scans lost on the way from generator to field."""
+    """Return the total number of frames, chunks and scans lost between the generator and the solver."""
     frames = row["sent"] - row["received"] + row["queue_dropped"]
     return int(frames + row["chunks_lost"] + row["scans_missed"] + row["scans"] - row["fields"])
 
@@ -232,7 +233,7 @@ def hand_name(row: Row) -> str:
 
 
 def _must(rows: list[Row]) -> list[Row]:
-    """Check the requirements, which apply only to hands with at least four buses and touched patches."""
+    """Check the requirements for each hand with at least four buses and with touched patches."""
     must = []
     for row in rows:
         if row["buses"] < 4 or not row["touched"]:

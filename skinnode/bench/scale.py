@@ -1,9 +1,10 @@
 """Measures how the CPU time of simulator and host grows with skin area and number of contacts.
 
-Hands with four patches per bus run on timed buses in virtual time, while bodies press on some of the patches.
-The CPU time of each thread is read from the thread's CPU clock: node threads belong to the simulator, all
-other threads to the host. A timed bus is simulated by whichever thread is the last to wait, so the CPU time
-of the bus is measured separately and subtracted from that thread's CPU time. Because of virtual time, each
+The simulated hands have four patches per bus, and spheres press on some of the patches. The hands run in
+virtual time, on buses that simulate the duration of each frame. The CPU time of each thread is read from the
+thread's CPU clock: node threads belong to the simulator, all other threads to the host. A bus has no thread
+of its own: when all threads are waiting, the last of them simulates the bus. The CPU time of the bus is
+therefore measured separately and subtracted from the CPU time of that thread. Because time is virtual, each
 patch sends every scan even on a slow machine.
 """
 
@@ -35,8 +36,8 @@ TOUCHED: Final = (0, 1, 4, 16)
 PATCHES_PER_BUS: Final = 4
 PERIOD_MS: Final = 100
 _SETTLED_S: Final = 1.0
-"""Time from the end of the bring-up to the start of the measurement, s; long enough for the presses to reach
-their full depth."""
+"""Time from the end of the bring-up to the start of the measurement, s. All presses reach their full depth
+within this time."""
 
 Row = dict[str, Any]
 
@@ -49,10 +50,11 @@ def run(patches: Sequence[int] = PATCHES, scans: int = 20) -> dict[str, Any]:
         scans: Number of scans per measurement.
 
     Returns:
-        ``machine``; ``area`` and ``contact``, lists of rows with ``patches``, ``touched``, CPU time per patch
-        and scan in ms (``nodes_ms``, ``bus_ms``, ``host_ms``), ``fields`` solved, ``faster``, the ratio of
-        virtual to real time, and ``memory_mb`` of the process; and ``physics``, the time of one reading
-        of a simulated patch in µs, untouched and touched.
+        Processor and library versions (``machine``), the lists of rows ``area`` and ``contact``, and the
+        result of :func:`physics`. A row contains the numbers of ``patches`` and ``touched`` patches, the CPU
+        times per patch and scan in ms (``nodes_ms``, ``bus_ms``, ``host_ms``), the number of solved
+        ``fields``, the ratio of virtual to real time (``faster``), and the memory of the process
+        (``memory_mb``).
     """
     measure(1, 1, 2)  # compile the kernels and fill the caches
     contact = [measure(FIXED, count, scans) for count in TOUCHED]
@@ -104,7 +106,7 @@ def measure(patches: int, touched: int, scans: int) -> Row:
 
 
 def physics() -> dict[str, float]:
-    """Time one reading of a simulated patch, without sending frames: untouched and pressed.
+    """Time one reading of an untouched and of a touched simulated patch, without sending frames.
 
     Returns:
         ``untouched_us`` and ``touched_us``, µs.

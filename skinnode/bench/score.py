@@ -1,9 +1,9 @@
 """Scores decoded fields: compares their errors with the reported uncertainty and the theoretical bound.
 
-The theoretical bound is the Cramér-Rao bound for a single scan. S denotes the diagonal matrix of the standard
-deviations of the relative residuals F/b − 1; J is the residuals' Jacobian at the true position. The
-covariance of an unbiased estimator of a wire's electrode positions is at least J⁻¹ S Sᵀ J⁻ᵀ. To be
-independent of the solver, this module computes the bound with the NumPy reference model.
+The bound is the Cramér-Rao bound for a single scan. S denotes the diagonal matrix of the standard deviations
+of the relative residuals F/b − 1; J is the residuals' Jacobian at the true position. The covariance of an
+unbiased estimator of a wire's electrode positions is at least J⁻¹ S Sᵀ J⁻ᵀ. To be independent of the solver,
+this module computes the bound with the NumPy reference model.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ from skinnode.model.layout import Float, PatchLayout
 
 OUTLIER_DEVIATIONS = 6.0
 """Maximum permissible error of a coordinate, in reported standard deviations. A run scores about 1e5
-coordinates; on average, the errors of 2e-4 coordinates exceed six standard deviations by chance. The expected
-false-alarm rate is therefore one per 5,000 runs."""
+coordinates. The probability that any of them exceeds six standard deviations by chance is 2e-4, which is one
+false alarm per 5,000 runs."""
 
 EXCESS_LIMIT = 1.15
 """Maximum permissible ratio of a run's RMS error to its RMS reported standard deviation."""
@@ -49,7 +49,7 @@ def bound_std_m(layout: PatchLayout, upper_m: Float, relative_std: Float) -> Flo
 
 @dataclass(frozen=True, slots=True)
 class Score:
-    """Results for one patch in a run; lengths are in metres; a length is NaN if no scan was scored."""
+    """Results for one patch in a run. Lengths are in metres, and NaN if no scan was scored."""
 
     scans: int
     untrusted: int
@@ -86,7 +86,7 @@ class Scorer:
     layout: PatchLayout
     code_std: float
     bound_every: int = 10
-    """Number of scans between computations of the Cramér-Rao bound, which changes slowly."""
+    """The Cramér-Rao bound is computed only for every ``bound_every``-th scan, because it changes slowly."""
     _scans: int = 0
     _untrusted: int = 0
     _squares: float = 0.0

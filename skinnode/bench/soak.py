@@ -2,12 +2,11 @@
 
 The host and the simulated nodes run in the same process and communicate over two virtual buses. Each round of
 the test injects one to three kinds of fault, such as dropped frames, into one or all patches. Subscribers
-come and go during each round. At the end of the round, the faults are removed, and the test waits until every
-patch is operational and publishes fields again. In some rounds, additional child processes keep all
+join and leave during each round. At the end of the round, the faults are removed, and the test waits until
+every patch is operational and publishes fields again. In some rounds, additional child processes keep all
 processors busy. Memory use is measured without faults, after a warm-up and at the end. The measurements are
-the resident memory and the number of blocks allocated by Python (:func:`sys.getallocatedblocks`). The number
-of blocks would reveal even a leak of one object per scan. This module may import the simulator, like the
-demo, because the simulator injects the faults.
+the resident memory and the number of blocks allocated by Python (:func:`sys.getallocatedblocks`). This number
+reveals even a leak of one object per scan. This module imports the simulator, which injects the faults.
 """
 
 from __future__ import annotations
@@ -46,8 +45,8 @@ from vcan_sim.sensor import REMEMBERED_READINGS
 WARM_UP: Final = 0.25
 """Warm-up time before the first memory measurement, as a fraction of the test duration."""
 BLOCKS: Final = 2000
-"""Maximum permissible increase in the number of memory blocks. The number normally varies by a few hundred; a
-leak of one block per scan would add 10,000 blocks in three minutes."""
+"""Maximum permissible increase in the number of memory blocks. The number normally varies by a few hundred. A
+leak of one block per scan adds 10,000 blocks in three minutes."""
 RESIDENT_MB: Final = 8.0
 """Maximum permissible increase of resident memory, MB; small increases are normal, because the C allocator
 does not return all freed memory at once."""
@@ -64,7 +63,7 @@ TARED: Final = 0.2
 CALM_S: Final = 1.5
 _PATCHES: Final = 4
 _MANY: Final = 8
-"""Minimum number of simultaneous fault kinds for which a report states the number instead of the names."""
+"""If a round injects at least this number of faults, its report states the number instead of the names."""
 
 _KINDS: Final[tuple[dict[str, Any], ...]] = (
     {"lost": 0.05},
@@ -339,15 +338,14 @@ def _calm(fleet: Fleet) -> None:
     for bus in fleet.hand.buses:
         fleet.bus_off(bus.name, off=False)
     fleet.inject(NO_FAULTS)
-    fleet.faults.forget_log()  # the growth of the log would look like a memory leak
+    fleet.faults.forget_log()  # a growing log would look like a memory leak
 
 
 def _wait_for_patches(host: Host, names: list[str]) -> tuple[float, str]:
     """Wait until every patch is operational and has published a field whose SYNC was sent after the call.
 
     Returns:
-        The waiting time in s, and a text that names the last patch for which the function waited and the
-        reason.
+        The waiting time, s, and a text that names the last patch to recover and the reason for its delay.
     """
     begin_ns, waited_for = time.monotonic_ns(), ""
 

@@ -10,8 +10,8 @@ from collections.abc import Iterator
 from typing import Final
 
 _NICE: Final = -5
-"""Nice value of the child processes. If the user may not set this value, the child processes inherit the
-parent's nice value."""
+"""Nice value of the child processes. If the user is not permitted to set this value, the child processes
+inherit the parent's nice value."""
 _CHILDREN_PER_PROCESSOR: Final = 3
 _LONGEST_S: Final = 30.0
 """Maximum lifetime of a child process, s; a child also exits when its parent has exited."""

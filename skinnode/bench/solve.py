@@ -1,9 +1,9 @@
-"""Compares our solvers with other libraries, using the same F and J for one wire at a time.
+"""Compares our solvers with other libraries; each solver computes one wire at a time.
 
-The benchmark solves each wire of the reference patch. The initial guess is the solution for a 9 % press, and
-the benchmark solves for a 10 % press. Every solver is timed with its loosest tolerance that leads to a
-displacement error of at most 1e-9. A solver that does not reach this error with any tolerance is listed
-without a time.
+All solvers use the same functions for the potential F and its Jacobian J. The benchmark solves each wire of
+the reference patch for a 10 % press, starting from the solution for a 9 % press. Every solver is timed with
+the loosest tolerance at which its displacement error is at most 1e-9. A solver that does not reach this error
+with any tolerance is listed without a time.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ class Case:
 
 
 def press(layout: PatchLayout, depth: float) -> Float:
-    """Return the displacement (U, N, 3), metres, of a smooth sheared dent, ``depth`` heights deep."""
+    """Return the displacement (U, N, 3), metres, of a smooth sheared dent of ``depth`` layer heights."""
     middle = layout.upper_m[..., :2].mean(axis=(0, 1)) + 0.3 * layout.pitch_m
     away = ((layout.upper_m[..., :2] - middle) ** 2).sum(axis=-1) / (2.0 * layout.pitch_m) ** 2
     dent = depth * layout.height_m / (1.0 + away)
@@ -184,7 +184,7 @@ def _solve_all(solve: Solve, cases: list[Case], tolerance: float) -> None:
 
 
 def run(rounds: int) -> dict[str, Any]:
-    """Run the benchmark; return each solver's time per wire (µs), ratio to our dogleg's time, and error."""
+    """Run the benchmark; return each solver's time per wire (µs), its ratio to our dogleg, and its error."""
     layout = PatchLayout.preset("staggered", pitch_m=4e-3, height_m=2e-3)
     problem = PatchProblem.of(layout)
     cases = []

@@ -57,7 +57,7 @@ def run(
         report: Function that receives each row as soon as it is complete.
 
     Returns:
-        The rows, and the number of wrong wires not covered by a known limit.
+        The rows, and the number of wrong wires, excluding the known limitations (``Case.known_wrong``).
     """
     rows: list[dict[str, Any]] = []
     with contextlib.ExitStack() as stack:

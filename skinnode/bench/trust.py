@@ -1,8 +1,8 @@
-"""Implements ``skinnode bench trust``: tests that trusted values are right and intact patches are trusted.
+"""Implements ``skinnode bench trust``: checks the errors of trusted values and the detection of faults.
 
-::
+For each stream, data pass through the modules in this order::
 
-    loads, faults -> signal (codes and truth) -> the host's solver -> score -> rows, verdicts
+    trust_loads, trust_faults -> trust_signal -> trust_solver -> trust_score -> trust_report
 
 Because a stream's random numbers depend only on the seed and the stream's name, a part of a run can be
 repeated separately.
@@ -47,11 +47,12 @@ SHORT: Final[dict[str, Any]] = {
 }
 """Options for a short run of :func:`run`."""
 WATCHED: Final = 4000
-"""Number of scans in a stream for counting false alarms; such a stream contains ten touches."""
+"""Number of scans in each stream for counting false alarms; the stream contains ten touches."""
 QUIET: Final = Timeline(rest=200, press=10, hold=30, slide=40, release=10, after=110)
-"""Phases of each touch in the streams for counting false alarms."""
+"""Numbers of scans in the phases of each touch, in the streams for counting false alarms."""
 PAIRED: Final = Timeline(rest=9, press=6, hold=7, slide=6, release=4, after=6)
-"""Phases of a stream with two faults; short, because there are many streams with two faults."""
+"""Numbers of scans in the phases of a stream with two faults. They are small, because there are many streams
+with two faults."""
 
 
 @dataclass(frozen=True)
@@ -118,7 +119,7 @@ def solve_item(item: Item, seed: int) -> Score:
 
 
 def _watch(item: Item, rng: np.random.Generator) -> Score:
-    """Score the touches in a long fault-free stream, and count its false alarms."""
+    """Score all touches of a long fault-free stream, and count the false alarms."""
     total, known, number = Score(), set[Naming](), 0
     patch = None
     for touch in range(WATCHED // QUIET.scans):
@@ -233,7 +234,7 @@ def run(  # noqa: PLR0913 - options of a command
 def with_parts(
     figures: dict[str, Any], seed: int, parts: Sequence[str], progress: Callable[[str], object]
 ) -> dict[str, Any]:
-    """Run additional parts of the benchmark; return ``figures`` extended by their results.
+    """Run additional parts of the benchmark; return a copy of ``figures`` with their results added.
 
     Args:
         figures: Result of :func:`run`.

@@ -48,7 +48,7 @@ class Fault:
     stated: float = 1.0
     """Ratio of the noise stated in the hand file to the true noise."""
     ordinary: bool = False
-    """Whether the hand file states ordinary tolerances; if False, it states exact positions."""
+    """Whether the hand file states ordinary tolerances instead of exact positions."""
     local: bool = False
     """Whether the fault affects only single crossings or wires, so that the other wires can be trusted."""
     scored_from: int = 0
@@ -62,7 +62,7 @@ class Fault:
 
 
 def _one(signal: Signal, axis: int, many: int = 1) -> int:
-    """Choose ``many`` adjacent upper (``axis`` 1) or lower (2) wires at random; return the lowest index."""
+    """Choose ``many`` adjacent upper (``axis`` 1) or lower (2) wires; return the index of the first wire."""
     return int(signal.rng.integers(signal.shape[axis] - many + 1))
 
 
@@ -93,7 +93,7 @@ def _pressing(signal: Signal) -> int:
 
 
 def _row(signal: Signal, axis: int, wire: int, start: int = 0) -> tuple[slice | int, ...]:
-    """Return the array index of a wire's readings from scan ``start`` onwards."""
+    """Return an index that selects all readings of one wire from scan ``start`` onwards."""
     scans = slice(start, None)
     return (scans, wire, slice(None)) if axis == 1 else (scans, slice(None), wire)
 
@@ -191,7 +191,7 @@ def _flip_for_ever(signal: Signal) -> None:
 
 
 def _corrupt(signal: Signal) -> None:
-    """Corrupt a byte of a random code in every tenth scan, as is possible if scans have no checksum."""
+    """Corrupt a byte of a random code in every tenth scan, as if the scans had no checksum."""
     for t in range(4, signal.shape[0], 10):
         u, k = _one(signal, 1), _one(signal, 2)
         low = signal.rng.random() < 0.5

@@ -85,7 +85,7 @@ class Ridge:
     traction_ratio: tuple[float, float] = (0.0, 0.0)
 
     def _lines(self) -> tuple[Float, Float]:
-        """Return each line's offset (L,) from the ridge's axis, metres, and its fraction (L,) of the load."""
+        """Return the offset (L,) of each line from the axis, metres, and its fraction (L,) of the load."""
         step = np.pi * np.arange(1, LINES + 1) / (LINES + 1)
         weight = np.sin(step) ** 2
         return self.half_width_m * np.cos(step), weight / weight.sum()
@@ -129,7 +129,7 @@ class Ridge:
 
 @dataclass(frozen=True)
 class Dent:
-    """A Gaussian dent that pulls the skin towards its centre, unlike any load on a half-space."""
+    """A Gaussian dent with displacements towards its centre, which no load on a half-space causes."""
 
     center_m: tuple[float, float]
     spread_m: float

@@ -1,7 +1,7 @@
 """Runs a host and simulated nodes with faults on virtual buses, for ``skinnode bench trust``.
 
 Simulated spheres press on a hand of full-size patches. After a fault-free period, a different fault is
-injected into each patch. This module is permitted to import the simulator, which injects the faults.
+injected into each patch. This module imports the simulator, which injects the faults.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ ROAD: Final[tuple[dict[str, Any], ...]] = (
 AT_ONCE: Final = 4
 """Number of patches simulated simultaneously by this process."""
 CLEAN_S: Final = 1.2
-"""Fault-free time after bring-up, s; by the end of this time, the first press has begun."""
+"""Fault-free time after bring-up, s. The first press begins within this time."""
 FAULTY_S: Final = 4.0
 PERIOD_MS: Final = 80
 
@@ -92,7 +92,7 @@ def _together(kinds: tuple[dict[str, Any], ...], seed: int) -> list[dict[str, An
 
 
 def _patch(field: FieldFrame) -> str:
-    assert field.stamp is not None  # always true: the host stamps every field
+    assert field.stamp is not None  # the host sets the stamp of every field
     return field.stamp.patch
 
 

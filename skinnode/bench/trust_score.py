@@ -38,7 +38,7 @@ class Score:
     trusted: int = 0
     """Number of trusted fields."""
     coordinates: int = 0
-    """Number of trusted coordinates, i.e. coordinates of trusted wires in trusted fields."""
+    """Number of trusted coordinates: the coordinates of trusted wires in trusted fields."""
     beyond: int = 0
     """Number of trusted coordinates whose error exceeds :data:`LIMIT`."""
     worst: float = 0.0
@@ -53,13 +53,13 @@ class Score:
     after: int = 0
     """Number of fields from the first correct fault report onwards."""
     after_trusted: int = 0
-    """Number of trusted fields from the first correct fault report onwards."""
+    """Number of trusted fields among those counted in ``after``."""
     false_names: int = 0
     """Number of false alarms: faults reported for parts whose readings were correct."""
     touches: int = 0
     """Number of trusted fields while the load is at full depth or the patch is at rest."""
     touches_right: int = 0
-    """Number of fields counted in ``touches`` that have the right number of contacts: one, or none at
+    """Number of fields counted in ``touches`` with the right number of contacts: one under load, none at
     rest."""
     forces: int = 0
     """Number of trusted fields with exactly one contact and a known true force."""

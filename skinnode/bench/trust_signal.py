@@ -1,11 +1,11 @@
 """Generates code streams and their true displacements, for ``skinnode bench trust``.
 
-::
+A stream is generated in these steps::
 
     load, timeline -> displacement -> true resistances -> noise -> faults -> codes -> faults
 
-A stream has six phases: the patch is at rest; a load is applied, held, moved sideways and released; the patch
-is at rest again.
+A stream has six phases. The patch is first at rest. Then a load is applied, held, moved sideways and
+released. In the last phase, the patch is at rest again.
 """
 
 from __future__ import annotations
@@ -77,7 +77,7 @@ class Signal:
     ohm: Float
     """(T, U, K), readings in ohm."""
     bad: NDArray[np.bool_]
-    """(T, U, K), whether a fault changed the reading by more than noise."""
+    """(T, U, K), whether a fault changed the reading."""
     pressed: slice
     """Range of the scans in which the load is at full depth."""
     phase: NDArray[np.int64]

@@ -45,7 +45,7 @@ class HostPatch:
 
 
 def host_patch(taken: CodeStream, config: PatchConfig | None = None, **options: Any) -> HostPatch:
-    """Create solver and fault detection for a patch with the stream's layout, noise and tolerances.
+    """Create the solver and the fault detection for the patch that produced a stream.
 
     Args:
         taken: The stream.

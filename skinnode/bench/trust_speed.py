@@ -1,4 +1,4 @@
-"""Compares the speed and error of the exact inverse (with and without tests) and the posterior."""
+"""Compares the speed and error of the posterior and of the exact inverse, with and without its data tests."""
 
 from __future__ import annotations
 

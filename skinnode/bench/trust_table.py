@@ -33,12 +33,12 @@ COARSE: Final = Setting("staggered", 0.5, 1e-4)
 NAMED: Final = 0.95
 """Minimum fraction of trusted fields after a faulty wire or crossing has been identified."""
 BRIEF: Final = Timeline(rest=4, press=5, hold=6, slide=0, release=0, after=0)
-"""Phases of a short stream that ends while the load is held."""
+"""Numbers of scans in the phases of a short stream, which ends while the load is held."""
 BLUNT_M: Final = 100e-6
-"""Maximum error (m) of a trusted, precise field if half of the readings are missing: 5 % of the layer
-height."""
+"""Maximum error of a field that is trusted and precise although half of its readings are missing, metres: 5 %
+of the layer height."""
 STEADY: Final = 0.95
-"""Minimum fraction of fields with the right number of contacts, and of contacts with a correct force."""
+"""Minimum fraction of fields with the right number of contacts, and minimum fraction of correct forces."""
 
 Solved = tuple[CodeStream, list[FieldFrame]]
 
@@ -171,7 +171,7 @@ def _whole(seed: int) -> tuple[str, bool]:
 
 
 def _paths(seed: int) -> tuple[str, bool]:
-    """Solve noise-free paths to 72 sheared presses of a patch with 10 upper wires."""
+    """Solve 72 noise-free sheared presses on a patch with 10 upper wires, each as a path of 20 samples."""
     skin = Skin(PatchLayout.preset("aligned", pitch_m=PITCH_M, height_m=0.5 * PITCH_M))
     right, wrong, errors = 0, 0, []
     for number in range(72):

@@ -1,10 +1,10 @@
-"""Generates ground truth for benchmarks independently of the solvers' assumptions.
+"""Generates ground truth for benchmarks, without the assumptions of the solvers.
 
 Displacements are closed-form solutions for rigid spheres on rubber
-(:class:`skinnode.model.elastic.HertzContact`), which depend on neither a grid nor a prior. Resistances are
-computed by :class:`Skin`. Unlike the solver's model, a skin may have electrodes of finite size,
-strain-dependent resistivity, a different thickness, or a series contact resistance. Like real converters,
-simulated converters add noise and quantise readings to codes.
+(:class:`skinnode.model.elastic.HertzContact`), which require no grid and no prior. Resistances are computed
+by :class:`Skin`. Unlike the solver's model, a skin may have electrodes of finite size, strain-dependent
+resistivity, a different thickness, or a series contact resistance. Like real converters, simulated converters
+add noise and quantise readings to codes.
 """
 
 from __future__ import annotations
@@ -30,7 +30,10 @@ point pairs."""
 
 
 class Load(Protocol):
-    """A body that presses on the skin; ``share`` is the current depth divided by the full depth."""
+    """A body that presses on the skin.
+
+    The argument ``share`` is the current depth divided by the full depth.
+    """
 
     @property
     def center_m(self) -> tuple[float, float]:
@@ -128,7 +131,7 @@ class Skin:
 
     @property
     def _gap_m(self) -> Float:
-        """Heights (U, N), metres, of the upper above the nearest lower electrodes, along the normals."""
+        """Distances (U, N), metres, of the upper electrodes from the lower layer, along the normals."""
         gap = self.layout.upper_m[:, :, None] - self.layout.lower_m.reshape(-1, 3)
         nearest = np.argmin((gap**2).sum(axis=-1), axis=-1)[..., None, None]
         assert self.axes is not None
@@ -166,7 +169,7 @@ class Skin:
         return self._points(self.body.upper_m)
 
     def _points(self, upper: Float) -> Float:
-        """Compute the same as :func:`skinnode.model.forward.resistance_ohm` in a fifth of the time."""
+        """Do the same as :func:`skinnode.model.forward.resistance_ohm`, but about five times as fast."""
         lower = self.body.lower_m.reshape(-1, 3)
         square = np.zeros((upper.shape[0] * upper.shape[1], len(lower)))
         for axis in range(3):

@@ -1,27 +1,26 @@
-"""Compares the solved wires with the truth and assigns verdicts.
+"""Compares solved displacements with the true displacements and assigns a verdict to each wire.
 
 Each wire of a frame receives one of three verdicts:
 
-flagged    no accuracy was claimed, because the status is not CONVERGED or the data failed a test
-           (``wires_trusted``)
-accurate   accuracy was claimed, and every coordinate is within the reported uncertainty
-wrong accuracy was claimed but an error is too large, or a value is not finite (with any status)
+flagged    The status is not CONVERGED, or the data failed a test (``wires_trusted``).
+accurate   The wire is not flagged, and every coordinate is within the reported uncertainty.
+wrong      The wire is not flagged, but an error is too large; or (with any status) a value is not finite.
 
 With noise, errors up to 5 reported standard deviations are accepted, but 6e-7 of all coordinates exceed this
-limit by chance. A long run must not fail by chance, and a genuine fault must not be dismissed as chance. Each
-row of the report is therefore tested for two conditions. For Gaussian errors with the reported standard
-deviation, the probability of violating a condition is 1e-4:
+limit by chance. A long run should neither fail by chance nor miss a real defect. Each row of the report must
+therefore meet the two conditions below. If the errors are Gaussian with the reported standard deviation, the
+probability of violating each condition is 1e-4.
 
 - No error exceeds the larger of z(n) and 5 standard deviations. With a probability of 1e-4, at least one of n
   independent coordinates exceeds z(n), which is 5.7 for 9,000 coordinates and 6.4 for 1e6. z(n) is
   Bonferroni's bound, so the probability is lower if coordinates are correlated.
-- The number of seeds with an error above 5 standard deviations does not exceed a limit computed from a
-  binomial distribution. The binomial probability per seed is bounded by the expected number of such errors
-  per seed. The test counts seeds instead of coordinates, because only seeds are independent.
+- The number of seeds with an error above 5 standard deviations does not exceed a quantile of the binomial
+  distribution. The expected number of such errors per seed serves as the probability per seed, because it is
+  an upper bound. The test counts seeds instead of coordinates, because only seeds are independent.
 
-If the second condition is violated, every wire with an error above 5 standard deviations is wrong. With exact
-data, no error is attributed to chance: the limit is 5 reported standard deviations or 1e-6 of the wire's
-largest displacement, whichever is larger.
+If the second condition is violated, every wire with an error above 5 standard deviations is classified as
+wrong. With exact data, no error is attributed to chance: the limit is 5 reported standard deviations or 1e-6
+of the wire's largest displacement, whichever is larger.
 """
 
 from __future__ import annotations
@@ -39,19 +38,20 @@ from skinnode.model.layout import Float
 LIMIT: Final = 5.0
 """Maximum permissible error of a coordinate, in reported standard deviations."""
 CHANCE: Final = 1e-4
-"""Probability of a false alarm per row; with 350 rows per run, one in about 30 runs has a false alarm."""
+"""Probability of a false alarm per row. A run with 350 rows has a false alarm with a probability of 1/30."""
 EXACT_SHARE: Final = 1e-6
 """Maximum permissible error with exact data, relative to the wire's largest displacement."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Solved:
-    """A method's estimates for the frames of a stream."""
+    """Displacements and standard deviations that a method computed for the frames of a stream."""
 
     displacement_m: Float
     """(F, U, N, 3)"""
     std_m: Float
-    """(F, U, N, 3), reported standard deviation, metres; for path methods, error estimate / 5."""
+    """(F, U, N, 3), reported standard deviation, metres. For path methods, it is the error estimate divided
+    by 5."""
     converged: NDArray[np.bool_]
     """(F, U), whether a wire is CONVERGED and, if trust was assessed, trusted."""
 
@@ -65,7 +65,7 @@ class Solved:
 
 
 def beyond(deviations: float) -> float:
-    """Return the probability that a Gaussian error exceeds ``deviations`` standard deviations."""
+    """Return the probability that the magnitude of a Gaussian error exceeds ``deviations`` sigma."""
     return math.erfc(deviations / math.sqrt(2.0))
 
 

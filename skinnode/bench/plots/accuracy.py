@@ -1,4 +1,4 @@
-"""Plots the accuracy benchmark: Pareto fronts, error versus noise and code width, coverage and time."""
+"""Plots the results of ``skinnode bench accuracy``."""
 
 from __future__ import annotations
 

@@ -59,7 +59,7 @@ def _draw_iterations(axes: Any, setting: dict[str, Any], paper: dict[str, Any]) 
         at = np.arange(1, len(each) + 1) / int(steps)
         axes.plot(at, np.cumsum(each), "-", color=colour, label=f"uniform, {steps} samples")
         kept = np.array(data["periodic_at"]) / int(steps)
-        label = f"periodic, {steps} samples, {len(kept)} kept"
+        label = f"periodic, {steps} samples, {len(kept)} solved"
         solves = np.cumsum(data["periodic_each"])
         axes.plot(kept, solves, f"{marker}--", ms=size, mfc="none", color=colour, label=label)
     theirs = paper["figure11_iterations"]
@@ -84,7 +84,7 @@ def _draw_table(axes: Any, setting: dict[str, Any], paper: dict[str, Any]) -> No
         times = [row["runtime_ms"] / 1e3 for row in rows]
         axes.loglog([row["steps"] for row in rows], times, "o-", color=colour, label=label)
     adaptive = setting["adaptive"]["runtime_ms"] / 1e3
-    axes.loglog([1], [adaptive], "*", ms=11, color=COLOURS[2], label="Adaptive, last sample alone")
+    axes.loglog([1], [adaptive], "*", ms=11, color=COLOURS[2], label="Adaptive, last sample only")
     axes.set_xlabel("steps")
     axes.set_ylabel("time per path of one wire (s)")
     axes.set_title("Time per path (table 4)")

@@ -50,7 +50,7 @@ def draw(file: Path, figures: dict[str, Any]) -> None:
 
 
 def _verdicts(axes: Any, rows: list[dict[str, Any]], names: list[str]) -> None:
-    """Plot a stacked bar of verdict fractions for each case and method; ``wrong`` is drawn enlarged."""
+    """Plot the fractions of the verdicts as a stacked bar for each row; enlarge the fraction ``wrong``."""
     place = {name: number for number, name in enumerate(names)}
     column = {method: number for number, (_, method) in enumerate(COLUMNS)}
     for row in rows:
@@ -91,7 +91,7 @@ def _scatter(axes: Any, rows: list[dict[str, Any]]) -> None:
         if not points:
             continue
         reported, error, wrong = np.array(points).T
-        label = "path solver (reported value: error estimate / 5)" if kind == "path" else kind
+        label = "path solver (std. dev. = error estimate / 5)" if kind == "path" else kind
         axes.scatter(reported, error, s=14, color=colour, label=label, alpha=0.8, lw=0)
         bad = wrong > 0
         axes.scatter(reported[bad], error[bad], s=46, facecolors="none", edgecolors=VERDICTS[2][1], lw=1)

@@ -3,8 +3,8 @@
 On each bus, the plan includes SYNC, the host's heartbeat (if enabled), and the frames of other devices (if
 listed in the hand file). The fraction :data:`SDO_SHARE` of the bandwidth is reserved for SDO transfers. For
 each patch, the plan includes the chunks and the summary of one scan per SYNC period, and one heartbeat and
-one EMCY per heartbeat period. SDO transfers for configuring a node that has rejoined the bus are not
-included: SDO frames have a lower priority than PDOs, so these transfers use only spare bandwidth.
+one EMCY per heartbeat period. When a node rejoins the bus, the host configures it with further SDO transfers.
+They are not included, because SDO frames have a lower priority than PDOs and use only spare bandwidth.
 """
 
 from __future__ import annotations
@@ -24,11 +24,10 @@ from skinnode.errors import BusLoadError, ConfigError, Shown
 from skinnode.protocol.profile import PatchProfile
 
 SCAN_SHARE: Final = 0.8
-"""Fraction of the SYNC period reserved for scans; the remainder is left for SDO, EMCY and late frames."""
+"""Fraction of the SYNC period reserved for scans. The rest is left for SDO, EMCY and late frames."""
 
 SDO_SHARE: Final = 0.01
-"""Fraction of the bandwidth reserved for SDO: at 1 Mbit/s, enough for a request and a response every 27
-ms."""
+"""Fraction of the bandwidth reserved for SDO. At 1 Mbit/s, it allows one request and response every 27 ms."""
 
 NODE_LATENCY_S: Final = 2e-3
 """Maximum delay from SYNC to the first chunk, s, specified for a node on an otherwise idle machine."""
@@ -203,7 +202,7 @@ def plan_of(hand: HandConfig) -> tuple[BusPlan, ...]:
 
 
 def inhibit_time_100us(period_ms: int, frames: int) -> int:
-    """Return the inhibit time (0x1800:3, unit 100 µs) that spreads a scan over SCAN_SHARE of a period.
+    """Return the inhibit time (0x1800:3, unit 100 µs) that makes a scan last SCAN_SHARE of the SYNC period.
 
     Args:
         period_ms: SYNC period, ms.
@@ -227,7 +226,8 @@ def _plan_of_bus(hand: HandConfig, i: int, bus: BusConfig, profiles: dict[str, P
     for patch in patches:
         frames += _of_a_patch(hand, bus, patch, profiles[patch.name])
     ours = {frame.can_id: frame.name for frame in frames}
-    for patch in patches:  # the plan contains one SDO channel, but every node has its own SDO identifiers
+    # The plan has frames for only one SDO channel, but every node has its own SDO identifiers.
+    for patch in patches:
         ours |= {
             od.command_cob_id(patch.node_id): f"commands to {patch.name}",
             od.sdo_response_cob_id(patch.node_id): f"SDO answers of {patch.name}",
@@ -336,7 +336,11 @@ def _ceil_ns(time_s: float) -> int:
 def _scan_time(
     patch: PatchConfig, profile: PatchProfile, hand: HandConfig, answers: dict[int, float | None]
 ) -> ScanTime:
-    """Compute a patch's scan time; the worst case sums SYNC, latency, pacing, last chunk and summary."""
+    """Compute the nominal and the worst-case duration of a patch's scans.
+
+    The worst case is the sum of the response times of SYNC, last chunk and summary, the node's latency, and
+    the nominal duration.
+    """
     spacing_s = inhibit_time_100us(hand.sync.period_ms, profile.n_chunks + 1) * 1e-4
     paced_s = (profile.n_chunks - 1) * spacing_s
     parts = [

@@ -1,17 +1,17 @@
 """Computes worst-case response times on a CAN bus: from queueing a frame to the end of its last bit.
 
-The analysis follows Davis, Burns, Bril, Lukkien, "Controller Area Network (CAN) schedulability analysis:
-Refuted, revisited and revised", Real-Time Systems 35, 2007, section 3. The frame with the lowest identifier
-wins arbitration, and a transmission is never preempted. The analysis examines all instances of a message in
-its longest priority-level busy period, because the worst response time is not always that of the first
-instance.
+The method is described in section 3 of Davis, Burns, Bril, Lukkien, "Controller Area Network (CAN)
+schedulability analysis: Refuted, revisited and revised", Real-Time Systems 35, 2007. The frame with the
+lowest identifier wins arbitration, and a transmission is never preempted. The analysis examines all instances
+of a message in its longest priority-level busy period, because the worst response time is not always that of
+the first instance.
 
 This module extends the analysis to messages that are sent in bursts, such as the chunks of a scan: each
 period starts with ``count`` frames at intervals of ``spacing_ns``. The number of frames in a time window is
-greatest if the window starts with a burst. The analysis remains valid if the number of frames in such a
-window replaces the paper's ⌈(t + J) / T⌉.
+greatest if the window starts with a burst. The analysis therefore uses this greatest number instead of the
+paper's ⌈(t + J) / T⌉.
 
-Retransmissions after errors are not modelled, nor are controllers that do not always send their
+The analysis ignores retransmissions after errors. It assumes that each controller always sends its
 highest-priority frame first.
 """
 
@@ -40,7 +40,7 @@ class Message:
     spacing_ns: int = 0
     """Minimum time between consecutive frames of a burst, ns."""
     jitter_ns: int = 0
-    """Maximum queueing jitter of a frame, ns; jitter does not change the order of frames."""
+    """Maximum queueing jitter of a frame, ns. Frames keep their order despite the jitter."""
 
     def __post_init__(self) -> None:
         for name, least in (

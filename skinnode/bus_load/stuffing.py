@@ -1,7 +1,6 @@
 """Compiled kernels of :mod:`skinnode.bus_load.timing` that count a frame's bits, including stuff bits.
 
-Identifiers are arrays of uint32, lengths and payloads are arrays of uint8, and bit counts are arrays of
-int64.
+The kernels take identifiers as uint32, lengths and payloads as uint8, and bit counts as int64 arrays.
 """
 
 from __future__ import annotations
@@ -31,9 +30,9 @@ _Bytes = NDArray[np.uint8]
 def tables() -> tuple[tuple[int, ...], tuple[int, ...], tuple[int, ...]]:
     """Return three lookup tables: CRC, next run, and number of stuff bits.
 
-    The CRC table is indexed by byte, the other tables by ``run << 8 | byte``. A run of 1 to 4 equal bits is
-    encoded as (value << 2 | length − 1) + 1; before the first bit of a frame, the run is 0. After five equal
-    bits, a stuff bit is inserted, and this bit begins a new run.
+    The CRC table is indexed by byte, the other tables by ``run << 8 | byte``. ``run`` encodes the 1 to 4
+    equal bits that precede the byte as (value << 2 | length − 1) + 1; at the start of a frame, it is 0. After
+    five equal bits, a stuff bit is inserted, which begins a new run.
     """
     crc_table = []
     for byte in range(256):
@@ -129,8 +128,9 @@ def _classic(  # noqa: PLR0913 - arrays of a compiled kernel
         crc = (crc << 8 & 0x7FFF) ^ np.int64(crc_of[crc >> 7 ^ (head & 0xFF)])
         for k in range(begin, begin + length):
             crc = (crc << 8 & 0x7FFF) ^ np.int64(crc_of[crc >> 7 ^ np.int64(payload[k])])
-        # The head has 19 bits and the CRC 15 bits; six filler bits extend them to five bytes. In the stuffed
-        # region, the payload is not byte-aligned, so each byte is assembled from two adjacent payload bytes.
+        # The 19 bits of the head, the 15 bits of the CRC and six filler bits make up five bytes. The head is
+        # not a whole number of bytes, so each byte to be stuffed is assembled from two adjacent payload
+        # bytes.
         stream = (ALTERNATING & 0x3F) << 18 | head >> 1
         stuff: Any = 0
         run: Any = 0
@@ -166,8 +166,8 @@ def _fd(  # noqa: PLR0913 - arrays of a compiled kernel
         else:
             code = 11 + length // 16  # 32, 48, 64
 
-        # Two filler bits extend the 22 bits from SOF to the length code to three bytes; the data bytes
-        # follow. FDF, res and BRS alternate, so no stuff bit is inserted between the first two bytes (sent at
+        # The 22 bits from SOF to the length code are preceded by two filler bits and followed by the data
+        # bytes. FDF, res and BRS alternate, so no stuff bit is inserted between the first two bytes (sent at
         # the nominal bit rate) and ESI.
         stream = 0b01 << 22 | np.int64(ids[i] & 0x7FF) << 10 | 0b10100000 | code
         slow: Any = 0

@@ -335,7 +335,7 @@ class BusLoad:
 
     @property
     def bits(self) -> int:
-        """Total length of all counted frames, in nominal bit times; bits of the data phase are shorter."""
+        """Total duration of all counted frames, in nominal bit times."""
         self._work_off()
         return self._bits + round(self._fast_bits * self._data_bit)
 
@@ -352,7 +352,7 @@ class BusLoad:
         self._frames += len(ids)
         if (
             not stuffing.are_loaded()
-        ):  # do not load the kernels: this would noticeably delay a command that runs for 1 or 2 s
+        ):  # do not load the kernels, because loading would noticeably delay a short command
             self._bits += sum(map(exact_bits, ids, data))
         elif ids:
             self._bits += stuffing.classic_bits(*_packed(ids, data), 0, np.empty(len(ids), np.int64))

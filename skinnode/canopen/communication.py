@@ -160,7 +160,6 @@ def _mapping(index: int, name: str, pdo: PdoDefault, slots: int) -> Object:
     entries = tuple(
         Entry(index, sub, f"Mapped object {sub}", _U32, "rw", value) for sub, value in enumerate(values, 1)
     )
-    # No upper limit is declared: for too many mapped objects, CiA 301 requires a different abort code from
-    # the one for a value above its limit.
+    # No upper limit is declared, because CiA 301 has a special abort code for too many mapped objects.
     first = Entry(index, 0, "Number of mapped objects", _U8, "rw", len(pdo.mapped))
     return record(index, f"{name} mapping parameter: {pdo.purpose}", entries, first)

@@ -61,7 +61,7 @@ class Entry:
     access: str
     """Access type: ro, rw, wo, const or rww, where rww means rw and mappable into an RPDO."""
     default: Value | None = None
-    """Default value; None for a value specific to each device, such as its serial number, which is initially
+    """Default value. None for a value specific to each device, such as the serial number; it is initially
     zero."""
     plus_node_id: bool = False
     """Whether the node-ID is added to the default value at start-up, as for a COB-ID."""
@@ -137,7 +137,7 @@ def record(index: int, name: str, entries: Sequence[Entry], first: Entry | None 
     Args:
         index: index of the record.
         name: name of the record.
-        entries: entries from sub-index 1 on, in ascending order of sub-index.
+        entries: entries at sub-index 1 and above, in ascending order of sub-index.
         first: entry at sub-index 0; None for a constant entry that contains the highest sub-index.
     """
     first = first or highest(index, entries[-1].subindex)
@@ -158,8 +158,8 @@ def array(  # noqa: PLR0913 - one argument for each column of the standard's tab
 ) -> Object:
     """Declare an array with one entry per label.
 
-    The entries from sub-index 1 on are named after ``labels``. The argument ``first`` has the same meaning as
-    in :func:`record`; all other arguments are fields of :class:`Entry`.
+    Entry k, at sub-index k, is named after the k-th label. The argument ``first`` has the same meaning as in
+    :func:`record`; all other arguments are fields of :class:`Entry`.
     """
     entries = tuple(
         Entry(index, sub, label, data_type, access, default, mappable=mappable, high=high)

@@ -12,7 +12,7 @@ _HEADER: Final = re.compile(r"\[(.+)\]")
 _OBJECT: Final = re.compile(r"[0-9a-f]{4}(sub[0-9a-f]{1,2})?", re.IGNORECASE)
 _FURTHER: Final = re.compile(r"[0-9a-f]{4}(?!sub)[g-z][a-z]*", re.IGNORECASE)
 """Pattern for titles of supplementary object sections, such as 1003Value and 1003ObjectLinks. These titles
-contain no digits after the index; 1018sb1 is a misspelled sub-object."""
+contain no digits after the index, so misspelled sub-objects such as 1018sb1 do not match."""
 _OF_OBJECT: Final = re.compile(r"[0-9]\w*|[0-9a-f]{4}sub.*", re.IGNORECASE)
 """Pattern for section titles that are probably meant to denote an object, including malformed titles."""
 _NUMBER: Final = re.compile(r"0x[0-9a-f]{1,8}|[0-9]{1,10}", re.IGNORECASE)
@@ -22,14 +22,14 @@ _LONGEST_SHOWN: Final = 60
 
 
 def check_form(text: str, source: str) -> None:
-    """Check the titles of the object sections, and the object lists, of an EDS file.
+    """Check the titles of the object sections and the object lists in an EDS file.
 
     Args:
         text: content of the EDS file.
         source: name of the EDS file, shown in the error.
 
     Raises:
-        ProfileError: if the file has a format error; the message states the line of the first format error.
+        ProfileError: if the file has a format error; the message states the line of the first one.
     """
     for line, section, key, value in _lines(text):
         if not key:

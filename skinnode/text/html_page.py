@@ -1,4 +1,4 @@
-"""Creates the HTML skeleton of all pages that skinnode writes, and escapes untrusted text."""
+"""Template of the HTML pages that skinnode writes, and escaping of untrusted text."""
 
 from __future__ import annotations
 

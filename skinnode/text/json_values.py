@@ -7,7 +7,7 @@ from typing import Any
 
 
 def plain(value: Any) -> Any:
-    """Return ``value`` with tuples converted to lists; NaN and infinity, which JSON lacks, become None."""
+    """Return ``value`` with tuples converted to lists, and with NaN and infinity replaced by None."""
     if isinstance(value, dict):
         return {key: plain(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):

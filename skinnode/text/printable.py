@@ -1,18 +1,17 @@
-r"""Makes untrusted text printable; only this module defines which characters output may contain.
+r"""Makes untrusted text safe to print. This module alone defines which characters are printable.
 
 Text from a device, a file, a recording or the command line is untrusted. The rules are:
 
-* Text from a bus or an EDS is made printable when decoded (:func:`printable`), and is limited to one line.
-  The original bytes are preserved in ``od --json``, in a DCF and in comparisons.
+* Text from a bus or an EDS is converted to one printable line when it is decoded (:func:`printable`). Only
+  ``od --json``, DCF files and comparisons use the original bytes.
 * A name in hand.toml that is not printable is rejected (``skinnode.config``).
-* The output of every command passes through :class:`PrintableStream`, and output from rich passes through the
-  console of ``skinnode.cli``. Both mechanisms are safety nets for echoed text, such as file names and
-  arguments.
+* The output of every command passes through :class:`PrintableStream`, or through the console of
+  ``skinnode.cli`` if it comes from rich. Both also escape file names and arguments that a command prints.
 * In HTML pages, text is also HTML-escaped, so that untrusted text is never interpreted as markup.
 
-Text is printable according to :meth:`str.isprintable` if it contains no control characters (C0, DEL, C1), no
-format characters (some of which reverse the text direction or have no width) and no surrogates. Non-printable
-characters are replaced by Python escapes: ``\x1b``, ``\u202e``.
+The method :meth:`str.isprintable` decides whether a character is printable. Control characters, surrogates
+and format characters, such as those that reverse the text direction, are not printable. They are replaced by
+Python escape sequences, such as ``\x1b`` and ``\u202e``.
 """
 
 from __future__ import annotations
@@ -21,15 +20,14 @@ import re
 from typing import Any, Final, TextIO
 
 MOST: Final = 200
-"""Maximum number of characters shown of an untrusted text; longer than any name, but short enough for one
-line."""
+"""Maximum number of characters of an untrusted text that are printed. No name is longer than this limit."""
 
 _SUSPECT: Final = re.compile(r"[^ -~]")
 _SUSPECT_IN_LINES: Final = re.compile(r"[^\n\t -~]")
 
 
 def printable(text: str | bytes, most: int = MOST) -> str:
-    """Return ``text`` on one line, without control sequences.
+    """Return ``text`` as one line, with non-printable characters escaped.
 
     Args:
         text: The text. Bytes are decoded as a VISIBLE_STRING: one character per byte, without trailing NULs.
@@ -43,7 +41,7 @@ def printable(text: str | bytes, most: int = MOST) -> str:
 
 
 def printable_lines(text: str) -> str:
-    """Return the whole ``text`` without control sequences, but keep its line ends and tabs.
+    """Return ``text`` with non-printable characters escaped, except line ends and tabs.
 
     Use this function for messages that contain untrusted parts.
     """
@@ -56,23 +54,23 @@ def _escaped(found: re.Match[str]) -> str:
 
 
 class PrintableStream:
-    """Wrapper for a text stream, such as stdout, that escapes control characters.
+    """Wrapper for a text stream, such as stdout, that escapes non-printable characters.
 
-    Because of the attribute ``rich_proxied_file``, output from rich bypasses the wrapper.
+    Rich finds the original stream in the attribute ``rich_proxied_file`` and writes to that stream directly.
     """
 
     def __init__(self, stream: TextIO) -> None:
         self.rich_proxied_file = stream
 
     def write(self, text: str) -> int:
-        """Write ``text`` with its control characters escaped, and return its length."""
+        """Write ``text`` with non-printable characters escaped; return the length of ``text``."""
         if not isinstance(text, str):
             raise TypeError(f"write() argument must be str, not {type(text).__name__}")
         self.rich_proxied_file.write(printable_lines(text))
         return len(text)
 
     def writelines(self, lines: Any) -> None:
-        """Write each of ``lines`` with its control characters escaped."""
+        """Write ``lines`` with non-printable characters escaped."""
         for line in lines:
             self.write(line)
 

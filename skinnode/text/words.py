@@ -4,12 +4,12 @@ from __future__ import annotations
 
 
 def counted(number: int, one: str, several: str = "") -> str:
-    """Return a number with its noun, such as ``1 node`` or ``2 nodes``.
+    """Return a number followed by a noun, such as ``1 node`` or ``2 nodes``.
 
     Args:
         number: The number.
         one: The noun in the singular.
-        several: The noun in the plural; by default ``one`` with an s appended.
+        several: The noun in the plural; default: ``one`` followed by s.
     """
     return f"{number} {one}" if number == 1 else f"{number} {several or one + 's'}"
 

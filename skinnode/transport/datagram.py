@@ -1,8 +1,8 @@
-"""Provide a UDP bus for load tests; each packet contains one frame in SocketCAN's memory layout.
+"""Provide a UDP bus for load tests. Each UDP packet contains one frame in SocketCAN's memory layout.
 
-The reader for SocketCAN frames also receives the UDP packets, so system calls, kernel timestamps, bounded
-buffer and drop counter are the same. Only the kernel's CAN driver and CAN protocol layer are replaced, by UDP
-over the loopback device; the cost to the receiver is about the same.
+The UDP packets are received by the same reader as SocketCAN frames, so the tests also cover its system calls,
+timestamps and drop counter. UDP over the loopback device replaces the kernel's CAN driver and CAN protocol
+layer.
 """
 
 from __future__ import annotations
@@ -32,14 +32,14 @@ def datagram(can_id: int, data: bytes, *, fd: bool = False) -> bytes:
 
 
 def free_channel() -> str:
-    """Return the number of a UDP port that no program on this machine is using."""
+    """Return the number of a free UDP port on this machine."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
         sock.bind((LOOPBACK, 0))
         return str(sock.getsockname()[1])
 
 
 class DatagramPort(CanPort):
-    """Receive-only port for a UDP bus. The ``channel`` in its configuration is a UDP port number."""
+    """Receive-only port for a UDP bus. The ``channel`` in its configuration is the number of a UDP port."""
 
     def _open(self) -> can.BusABC:
         try:

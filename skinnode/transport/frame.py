@@ -1,4 +1,4 @@
-"""Received CAN frame; its fields are the same for every type of interface."""
+"""Received CAN frame, in the same form for every type of interface."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import NamedTuple
 class Frame(NamedTuple):
     """A received CAN frame.
 
-    ``t_ns`` is the frame's time on the monotonic clock; ``data`` is empty in a remote frame.
+    ``t_ns`` is the arrival time on the monotonic clock. ``data`` is empty in a remote frame.
     """
 
     can_id: int

@@ -1,9 +1,9 @@
 """Write CAN frames to a candump text file (``.log``) or a Vector BLF file.
 
-In both formats, all frames written before the last :meth:`FrameLog.flush` survive if the process is killed
-later. Each frame is simply appended to a ``.log`` file. For BLF files, python-can's writer buffers up to 128
-kB of frames and completes the file header only when the writer stops. Each flush of a BLF file therefore
-stops the writer, which completes the file, and opens a new writer in append mode.
+If the process is killed, the file contains at least the frames written before the last
+:meth:`FrameLog.flush`. python-can's BLF writer buffers up to 128 kB of frames and completes the file header
+only when it stops. Flushing a BLF file therefore stops the writer, and the next frame is written by a new
+writer in append mode.
 """
 
 from __future__ import annotations
@@ -22,30 +22,31 @@ LogFormat = Literal["log", "blf"]
 SUFFIXES: Final = (".log", ".blf")
 
 _CONTAINER_BYTES: Final = 1 << 20
-"""Maximum size of a BLF container before compression, bytes. The limit exceeds the data written between two
-flushes, so that no frame is split between two containers."""
+"""Maximum size of a BLF container before compression, bytes. The limit exceeds the amount of data written
+between two flushes, so that no frame is split between containers."""
 
 
 class LoggedFrame(NamedTuple):
-    """CAN frame in a log file, where ``t_ns`` is wall-clock time with a resolution of 1 µs."""
+    """CAN frame in a log file. Its ``t_ns`` is a wall-clock time with a resolution of 1 µs."""
 
     frame: Frame
     channel: str
-    """Name of the channel; in a BLF file, the channel's number, counted from 0, because BLF has no names."""
+    """Name of the channel. When read from a BLF file, which contains no names, the number of the channel,
+    counted from 0."""
     sent: bool
     """Whether the recording program sent the frame."""
 
 
 class FrameLog:
-    """Open log file to which CAN frames are written. Owned by one thread.
+    """Log file to which CAN frames are written. Owned by one thread.
 
     Args:
         path: Path of the file to create, ending in ``.log`` or ``.blf``.
         channels: Names of the channels; BLF numbers them in this order.
 
     Raises:
-        ConfigError: if the file exists already, or cannot be created.
-        OSError: raised by the other methods if writing to the disk fails.
+        ConfigError: if the file already exists or cannot be created.
+        OSError: raised by the other methods if writing fails.
     """
 
     def __init__(self, path: Path, channels: tuple[str, ...]) -> None:
@@ -61,7 +62,7 @@ class FrameLog:
         """Number of frames written."""
 
     def write(self, logged: LoggedFrame) -> None:
-        """Write a frame, which survives a crash only after the next :meth:`flush`."""
+        """Write a frame. A crash before the next :meth:`flush` can lose the frame."""
         frame = logged.frame
         if self._writer is None:
             self._writer = self._open()
@@ -82,10 +83,11 @@ class FrameLog:
         self.frames += 1
 
     def flush(self, *, to_disk: bool) -> None:
-        """Pass all data written so far to the kernel, so that the data survive if the process is killed.
+        """Pass all data to the operating system, so that killing the process does not lose any frames.
 
         Args:
-            to_disk: Whether to wait until the data are on the disk, so that they survive a loss of power.
+            to_disk: Whether to wait until the data are on the disk, so that a power failure does not lose
+                them.
         """
         if self._is_blf:
             self._end_blf()
@@ -97,7 +99,7 @@ class FrameLog:
     def close(self) -> None:
         """Close the file.
 
-        Closing raises no exception, because earlier calls have already reported any error.
+        Errors are ignored, because earlier calls have already reported any disk error.
         """
         with contextlib.suppress(OSError):
             self.flush(to_disk=True)
@@ -117,7 +119,7 @@ class FrameLog:
         try:
             writer.stop()
         finally:
-            with contextlib.suppress(OSError):  # on a full disk, closing raises the error again
+            with contextlib.suppress(OSError):  # if the disk is full, closing raises the same error again
                 writer.file.close()
 
 

@@ -1,9 +1,9 @@
 """Read frames from a candump log or a BLF file, even if the file is damaged.
 
-All complete frames of a truncated or partly overwritten file are read. Each damaged part of a file is
-counted, and its line or offset is recorded (:class:`Damage`). Invalid file content never causes an exception.
-A corrupted byte that leaves a frame well-formed is detected only in a BLF file, because candump logs have no
-checksums.
+The reader skips damaged parts of a truncated or partly overwritten file and reads all other frames. Each
+damaged part is counted, and its line or offset is recorded (:class:`Damage`). Invalid file content never
+causes an exception. In a candump log, which has no checksums, a corrupted frame is not detected if it is
+still well-formed.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from skinnode.transport.frame import Frame
 from skinnode.transport.frame_log import SUFFIXES, LoggedFrame
 
 DAMAGES_KEPT: Final = 100
-"""Maximum number of damaged parts of a file that are described; any others are only counted."""
+"""Maximum number of damaged parts whose descriptions are kept. Further damaged parts are only counted."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,17 +49,17 @@ class _Container(NamedTuple):
     """Container in a BLF file."""
 
     end: int
-    """File offset at the start of the search for the next container, bytes."""
+    """File offset from which to search for the next container, bytes."""
     objects: bytes | None
-    """Readable part of the container's content; None if no part is readable."""
+    """Content of the container as far as it is readable; None if it is not readable."""
     intact: bool = False
 
 
 class FrameLogReader:
-    """Reader of a log file; iterating over the reader yields the frames, once only. Owned by one thread.
+    """Reader that yields the frames of a log file; it can be iterated over only once. Owned by one thread.
 
     Raises:
-        ConfigError: if the file cannot be opened, or its name does not end in ``.log`` or ``.blf``.
+        ConfigError: if the file cannot be opened, or has a suffix other than ``.log`` and ``.blf``.
     """
 
     def __init__(self, path: Path) -> None:
@@ -123,7 +123,7 @@ class FrameLogReader:
                 if objects is not None:
                     whole, tail = self._whole_objects(tail + objects, at)
                     yield from self._frames(header, whole, at)
-                if not intact:  # a partial frame with a wrong length could swallow the frames that follow
+                if not intact:  # with a wrong length, a partial frame could include the frames that follow
                     tail = b""
                 following = _find_container(data, end)
                 if following > end + _PADDING_BYTES and intact:
@@ -166,9 +166,9 @@ class FrameLogReader:
         return _Container(min(end, len(data)), objects, intact=True)
 
     def _whole_objects(self, data: bytes, container: int) -> tuple[bytes, bytes]:
-        """Return the complete objects in ``data``, and the beginning of an incomplete object at its end."""
+        """Return the complete objects in ``data``, and the incomplete object at the end of ``data``."""
         pieces: list[bytes] = []
-        begin = at = 0  # begin: offset of the first object after the last gap; at: offset of the next object
+        begin = at = 0  # offset of the first object after the last gap, and of the next object
         while True:
             start = data.find(b"LOBJ", at, at + _PADDING_BYTES + 4)
             if start < 0 and len(data) - at <= _PADDING_BYTES:
@@ -192,13 +192,13 @@ class FrameLogReader:
                 at = start + length
 
     def _frames(self, header: bytes, objects: bytes, container: int) -> Iterator[LoggedFrame]:
-        """Yield the CAN frames in ``objects``; python-can parses the objects as an in-memory BLF file."""
+        """Yield the CAN frames in ``objects``, parsed by python-can as an in-memory BLF file."""
         head = _OBJECT.pack(b"LOBJ", _OBJECT.size, 1, _CONTAINER_HEAD_BYTES + len(objects), _LOG_CONTAINER)
         file = io.BytesIO(header + head + struct.pack("<H6xL4x", _STORED, len(objects)) + objects)
         try:
             for message in can.BLFReader(file):
                 yield _blf_frame(message)
-        except Exception as error:  # python-can does not catch its parser's exceptions
+        except Exception as error:  # python-can's parser raises various exceptions on invalid data
             self._complain(None, container, f"objects that cannot be read ({type(error).__name__}: {error})")
 
 
@@ -214,7 +214,7 @@ _ERROR_BIT: Final = 0x2000_0000
 
 
 def _candump_frame(line: bytes) -> LoggedFrame | None:
-    """Return the frame on a line written by ``candump -L`` or python-can; None for any other line."""
+    """Parse a line written by ``candump -L`` or python-can; return None for any other line."""
     match = _LINE.fullmatch(line)
     if match is None:
         return None

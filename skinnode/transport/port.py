@@ -1,9 +1,9 @@
 """Provide a CAN bus endpoint with the same behaviour on every type of interface.
 
-Every error of python-can is converted to a :class:`~skinnode.errors.BusError` with a one-line message. The
-arrival time of each frame is a time on the host's monotonic clock. Some interfaces (virtual, udp_multicast,
-socketcan) timestamp frames with the wall clock. For these interfaces, the arrival time is the time of reading
-minus the timestamp's age, so time spent in a queue has no effect.
+Every error of python-can is converted to a :class:`~skinnode.errors.BusError` with a one-line message.
+Arrival times are times on the host's monotonic clock. If an interface timestamps frames with the wall clock,
+the timestamps are converted to the monotonic clock. The interfaces virtual, udp_multicast and socketcan
+provide such timestamps.
 """
 
 from __future__ import annotations
@@ -31,13 +31,12 @@ if TYPE_CHECKING:
     from skinnode.config import BusConfig
 
 VIRTUAL_QUEUE_FRAMES: Final = 32768
-"""Capacity, in frames, of the queue of an endpoint on python-can's virtual bus: about 4 s of traffic on a
-fully loaded bus at 1 Mbit/s. Without a limit, the queue of an endpoint that is never read would fill the
-memory."""
+"""Capacity of an endpoint's receive queue on python-can's virtual bus, frames. The queue can store 4 s of
+traffic from a fully loaded bus at 1 Mbit/s."""
 
 RECEIVE_BUFFER_BYTES: Final = 1 << 22
-"""Size (bytes) of the receive buffer that is requested from the kernel for a socket; each frame in the buffer
-occupies about 800 bytes."""
+"""Size of a socket's receive buffer that is requested from the kernel, bytes. A frame in the buffer occupies
+about 800 bytes."""
 
 # Python has no names for these constants from <asm-generic/socket.h>, <linux/in.h> and <linux/in6.h>.
 SO_RCVBUFFORCE: Final = 33
@@ -45,33 +44,33 @@ _IP_MULTICAST_ALL: Final = 49
 _IPV6_MULTICAST_ALL: Final = 29
 
 _OLDEST_STAMP_S: Final = 10.0
-"""Maximum age of a frame's timestamp, s. A timestamp that is older or in the future is not from this
-machine's wall clock; the time of reading replaces it."""
+"""Maximum age of a frame's timestamp, s. An older timestamp, or a timestamp in the future, cannot come from
+this machine's wall clock and is replaced by the time of reading."""
 
 _LINK_GONE: Final = (errno.ENETDOWN, errno.ENODEV, errno.ENXIO)
-"""Error codes of the kernel for an interface that went down. The kernel reports the error once per socket,
-from either a receive or a send call."""
+"""Error codes that the kernel returns after an interface went down. Only the first call after this event,
+either a send or a receive call, returns the error."""
 
 _SOCKETCAN: Final = "socketcan"
 _MULTICAST: Final = "udp_multicast"
 _VIRTUAL: Final = "virtual"
 
 _DELIVERY_S: Final = 0.05
-"""Time allowed for the kernel to finish delivering a frame, s. This assumed value exceeds the longest delay
-observed, 28 ms on a virtual machine."""
+"""Maximum time that the kernel is assumed to take to deliver a frame, s. The longest time observed was 28
+ms."""
 
-# In a program that does not configure logging, python-can's loggers would print warnings to stderr, even for
-# errors that are already reported by a BusError.
+# Without this handler, python-can would print warnings to stderr in a program that does not configure
+# logging. The same errors are already reported by BusError.
 logging.getLogger("can").addHandler(logging.NullHandler())
 
 
 def is_interface(config: BusConfig) -> bool:
-    """Return whether python-can, or a plugin for python-can, provides the type of interface of the bus."""
+    """Return whether python-can or one of its plugins provides the bus's type of interface."""
     return config.interface in can.VALID_INTERFACES
 
 
 def allowed_interfaces(config: BusConfig) -> str:
-    """Return a phrase that lists python-can's interface types and suggests the closest match."""
+    """Return text that lists python-can's interface types and suggests the closest match."""
     known = ", ".join(sorted(can.VALID_INTERFACES))
     near = difflib.get_close_matches(config.interface.lower(), can.VALID_INTERFACES, 1)
     return f"one of {known}; did you mean {near[0]!r}?" if near else f"one of {known}"
@@ -80,7 +79,7 @@ def allowed_interfaces(config: BusConfig) -> str:
 class _Message(can.Message):
     """CAN message that is copied five times as fast as python-can's ``Message``.
 
-    Copying speed matters because python-can's virtual bus copies each message once per receiver.
+    python-can's virtual bus copies each message once per receiver.
     """
 
     __slots__ = ()
@@ -103,7 +102,7 @@ class _Message(can.Message):
 
 
 def open_can_bus(config: BusConfig) -> can.BusABC:
-    """Open an endpoint as a python-can bus, for a program that does not use :class:`CanPort`.
+    """Open a python-can bus, for a program that does not use :class:`CanPort`.
 
     Args:
         config: Interface, channel, bit rates and options of the bus.
@@ -137,7 +136,7 @@ def _where(config: BusConfig) -> str:
 
 
 class CanPort:
-    """Endpoint on a bus, open from construction until :meth:`close` or the end of a ``with`` block.
+    """Endpoint on a CAN bus, open until :meth:`close` is called or a ``with`` block ends.
 
     An endpoint does not receive the frames that it sends. python-can's configuration files and environment
     variables are ignored.
@@ -157,15 +156,14 @@ class CanPort:
         self._longest = 64 if config.fd else 8
         self._closed = False
         self._link_gone: Exception | None = None
-        self._counting = clock.lock()  # protects counters in send(), which several threads may call
+        self._counting = clock.lock()  # protects the counters when several threads call send()
         self._sent = self._received = self._errors = self._undelivered = self._malformed = 0
-        self._dropped_before = 0  # frames dropped while earlier readers were in use
+        self._dropped_before = 0  # number of frames dropped by earlier readers
         self._away = False
         self._bus = self._open()
         self._reader = self._open_reader()
-        # A multicast group returns each frame to its sender, and all members have the same address and port.
-        # To recognise its own frames, the port marks them in the channel field, which python-can sends but
-        # does not use.
+        # The sender of a multicast frame also receives the frame. To recognise its own frames, this port
+        # sends a unique tag in the channel field, which python-can transmits but does not use.
         self._tag = f"skinnode-{uuid.uuid4().hex}" if config.interface == _MULTICAST else None
         self._send_timeout_s = 0.0 if config.interface == _VIRTUAL else None
 
@@ -173,7 +171,7 @@ class CanPort:
         return open_can_bus(self.config)
 
     def _open_reader(self) -> SocketReader | None:
-        """Return the reader that receives frames in place of python-can; None if no such reader is used."""
+        """Return the reader for SocketCAN frames; None for other interfaces."""
         bus: Any = self._bus  # python-can's SocketcanBus
         return SocketReader(bus.socket) if self.config.interface == _SOCKETCAN else None
 
@@ -183,7 +181,7 @@ class CanPort:
         return self._reader is not None
 
     def fileno(self) -> int:
-        """Return the socket's file descriptor; -1 if the port does not read batches of frames."""
+        """Return the socket's file descriptor, or -1 if the port cannot read batches of frames."""
         return -1 if self._reader is None else self._reader.fileno()
 
     @property
@@ -203,7 +201,7 @@ class CanPort:
 
     @property
     def undelivered(self) -> int:
-        """Number of sent frames that another endpoint on the virtual bus lost because its queue was full."""
+        """Number of sent frames not delivered to all endpoints of a virtual bus due to a full queue."""
         return self._undelivered
 
     @property
@@ -213,15 +211,15 @@ class CanPort:
 
     @property
     def dropped(self) -> int:
-        """Number of frames dropped because the kernel's buffer was full; 0 unless socketcan is used."""
+        """Number of frames dropped because the kernel's receive buffer was full; 0 except with socketcan."""
         return self._dropped_before + (0 if self._reader is None else self._reader.dropped)
 
     def send(self, can_id: int, data: bytes, *, remote: bool = False) -> None:
         """Send a frame with an 11-bit identifier.
 
         On a bus with ``fd``, data of more than 8 bytes are sent as a CAN FD frame with bit-rate switching,
-        padded with zeros to a valid length. An endpoint on a virtual bus loses the frame if the endpoint's
-        queue is full.
+        padded with zeros to a valid length. On a virtual bus, an endpoint with a full receive queue does not
+        receive the frame.
 
         Args:
             can_id: Identifier, 0 to 0x7FF.
@@ -273,10 +271,10 @@ class CanPort:
         return batch[0] if batch else None
 
     def recv_batch(self, timeout_s: float, most: int = BATCH_FRAMES) -> list[Frame]:
-        """Return the frames that have arrived; if there are none, wait for the first frame.
+        """Return all frames that have arrived. If there are none, wait for the next frame.
 
         Args:
-            timeout_s: Maximum wait for the first frame, s.
+            timeout_s: Maximum time to wait for a frame, s.
             most: Maximum number of frames. Interfaces other than socketcan return one frame at a time.
 
         Raises:
@@ -310,17 +308,17 @@ class CanPort:
                     self._errors += 1
                     raise BusError(f"{self._where}: cannot receive ({_why(error)})") from error
                 self._malformed += 1
-            # The frame was this endpoint's own or malformed: wait for another until the timeout.
+            # The frame was malformed or sent by this endpoint. Wait for another frame for the remaining time.
             timeout_s = max(0.0, (end_ns - clock.monotonic_ns()) * 1e-9)
 
     def reopen(self) -> None:
-        """Close and reopen the interface after a failure; the counters are not reset.
+        """Close and reopen the interface after a failure, without resetting the counters.
 
         While the interface is closed, sending raises BusError. The receiving thread must have ended before
         the call.
 
         Raises:
-            BusError: if the interface cannot be opened; the call may be repeated later.
+            BusError: if the interface cannot be opened. The call may be repeated.
         """
         if not self._away:
             self._away = True
@@ -338,8 +336,8 @@ class CanPort:
         receiving thread must have ended before the call.
 
         Raises:
-            BusError: if the interface rejects the bit rate; the interface stays open at the previous bit
-                rate.
+            BusError: if the interface rejects the bit rate. The interface then remains open at the previous
+                bit rate.
         """
         before = self.config
         self.config = before.model_copy(update={"bitrate_bps": bitrate_bps})
@@ -353,7 +351,7 @@ class CanPort:
             self.reopen()
 
     def close(self) -> None:
-        """Close the interface; a second call is allowed. The receiving thread must have ended."""
+        """Close the interface. The receiving thread must have ended. Repeated calls have no effect."""
         if not self._closed:
             self._closed = True
             self._bus.shutdown()
@@ -371,15 +369,15 @@ class CanPort:
 
 
 def _tune_socket(fileno: int) -> None:
-    """Request a large receive buffer, and restrict reception to the socket's own multicast group."""
+    """Enlarge the receive buffer, and receive only frames sent to the socket's own multicast group."""
     duplicate = socket.socket(fileno=os.dup(fileno))
     try:
         try:
             duplicate.setsockopt(socket.SOL_SOCKET, SO_RCVBUFFORCE, RECEIVE_BUFFER_BYTES)
         except OSError:  # only root may exceed net.core.rmem_max
             duplicate.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER_BYTES)
-        # python-can binds the socket to any address. Such a socket receives frames from every multicast group
-        # joined by any program on the machine, so the buses of different groups would be merged.
+        # python-can binds the socket to all addresses. By default, such a socket receives the frames of every
+        # multicast group that any program on the machine has joined.
         if duplicate.family == socket.AF_INET:
             duplicate.setsockopt(socket.IPPROTO_IP, _IP_MULTICAST_ALL, 0)
             _discard_other_groups(duplicate)
@@ -391,9 +389,10 @@ def _tune_socket(fileno: int) -> None:
 
 
 def _discard_other_groups(sock: socket.socket) -> None:
-    """Discard the frames received while the socket still accepted other multicast groups.
+    """Discard frames that arrived before the restriction to one multicast group took effect.
 
-    If any frame is discarded, the kernel may still be delivering another, so wait and discard again.
+    After any frame has been discarded, wait and repeat once, because the kernel may still be delivering
+    others.
     """
     if _discard_waiting(sock):
         clock.sleep(_DELIVERY_S)
@@ -401,7 +400,7 @@ def _discard_other_groups(sock: socket.socket) -> None:
 
 
 def _discard_waiting(sock: socket.socket) -> int:
-    """Discard the frames waiting in a socket. Returns the number of frames discarded."""
+    """Discard all frames in a socket's receive buffer; return their number."""
     count = 0
     with contextlib.suppress(BlockingIOError):
         while True:
@@ -427,17 +426,16 @@ def _frame(message: can.Message) -> Frame:
 
 
 def _is_garbage(error: Exception) -> bool:
-    """Return whether a packet's content, rather than the network, caused an error on a multicast bus.
+    """Return whether an error on a multicast bus was caused by a packet's content, not by the network.
 
-    Invalid content causes an exception in msgpack or in a check of the message; a network error causes an
-    OSError in the socket.
+    Only network errors are caused by an OSError.
     """
     cause = error.__cause__
     return isinstance(error, can.CanOperationError) and cause is not None and not isinstance(cause, OSError)
 
 
 def _why(error: BaseException) -> str:
-    """Return, as one line, the message of the most informative exception in an exception chain."""
+    """Return the message of the most informative exception in a chain, as a single line."""
     while error.__cause__ is not None:
         error = error.__cause__
     if error.__context__ is not None and isinstance(error.__context__, OSError):

@@ -1,6 +1,6 @@
-"""Receive CAN frames on threads that only copy the frames into bounded queues, and count dropped frames.
+"""Receive CAN frames on dedicated threads, which only put the frames into bounded queues.
 
-A single reader thread takes all queued frames at a time.
+A reader thread processes the queued frames. Frames that arrive while a queue is full are dropped and counted.
 """
 
 from __future__ import annotations
@@ -20,51 +20,49 @@ from skinnode.transport.frame import Frame
 from skinnode.transport.port import CanPort
 
 CAPACITY_FRAMES: Final = 16384
-"""Capacity of an intake, frames: 2 s of traffic on a fully loaded bus at 1 Mbit/s (8,000 frames/s). If the
-reader thread pauses for longer than 2 s, frames are lost."""
+"""Default capacity of a queue, frames. The queue can store 2 s of traffic from a fully loaded bus at 1 Mbit/s
+(8,000 frames/s)."""
 
 _POLL_S: Final = 0.02
-"""Maximum time that a receiving thread waits for a frame before it checks whether to end, s."""
+"""Maximum time that a receiving thread waits for a frame before it checks for a request to end, s."""
 
 
 GATHER_NS: Final = 1_500_000
-"""Pause after receiving a batch of frames, ns; comparable to a network card's interrupt moderation. Without
-the pause, the thread would wake for each frame, 8,000 times a second, at a higher cost than handling the
-frames. The first frame after a period of silence is not delayed, and every frame keeps its original arrival
-time."""
+"""Pause between two batches of frames, ns. Without this pause, the thread would wake up for every frame, up
+to 8,000 times per second. The pause has no effect on the timestamps of the frames."""
 
 LONG_NS: Final = 5_000_000
-"""Pause after receiving a batch if the arrival time of every awaited frame is predicted, ns. An unpredicted
-frame may remain in the kernel for up to 1.5 times this pause."""
+"""Pause between two batches of frames if the arrival times of all expected frames are predicted, ns. An
+unexpected frame is received with a delay of up to 1.5 times this pause."""
 
 _BEFORE_NS: Final = 800_000
-"""Lead time of an extra fetch before each predicted arrival, ns. The extra fetch leaves little work for the
-moment when the predicted frame arrives."""
+"""Time before a predicted arrival at which earlier frames are fetched, ns. The predicted frame can then be
+fetched without delay."""
 _SHORT_NS: Final = 300_000
-"""Minimum pause between two fetches, ns; used while a predicted frame is imminent or slightly overdue."""
+"""Minimum pause between two batches of frames, ns. It applies around the predicted arrival time of a
+frame."""
 _LATE_NS: Final = 600_000
-"""Period after a predicted arrival, ns, in which the receiver fetches at the minimum pause."""
+"""Time after a predicted arrival for which the minimum pause applies, ns."""
 _GIVEN_UP_NS: Final = 200_000_000
-"""Time limit, after a predicted arrival, for the predicted frame to arrive, ns."""
+"""Time after a predicted arrival at which a frame is considered lost, ns."""
 _ANSWER_NS: Final = 20_000_000
-"""Period after sending a request, ns, in which a response may arrive at any time."""
+"""Time after a request for which a response is expected, ns."""
 _LAG_NS: Final = 50_000
-"""Delay from a frame's arrival until the frame can be read from the socket, ns."""
+"""Time between the arrival of a frame and its availability in the socket, ns."""
 
 
 class Intake:
-    """Bounded queue between the receiving thread of a port and the reader.
+    """Bounded queue of frames between a receiving thread and the reader thread.
 
-    If the queue is full, the newest frame is dropped, as by a kernel socket. The queued frames therefore stay
-    in order without gaps, and only the receiving thread modifies the end of the queue. ``dropped`` counts the
-    lost frames.
+    If the queue is full, newly arrived frames are dropped, like in a full socket buffer, and counted in
+    ``dropped``.
 
     Threads: only the reader may call :meth:`take` and :meth:`expect`. Only the receiving thread may call the
     other methods, except those marked "Any thread".
 
     Args:
         port: Port from which frames are received.
-        capacity: Maximum number of waiting frames.
+        capacity: Maximum number of frames in the queue.
 
     Raises:
         ValueError: if ``capacity`` is below 1.
@@ -75,40 +73,40 @@ class Intake:
             raise ValueError(f"capacity: got {capacity}, must be at least 1")
         self.port = port
         self.seen_ns = 0
-        """Monotonic time, ns; all frames that arrived earlier have been queued or dropped."""
+        """Monotonic time up to which all frames that arrived have been queued or dropped, ns."""
         self.due_ns = 0
         """Monotonic time of the next :meth:`fetch`, ns. Used only by the receiver."""
         self._capacity = capacity
         self._queue: deque[list[Frame]] = deque()
-        # _taken is written by the reader, _put and _dropped by the receiving thread
+        # The reader thread writes _taken. The receiving thread writes _put and _dropped.
         self._put = self._taken = self._dropped = 0
         self._error: Exception | None = None
         self._expected: dict[str, tuple[int, ...]] = {}
-        self._first_ns = 0  # earliest predicted arrival; 0 if a group has no prediction
+        self._first_ns = 0  # earliest predicted arrival; 0 if any group of frames may arrive at any time
         self._asked_ns = 0
 
     @property
     def dropped(self) -> int:
         """Number of frames lost because the queue was full.
 
-        The port counts the frames dropped by the kernel.
+        Frames dropped by the kernel are counted in :attr:`CanPort.dropped`.
         """
         return self._dropped
 
     @property
     def queued(self) -> int:
         """Number of frames waiting in the queue."""
-        taken = self._taken  # _taken is read before _put, so that the difference is never negative
+        taken = self._taken  # read before _put, so that the result is never negative
         return self._put - taken
 
     def take(self) -> list[Frame]:
         """Return all queued frames in order of arrival, without waiting.
 
         Raises:
-            BusError: if the bus failed and all frames received before the failure have already been taken.
+            BusError: if the bus has failed, after all earlier frames have been taken.
             Exception: any other exception raised by the receiving thread.
         """
-        # read the error before the queue, which then contains all frames received before the error
+        # Read the error first: the queue then contains all frames that were received before the error.
         error, batches = self._error, self._queue
         if not batches:
             if error is not None:
@@ -121,18 +119,19 @@ class Intake:
         return frames
 
     def expect(self, what: str, times_ns: tuple[int, ...]) -> None:
-        """Set the predicted arrival time of a group's last frame, so that the frame is fetched without delay.
+        """Predict the arrival of the last frame in a group, so that this frame is fetched without delay.
 
         Args:
-            what: Name of the group of frames. A new prediction replaces the group's previous prediction.
-            times_ns: Possible monotonic arrival times in ascending order, ns; empty if the frame may arrive
-                at any time.
+            what: Name of the group of frames. A prediction replaces the previous prediction for the same
+                group.
+            times_ns: Possible arrival times on the monotonic clock, ascending, ns; empty if the frame may
+                arrive at any time.
         """
         self._expected[what] = times_ns
         self._first_ns = min([times[0] if times else 0 for times in self._expected.values()])
 
     def asked(self, t_ns: int) -> None:
-        """Record that a request was sent at monotonic time ``t_ns``, so a response may arrive soon.
+        """Announce a response to a request that was sent at monotonic time ``t_ns``.
 
         Any thread may call this method.
         """
@@ -141,9 +140,9 @@ class Intake:
     # --- called by the receiver
 
     def gather(self, now_ns: int) -> None:
-        """Set the time of the next fetch, :attr:`due_ns`, so that frames accumulate until then."""
+        """Choose the time of the next fetch, :attr:`due_ns`, until which frames accumulate."""
         known = now_ns > self._asked_ns + _ANSWER_NS
-        if now_ns < self._first_ns:  # fast path: this method runs after every batch from every bus
+        if now_ns < self._first_ns:  # fast path, because this method runs after every batch
             awaited_ns = _before(self._first_ns, now_ns)
         else:
             awaited_ns, all_known = self._next_awaited(now_ns)
@@ -151,7 +150,7 @@ class Intake:
         self.due_ns = min(awaited_ns, _together(now_ns, LONG_NS if known else GATHER_NS))
 
     def _next_awaited(self, now_ns: int) -> tuple[int, bool]:
-        """Return the fetch time (ns) of the next predicted frame, and whether all frames are predicted."""
+        """Return when to fetch the next predicted frame (ns), and whether all frames are predicted."""
         awaited_ns, all_known = now_ns + LONG_NS, bool(self._expected)
         for times in tuple(self._expected.values()):
             for t_ns in times:
@@ -164,7 +163,7 @@ class Intake:
 
     @property
     def failed(self) -> bool:
-        """Whether reception has failed and is stopped until :meth:`Receiver.resume` is called."""
+        """Whether reception has stopped due to an error, until :meth:`Receiver.resume` is called."""
         return self._error is not None
 
     def resume(self) -> None:
@@ -172,18 +171,18 @@ class Intake:
         self._error = None
 
     def fetch(self, timeout_s: float) -> bool:
-        """Move the frames that have arrived at the port into the queue.
+        """Move all frames that have arrived at the port to the queue.
 
         Args:
-            timeout_s: Maximum wait for the first frame, s.
+            timeout_s: Maximum time to wait for a frame, s.
 
         Returns:
-            Whether new frames or an error can be taken.
+            Whether :meth:`take` has new frames to return or an error to raise.
         """
         now_ns = clock.monotonic_ns()
         try:
             frames = self.port.recv_batch(timeout_s)
-        except Exception as error:  # pass every exception to the reader thread
+        except Exception as error:  # passed to the reader thread
             self._error = error
             return True
         if not frames:
@@ -203,24 +202,24 @@ class Intake:
 
 @dataclass(slots=True)
 class _Shared:
-    """Intakes and poll object of the shared receiving thread."""
+    """State of the receiving thread that several intakes share."""
 
     intakes: dict[Intake, None]
-    """Intakes in order of addition, without duplicates."""
+    """Intakes in the order in which they were added, as keys."""
     poll: select.poll
 
 
 class Receiver:
-    """Receiver that fills ``intakes`` with frames from their ports, from construction until :meth:`close`.
+    """Receives frames from the ports of several intakes until :meth:`close` is called.
 
-    Threads: all ports that read batches share one thread, which wakes once for several buses where possible.
-    Each other port has its own thread, because receiving with python-can may block. If a port fails, only the
-    reception from that port stops.
+    Threads: all ports that can read batches of frames share one receiving thread. Each other port has its own
+    thread, because receiving with python-can may block. If a port fails, reception from the other ports
+    continues.
 
     Args:
         intakes: Queues to fill.
-        on_defect: Function called with any exception raised outside the ports, on the thread that raised the
-            exception. Reception continues.
+        on_defect: Function that a receiving thread calls with any exception that does not come from a port.
+            Reception then continues.
     """
 
     def __init__(
@@ -228,7 +227,7 @@ class Receiver:
     ) -> None:
         self._on_defect = on_defect
         self._news: queue.SimpleQueue[None] = clock.simple_queue()
-        self._joining: deque[Intake] = deque()  # new intakes, which the shared thread adds to its poll object
+        self._joining: deque[Intake] = deque()  # intakes that the shared thread has not added yet
         self._stop = clock.event()
         self._shared: threading.Thread | None = None
         self._alone: dict[Intake, threading.Thread] = {}
@@ -253,16 +252,17 @@ class Receiver:
             self._joining.append(intake)
             return
         if intake in self._alone:
-            # The port's thread ends because the error is set, so clear the error only after the thread's end.
+            # The old thread ends because of the error, so the error must not be cleared before the thread has
+            # ended.
             self._alone[intake].join()
         intake.resume()
         name = f"receive {intake.port.config.name}"
         thread = clock.thread(target=self._receive_alone, args=(intake,), name=name)
         thread.start()
-        self._alone[intake] = thread  # only after start(): a thread must be started before it can be joined
+        self._alone[intake] = thread  # after start(), because close() joins all threads in this table
 
     def close(self) -> None:
-        """End and join the receiving threads. The ports stay open and are closed by their owner."""
+        """End and join the receiving threads, without closing the ports."""
         self._stop.set()
         for thread in self._alone.values():
             thread.join()
@@ -289,7 +289,7 @@ class Receiver:
                 clock.sleep(_POLL_S)
 
     def _receive_batch(self, shared: _Shared) -> None:
-        """Run one iteration of the shared receiving thread's loop."""
+        """Wait for frames on all shared ports, fetch them, and pause."""
         intakes = shared.intakes
         if self._joining:
             while self._joining:
@@ -322,7 +322,7 @@ class Receiver:
             try:
                 if self._stop.is_set() or intake.failed:
                     return
-                # Fetch twice: this thread may have been suspended after the first fetch found no frames.
+                # Fetch twice: frames may have arrived while this thread was suspended.
                 if intake.fetch(_POLL_S) or intake.fetch(0.0):
                     self._notify()
             except Exception as error:
@@ -330,25 +330,25 @@ class Receiver:
                 clock.sleep(_POLL_S)
 
     def _notify(self) -> None:
-        if self._news.empty():  # one notification covers all intakes
+        if self._news.empty():  # a single notification is enough for all intakes
             self._news.put(None)
 
 
 def _fetch(intakes: Iterable[Intake]) -> bool:
-    """Fetch frames from every port, and return whether any intake has new frames or an error."""
-    return sum(intake.fetch(0.0) for intake in intakes) > 0  # any() would skip intakes after a success
+    """Fetch frames for all ``intakes``, and return whether any intake has new frames or an error."""
+    return sum(intake.fetch(0.0) for intake in intakes) > 0  # any() would stop at the first success
 
 
 def _together(now_ns: int, pause_ns: int) -> int:
-    """Return the end of a pause that lasts 0.5 to 1.5 times ``pause_ns``.
+    """Return the end (ns) of a pause that lasts 0.5 to 1.5 times ``pause_ns``.
 
-    Pauses end at multiples of ``pause_ns``, so that all buses are read in one wake-up.
+    Pauses end at multiples of ``pause_ns``, so that all buses are read at the same time.
     """
     return (now_ns + pause_ns // 2) // pause_ns * pause_ns + pause_ns
 
 
 def _before(t_ns: int, now_ns: int) -> int:
-    """Return the fetch time for a frame that is predicted to arrive at ``t_ns``."""
+    """Return the time (ns) at which to fetch a frame that is predicted to arrive at ``t_ns``."""
     due_ns = t_ns + _LAG_NS
     if due_ns >= now_ns + _BEFORE_NS + GATHER_NS:
         due_ns -= _BEFORE_NS
@@ -364,7 +364,7 @@ def _poll_of(intakes: Iterable[Intake]) -> select.poll:
 
 
 def drain(port: CanPort, within_s: float) -> list[Frame]:
-    """Return all frames that arrive within ``within_s``; only for use without a receiving thread."""
+    """Return all frames that arrive within ``within_s``. The port must not have a receiving thread."""
     frames: list[Frame] = []
     end_ns = clock.monotonic_ns() + int(within_s * 1e9)
     while (left_ns := end_ns - clock.monotonic_ns()) > 0:

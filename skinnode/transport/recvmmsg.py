@@ -1,8 +1,7 @@
-"""Receive many socket messages with one call to recvmmsg(2), which Python's socket module does not provide.
+"""Receive many socket messages with one call of recvmmsg(2), which Python's socket module lacks.
 
-The global interpreter lock stays held during the call, which never waits and takes only about 1 µs per
-message. Releasing the lock for every message, 8,000 times a second, would delay other threads more than
-keeping it.
+The call does not release the global interpreter lock, because it never waits and takes only about 1 µs per
+message. Releasing the lock so often would delay other threads more.
 """
 
 from __future__ import annotations
@@ -69,17 +68,17 @@ class MessageBatch:
         self._got = 0
 
     def receive(self, sock: socket.socket, most: int) -> int:
-        """Replace the batch with up to ``most`` new messages (at most ``count``), without waiting.
+        """Receive up to ``most`` messages without waiting; they replace the previous messages.
 
         Returns:
             Number of messages received.
 
         Raises:
-            OSError: if receiving fails. If messages arrived before the error, they are returned, and the next
+            OSError: if receiving fails. Messages received before the error are returned first, and the next
                 call raises the error.
         """
         used = self._got * _USED.size
-        # restore the buffer sizes, which the kernel overwrote with the used sizes
+        # The kernel has replaced the buffer sizes by the sizes of the messages, so restore them.
         self._memory[:used] = self._fresh[:used]
         self._got = 0
         got = _libc.recvmmsg(sock.fileno(), self._messages, min(most, self._count), socket.MSG_DONTWAIT, None)
@@ -92,13 +91,14 @@ class MessageBatch:
         return self._got
 
     def used(self) -> Iterator[tuple[int, int]]:
-        """Yield two lengths for each received message: of its ancillary data and of the message, bytes."""
+        """Yield the length of the ancillary data and the length of the data of each message, bytes."""
         return _USED.iter_unpack(self._memory[: self._got * _USED.size])
 
     def taken(self) -> memoryview:
         """Return the memory that contains the received messages.
 
-        Each message occupies a record of fixed size: the padded data, followed by the padded ancillary data.
+        Each message occupies a record of fixed size, which contains the padded data and then the padded
+        ancillary data.
         """
         return self._room[: self._got * self._record]
 

@@ -1,9 +1,8 @@
-"""Read a raw SocketCAN socket in batches, with kernel timestamps and the kernel's drop counter.
+"""Read batches of frames from a raw SocketCAN socket, with kernel timestamps and the kernel's drop counter.
 
-python-can opens and configures the socket and sends frames. Frames are not received with python-can, which
-needs a ``select``, a ``recvmsg`` and a ``Message`` for each frame and ignores the drop counter. Structures
-and constants are defined in <linux/can.h>, <linux/can/raw.h>, <asm-generic/socket.h> and
-<linux/net_tstamp.h>.
+python-can opens and configures the socket and sends frames. Frames are not received with python-can, because
+it makes two system calls per frame and ignores the drop counter. Structures and constants are defined in
+<linux/can.h>, <linux/can/raw.h>, <asm-generic/socket.h> and <linux/net_tstamp.h>.
 """
 
 from __future__ import annotations
@@ -43,17 +42,17 @@ times."""
 _EXTENDED, _REMOTE, _ERROR = 1 << 31, 1 << 30, 1 << 29
 
 _OLDEST_NS: Final = 10_000_000_000
-"""Maximum age of a received frame, ns. An older timestamp, taken before the wall clock was set, is replaced
-by the time of reading."""
+"""Maximum age of a received frame, ns. A frame appears older if the wall clock was set after its arrival. Its
+timestamp is then replaced by the time of reading."""
 
 _NEWEST_NS: Final = 100_000_000
-"""Maximum time from the start of reading a batch to the arrival of the batch's last frame, ns."""
+"""Maximum time by which a frame's timestamp may be later than the start of reading its batch, ns."""
 
 _IP_S: Final = 5.0
 """Maximum duration of an ``ip link`` command, s."""
 
 BATCH_FRAMES: Final = 256
-"""Maximum number of frames received per system call: 30 ms of traffic on a fully loaded bus at 1 Mbit/s."""
+"""Maximum number of frames per system call. A fully loaded bus at 1 Mbit/s transmits this number in 30 ms."""
 
 
 class SocketReader:
@@ -69,14 +68,14 @@ class SocketReader:
         self._poll = select.poll()
         self._poll.register(sock, select.POLLIN)
         self.dropped = 0
-        """Number of frames dropped because the socket's kernel buffer was full."""
+        """Number of frames dropped because the socket's receive buffer was full."""
         self._batch = MessageBatch(BATCH_FRAMES, FD_MTU, _ANCILLARY_BYTES)
         self.hardware_stamps = False
         """Whether the newest frame had a hardware timestamp."""
         self._delay = HardwareDelay()
         sock.setsockopt(
             socket.SOL_SOCKET, _SO_TIMESTAMPNS, 0
-        )  # python-can enables this option, but a socket supports only one kind of timestamp
+        )  # enabled by python-can, but a socket supports only one kind of timestamp
         sock.setsockopt(
             socket.SOL_SOCKET, _SO_TIMESTAMPING, _RX_SOFTWARE | _SOFTWARE | _RX_HARDWARE | _RAW_HARDWARE
         )
@@ -87,11 +86,11 @@ class SocketReader:
         return self._sock.fileno()
 
     def read(self, timeout_s: float, most: int = BATCH_FRAMES) -> list[Frame]:
-        """Return the frames that have arrived; if there are none, wait for the first frame.
+        """Return all frames that have arrived. If there are none, wait for the next frame.
 
         Args:
-            timeout_s: Maximum wait for the first frame, s.
-            most: Maximum number of frames, capped at :data:`BATCH_FRAMES`.
+            timeout_s: Maximum time to wait for a frame, s.
+            most: Maximum number of frames to return, at most :data:`BATCH_FRAMES`.
 
         Raises:
             OSError: if the interface fails.
@@ -131,7 +130,7 @@ class SocketReader:
         return frames
 
     def _arrival(self, control: bytes, now_ns: int, wall_to_mono_ns: int) -> int:
-        """Derive a frame's monotonic arrival time, ns, from the frame's ancillary data."""
+        """Return the monotonic arrival time (ns) of a frame, given its ancillary data."""
         t_ns, at = now_ns, 0
         while at < len(control):
             length, _, kind = _CONTROL.unpack_from(control, at)
@@ -155,7 +154,7 @@ def set_link_bitrate(config: BusConfig) -> None:
     """Take a CAN interface down, set its bit rates and bring it up again, using ``ip link``.
 
     Raises:
-        BusError: if an ``ip link`` command fails; the message contains the command's error output.
+        BusError: if an ``ip link`` command fails. The message contains the command's error output.
     """
     rates = ["bitrate", str(config.bitrate_bps)]
     if config.fd:
@@ -182,10 +181,9 @@ def _ip_link(config: BusConfig, *arguments: str) -> None:
 class HardwareDelay:
     """Converts a CAN controller's hardware timestamps to the monotonic clock.
 
-    The converted arrival time is correct even if the kernel timestamped the frame late. A kernel timestamp is
-    never early, so each frame provides an upper bound on the difference between the two clocks. The clock
-    difference is estimated as the lower envelope of the bounds from all frames; the estimate may increase no
-    faster than two crystals can drift apart. Owned by one thread.
+    The result is accurate even if the kernel timestamps a frame late. A kernel timestamp is never early, so
+    each frame provides an upper bound on the difference between the two clocks. The difference is estimated
+    from the lowest bounds. The estimate rises no faster than two clocks can drift apart. Owned by one thread.
     """
 
     DRIFT: Final = 200e-6  # maximum relative drift of two oscillators with a tolerance of 100 ppm each

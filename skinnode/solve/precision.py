@@ -1,9 +1,10 @@
 """Precision of a field: whether its standard deviations are within the user's limits.
 
-The default limit for the displacement depends on the layout, the noise and the tolerances. The limit is
-:data:`MULTIPLE` times the standard deviation of the exact inverse at rest, plus (in quadrature) a part for
-the tolerances, but at most :data:`MOST` clearances. A healthy patch stays within the default limit. A patch
-that has lost readings, or that is noisier than stated, exceeds the limit.
+The default limit for the displacement depends on the layout, the noise and the tolerances. The limit is the
+root of the sum of two squares: :data:`MULTIPLE` times the standard deviation of the exact inverse at rest,
+and a term for the tolerances. It is at most :data:`MOST` times the clearance. The standard deviations of a
+healthy patch are below the default limit; if readings are lost or the noise is higher than stated, they can
+exceed it.
 """
 
 from __future__ import annotations
@@ -23,23 +24,22 @@ from skinnode.solve.options import TrackerOptions
 from skinnode.solve.wires.problem import PatchProblem
 
 MULTIPLE: Final = 15.0
-"""Maximum standard deviation, as a multiple of the exact inverse's RMS standard deviation at rest. In
-2,640 healthy fields, the largest standard deviation was up to 8.5 times this RMS at rest and up to 12.2
-times under a press (ten layouts, noise from 3e-6 to 1e-3, presses from 5 to 30 %)."""
+"""Maximum standard deviation, as a multiple of the exact inverse's RMS standard deviation at rest. In 2,640
+fields of healthy patches (ten layouts, relative noise from 3e-6 to 1e-3, presses from 5 to 30 %), the largest
+standard deviation was 12.2 times this RMS."""
 MOST: Final = 0.3
 """Maximum standard deviation, in clearances, for layouts and noise levels at which the displacement mainly
-depends on the prior. In the 2,640 fields measured for :data:`MULTIPLE`, only thick patches (h = 1) with a
-noise of 1e-3 exceeded this limit. On `staggered`, 5 of 66 such fields exceeded the limit; on `aligned`, 20
-of 66."""
+depends on the prior. Of the 2,640 fields described at :data:`MULTIPLE`, only fields of thick patches (h = 1)
+with a relative noise of 1e-3 exceeded this limit."""
 TOLERANCE_SHARE: Final = 0.06
 """Contribution of ordinary manufacturing tolerances to the limit, in clearances; scaled with the largest
-tolerance. In the presses measured for :data:`MULTIPLE`, the ordinary tolerances caused standard deviations
-of up to 0.028 clearances at noise levels of 3e-6 and 1e-5."""
+tolerance. In presses with a relative noise of at most 1e-5, ordinary tolerances caused standard deviations of
+up to 0.028 clearances."""
 FORCE_SHARE: Final = 0.3
 """Maximum standard deviation of a normal force, divided by the product of modulus, clearance and pitch.
 
-In the fields measured for :data:`MULTIPLE`, this ratio was at most 0.1. In presses of 50 % that are half
-outside the patch, the ratio reaches 0.26.
+In the fields described at :data:`MULTIPLE`, this ratio was at most 0.1; in presses of 50 % that were half
+outside the patch, it reached 0.26.
 """
 
 

@@ -1,7 +1,7 @@
 """Bayesian estimate of a whole patch, tracked through a stream of frames.
 
-The entry point is ``posterior``, which estimates a field from each frame of a stream and tests the readings.
-``frame_estimator`` solves a frame without testing its readings.
+``posterior`` is the entry point: it estimates a field from each frame and tests the readings.
+``frame_estimator`` does the same without the test.
 
 ``observation`` converts each frame to residuals with weights. ``gating`` uses χ² tests to find the wires that
 moved. ``map_estimate`` computes the maximum a posteriori (MAP) displacement; ``measurement_update`` contains
@@ -11,5 +11,5 @@ tolerances.
 The prior combines the elasticity of the rubber (``elastic_prior``) with the expected loads (``load_prior``).
 ``hyperparameters`` sets the scale of the prior and the noise from the evidence. ``load_posterior`` estimates
 the loads of a frame, ``contact_regions`` divides them into contacts, and ``contacts`` measures each contact.
-``data_share`` computes how much of a displacement comes from the data.
+``data_share`` computes how much of a displacement is determined by the data rather than by the prior.
 """

@@ -1,20 +1,21 @@
 """Contact regions: assign the loaded cells of a patch to contacts.
 
-The load sum of a cell is the sum of the pressing loads of its 3 × 3 neighbourhood. The cells are visited in
-order of decreasing load sum, and each cell joins the area of a neighbouring peak. Where the areas of two
-peaks meet, the peaks belong to the same body, unless the load sum between the peaks is much smaller than both
-and the difference is significant (topological persistence).
+The load sum of a cell is the sum of the pressing loads in its 3 × 3 neighbourhood; a peak is a local maximum
+of the load sum. The cells are processed in order of decreasing load sum, and each cell is added to the area
+of a neighbouring peak. Two peaks with adjacent areas are separate contacts only if the load sum between them
+is much smaller than at both peaks, and the difference is significant (topological persistence).
 
-A peak is a contact if one of three tests is significant: the load sum of its 3 × 3 cells, the χ² of the loads
-of these cells, or the sum of the loads over its area. The strongest peak is also a contact if the skin under
-it is significantly pressed in. A significantly indented skin is touched even if the loads cannot be located.
+A peak is a contact if one of three values is significant: its load sum, the χ² of the loads of the same
+cells, or the sum of the loads over its area. The strongest peak is also a contact if the skin is
+significantly indented there. Significant indentation indicates a touch even if the loads cannot be located.
 
-Only cells with an electrode are tested: beyond the outermost electrodes, loads of different sizes at
-different distances cause nearly the same displacement. Cells beyond the outermost electrodes are added to the
+Only cells with an electrode are tested. Beyond the outermost electrodes, a small load nearby and a large load
+farther away cause nearly the same displacement. Cells beyond the outermost electrodes are added to the
 adjacent contact.
 
-The thresholds depend on the last frame, so that noise does not switch a contact on and off. The loads between
-two peaks must change by a third before one contact is split or two contacts are merged.
+The thresholds have hysteresis, so that contacts do not appear and disappear because of noise. With
+hysteresis, the load sum between two peaks must change by a third before one contact is split or two are
+merged.
 """
 
 from __future__ import annotations
@@ -30,46 +31,43 @@ from skinnode.model.layout import Float
 from skinnode.solve.linalg.vectors import Index
 
 SIGNIFICANT: Final = 5.0
-"""Minimum significance of a load, in standard deviations, for the load to be a contact. With 100 load sums
-per frame, noise exceeds this threshold about once in ten thousand frames."""
+"""Minimum significance of a load, in standard deviations, for the load to be a contact. If each frame has 100
+load sums, noise exceeds this threshold about once in ten thousand frames."""
 SIGNIFICANT_STILL: Final = 4.0
-"""Minimum significance, in standard deviations, for a contact of the last frame to be kept."""
+"""Value of :data:`SIGNIFICANT` for a contact that existed in the last frame."""
 BLOCK_EXTRA: Final = 22.0
-"""Minimum difference between the χ² of the nine loads around a peak and the squared significance threshold.
-With nine degrees of freedom, χ² exceeds 47 as rarely as a normal variable exceeds five standard
-deviations."""
+"""Amount by which the χ² of the nine loads around a peak must exceed the square of the significance
+threshold. For a threshold of 5, the limit is thus 47; with nine degrees of freedom, χ² exceeds 47 as rarely
+as a normal variable exceeds five standard deviations."""
 PRESSED: Final = 6.0
 """Minimum indentation of the skin, in standard deviations, for the strongest peak to be a contact."""
 PRESSED_STILL: Final = 5.0
-"""Minimum indentation of the skin, in standard deviations, for a contact of the last frame to be kept."""
+"""Value of :data:`PRESSED` for a contact that existed in the last frame."""
 RELEVANT: Final = 0.2
-"""Minimum ratio of a peak's load sum to the strongest contact's load sum, for the peak to be another contact.
-Ringing next to a contact reaches a tenth of the contact's load sum."""
+"""Minimum load sum of each other contact, as a fraction of the load sum of the strongest contact. Errors of
+the load estimate next to a contact reach a tenth of the contact's load sum."""
 RELEVANT_STILL: Final = 0.15
-"""Minimum ratio of a peak's load sum to the strongest contact's load sum, for a contact of the last frame to
-be kept."""
+"""Value of :data:`RELEVANT` for a contact that existed in the last frame."""
 PART: Final = 0.1
-"""Minimum ratio of a cell's load sum to the peak's load sum, for the cell to belong to the contact."""
+"""Minimum load sum of the cells of a contact, as a fraction of the load sum at the contact's peak."""
 PART_SIGNIFICANT: Final = 3.0
-"""Minimum load sum of a cell, in standard deviations of the peak's load sum, for the cell to belong to the
-contact. Without this limit, noise around a touch near the detection limit would shift the centre by a
-pitch."""
+"""Minimum load sum of the cells of a contact, in standard deviations of the peak's load sum. Without this
+limit, noise would shift the centres of very light touches by a pitch."""
 PART_MOST: Final = 0.6
-"""Minimum ratio of a cell's load sum to the peak's load sum for the cell to belong to the contact even if the
-cell's load sum is not significant."""
+"""Load sum, as a fraction of the peak's, above which a cell belongs to the contact even if its load sum is
+not significant."""
 GAP: Final = 0.5
-"""Maximum ratio of the load sum between two peaks to the load sum of the smaller peak, for the peaks to be
-two contacts. Measured on ten families of loads (spheres inside, on the edge and half off the patch, punches,
-plates, ridges, dents, large areas; ``tests/solve/test_contact_number.py``): with 0.4, 0.5 and 0.6, no single
-body was split. With 0.75, plates at the edge were split because of ringing. Two spheres are separated if they
-are at least 5 pitches apart."""
+"""Two peaks are separate contacts only if the load sum between them is below this fraction of the smaller
+peak's load sum. With values from 0.4 to 0.6, no single body was split in
+``tests/solve/test_contact_number.py``; with 0.75, plates at the edge of the patch were split. Two spheres are
+separated if they are at least 5 pitches apart."""
 GAP_ONE: Final = 0.4
 """Value of :data:`GAP` for two peaks that were one contact in the last frame."""
 GAP_TWO: Final = 0.6
 """Value of :data:`GAP` for two peaks that were two contacts in the last frame."""
 GAP_SIGNIFICANT: Final = 3.0
-"""Minimum difference, in standard deviations, between the load sum of the smaller peak and the load sum
-between two peaks, for the peaks to be two contacts."""
+"""Two peaks are separate contacts only if the load sum of the smaller peak exceeds the load sum between the
+peaks by this number of standard deviations."""
 
 
 RegionScratch = tuple[
@@ -91,7 +89,7 @@ def region_scratch(cells: int) -> RegionScratch:
 def _variance(  # noqa: PLR0913 - a kernel: loads and their posterior by name
     cells: Index, signs: Float, count: int, rows: Float, weight: Float, share: Float, scale2: float
 ) -> float:
-    """Return the posterior variance of the signed sum of the normal loads of ``cells``."""
+    """Return the posterior variance of the sum of ``signs`` times the normal loads of ``cells``."""
     own, seen = 0.0, 0.0
     for c in range(count):
         own += signs[c] * signs[c] * share[cells[c]]
@@ -152,7 +150,7 @@ def _block_chi2(  # noqa: PLR0913, C901 - a kernel: loads and their posterior by
 
 @njit_part
 def _box(cell: int, near: Index, own: NDArray[np.bool_], out: Index) -> int:
-    """Write those of a cell and its neighbours that have an electrode into ``out``; return their number."""
+    """Write the cells with an electrode among a cell and its neighbours into ``out``; return their number."""
     count = 0
     for i in near[cell]:
         if i >= 0 and own[i]:
@@ -177,9 +175,9 @@ def _apart(  # noqa: PLR0913 - a kernel: loads and their posterior by name
     cells: Index,
     signs: Float,
 ) -> bool:
-    """Return whether ``peak`` and the smaller peak ``other``, separated by ``between``, are two contacts.
+    """Return whether ``peak`` and the smaller peak ``other`` are two contacts.
 
-    ``cells`` (27,) and ``signs`` (18,) are work arrays.
+    ``between`` is a cell between them. ``cells`` (27,) and ``signs`` (18,) are work arrays.
     """
     gap = GAP
     if before[peak] > 0 and before[other] > 0:
@@ -369,7 +367,7 @@ def find_regions(  # noqa: PLR0913 - a kernel: loads, their posterior, lattice a
     outside: Index,
     scratch: RegionScratch,
 ) -> int:
-    """Find the contacts, number their cells from 1, strongest peak first, and return the number of contacts.
+    """Find the contacts and return their number; contact 1 has the strongest peak.
 
     Args:
         press: (Q,) pressing loads.

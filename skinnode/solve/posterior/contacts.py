@@ -1,6 +1,6 @@
 """Contacts on the skin, measured from the posterior of the loads.
 
-According to the prior, the loads q ~ N(0, s² D) displace the electrodes by u = G q plus a small slack. The
+In the prior, the loads q ~ N(0, s² D) displace the electrodes by u = G q plus a small independent term. The
 posterior mean of q for a displacement u is D Gᵀ C⁻¹ u. The posterior variance of a sum wᵀ q is s² wᵀ D w −
 ‖L⁻¹ J G s² D w‖², in the notation of :mod:`skinnode.solve.posterior.measurement_update`.
 
@@ -27,27 +27,26 @@ from skinnode.solve.posterior.elastic_prior import ElasticPrior
 from skinnode.solve.posterior.map_estimate import PRIOR_DOUBT
 
 HERTZ_SPREAD: Final = 2.5
-"""Ratio of the squared contact radius a² to the mean of r²; the weight of this mean is the Hertz pressure √(1
-− r²/a²)."""
+"""Ratio of a² to the mean of r² under a Hertz contact of radius a, weighted with the pressure √(1 −
+r²/a²)."""
 PULLING: Final = 0.25
-"""Threshold for the ratio of the sum of all loads of a contact to the sum of its pressing loads; below the
-threshold, pulling loads are left out. Real objects do not pull on the skin, but the half-space model needs
-pulling loads at the rim of the contact to reproduce the displacement of a supported layer. The ratio is 0.5
-for 16 mm of rubber bonded to metal, 0.15 for 8 mm, and about 0 for 4 mm or less. On a half-space, the ratio
-is 0.8 to 1, or at least 0.33 if the contact is much smaller than a cell."""
+"""Ratio of the sum of all loads of a contact to the sum of its pressing loads, below which pulling loads are
+left out. The half-space model needs pulling loads at the rim of a contact to reproduce the displacement of a
+supported layer; for bonded layers of 8 mm or less, this ratio was at most 0.15. For contacts on a half-space,
+the ratio was at least 0.33."""
 PULLED_OFF: Final = 0.1
-"""Standard deviation, in cell widths, of a contact's centre along the surface if pulling loads were left out.
-Measured RMS errors on layers of 2, 4 and 8 mm were 0.11, 0.08 and 0.05; the maximum was 0.25. If pulling
-loads are left out, the standard deviation of the contact's area is at least as large as the area."""
+"""Standard deviation, in cell widths, of a contact's centre along the surface if pulling loads are left out.
+On layers of 2 to 8 mm, the measured RMS error was at most 0.11. The standard deviation of the area is then at
+least as large as the area."""
 BEYOND: Final = 1.0
-"""Standard deviation of the loads in the outermost ring of cells, relative to these loads. The outermost ring
-represents all loads beyond the patch. With a value of 0.5, the force errors of plates larger than the patch
+"""Standard deviation of the loads in the outermost ring of cells, relative to these loads. The ring
+represents all loads beyond the patch. With a value of 0.5, force errors under plates larger than the patch
 reached 4.8 standard deviations."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LoadEstimate:
-    """Loads estimated from a frame, with posterior covariance s² (D − s² D Wᵀ W D), W = diag(weight) rows."""
+    """Loads estimated from a frame; their covariance is s² (D − s² D Wᵀ W D) with W = diag(weight) rows."""
 
     mean: Float
     """(Q, 3) mean loads, in units of the prior's loads."""
@@ -62,7 +61,7 @@ class LoadEstimate:
 
 
 class ContactFinder:
-    """Contact finder of one patch for a stream of frames. Do not share an instance between owners.
+    """Contact finder of one patch for a stream of frames. Each stream needs its own instance.
 
     The number of contacts depends on the contacts of the last frame
     (:mod:`skinnode.solve.posterior.contact_regions`), which :meth:`reset` discards.
@@ -76,7 +75,8 @@ class ContactFinder:
             bonded to a rigid support.
         thickness: Tolerance of the thickness, as a fraction of the clearance.
         outermost: Whether to add the loads of the outermost ring of cells to an adjacent contact. Use False
-            if the prior expects equal loads everywhere, because such a prior spreads the loads too far.
+            if the prior expects equal loads everywhere, because such a prior moves too much load into the
+            outermost ring.
     """
 
     def __init__(  # noqa: PLR0913 - what the patch is
@@ -198,7 +198,7 @@ def _prepare(  # noqa: PLR0913 - a kernel: loads, field and outputs by name
     depth: Float,
     force: Float,
 ) -> None:
-    """Write pressing loads (Q,), depths (Q,) in m and in standard deviations, and forces (UN, 3) in N.
+    """Write pressing loads (Q,), depths (Q,) in m, depths (Q,) in standard deviations, and forces (UN, 3), N.
 
     ``field`` (2, UN, 3) contains the displacement and its standard deviations, m. A depth with an infinite
     standard deviation is written as 0. Depths of cells without an electrode are not written.
@@ -242,9 +242,9 @@ def _measure(  # noqa: PLR0913, C901 - a kernel: cells, loads and outputs by nam
 
     Writes the seven values into ``mean``, and their standard deviations (computed by the delta method) into
     ``std``. Returns the cell closest to the centre, whether pulling loads were left out, and the sum of the
-    pressing loads in N. The variances are multiplied by ``PRIOR_DOUBT``, because mainly the prior determines
-    how a contact's load is distributed over its cells. ``cells`` (Q,), ``r2`` (Q,) and ``slopes`` (Q, 5) are
-    work arrays.
+    pressing loads in N. The variances are multiplied by ``PRIOR_DOUBT``, because the distribution of the load
+    over the cells mainly depends on the prior. ``cells`` (Q,), ``r2`` (Q,) and ``slopes`` (Q, 5) are work
+    arrays.
     """
     size, every, pressing = 0, 0.0, 0.0
     for cell in range(number.size):

@@ -1,4 +1,4 @@
-"""Data share: how much of an estimated displacement comes from the frame rather than from the prior."""
+"""Data share: fraction of an estimated displacement that is determined by the frame, not by the prior."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from skinnode.solve.posterior.map_estimate import PRIOR_DOUBT, SMOOTH_SHARE
 def data_share(std: Float, core: Float, prior_variance: Float) -> Float:
     """Return 1 minus the ratio of the posterior variance to the prior variance; 0 where ``std`` is infinite.
 
-    The part of the variance that only the prior determines is multiplied by :data:`PRIOR_DOUBT` in ``std``
-    and by :data:`SMOOTH_SHARE` in ``core``. The difference between ``std``² and ``core``² therefore yields
-    this part, and the posterior variance.
+    ``std``² is larger than the posterior variance, because the part that depends on the prior is multiplied
+    by :data:`PRIOR_DOUBT`. In ``core``², the same part is multiplied by :data:`SMOOTH_SHARE`, so the part can
+    be computed from the difference between ``std``² and ``core``².
 
     Args:
         std: (U, f) standard deviations, pitches.

@@ -6,9 +6,9 @@ the electrodes by the response G of an elastic half-space (Boussinesq, Cerruti;
 
     u ~ N(0, s² C),   C = G diag(q) Gᵀ + ε² I
 
-One scale s for the whole patch is estimated from the data. The cells extend beyond the outermost electrodes,
-because the skin can also be pressed there. The ε term allows each electrode to deviate slightly and
-independently from the half-space.
+The scale s, common to the whole patch, is estimated from the data. The cells extend beyond the outermost
+electrodes, because the skin can also be pressed there. The ε term allows each electrode to deviate slightly
+and independently from the half-space.
 """
 
 from __future__ import annotations
@@ -27,18 +27,16 @@ from skinnode.solve.linalg.cholesky import multiply
 from skinnode.solve.posterior.load_cells import MARGIN, LoadCells
 
 SHEAR_SHARE: Final = 0.4
-"""Ratio of the standard deviations of shear and normal loads; a contact that slides with a friction
-coefficient of 0.6 has a shear load of 1.5 standard deviations. The evidence varies by 2 % for ratios from
-0.25 to 0.4. With smaller ratios, the standard deviations are too small on layouts that are insensitive to
-shear (`aligned`)."""
+"""Ratio of the expected shear loads to the expected normal loads (standard deviations). The marginal
+likelihood of the data is nearly constant for ratios from 0.25 to 0.4. With smaller ratios, the standard
+deviations are too small on layouts that are insensitive to shear (`aligned`)."""
 LAYER_SHARE: Final = 0.25
-"""Ratio, in the data check, of the expected displacement by loads on a bonded layer to that by loads on a
-half-space. Values from 0.25 to 1 explain all presses on thin layers; with 0.1, a dent that cannot form on a
-half-space was mistaken for a faulty wire. With 0.5 or more, an upper wire whose readings are delayed by four
-scans is not detected, because loads on the layer explain these readings."""
+"""Size of the displacements that the data check expects on a bonded layer, relative to those on a half-space.
+With 0.1, a dent in a thin layer was reported as a faulty wire. With 0.5 or more, the data check does not
+detect an upper wire with readings that are delayed by four scans."""
 SLACK: Final = 0.005
-"""Ratio of ε to the standard deviation of the normal displacement. It keeps C regular. Values from 0.001 to
-0.02 give the same results."""
+"""Ratio of ε to the standard deviation of the normal displacement. A positive ε makes C invertible. With
+values from 0.001 to 0.02, the estimates are the same."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,10 +91,10 @@ class ElasticPrior:
 def bonded_response(layout: PatchLayout) -> Float:
     """Return the response (3UN, Q) of a bonded layer to normal loads, pitches per unit load.
 
-    The layer is incompressible, and its thickness equals the height of the electrodes. This support of the
-    rubber differs most from the half-space. Around a contact, the surface of the layer moves outwards and
-    hardly downwards. The median standard deviation of the normal displacement is :data:`LAYER_SHARE` pitches
-    if the loads have a standard deviation of 1.
+    The layer is incompressible, and its thickness equals the height of the electrodes. Of all supports, this
+    one differs most from a half-space: around a contact, the surface moves outwards rather than downwards.
+    For loads with a standard deviation of 1, the median standard deviation of the normal displacement is
+    :data:`LAYER_SHARE` pitches.
     """
     cells = LoadCells.of(layout)
     radius_m = math.sqrt(cells.size_m[0] * cells.size_m[1] / math.pi)  # disc with the area of a cell

@@ -1,10 +1,12 @@
-"""Posterior of a patch, tracked through a stream of frames without testing their readings for faults.
+"""Posterior of a patch for each frame of a stream, without a test of the readings for faults.
+
+Each frame is processed in these steps:
 
 - Gate: use only the equations of wires whose resistances differ from those at rest by more than the noise.
 - Hold: keep the last field if this field explains the whole frame within the noise.
-- Track: take chord or Gauss-Newton steps from the last field; after a jump, anneal from rest
+- Track: take chord or Gauss-Newton steps from the last field; if this fails, anneal from rest
   (``map_estimate``).
-- Adapt: set the prior's scale, the expected load locations and, on request, the noise from the evidence.
+- Adapt: estimate the prior's scale, the expected load locations and (optionally) the noise from the frame.
 - Reject: if no deformation explains a wire's residual, mark the wire as INCONSISTENT, leave it out, and solve
   the other wires again.
 """
@@ -39,15 +41,15 @@ from skinnode.solve.wires.decode import A_MAX, A_MIN
 from skinnode.solve.wires.problem import PatchProblem
 
 NOISE_LEAST: Final = 1e-6
-"""Minimum relative noise: a fifth of a 16-bit code, which is also the accuracy of the forward model. With
-lower noise, the field would be forced to a root of F = b, possibly a wrong root. On layouts with folds, wrong
-roots occur even at ten times the minimum noise."""
+"""Minimum relative noise used in a solve. The accuracy of the forward model is no better. With less noise,
+the solve would always end at a root of F = b, possibly a wrong root. On layouts with folds, wrong roots occur
+even with ten times this noise."""
 LEFT_OUT: Final = 3
-"""Maximum number of wires left out of a frame, one at a time; if that is not sufficient, the whole frame is
-INCONSISTENT."""
+"""Maximum number of wires that are left out of a frame. If the other wires are still inconsistent, all wires
+are INCONSISTENT."""
 LEAST_STEPS: Final = 3.0
 """Minimum duration of a solve from rest, as a multiple of the time to factorise all wires and compute their
-standard deviations. Measured solves of presses on 1 to 10 wires took 11 to 20 times as long as this basic
+standard deviations. In measurements, solves of presses on 1 to 10 wires took 11 to 20 times as long as this
 computation."""
 
 Mask = NDArray[np.bool_]
@@ -56,8 +58,8 @@ Mask = NDArray[np.bool_]
 class FrameEstimator:
     """Estimator of the displacement, loads and contacts of one patch, frame by frame.
 
-    This class uses all available readings; :class:`skinnode.Posterior` also detects wrong readings. Do not
-    share an instance between owners. The kernels release the GIL; :meth:`warm_up` compiles them.
+    This class uses all available readings; :class:`skinnode.Posterior` also detects wrong readings. Each
+    stream needs its own instance. The kernels release the GIL; :meth:`warm_up` compiles them.
 
     Args:
         layout: The patch, with any number of lower wires.
@@ -254,7 +256,7 @@ class FrameEstimator:
         estimate = self.noise_estimate
         if estimate is not None:
             if estimate.see(frame, noise, rounding_ohm, mask):
-                self._seen = np.zeros_like(self._seen)  # the trusted field assumed the previous noise
+                self._seen = np.zeros_like(self._seen)  # the trusted field assumed other noise
             if estimate.factor != 1.0:
                 noise = estimate.factor * noise
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
@@ -272,19 +274,19 @@ class FrameEstimator:
         return self._model.observe(readings, self._hyper.noise_factor)
 
     def _beyond_prior(self, observation: Observation, deviations: float) -> bool:
-        # among a hundred geometry errors, one may exceed three standard deviations by chance
+        # the lower limit ignores geometry errors: one of a hundred can exceed it by chance
         count = self._model.fixed if deviations < roots.BELIEVABLE else observation.d.size
         return roots.beyond_prior(self._estimator.g[:count], observation.d[:count], deviations)
 
     def _is_quiet(self, observation: Observation) -> bool:
         """Return whether the last field explains the frame within noise.
 
-        If a wire was used for the last field, its residual contains the noise of this frame and the noise of
-        the last field.
+        For wires that were used in the last field, the noise variance is doubled, because the last field
+        contains noise as well.
         """
         seen_before = self._known and np.array_equal(observation.weight > 0, self._seen)
         if not (self.options.hold and seen_before):
-            return False  # the uncertainty of the field depends on which resistances are used
+            return False  # with other resistances, the standard deviations would change
         if self._beyond_prior(observation, roots.SUSPICIOUS):
             return False
         noises = np.ones(len(self._wires))
@@ -301,7 +303,7 @@ class FrameEstimator:
         self._gate.next_frame()
         at_rest = self._estimator.fit(observation, None)
         touched = self._gate.touched(at_rest, observation.count, self._members)
-        # an untouched patch can be confirmed only from all wires together
+        # if no wire is touched, confirm this with all wires
         wanted = touched if self.options.hold and touched.size else self._wires
         seen = readings.usable
         for _ in range(LEFT_OUT + 3):
@@ -332,7 +334,7 @@ class FrameEstimator:
         return self._give_up(Status.INCONSISTENT)
 
     def _joining(self, fit: Fit, observation: Observation, wanted: Index) -> Index:
-        """Return the wires outside ``wanted`` that contradict the current field, and keep using them."""
+        """Return the wires outside ``wanted`` that contradict the field, and keep them in the estimate."""
         moved = self._gate.moved(fit, observation.count)
         moved[wanted] = False
         joining = np.flatnonzero(moved)
@@ -342,7 +344,7 @@ class FrameEstimator:
     def _accept(
         self, status: NDArray[np.int64], members: Index, seen: Mask
     ) -> tuple[NDArray[np.int64], Mask]:
-        """Accept the current field as the trusted field, unless an electrode moved impossibly far."""
+        """Accept the current field as the trusted field, unless an electrode is out of reach."""
         estimator = self._estimator
         if self._problem.out_of_reach(self._problem.rest + estimator.moved).any():
             return self._give_up(Status.ILL_CONDITIONED)
@@ -381,7 +383,7 @@ class FrameEstimator:
     def _anneal_and_compare(self, observation: Observation, members: Index) -> bool:
         """Anneal from rest, and keep the more likely of the tracked and the annealed field.
 
-        If the field is far from the last compared field, tracking may have reached a wrong maximum.
+        This comparison is made after large movements, because tracking may then have reached a wrong maximum.
         """
         estimator = self._estimator
         self._compared[:] = estimator.moved
@@ -401,9 +403,9 @@ class FrameEstimator:
     ) -> Observation:
         """Adapt the hyperparameters and, if the layout has folds, select the more likely of two maxima.
 
-        A prior that expects loads everywhere can lead to a wrong maximum. The field is therefore annealed
-        again with a prior that expects loads at the locations found. The new field replaces the old field if
-        its −2 log posterior is lower by at least :data:`skinnode.solve.roots.LIKELIER`.
+        Annealing with a prior that expects loads everywhere can lead to a wrong maximum. The frame is
+        therefore annealed again with a prior that expects loads where they were found. The new field replaces
+        the old field if its −2 log posterior is lower by at least :data:`skinnode.solve.roots.LIKELIER`.
         """
 
         def observe(noise_factor: float) -> Observation:
@@ -437,7 +439,7 @@ class FrameEstimator:
         displacement = problem.displacement_m(problem.rest + self._trusted)
         std, core = np.zeros_like(self._trusted), np.zeros_like(self._trusted)
         std[:, self._free], core[:, self._free] = estimator.std, estimator.core
-        if held.all():  # include half of any displacement that the gate may have missed
+        if held.all():  # cover displacements that are too small for the gate
             for each in (std, core):
                 each[:, self._free] = np.maximum(each[:, self._free], 0.5 * self._overlooked)
         if self._contacts is not None and self._known and not held.all():

@@ -1,7 +1,7 @@
 """Gating: χ² tests that find the wires that moved, and the wires whose resistances no deformation explains.
 
-Each wire is tested with the χ² of its residuals and with the apparent movement of each coordinate. The χ²
-test alone can miss an electrode that moved by 7 standard deviations.
+Each wire is tested with the χ² of its residuals and with the apparent movement of each coordinate. The test
+of χ² alone can miss a movement of one electrode by 7 standard deviations.
 """
 
 from __future__ import annotations
@@ -21,8 +21,7 @@ QUIET_DEVIATIONS: Final = 3.7
 """Maximum apparent movement of a coordinate, in standard deviations, for its wire to be considered unmoved.
 With 300 coordinates at rest, noise alone exceeds this limit in one frame in 15."""
 KEPT: Final = 50
-"""Number of frames for which a wire's equations are used after the wire moved in a way that the other wires
-did not predict."""
+"""Number of frames for which a wire stays in the estimate after an unexpected movement."""
 
 
 class Fit(NamedTuple):
@@ -33,7 +32,7 @@ class Fit(NamedTuple):
     sharpest: Float
     """(U,) largest apparent error of a single coordinate, in standard deviations."""
     move: Float
-    """(U, f) best-fitting movement of each coordinate, assuming that no other coordinate moved, pitches."""
+    """(U, f) movement of each coordinate that fits best if no other coordinate moves, pitches."""
 
 
 class Gate:
@@ -92,7 +91,7 @@ class Gate:
         return np.flatnonzero(touched)
 
     def excess(self, fit: Fit, count: Index) -> Float:
-        """Return the ratios (U,) of each wire's χ² to the limit above which the model is rejected."""
+        """Return the ratios (U,) of each wire's χ² to the limit above which the wire is INCONSISTENT."""
         return np.asarray(fit.chi_squared / self._impossible[count])
 
 

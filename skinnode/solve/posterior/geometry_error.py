@@ -1,19 +1,21 @@
 """Geometry errors: nuisance parameters for a patch's manufacturing errors, and their effects on residuals.
 
 The resistances at rest (R₀) are measured, so a geometry error θ does not affect the residuals at rest. Away
-from rest, the effect is θ times the change of ∂ ln F/∂θ since rest. The effect of a geometry error increases
-with the depth of the press. The errors are nuisances with a variance of 1, in units of their tolerance.
+from rest, the effect is θ times the difference between ∂ ln F/∂θ and its value at rest; the effect increases
+with the depth of the press. In units of their tolerances, the errors have a variance of 1; they are estimated
+as nuisances.
 
 - Thickness: all upper electrodes are shifted along their normals, in proportion to the clearance.
-- Radius: the mean of F over the rims of electrodes of radius ρ is F + (ρ²/2) ∇²F, with the Laplacian within
-  the surface; each layer contributes ρ²/4. The nuisance is ρ² in units of the squared tolerance.
+- Radius: for electrodes of radius ρ, the mean of F over their rims is F + (ρ²/2) ∇²F, to which each layer
+  contributes half. ∇² is the Laplacian within the surface. The nuisance is ρ² in units of the squared
+  tolerance.
 - Gain: the change in each resistance is multiplied by e^γ. Half of the variance of γ is common to the patch;
   the other half is independent in each upper wire.
 - Placement: each upper and each lower wire is shifted along x, y and z.
 
-The residuals are computed from the shifted geometry without linearising the errors. At a noise of 1e-5, the
-second-order effect of an error of 0.02 pitch is a hundred standard deviations. Each residual depends on ten
-of the nuisances; the other elements of H are zero and are not stored.
+The residuals are computed from the shifted geometry without linearising the errors. With a relative noise of
+1e-5, the second-order effect of a placement error of 0.02 pitch is a hundred standard deviations. Each
+residual depends on ten of the nuisances; the other elements of H are zero and are not stored.
 """
 
 from __future__ import annotations
@@ -169,7 +171,7 @@ def _linearise(  # noqa: PLR0913 - a kernel: arrays by name
             h_u[k, GAIN] = w * gain * change * own / before
             h_u[k, COMMON + 3] = h_u[k, GAIN]
             r_u[k] = scale * own - w + rim * g[RADIUS]
-            # reuse the work arrays for factors of the derivatives of F and of the rims, at ``x`` and at rest
+            # reuse the work arrays for the factors by which _slopes multiplies the derivatives
             rims[k] = w * square * g[RADIUS] / own
             bend[k] = scale - rims[k] * bend[k] / own
             at_rest = w * square * g[RADIUS] / before
@@ -209,7 +211,7 @@ def _residuals(  # noqa: PLR0913 - a kernel: arrays by name
     normal: Float, square: float, gain: float, h: Float, own: Float, g: Float, rows: Float, slopes: Float,
     r: Float,
 ) -> float:  # fmt: skip
-    """Write the residuals minus H g of the other nuisances into ``r``, and return their sum of squares."""
+    """Write the residuals, corrected for all nuisances, into ``r``; return their sum of squares."""
     f, bend, rest_bend = rows[0], rows[1], rows[2]
     total = 0.0
     for i in range(members.size):
@@ -250,7 +252,7 @@ def effect_on(  # noqa: PLR0913 - a kernel
 def add_effect(  # noqa: PLR0913 - a kernel
     effect: Float, u: int, k: int, value: float, g: Float, first: int, wires: int
 ) -> None:
-    """Add Hᵀ times ``value`` of one residual to ``g``, where geometry nuisances start at ``g[first]``."""
+    """Add ``value`` times one column of Hᵀ to the geometry nuisances, which start at ``g[first]``."""
     row = effect[u, k]
     upper, lower = first + COMMON + UPPER * u, first + COMMON + UPPER * wires + LOWER * k
     for q in range(COMMON):
@@ -307,7 +309,7 @@ def estimate(members: Index, effect: Float, v: Float, g: Float) -> None:
 def add_variance(  # noqa: C901 - a kernel: sums as loops
     members: Index, effect: Float, gain_t: Float, work: Float, out: Float
 ) -> None:
-    """Add diag(K H Hᵀ Kᵀ) to ``out`` (n,), with ``gain_t`` (m, n) = Kᵀ and a work array (EFFECTS, n)."""
+    """Add diag(K H Hᵀ Kᵀ) to ``out`` (n,); ``gain_t`` (m, n) is Kᵀ, and ``work`` (EFFECTS, n) is scratch."""
     equations, n = effect.shape[1], out.size
     for j in range(COMMON * n):
         work[j // n, j % n] = 0.0

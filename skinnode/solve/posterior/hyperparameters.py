@@ -1,6 +1,7 @@
 """Hyperparameters of the posterior: scale s of the prior, expected load locations, and noise.
 
-All hyperparameters are set from the evidence of the frames (MacKay, Neural Computation 4, 415, 1992).
+All hyperparameters are estimated by maximising the marginal likelihood (evidence) of the frames (MacKay,
+Neural Computation 4, 415, 1992).
 """
 
 from __future__ import annotations
@@ -18,20 +19,19 @@ from skinnode.solve.posterior.map_estimate import MapEstimator
 from skinnode.solve.posterior.observation import Observation
 
 SCALE_WORTH: Final = 2.0
-"""Weight of the prior on s², as a number of directions in data space; the data typically determine 100 to 200
-directions."""
+"""Weight of the prior on s², as an equivalent number of parameters. For comparison, the data typically
+determine 100 to 200 parameters."""
 SCALE_REST: Final = 0.005
 """Expected value of the prior scale s, in clearances; typical of presses that indent the layer by a tenth of
 its thickness."""
 SCALE_MOST: Final = 1.0
 """Maximum prior scale s, in clearances; with a larger scale, the surface could be below the lower layer."""
 SCALE_STEP: Final = math.log(1.25)
-"""Logarithm of the minimum change of the prior scale that triggers an update. A change of the scale changes
-the standard deviations by a smaller factor."""
+"""Minimum change in the logarithm of the prior scale that triggers an update. The standard deviations change
+by a smaller factor than the scale."""
 SCALE_LEAST: Final = 1.0
-"""Minimum prior scale, relative to the scale of a field whose mean change of the resistances equals their
-noise. Smaller fields cannot be detected, so the standard deviations of an untouched patch must allow for
-undetected fields."""
+"""Minimum prior scale, relative to the scale at which the expected change in the resistances equals their
+noise. Smaller displacements cannot be detected, so the standard deviations must cover them."""
 ADAPTIONS: Final = 5
 """Maximum number of updates of the prior or the noise per frame."""
 REFINEMENTS: Final = 3
@@ -40,14 +40,14 @@ solves."""
 NOISE_WORTH: Final = 20.0
 """Weight of the configured noise in the noise estimate, as a number of resistances."""
 NOISE_STEP: Final = math.log(1.1)
-"""Logarithm of the minimum change of the estimated noise that triggers an update."""
+"""Minimum change in the logarithm of the estimated noise that triggers an update."""
 
 Observe = Callable[[float], Observation]
 """Function that returns the observation of a frame for a given noise factor."""
 
 
 class Hyperparameters:
-    """Prior scale, expected load locations and noise of one patch. Do not share an instance between owners.
+    """Prior scale, expected load locations and noise of one patch. Each stream needs its own instance.
 
     Args:
         estimator: MAP estimator of the patch.
@@ -105,7 +105,7 @@ class Hyperparameters:
             observation: The frame.
             observe: Function that returns the observation of the frame for another noise factor.
             members: Wires whose equations are used.
-            local: Whether to set the expected load locations as well.
+            local: Whether to estimate the expected load locations as well.
 
         Returns:
             The observation with the estimated noise.
@@ -130,7 +130,7 @@ class Hyperparameters:
             if not changed:
                 break
             if not (estimator.track(observation, members) or estimator.anneal(observation, members)):
-                # restore the previous field and prior; the next frame starts with the estimated noise
+                # restore the previous field and prior, but use the new noise from the next frame on
                 self.noise_factor = found
                 estimator.moved[:], estimator.g[:], observation = moved, g, before
                 if not prior.localise(scale2 * share):

@@ -16,12 +16,11 @@ from skinnode.solve.posterior.contacts import LoadEstimate
 from skinnode.solve.posterior.map_estimate import MapEstimator
 
 LOCAL_SIGNIFICANT: Final = 4.0
-"""Minimum squared significance, in squared standard deviations, for a load to be considered detected."""
+"""Minimum ratio of a squared load to its noise variance for the load to be considered detected."""
 LOCAL_CERTAIN: Final = 100.0
-"""Minimum squared significance, in squared standard deviations, for a press to be considered certain. With a
-value of 25 and high noise, the first load locations are unreliable and errors are 1 % larger. With values of
-1000 and above, on layouts with low sensitivity (`aligned`), half of the expected load is still spread over
-the whole patch, which increases errors by 14 %."""
+"""Minimum ratio of a squared load to its noise variance for a press to be considered certain. In tests,
+displacement errors were 1 % larger with a value of 25 (at high noise), and 14 % larger with values of 1000
+and above (on `aligned` layouts)."""
 
 
 class LoadPosterior:
@@ -49,11 +48,11 @@ class LoadPosterior:
         return self._prior.loads(self._estimator.free_displacement())
 
     def expected(self, least: float) -> Float:
-        """Return the load variances (Q,) in pitch² that the loads of the frame imply, at least ``least``.
+        """Return the next prior variances (Q,) of the loads, pitch²; each is at least ``least``.
 
-        Without its own prior, a load has the estimate q / (s² k) and the variance 1/k − s², where k is the
-        increase in χ² per unit of the load (Tipping and Faul, Fast marginal likelihood maximisation for
-        sparse Bayesian models, 2003).
+        If a load's own prior is removed, its estimate is q / (s² k) and its variance is 1/k − s², where k is
+        the sensitivity of the data to the load, Σ (L⁻¹ J G)² (Tipping and Faul, Fast marginal likelihood
+        maximisation for sparse Bayesian models, 2003).
         """
         prior = self._prior
         found = np.empty(len(prior.share))
@@ -63,7 +62,7 @@ class LoadPosterior:
         return prior.expected(found, least, certain=most > LOCAL_CERTAIN)
 
     def _whiten(self) -> Float:
-        """Return L⁻¹ J G (m, 3Q) for the current factors, and update k of each load."""
+        """Return L⁻¹ J G (m, 3Q) for the current factors, and update the sensitivity k to each load."""
         rows = self._whitened[: self._estimator.factored_rows]
         if self._factors != self._estimator.factors:
             self._factors = self._estimator.factors
@@ -74,11 +73,11 @@ class LoadPosterior:
 
 @njit
 def _found(q: Float, own: Float, stiffness: Float, significant: float, found: Float) -> float:
-    """Write the largest squared load of each cell, estimated without its own prior, into ``found`` (Q,).
+    """Write the largest significant squared load of each cell, without its own prior, into ``found`` (Q,).
 
-    For loads below the significance threshold, 0 is written. ``q`` (Q, 3) contains the loads, ``own`` (Q,)
-    their prior variances and ``stiffness`` (3Q,) their k. Returns the largest ratio of a squared load to its
-    noise variance.
+    If no load of a cell is significant, 0 is written. ``q`` (Q, 3) contains the loads, ``own`` (Q,) their
+    prior variances, and ``stiffness`` (3Q,) the sensitivities k (see :meth:`LoadPosterior.expected`). Returns
+    the largest ratio of a squared load to its noise variance.
     """
     most = 0.0
     for cell in range(found.size):

@@ -2,9 +2,8 @@
 
 Initially, the prior expects equal loads over the whole patch, with one scale s². After loads have been found,
 the prior expects loads mainly where they were found (:meth:`LoadPrior.localise`). The skin next to a contact
-then moves only as far as the contact's loads require. Compared with one scale for the whole patch,
-localisation reduces the error by a factor of two to three, and the error of a narrow contact no longer
-exceeds the reported standard deviation.
+then moves only as far as the contact's loads require. In tests, this reduced displacement errors by a factor
+of two to three. Without it, errors under narrow contacts were larger than the reported standard deviations.
 """
 
 from __future__ import annotations
@@ -25,21 +24,22 @@ from skinnode.solve.linalg.vectors import Index
 from skinnode.solve.posterior.elastic_prior import SLACK, ElasticPrior
 
 LOCAL_SPREAD: Final = 0.7
-"""Standard deviation, in cells, of the Gaussian that spreads the squared loads over neighbouring cells. A
-smaller value improves the estimate if the rubber matches the prior, but makes the estimate overconfident if
-the rubber differs from the prior. With a value of 1, a quarter of the improvement is lost."""
+"""Standard deviation, in cells, of the Gaussian that spreads the squared loads over neighbouring cells. With
+a smaller value, the displacement is more accurate if the rubber behaves like a half-space, but the standard
+deviations are too small if it does not. With a value of 1, the benefit of :meth:`LoadPrior.localise` is a
+quarter smaller."""
 LOCAL_FLOOR: Final = 0.05
 """Mean square load expected in cells where no load was found, relative to the mean over the patch. This
 minimum allows for light touches near a press."""
 LOCAL_CHANGE: Final = 0.35
-"""Minimum fraction of the expected loads that must change location before the prior is rebuilt. With a value
-of 0.5, errors in a slow press reach 6 standard deviations; with 0.25, twice as many frames need a rebuild."""
+"""The prior is rebuilt if at least this fraction of the expected loads has changed location. In tests with
+slow presses, displacement errors reached 6 standard deviations with a value of 0.5; with 0.25, the prior was
+rebuilt twice as often."""
 LOCAL_SURPRISE: Final = 16.0
 """Maximum ratio of a cell's squared load to its expected squared load; at larger ratios, the prior is rebuilt
-even if the load locations hardly changed. Without this limit, the error reached 7 standard deviations when an
-unusual motion had left small expected loads and the depth of the press then doubled in one frame. A value of
-16 costs no time: in slow presses, the number of frames that need a factorisation is the same as without the
-limit."""
+even if the load locations hardly changed. Without this limit, displacement errors reached 7 standard
+deviations when the depth of a press doubled in one frame. In slow presses, the limit does not increase the
+number of factorisations."""
 
 
 class LoadPrior:
@@ -98,11 +98,11 @@ class LoadPrior:
         return True
 
     def expected(self, found: Float, least: float, *, certain: bool) -> Float:
-        """Return the load variances (Q,) in pitch² that the found loads imply, at least ``least``.
+        """Return the next prior variances (Q,) of the loads, pitch².
 
-        The variances move halfway from their current values to the implied values, because full steps would
-        make the variances of neighbouring cells oscillate. A full step is taken if a press is certain and
-        equal loads were expected over the whole patch.
+        Each variance moves halfway from its current value to the variance of the loads found, because the
+        variances of neighbouring cells would oscillate with full steps. A full step is taken only if a press
+        is certain and equal loads were expected over the whole patch before.
 
         Args:
             found: (Q,) squared loads found in the frame, pitch².

@@ -5,9 +5,8 @@
 - Newton: refactorise at the current field, then take chord steps.
 - Anneal: start at the rest position with an assumed noise of 3 %, which is divided by four until it reaches
   the true noise. At high noise, the posterior has a single maximum, close to the maximum of the prior.
-  Tracking this maximum while the noise decreases leads to the correct maximum. Annealing solves presses that
-  indent the layer by 70 % between two frames, even on layouts where the exact inverse fails when it tracks
-  the press sample by sample.
+  Tracking this maximum while the noise decreases usually leads to the correct maximum, even if a press
+  indents the layer by 70 % between two frames.
 """
 
 from __future__ import annotations
@@ -33,12 +32,12 @@ from skinnode.solve.posterior.observation import Observation, eased
 from skinnode.solve.wires.problem import PatchProblem
 
 ANNEAL_NOISE: Final = 0.03
-"""Initial relative noise for annealing; at such high noise, one Gauss-Newton step from rest nearly reaches
+"""Initial relative noise for annealing. With so much noise, one Gauss-Newton step from rest nearly reaches
 the maximum."""
 ANNEAL_RATIO: Final = 4.0
-"""Ratio of the noise in one annealing step to the noise in the next step. In 80 presses of up to 70 % from
-rest on the staggered and aligned layouts, h = 0.5 and 1, a ratio of 3 leads to the correct maximum in 80
-cases, a ratio of 5 in 79."""
+"""Ratio of the noise in one annealing step to the noise in the next step. In tests with 80 presses of up to
+70 %, annealing reached the correct maximum in all cases with a ratio of 3, and in 79 cases with a ratio of
+5."""
 SETTLED: Final = 0.02
 """Tolerance of the chord steps: the RMS of the last step, relative to the RMS standard deviation."""
 CHORDS: Final = 4
@@ -47,41 +46,36 @@ CHORD_RATE: Final = 0.35
 """Maximum ratio of successive chord step sizes; at larger ratios, a new factorisation is cheaper than further
 chord steps. A factorisation costs as much as ten chord steps."""
 NEWTONS: Final = 12
-"""Maximum number of factorisations in a solve that starts near the maximum. A solve that starts near the
-maximum typically needs one or two factorisations, or more if full steps would oscillate."""
+"""Maximum number of factorisations in a solve that starts near the maximum. One or two factorisations are
+typical; more are needed if full steps oscillate."""
 NEWTONS_MADE: Final = 40
-"""Limit on the factorisations in a solve that includes geometry errors; the posterior then peaks at the end
-of a curved ridge. On the aligned layout, h = 0.5, with ordinary tolerances, 12 factorisations were
-insufficient for one in three presses of 30 %."""
+"""Maximum number of factorisations in a solve with geometry errors. Convergence is slower because the maximum
+is at the end of a curved ridge: on one layout, 12 factorisations were not enough for one in three presses."""
 FLAT: Final = 0.1
 """Convergence threshold of a solve with geometry errors: the decrease in −2 log posterior over
 :data:`FLAT_STEPS` factorisations."""
 FLAT_STEPS: Final = 4
-"""Number of factorisations over which the decrease in −2 log posterior is measured; the decrease is compared
-with :data:`FLAT`."""
+"""Number of factorisations over which the decrease in −2 log posterior is compared with :data:`FLAT`."""
 EFFECT_STEP: Final = 0.2
 """Relative change (root sum of squares) in the effects of the geometry errors above which the factors and
-standard deviations are recomputed. Smaller changes of the effects change the standard deviations by less than
-this ratio."""
+standard deviations are recomputed. With smaller changes, the relative change in the standard deviations is
+also below this value."""
 HALVINGS: Final = 6
 """Maximum number of halvings of a Gauss-Newton step."""
 PRIOR_DOUBT: Final = 3.0
-"""Factor applied to the part of the variance that only the prior determines, because the expected load at a
-location is known only roughly. With a factor of 1, the errors on one wire in 20 000 were 5 to 7 standard
-deviations, at a first touch and in dents that cannot form on a half-space. With a factor of 2, the error in
-such dents was 5.6 standard deviations on one coordinate in 12 000, and at most 5 standard deviations in other
-difficult cases."""
+"""Factor by which the prior's part of the variance is multiplied, because the expected loads are known only
+roughly. In tests of difficult cases, such as first touches and dents that cannot form on a half-space,
+displacement errors reached 7 standard deviations with a factor of 1, and 5.6 with a factor of 2."""
 SMOOTH_SHARE: Final = 0.25
-"""Factor that the 95 % interval applies to the part of the variance that only the prior determines.
-Independent loads on cells are rougher than the loads of real bodies. The measured errors contain a fraction
-of 0.0 to 0.13 of the prior's part of the variance for spheres, and 0.02 to 0.5 for Gaussian dents. The
-standard deviation covers the tail of the error distribution; the 95 % interval covers its centre."""
+"""Factor by which the prior's part of the variance is multiplied for the 95 % interval. The factor is below
+1, because the loads of real bodies are smoother than the prior's independent loads. Factors computed from
+measured errors were at most 0.13 for spheres and 0.02 to 0.5 for Gaussian dents."""
 
 
 class MapEstimator:
     """MAP estimator of one patch, with its displacement, nuisances and last factors.
 
-    Do not share an instance between owners.
+    Each stream needs its own instance.
 
     Args:
         problem: The patch.
@@ -288,7 +282,7 @@ class MapEstimator:
         return np.asarray(np.einsum("uik,uij,ujk->uk", slopes, own, slopes))
 
     def guess_scale(self, observation: Observation, members: Index) -> float:
-        """Return the s² in pitch² for which the expected deviation of R from rest equals the measured one."""
+        """Return the s² in pitch² for which the expected change in R from rest equals the measured change."""
         self._linearise_at_rest(observation)
         trace = self._assemble(observation, members, 1.0, np.zeros_like(self.moved))
         square = float((self._b.r[members] ** 2).sum())
@@ -296,7 +290,7 @@ class MapEstimator:
         return excess / trace if trace > 0 else 0.0
 
     def gamma(self) -> float:
-        """Return the number of directions in data space that the data determine (MacKay's γ)."""
+        """Return the number of parameters that the data determine (MacKay's γ)."""
         if self._gamma is None:
             b, m = self._b, self.factored_rows
             inverse_diagonal(b.innovation_covariance, b.work, b.v, m)
@@ -307,7 +301,7 @@ class MapEstimator:
         """Return the next s² in pitch² by MacKay's fixed-point iteration (Neural Computation 4, 415, 1992).
 
         Args:
-            weight: Weight of the prior on s², as a number of directions in data space.
+            weight: Weight of the prior on s², as an equivalent number of parameters.
             scale2: Expected value of s² in its prior, pitch².
         """
         return (self.roughness(self.moved) + weight * scale2) / (self.gamma() + weight)
@@ -394,10 +388,11 @@ class MapEstimator:
         return size
 
     def _shorten(self, observation: Observation, moved: Float, g: Float) -> None:
-        """Shorten the last step, which began at ``moved`` and ``g``, to the minimum of a fitted parabola.
+        """Shorten the last step to the minimum of a parabola fitted to the objective.
 
-        Gauss-Newton neglects the curvature of F. If the data determine few directions, full steps can
-        alternate forever between the two sides of the minimum.
+        The step started at ``moved`` and ``g``. Gauss-Newton neglects the curvature of F. If the data
+        determine only a few parameters, full steps can therefore oscillate about the minimum without
+        converging.
         """
         way = self.moved - moved, self.g - g
 

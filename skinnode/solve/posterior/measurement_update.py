@@ -13,16 +13,17 @@ With J = ∂r/∂x, block-diagonal over wires, one Gauss-Newton step from x is
 
 S is the innovation covariance, s² J C the cross-covariance and K = s² C Jᵀ S⁻¹ the Kalman gain. The posterior
 covariance at x⁺ is s² C − Vᵀ V with V = L⁻¹ (s² J C) and L Lᵀ = S (Tarantola, Inverse Problem Theory, 2005,
-3.4). All eigenvalues of S are at least 1. Regardless of the condition number of J, rounding errors are
-therefore at most ε ‖S‖ standard deviations: a thousandth of a standard deviation for signals of 10⁶ σ.
+3.4). All eigenvalues of S are at least 1, so rounding errors do not depend on the condition number of J. They
+are at most ε ‖S‖ standard deviations, where ε is the machine precision. For residuals of 10⁶ σ, this is a
+thousandth of a standard deviation.
 
-Steps with the factors of an older J converge to the same point. At the maximum of the posterior,
-e_x = −s² C Jᵀ (r − H g) − x and e_g = d Hᵀ (r − H g) − g vanish. With the old J, H and S, the Newton
-correction is
+Newton steps with the factors of an older J (chord steps) converge to the same maximum. At the maximum of the
+posterior, e_x = −s² C Jᵀ (r − H g) − x and e_g = d Hᵀ (r − H g) − g vanish. With the old J, H and S, a chord
+step is
 
     δ = e − (s² C Jᵀ; −d Hᵀ) S⁻¹ (J e_x − H e_g)
 
-The Newton correction with old factors is called a chord step; it requires two triangular solves.
+A chord step requires two triangular solves.
 
 If a wire has more equations than unknowns, a QR decomposition of [J H] first reduces them to one equation per
 unknown without loss of information. This reduction is not possible with geometry errors
@@ -78,7 +79,7 @@ class Buffers(NamedTuple):
     whitened: Float
     """(U R, U f) whitened cross-covariance V = L⁻¹ (s² J C)."""
     kalman_gain_t: Float
-    """(U R, U f) transposed Kalman gain Kᵀ: the effect of unit noise in each equation on the estimate."""
+    """(U R, U f) transposed Kalman gain Kᵀ: change in the estimate per unit of noise in each equation."""
     work: Float
     """(U R, U R) work array."""
     gradient: Float
@@ -318,7 +319,7 @@ def noise_variance(  # noqa: C901 - a kernel: sums as loops
 ) -> None:
     """Write the variance of the estimate due to noise and nuisances into ``out`` (U f,), pitch².
 
-    The variance is diag(K (I + H d Hᵀ) Kᵀ) with Kᵀ = L⁻ᵀ V over ``m`` equations. Reads V and L from ``b``.
+    The variance is diag(K (I + H d Hᵀ) Kᵀ), where Kᵀ = L⁻ᵀ V has ``m`` rows. Reads V and L from ``b``.
     """
     n = out.size
     for k in range(m):
@@ -349,8 +350,8 @@ def standard_deviations(  # noqa: PLR0913 - a kernel: arrays by name
 ) -> None:
     """Compute the posterior's standard deviations (U, f) from its covariance s² C − Vᵀ V, with V from ``b``.
 
-    The variance due to noise, ``noise`` (U f,), is included in full. The remaining variance, which only the
-    prior determines, is multiplied by ``doubt`` for ``std`` and by ``share`` for ``core``.
+    ``noise`` (U f,) is the part of the variance due to noise. The remaining part depends on the prior; it is
+    multiplied by ``doubt`` for ``std`` and by ``share`` for ``core``.
     """
     n, f = noise.size, std.shape[1]
     explained = b.gradient

@@ -22,13 +22,14 @@ from skinnode.solve.options import PosteriorArguments, PosteriorOptions, merged
 from skinnode.solve.posterior.frame_estimator import FrameEstimator, Mask
 
 PLACED: Final = 2.0
-"""Assumed error of a reading per pitch of placement error, relative to the readings' largest change."""
+"""Assumed error of a reading, as a fraction of the largest change of any reading, per pitch of placement
+error."""
 
 
 class Posterior(FrameEstimator):
     """Estimator of the displacement, loads and contacts of one patch, frame by frame.
 
-    Do not share an instance between owners. The kernels release the GIL. The constructor compiles them.
+    Each stream needs its own instance. The kernels release the GIL. The constructor compiles them.
 
     Args:
         layout: The patch, with any number of lower wires.
@@ -72,11 +73,11 @@ class Posterior(FrameEstimator):
     ) -> FieldFrame:
         """Estimate the displacement field, loads and contacts of one frame.
 
-        This method never raises an exception because of a resistance value. A wire without usable resistances
-        is estimated from its neighbours, with a larger standard deviation. A wire whose resistances no
-        deformation explains is INCONSISTENT and left out of the estimate. A wire that does not converge even
-        when solved alone gets the status MAX_STEPS and is also left out. If the whole frame cannot be solved,
-        the last trusted field is returned with an infinite standard deviation.
+        This method never raises an exception because of a resistance value. The displacement of a wire
+        without usable resistances is estimated from its neighbours; its standard deviation is larger. A wire
+        whose resistances no deformation explains is INCONSISTENT and left out of the estimate. If a wire does
+        not converge even when solved alone, it has the status MAX_STEPS and is also left out. If the whole
+        frame cannot be solved, the last trusted field is returned with an infinite standard deviation.
 
         Args:
             frame_ohm: (U, K) resistances, ohm; values that are not positive and finite are ignored.

@@ -18,9 +18,8 @@ ERROR_LIMITS: Final = {"staggered": 0.03, "aligned": 0.10}
 """Maximum permissible error of the posterior for each layout, as a fraction of the RMS displacement. The
 limits apply to a 10 % press at h = 0.5 with a relative noise of 1e-5."""
 SCENES_A_CELL: Final = 25
-"""Each row of the coverage table uses this many times the scenes of a cell of the noise and code tables.
-Three scenes per cell are enough, because each scene contributes 300 coordinates to the RMS error of a
-cell."""
+"""Number of scenes in a row of the coverage table, relative to a cell of the noise and code tables. Three
+scenes per cell are enough, because each scene contributes 300 coordinates to the RMS error of a cell."""
 
 
 def run(scenes: int, rounds: int) -> dict[str, Any]:

@@ -2,10 +2,10 @@
 
 All solvers use the same compiled functions for the potential F and its Jacobian J. Only the patch's four
 middle wires, which are pressed most deeply, are solved. The simulated samples are noise-free. Every solver
-starts from rest. In some runs, a solver solves only the last sample. In the others, it solves a sequence of
-samples as in the paper, and the solution of each sample is the initial guess for the next. Each solver is run
-with several tolerances, and each run yields one data point. Only the time of ``solve_path`` includes setting
-up the patch, following the path, and estimating the error.
+starts from rest. In some runs, a solver solves only the last sample. In the other runs, it solves a sequence
+of samples as in the paper, with the solution of each sample as the initial guess for the next. Each solver is
+run with several tolerances, and each run yields one data point. Only the time of ``solve_path`` includes
+setting up the patch, following the path, and estimating the error.
 """
 
 from __future__ import annotations
@@ -30,15 +30,15 @@ from skinnode.solve.wires.problem import PatchProblem
 
 SCENES: Final = (("staggered", 0.5, 0.3), ("staggered", 1.0, 0.3), ("aligned", 0.5, 0.1))
 """Scenes as (preset, layer height in pitches, press depth divided by the layer height). Every solver solves
-the first press from rest, the second press requires intermediate samples, and the third uses the paper's
-layout."""
+the first press from rest. The second press requires intermediate samples, and the third press uses the
+paper's layout."""
 TOLERANCES: Final = (1e-4, 1e-7, 1e-10, 1e-13)
 SAMPLES: Final = (1, 5, 10, 20)
 SOLVED: Final = 0.01
 """Maximum error of a solved sample, relative to the true displacement. Results with larger errors are not
 plotted."""
 ROUNDING: Final = 1e-11
-"""Floor applied to all errors, because smaller differences are rounding errors. The floor is the rounding
+"""Lower limit for all errors; differences below this limit are rounding errors. The limit is the rounding
 error in F times the condition number of J."""
 LOOSE: Final = 1e-6
 """Solver tolerance for all samples except the last, as in the paper."""

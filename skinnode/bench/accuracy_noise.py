@@ -77,7 +77,7 @@ class Pool:
         self._size += float((truth_m[used] ** 2).sum())
 
     def row(self) -> dict[str, Any]:
-        """Return the statistics of all added scenes; the errors in them are NaN if no wire converged."""
+        """Return the statistics of all added scenes; the error is NaN if no wire converged."""
         size = self._size or math.nan
         return {
             "scenes": self.scenes,
@@ -242,8 +242,8 @@ def _streams(case: Case, converter: Converter, scenes: int) -> Iterable[Stream]:
 def pad_press(rng: np.random.Generator, layout: PatchLayout, depth: float) -> Press:
     """Return a random press by a fingertip-sized body whose contact radius is 1.5 to 2.5 pitches.
 
-    The errors can be compared with :data:`PROTOTYPE`, because the prototype's presses had the same Cramér-Rao
-    bounds.
+    The resulting errors can be compared with :data:`PROTOTYPE`, because the prototype's presses had the same
+    Cramér-Rao bounds.
     """
     press = random_press(rng, layout, depth)
     contact = rng.uniform(1.5, 2.5) * layout.pitch_m

@@ -40,8 +40,8 @@ class Case:
     stride: int = 1
     """A tracker solves only every ``stride``-th frame; path methods solve every frame."""
     known_wrong: tuple[str, ...] = ()
-    """Methods known to fail in this case (see ``docs/limits.md``). Their wrong results are reported, but do
-    not make the benchmark fail."""
+    """Methods known to fail in this case (see ``docs/limits.md``). Wrong results of these methods are
+    reported, but do not make the benchmark fail."""
     model_error: float = 0.0
     """Relative error of the predicted resistance change ΔR; passed to the solver as an option."""
     tolerances: Tolerances | None = None

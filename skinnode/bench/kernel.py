@@ -24,8 +24,8 @@ from skinnode.solve.operators.work import LIMIT, Work, workspace
 from skinnode.solve.wires.problem import PatchProblem
 
 SHORT: Final = 1e-3
-"""Trust radius, pitches per coordinate. It is much smaller than a Newton step, so that the benchmark also
-times the shortening of steps."""
+"""Trust radius, pitches per coordinate. The radius is much smaller than a Newton step, so that the benchmark
+also times the shortening of steps."""
 
 
 class NumpyWire:
@@ -66,7 +66,7 @@ class NumpyWire:
 def numpy_step(operator: str, wire: NumpyWire, x: Float, a: Float) -> Float:
     """Do the same work as :func:`compiled_steps` for one wire; return the relative residual after the step.
 
-    The Levenberg-Marquardt step uses a fixed parameter, although the compiled step also searches for it.
+    The Levenberg-Marquardt parameter is fixed here, whereas the compiled step searches for it.
     """
     f, jt = wire(x)
     r, j = relative_residual(a, f), (jt * a).T

@@ -36,8 +36,8 @@ from vcan_sim.scene import Scene
 from vcan_sim.sensor import SimulatedPatch
 
 TICK_S: Final = 0.25e-3
-"""Polling interval of the sender, s. If the bus is fully loaded, about two frames are due in each interval; a
-USB adapter also delivers frames in such groups."""
+"""Polling interval of the sender, s. On a fully loaded bus, about two frames are due per interval. They are
+sent together, as by a USB adapter."""
 LEAD_S: Final = 0.5
 """Delay between the call of :meth:`Generator.begin` and the first SYNC, s."""
 _BEAT_S: Final = 0.1

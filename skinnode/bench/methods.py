@@ -46,7 +46,7 @@ def _path(case: Case, how: str, stream: Stream) -> Solved:
         schedule=Adaptive() if adaptive else Uniform(),
         baseline_ohm=case.skin.rest_ohm,
     )
-    # The error estimate is an upper bound. Dividing it by LIMIT accepts errors up to this bound.
+    # The error estimate is an upper bound, and the verdict accepts errors of up to LIMIT times std.
     std = np.broadcast_to(path.error_estimate_m[:, None, None] / LIMIT, path.displacement_m.shape)
     return Solved(path.displacement_m[None], std[None], _converged(path.status)[None])
 

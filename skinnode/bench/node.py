@@ -168,7 +168,7 @@ def _load(rig: _Rig, rate_hz: int, stop: threading.Event) -> None:
 
 
 def handlers() -> dict[str, Callable[[], object]]:
-    """Return one function per kind of frame; each function passes a frame of its kind directly to a node.
+    """Return one function per kind of frame; the function passes a frame of that kind directly to a node.
 
     Each function also queries the node's next deadline, like the thread of a :class:`NodeRunner`.
     """

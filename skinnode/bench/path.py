@@ -1,4 +1,4 @@
-"""Repeats the path experiments of Xu et al. (2018) and compares the results with the paper's values.
+"""Repeats the path experiments of a paper by Xu and others, and compares the results (``paper.toml``).
 
 Each experiment uses one upper wire of 10 electrodes (30 unknowns), without the other wires of the patch. A
 sphere with a radius of 6 to 12 mm presses into the rubber at a random point near the middle of the patch. The
@@ -11,14 +11,14 @@ cost of F alone. One such evaluation replaces 31 calls, so our counts are multip
 the paper. As in the paper, the number of calls per step is averaged over all samples except the last. The
 accuracy is the relative error ‖X − X*‖ / ‖X* − X(0)‖, averaged over the experiments that converged. The
 first-order optimality ‖Jᵀr‖∞ is computed from the dimensionless residual r = a F − 1, with lengths in
-pitches. The paper's values, computed by MATLAB, are larger by a factor of F². They depend on the unit of
+pitches. The paper's values, computed by MATLAB, are larger by a factor of F² and depend on the unit of
 length, which the paper does not state.
 
 At the paper's press depth of 10 %, our Gauss-Newton solved all experiments on ``aligned``, with layer heights
 h of 0.3 to 1 pitches and any number of steps. For a depth of 10 %, the benchmark therefore uses the hardest
-``aligned`` setting, h = 1. In a search over h = 0.3 to 1 and depths of 15 to 30 %, Gauss-Newton failed as
-often as in the paper with h = 0.7 and a depth of 30 %. It failed in 6 of 10 experiments with 5 steps, in 2 of
-10 with 10 steps, and in none with 20 or more steps.
+``aligned`` setting, h = 1. The setting with h = 0.7 and a depth of 30 % was chosen because Gauss-Newton
+failed as often as in the paper. With this setting, Gauss-Newton failed in 6 of 10 experiments with 5 steps,
+in 2 of 10 with 10 steps, and in none with 20 or more steps.
 """
 
 from __future__ import annotations
@@ -443,7 +443,7 @@ def _print_operators(setting: dict[str, Any], paper: dict[str, Any], count: int,
                 f"  {_accuracy(own, count)}"
             )
     say(
-        f"cells in which our path solver always converges, more accurately than the paper: {better} of "
+        f"table cells that our path solver solved completely and more accurately than the paper: {better} of "
         f"{len(LABELS) * len(STEPS)}"
     )
 

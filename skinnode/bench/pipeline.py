@@ -33,8 +33,8 @@ from skinnode.transport.datagram import DatagramPort, free_channel
 
 PATCHES_A_BUS: Final = 4
 CLASSIC_MS: Final = 50
-"""SYNC period with classic CAN, ms. In each period, four patches send 101 frames each; that is 8,080
-frames/s."""
+"""SYNC period with classic CAN, ms. In each period, four patches send 101 frames each, which is a total of
+8,080 frames/s."""
 FD_MS: Final = 25
 STAGGER_MS: Final = 3.0
 """Offset between the SYNCs of successive buses in scenes with staggered SYNCs, ms. The offset is long enough

@@ -18,8 +18,7 @@ from skinnode.model.layout import Float, PatchLayout
 
 OUTLIER_DEVIATIONS = 6.0
 """Maximum permissible error of a coordinate, in reported standard deviations. A run scores about 1e5
-coordinates. The probability that any of them exceeds six standard deviations by chance is 2e-4, which is one
-false alarm per 5,000 runs."""
+coordinates. By chance, one in 5,000 runs has a coordinate whose error exceeds six standard deviations."""
 
 EXCESS_LIMIT = 1.15
 """Maximum permissible ratio of a run's RMS error to its RMS reported standard deviation."""

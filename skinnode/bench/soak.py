@@ -5,8 +5,9 @@ the test injects one to three kinds of fault, such as dropped frames, into one o
 join and leave during each round. At the end of the round, the faults are removed, and the test waits until
 every patch is operational and publishes fields again. In some rounds, additional child processes keep all
 processors busy. Memory use is measured without faults, after a warm-up and at the end. The measurements are
-the resident memory and the number of blocks allocated by Python (:func:`sys.getallocatedblocks`). This number
-reveals even a leak of one object per scan. This module imports the simulator, which injects the faults.
+the resident memory and the number of blocks allocated by Python (:func:`sys.getallocatedblocks`). The number
+of blocks reveals even a leak of one object per scan. This module imports the simulator, which injects the
+faults.
 """
 
 from __future__ import annotations

@@ -49,10 +49,9 @@ SHORT: Final[dict[str, Any]] = {
 WATCHED: Final = 4000
 """Number of scans in each stream for counting false alarms; the stream contains ten touches."""
 QUIET: Final = Timeline(rest=200, press=10, hold=30, slide=40, release=10, after=110)
-"""Numbers of scans in the phases of each touch, in the streams for counting false alarms."""
+"""Timeline of each touch in the streams for counting false alarms."""
 PAIRED: Final = Timeline(rest=9, press=6, hold=7, slide=6, release=4, after=6)
-"""Numbers of scans in the phases of a stream with two faults. They are small, because there are many streams
-with two faults."""
+"""Timeline of a stream with two faults. Its phases are short, because there are many of these streams."""
 
 
 @dataclass(frozen=True)

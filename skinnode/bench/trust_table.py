@@ -33,10 +33,10 @@ COARSE: Final = Setting("staggered", 0.5, 1e-4)
 NAMED: Final = 0.95
 """Minimum fraction of trusted fields after a faulty wire or crossing has been identified."""
 BRIEF: Final = Timeline(rest=4, press=5, hold=6, slide=0, release=0, after=0)
-"""Numbers of scans in the phases of a short stream, which ends while the load is held."""
+"""Timeline of a short stream, which ends while the load is held."""
 BLUNT_M: Final = 100e-6
-"""Maximum error of a field that is trusted and precise although half of its readings are missing, metres: 5 %
-of the layer height."""
+"""Maximum permissible error of a trusted, precise field when half of the readings are missing, metres. The
+limit is 5 % of the layer height."""
 STEADY: Final = 0.95
 """Minimum fraction of fields with the right number of contacts, and minimum fraction of correct forces."""
 

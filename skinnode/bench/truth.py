@@ -169,7 +169,7 @@ class Skin:
         return self._points(self.body.upper_m)
 
     def _points(self, upper: Float) -> Float:
-        """Do the same as :func:`skinnode.model.forward.resistance_ohm`, but about five times as fast."""
+        """Do the same as :func:`skinnode.model.forward.resistance_ohm`, about five times as fast."""
         lower = self.body.lower_m.reshape(-1, 3)
         square = np.zeros((upper.shape[0] * upper.shape[1], len(lower)))
         for axis in range(3):

@@ -50,8 +50,8 @@ class Solved:
     displacement_m: Float
     """(F, U, N, 3)"""
     std_m: Float
-    """(F, U, N, 3), reported standard deviation, metres. For path methods, it is the error estimate divided
-    by 5."""
+    """(F, U, N, 3), reported standard deviation, metres. For path methods, the value is the error estimate
+    divided by 5."""
     converged: NDArray[np.bool_]
     """(F, U), whether a wire is CONVERGED and, if trust was assessed, trusted."""
 

@@ -4,7 +4,8 @@ On each bus, the plan includes SYNC, the host's heartbeat (if enabled), and the 
 listed in the hand file). The fraction :data:`SDO_SHARE` of the bandwidth is reserved for SDO transfers. For
 each patch, the plan includes the chunks and the summary of one scan per SYNC period, and one heartbeat and
 one EMCY per heartbeat period. When a node rejoins the bus, the host configures it with further SDO transfers.
-They are not included, because SDO frames have a lower priority than PDOs and use only spare bandwidth.
+These transfers are not included, because SDO frames have a lower priority than PDOs and use only spare
+bandwidth.
 """
 
 from __future__ import annotations
@@ -24,10 +25,12 @@ from skinnode.errors import BusLoadError, ConfigError, Shown
 from skinnode.protocol.profile import PatchProfile
 
 SCAN_SHARE: Final = 0.8
-"""Fraction of the SYNC period reserved for scans. The rest is left for SDO, EMCY and late frames."""
+"""Fraction of the SYNC period reserved for scans. The rest of the period is left for SDO, EMCY and late
+frames."""
 
 SDO_SHARE: Final = 0.01
-"""Fraction of the bandwidth reserved for SDO. At 1 Mbit/s, it allows one request and response every 27 ms."""
+"""Fraction of the bandwidth reserved for SDO. At 1 Mbit/s, one request and one response can be sent every 27
+ms."""
 
 NODE_LATENCY_S: Final = 2e-3
 """Maximum delay from SYNC to the first chunk, s, specified for a node on an otherwise idle machine."""

@@ -8,10 +8,10 @@ the first instance.
 
 This module extends the analysis to messages that are sent in bursts, such as the chunks of a scan: each
 period starts with ``count`` frames at intervals of ``spacing_ns``. The number of frames in a time window is
-greatest if the window starts with a burst. The analysis therefore uses this greatest number instead of the
+greatest if the window starts with a burst. The analysis uses this maximum number of frames instead of the
 paper's ⌈(t + J) / T⌉.
 
-The analysis ignores retransmissions after errors. It assumes that each controller always sends its
+The analysis ignores retransmissions after errors. The analysis assumes that each controller always sends its
 highest-priority frame first.
 """
 

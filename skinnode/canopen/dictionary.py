@@ -61,8 +61,8 @@ class Entry:
     access: str
     """Access type: ro, rw, wo, const or rww, where rww means rw and mappable into an RPDO."""
     default: Value | None = None
-    """Default value. None for a value specific to each device, such as the serial number; it is initially
-    zero."""
+    """Default value. None for a value that differs between devices, such as the serial number, and is
+    initially zero."""
     plus_node_id: bool = False
     """Whether the node-ID is added to the default value at start-up, as for a COB-ID."""
     mappable: bool = False

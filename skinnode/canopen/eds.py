@@ -171,7 +171,7 @@ def _options(entry: Entry, kind: ObjectType, device: Commissioning | None) -> It
 
 
 def _is_configuration(entry: Entry) -> bool:
-    """Return whether a DCF states a value for the entry: not for commands and the error history."""
+    """Return whether the entry has a value in a DCF; commands and the error history have none."""
     refused = entry.index in (od.ERROR_FIELD, od.STORE, od.RESTORE)
     return entry.access not in ("ro", "const") and entry.default is not None and not refused
 

@@ -29,7 +29,7 @@ def check_form(text: str, source: str) -> None:
         source: name of the EDS file, shown in the error.
 
     Raises:
-        ProfileError: if the file has a format error; the message states the line of the first one.
+        ProfileError: if the file has a format error; the message states the line of the first error.
     """
     for line, section, key, value in _lines(text):
         if not key:

@@ -1,7 +1,8 @@
 """Human-readable texts for emergency messages (EMCY), the error register and the error history.
 
-The codes follow CiA 301 v4.2, 7.2.7, tables 26 and 48. Skinnode patches use some of the codes in a more
-specific sense. The manufacturer-specific bytes after an error code are decoded only for skinnode patches.
+The codes follow CiA 301 v4.2, 7.2.7, tables 26 and 48. Skinnode patches use some of these codes in a more
+specific sense than CiA 301. The manufacturer-specific bytes after an error code are decoded only for skinnode
+patches.
 """
 
 from __future__ import annotations
@@ -151,7 +152,7 @@ def history_text(entry: int, *, ours: bool) -> str:
 def says_too_slow(code: int, detail: bytes) -> bool:
     """Return whether an emergency message reports scans skipped because of a slow computer or bus.
 
-    Such scans do not indicate a fault in the skin.
+    Scans skipped because of a slow computer or bus do not indicate a fault in the skin.
 
     Args:
         code: error code.

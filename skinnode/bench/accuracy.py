@@ -1,4 +1,4 @@
-"""Measures accuracy, speed and calibration of the reported uncertainty, and checks the requirements."""
+"""Measures the accuracy and speed of the solvers and the calibration of their reported uncertainty."""
 
 from __future__ import annotations
 
@@ -50,8 +50,8 @@ def run(scenes: int, rounds: int) -> dict[str, Any]:
 def requirements(figures: dict[str, Any]) -> list[dict[str, Any]]:
     """Return a row for each requirement: name, measured value, limit as text, and whether the limit is met.
 
-    Time requirements are marked ``absolute``. Execution times depend on the machine, so an unmet time
-    requirement does not make the benchmark fail.
+    Requirements on execution times are marked ``absolute``. An unmet ``absolute`` requirement does not make
+    the benchmark fail, because execution times depend on the machine.
     """
     found = []
     for row in figures["noise"]:

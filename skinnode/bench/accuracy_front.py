@@ -113,7 +113,7 @@ def _bare(scene: Scene, solve: Solve, samples: int, tolerance: float) -> tuple[f
                 x = solve(Case(problem, wire, frame, np.ascontiguousarray(x), truth[wire]), loose)
             found[wire] = x
 
-    with np.errstate(all="ignore"):  # solvers that overflow are recognised by their errors
+    with np.errstate(all="ignore"):  # an overflow is later noticed as a large error
         us = _timed_us(paths) / len(found)
         return us, scene.error(problem.displacement_m(found))
 

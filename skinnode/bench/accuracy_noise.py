@@ -1,4 +1,4 @@
-"""Measures the error versus noise, code width and layout, and checks the calibration of standard deviations.
+"""Measures how the error depends on noise, code width and layout, and checks the standard deviations.
 
 A tracker solves the four frames of each scene in sequence, starting at rest; only the last frame is scored.
 Errors and standard deviations are RMS values over the coordinates of all converged wires in all scenes,

@@ -250,7 +250,7 @@ def _wrong_roots() -> Iterator[Case]:
 
 
 def _sheared() -> Iterator[Case]:
-    """Yield deep presses with a friction coefficient of 0.8; the true displacement passes through folds of F.
+    """Yield deep presses with a friction coefficient of 0.8; the wires pass through folds of the potential F.
 
     For some wires, the posterior and the live trackers then converge to a smooth but wrong root. Only path
     methods use the intermediate samples that reveal this error.
@@ -279,7 +279,7 @@ def _dragged(press: Press, rng: np.random.Generator) -> Press:
 
 
 def _swap(rng: np.random.Generator, layout: PatchLayout, share: float) -> Float:
-    """Rotate two adjacent electrodes of a wire about their midpoint; F has the same value at 0° and 180°."""
+    """Rotate two adjacent electrodes about their midpoint; the potential is equal at 0° and 180°."""
     wire, first = rng.integers(layout.shape[0]), rng.integers(layout.upper_m.shape[1] - 1)
     middle = 0.5 * (layout.upper_m[wire, first] + layout.upper_m[wire, first + 1])
     angle = np.pi * share
@@ -292,7 +292,7 @@ def _swap(rng: np.random.Generator, layout: PatchLayout, share: float) -> Float:
 
 
 def _mirror(rng: np.random.Generator, layout: PatchLayout, share: float) -> Float:
-    """Move an electrode through the lower layer to its mirror position, where F has its initial value."""
+    """Move an electrode through the lower layer to its mirror position, where the potential is the same."""
     moved = np.zeros(layout.upper_m.shape)
     wire, electrode = rng.integers(layout.shape[0]), rng.integers(layout.upper_m.shape[1])
     moved[wire, electrode, 2] = -2 * share * layout.height_m
@@ -308,7 +308,7 @@ def _after_detour(
 
     After the impossible motion, every resistance has returned to its rest value. The true displacement is
     undefined (NaN) during the motion, because swapping two electrodes of a wire or mirroring an electrode
-    leaves F unchanged.
+    leaves the potential unchanged.
     """
 
     def make(rng: np.random.Generator) -> Stream:
@@ -319,7 +319,7 @@ def _after_detour(
         frames, valid, noise = converter.read(resistance, skin.rest_ohm, rng)
         press = (random_press(rng, skin.layout, 0.2),)
         after = stream(skin, press, np.array([0.3, 0.6, 1.0, 0.0]), converter, rng)
-        odd[0], odd[1:-1], odd[-1] = 0.0, np.nan, 0.0  # at both ends, R equals its rest value
+        odd[0], odd[1:-1], odd[-1] = 0.0, np.nan, 0.0  # at both ends, all resistances have their rest values
         return Stream(
             np.concatenate([frames, after.frames_ohm]),
             np.concatenate([valid, after.valid]),

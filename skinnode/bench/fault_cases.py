@@ -164,7 +164,7 @@ def _open(axis: int) -> Spoil:
 
 
 def _shorted(axis: int) -> Spoil:
-    """Return a function that shorts two adjacent wires, which then read their resistances in parallel."""
+    """Return a function that shorts two adjacent wires, so that both show their parallel resistance."""
 
     def spoil(rng: np.random.Generator, taken: Stream, skin: Skin) -> Stream:
         frames, wire = taken.frames_ohm.copy(), int(rng.integers(taken.frames_ohm.shape[axis] - 1))
@@ -176,7 +176,7 @@ def _shorted(axis: int) -> Spoil:
 
 
 def _crossed(axis: int) -> Spoil:
-    """Return a function that swaps the R/R₀ of two adjacent wires, which were crossed before taring."""
+    """Return a function that swaps R/R₀ of two adjacent wires, as if they were exchanged before taring."""
 
     def spoil(rng: np.random.Generator, taken: Stream, skin: Skin) -> Stream:
         frames, wire = taken.frames_ohm.copy(), _wire(rng, taken, skin, axis)

@@ -36,7 +36,7 @@ from vcan_sim.scene import Scene
 from vcan_sim.sensor import SimulatedPatch
 
 TICK_S: Final = 0.25e-3
-"""Polling interval of the sender, s. On a fully loaded bus, about two frames are due per interval. They are
+"""Polling interval of the sender, s. On a fully loaded bus, about two frames are due per interval and are
 sent together, as by a USB adapter."""
 LEAD_S: Final = 0.5
 """Delay between the call of :meth:`Generator.begin` and the first SYNC, s."""

@@ -5,14 +5,14 @@ sphere with a radius of 6 to 12 mm presses into the rubber at a random point nea
 displacement is computed from Hertz's closed-form solution with friction. The wire nearest to that point is
 solved. The press consists of 1000 samples; a path of n steps uses n evenly spaced samples.
 
-The paper counts the calls of the potential function F. Its Jacobians are finite differences, so each Jacobian
-requires 30 additional calls. Our code evaluates F and an analytic Jacobian J together, at about twice the
-cost of F alone. One such evaluation replaces 31 calls, so our counts are multiplied by 31 for comparison with
-the paper. As in the paper, the number of calls per step is averaged over all samples except the last. The
-accuracy is the relative error ‖X − X*‖ / ‖X* − X(0)‖, averaged over the experiments that converged. The
-first-order optimality ‖Jᵀr‖∞ is computed from the dimensionless residual r = a F − 1, with lengths in
-pitches. The paper's values, computed by MATLAB, are larger by a factor of F² and depend on the unit of
-length, which the paper does not state.
+The paper counts the calls of the potential function F. The paper's Jacobians are finite differences, so each
+Jacobian requires 30 additional calls. Our code evaluates F and an analytic Jacobian J together, at about
+twice the cost of F alone. One joint evaluation replaces 31 calls, so our counts are multiplied by 31 for
+comparison with the paper. As in the paper, the number of calls per step is averaged over all samples except
+the last. The accuracy is the relative error ‖X − X*‖ / ‖X* − X(0)‖, averaged over the experiments that
+converged. The first-order optimality ‖Jᵀr‖∞ is computed from the dimensionless residual r = a F − 1, with
+lengths in pitches. The paper's values, computed by MATLAB, are larger by a factor of F² and depend on the
+unit of length, which the paper does not state.
 
 At the paper's press depth of 10 %, our Gauss-Newton solved all experiments on ``aligned``, with layer heights
 h of 0.3 to 1 pitches and any number of steps. For a depth of 10 %, the benchmark therefore uses the hardest
@@ -104,7 +104,7 @@ def preset(name: str, height: float) -> PatchLayout:
 
 
 def experiments(layout: PatchLayout, depth: float, count: int) -> list[Experiment]:
-    """Generate experiments with ``count`` random presses to ``depth`` times the layer height."""
+    """Generate ``count`` experiments, each with a random press to a depth of ``depth`` layer heights."""
     rng = np.random.default_rng(SEED)
     span = layout.upper_m[..., :2].max(axis=(0, 1))
     made = []

@@ -83,7 +83,7 @@ def run(  # noqa: PLR0913 - the options of the command
         The rows and the requirements.
 
     Raises:
-        BusError: A bus fails.
+        BusError: if a bus fails.
     """
     fullest = 1 if interface == "socketcan" else 4
     cores = sorted(os.sched_getaffinity(0))

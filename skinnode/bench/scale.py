@@ -1,4 +1,4 @@
-"""Measures how the CPU time of simulator and host grows with skin area and number of contacts.
+"""Measures how the CPU time of the simulator and the host grows with skin area and number of contacts.
 
 The simulated hands have four patches per bus, and spheres press on some of the patches. The hands run in
 virtual time, on buses that simulate the duration of each frame. The CPU time of each thread is read from the
@@ -30,7 +30,7 @@ from vcan_sim.virtual_time import VirtualClock
 PATCHES: Final = (1, 4, 16, 64)
 """Default numbers of patches in the hands with one touched patch."""
 FIXED: Final = 16
-"""Number of patches in the hand for measuring the effect of the number of touched patches."""
+"""Number of patches in the hand in which the number of touched patches is varied."""
 TOUCHED: Final = (0, 1, 4, 16)
 """Numbers of touched patches to measure in the hand with :data:`FIXED` patches."""
 PATCHES_PER_BUS: Final = 4

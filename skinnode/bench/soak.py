@@ -1,4 +1,4 @@
-"""Soak test with random faults: checks that host and patches recover, and that all frame counters agree.
+"""Soak test with random faults: checks that the host and the patches recover and the frame counters agree.
 
 The host and the simulated nodes run in the same process and communicate over two virtual buses. Each round of
 the test injects one to three kinds of fault, such as dropped frames, into one or all patches. Subscribers
@@ -46,8 +46,8 @@ from vcan_sim.sensor import REMEMBERED_READINGS
 WARM_UP: Final = 0.25
 """Warm-up time before the first memory measurement, as a fraction of the test duration."""
 BLOCKS: Final = 2000
-"""Maximum permissible increase in the number of memory blocks. The number normally varies by a few hundred. A
-leak of one block per scan adds 10,000 blocks in three minutes."""
+"""Maximum permissible increase in the number of memory blocks. The number of blocks normally varies by a few
+hundred. A leak of one block per scan adds 10,000 blocks in three minutes."""
 RESIDENT_MB: Final = 8.0
 """Maximum permissible increase of resident memory, MB; small increases are normal, because the C allocator
 does not return all freed memory at once."""

@@ -25,7 +25,7 @@ def fill(folder: Path) -> None:
     user's cache is never modified.
 
     Raises:
-        subprocess.SubprocessError: The child process fails.
+        subprocess.SubprocessError: if the child process fails.
     """
     from skinnode.compiled.jit import cache_dir, is_cold
 

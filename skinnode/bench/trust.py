@@ -51,7 +51,8 @@ WATCHED: Final = 4000
 QUIET: Final = Timeline(rest=200, press=10, hold=30, slide=40, release=10, after=110)
 """Timeline of each touch in the streams for counting false alarms."""
 PAIRED: Final = Timeline(rest=9, press=6, hold=7, slide=6, release=4, after=6)
-"""Timeline of a stream with two faults. Its phases are short, because there are many of these streams."""
+"""Timeline of a stream with two faults. The phases are short, because there are many streams with two
+faults."""
 
 
 @dataclass(frozen=True)

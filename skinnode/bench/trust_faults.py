@@ -236,7 +236,7 @@ def _open_unmarked(axis: int) -> InPlace:
 
 
 def _two_shorted(axis: int) -> InPlace:
-    """Return a function that shorts two adjacent wires, which then read their resistances in parallel."""
+    """Return a function that shorts two adjacent wires, so that both show their parallel resistance."""
 
     def wired(signal: Signal) -> None:
         at, t = _one(signal, axis, 2), _pressing(signal)

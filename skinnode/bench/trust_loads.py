@@ -1,6 +1,6 @@
 """Loads for ``skinnode bench trust``, which violate the assumptions of the posterior's prior.
 
-The prior assumes independent loads on the cells of a lattice. The loads in this module do not use a lattice:
+The prior assumes independent loads on the cells of a lattice. This module provides loads without a lattice:
 closed-form solutions for a sphere and for a flat punch, line loads at any angle, a dent that no load on a
 half-space can produce, and a rigid plate that covers the whole patch. The true force is known for bodies that
 press on a half-space or on a layer.

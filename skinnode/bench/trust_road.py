@@ -50,7 +50,7 @@ ROAD: Final[tuple[dict[str, Any], ...]] = (
 AT_ONCE: Final = 4
 """Number of patches simulated simultaneously by this process."""
 CLEAN_S: Final = 1.2
-"""Fault-free time after bring-up, s. The first press begins within this time."""
+"""Fault-free time after bring-up, s. The first press begins within this fault-free time."""
 FAULTY_S: Final = 4.0
 PERIOD_MS: Final = 80
 

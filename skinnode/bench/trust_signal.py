@@ -4,8 +4,7 @@ A stream is generated in these steps::
 
     load, timeline -> displacement -> true resistances -> noise -> faults -> codes -> faults
 
-A stream has six phases. The patch is first at rest. Then a load is applied, held, moved sideways and
-released. In the last phase, the patch is at rest again.
+The six phases of a stream are: rest, press, hold, slide, release, and rest again.
 """
 
 from __future__ import annotations
@@ -148,7 +147,7 @@ def all_settings() -> list[Setting]:
 def make(
     setting: Setting, load: Load, faults: Sequence[Fault], rng: np.random.Generator, timeline: Timeline
 ) -> CodeStream:
-    """Generate the code stream of a loaded patch, with faults.
+    """Generate the code stream of a loaded patch with faults.
 
     Args:
         setting: Layout and noise.

@@ -18,7 +18,7 @@ probability of violating each condition is 1e-4.
   distribution. The expected number of such errors per seed serves as the probability per seed, because it is
   an upper bound. The test counts seeds instead of coordinates, because only seeds are independent.
 
-If the second condition is violated, every wire with an error above 5 standard deviations is classified as
+If too many seeds have an error above 5 standard deviations, every wire with such an error is classified as
 wrong. With exact data, no error is attributed to chance: the limit is 5 reported standard deviations or 1e-6
 of the wire's largest displacement, whichever is larger.
 """

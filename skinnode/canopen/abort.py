@@ -42,7 +42,7 @@ class AbortCode(IntEnum):
 
 
 class Refused(Exception):
-    """Refusal of access to an object, for which the SDO server sends an abort code to the client.
+    """Access to an object was refused; the SDO server sends the abort code to the client.
 
     Args:
         code: abort code that states the reason for the refusal.

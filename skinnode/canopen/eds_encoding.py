@@ -2,7 +2,7 @@
 
 CiA 306 requires ASCII, but some tools write other encodings. No information is lost: each non-ASCII byte
 becomes a lone surrogate (PEP 383), from which the original byte can be recovered. The function
-:func:`for_people` decodes such text for display.
+:func:`for_people` decodes text with surrogates for display.
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ from typing import Final, NamedTuple
 ASCII: Final = "ASCII"
 
 MOST_EDS_BYTES: Final = 2 << 20
-"""Maximum accepted size of an EDS file, in bytes. This limit is twenty times the size of a patch's EDS and
-exceeds the size of the largest known EDS."""
+"""Maximum accepted size of an EDS file, in bytes. The limit is twenty times the size of a patch's EDS, and
+greater than the size of any known EDS."""
 
 _UTF_16: Final = {codecs.BOM_UTF16_LE: "utf-16-le", codecs.BOM_UTF16_BE: "utf-16-be"}
 _CODECS: Final = {

@@ -11,8 +11,8 @@ from skinnode.errors import ProfileError, Shown
 _HEADER: Final = re.compile(r"\[(.+)\]")
 _OBJECT: Final = re.compile(r"[0-9a-f]{4}(sub[0-9a-f]{1,2})?", re.IGNORECASE)
 _FURTHER: Final = re.compile(r"[0-9a-f]{4}(?!sub)[g-z][a-z]*", re.IGNORECASE)
-"""Pattern for titles of supplementary object sections, such as 1003Value and 1003ObjectLinks. These titles
-contain no digits after the index, so misspelled sub-objects such as 1018sb1 do not match."""
+"""Pattern for titles of supplementary object sections, such as 1003Value and 1003ObjectLinks. Such a title
+contains no digits after the index, so a misspelled sub-object such as 1018sb1 does not match."""
 _OF_OBJECT: Final = re.compile(r"[0-9]\w*|[0-9a-f]{4}sub.*", re.IGNORECASE)
 """Pattern for section titles that are probably meant to denote an object, including malformed titles."""
 _NUMBER: Final = re.compile(r"0x[0-9a-f]{1,8}|[0-9]{1,10}", re.IGNORECASE)

@@ -1,4 +1,4 @@
-"""Plots the results of ``skinnode bench scale``: CPU time against area and against contact."""
+"""Plots the results of ``skinnode bench scale``: CPU time versus area and number of touches."""
 
 from __future__ import annotations
 

@@ -2,7 +2,7 @@
 
 The solver computes forces from the displacement of an elastic half-space, but real skin is a layer on a
 support. The stiffest case is a layer of incompressible rubber bonded to a rigid support. For the same
-displacement, such a layer carries more force than the half-space; the ratio of the forces grows with the
+displacement, a bonded layer carries more force than a half-space; the ratio of the forces grows with the
 ratio of contact radius to layer thickness. A Hertz pressure p over a circle of radius a indents a layer of
 thickness t and shear modulus G by
 
@@ -10,10 +10,9 @@ thickness t and shear modulus G by
 
 where f = 1 for the half-space (Johnson, Contact Mechanics, 1985, 5.8; the thin-layer limit F ∝ G a⁴ δ / t³ is
 from Barber, International Journal of Mechanical Sciences 32, 129, 1990). At the same δ, the ratio of the
-bonded layer's force to the half-space's force is a function of a/t. The force on any real layer is between
-the force on the half-space and the force on the bonded layer. On thick layers, the half-space model needs
-negative loads that cancel part of the positive loads; the sum of the positive loads is therefore a second
-bound.
+bonded layer's force to the half-space's force is a function of a/t. A real layer carries more force than the
+half-space and less force than the bonded layer. On thick layers, the half-space model needs negative loads
+that cancel part of the positive loads; the sum of the positive loads is therefore a second bound.
 """
 
 from __future__ import annotations
@@ -26,15 +25,15 @@ from skinnode.model.elastic import Rubber
 LINEAR: Final = 1.05
 """Coefficient of a/t in the ratio of the bonded layer's force to the half-space's force.
 
-This coefficient and :data:`CUBIC` were fitted to the exact integral for a/t from 0.05 to 20; the error is at
+The coefficients LINEAR and CUBIC were fitted to the exact integral for a/t from 0.05 to 20; the error is at
 most 12 %.
 """
 CUBIC: Final = 0.51
 """Coefficient of (a/t)³ in the ratio of the bonded layer's force to the half-space's force."""
 SPAN: Final = 2.5
 """Ratio of the difference between the two forces (bonded layer and half-space) to the reported standard
-deviation. With a ratio of 3, force errors reached 4.3 standard deviations in tests; with 2.5, they remained
-below 5."""
+deviation. In tests, force errors were at most 4.3 standard deviations even with a ratio of 3; the value of
+2.5 adds a margin."""
 
 
 def stiffening(radius_m: float, thickness_m: float) -> float:

@@ -35,15 +35,15 @@ BLOCK: Final = 4
 WINDOW: Final = 11
 """Maximum number of blocks in the estimate (44 frames).
 
-The number is odd, so that the median is the noise of a single block; the mean of two blocks could mix old and
-new noise.
+The number of blocks is odd, so that the median is the noise of a single block. For an even number, the median
+would be the mean of two blocks.
 """
 LEAST_BLOCKS: Final = 5
 """Minimum number of blocks in the estimate (20 frames)."""
 PAUSE: Final = 12
 """Number of frames skipped after several rejected blocks, or after a block that agrees with a full window.
 
-Without this pause, the noise estimate would take 8 % of the computing time of a patch at rest.
+If no frames were skipped, the noise estimate would take 8 % of the computing time of a patch at rest.
 """
 REPEATED: Final = 0.15
 """Maximum fraction of readings that repeat exactly in a usable block.
@@ -62,21 +62,21 @@ A normal variable exceeds this margin once in 16,000 cases.
 """
 DEPARTED: Final = math.log(1.5)
 """Logarithm of the noise ratio (estimated to stated) above which the estimate replaces the stated noise.
-Below this threshold, the solver uses the stated noise unchanged."""
+If the ratio is smaller, the solver uses the stated noise unchanged."""
 RETURNED: Final = math.log(1.25)
 """Logarithm of the noise ratio (estimated to stated) below which the stated noise is used again."""
 STEP: Final = math.log(1.05)
 """Minimum change in the logarithm of the noise factor, in addition to the margin, for updating a factor other
 than 1. Each update requires another solve of the frame."""
 UNEQUAL: Final = 0.3
-"""Maximum mean logarithm of the ratio of the quadratic to the cubic contrast's variance. Motion at this limit
-raises the noise estimate by 8 %."""
+"""Maximum mean logarithm of the ratio of the quadratic to the cubic contrast's variance. At the limit, motion
+of the skin raises the noise estimate by 8 %."""
 LEAST: Final = 1.0 / 30.0
-"""Minimum ratio of estimated to stated noise."""
+"""Lower limit of the ratio of estimated to stated noise."""
 
 _CLIP: Final = 1.0
-"""Clipping limit for squared values in Huber's proposal 2, in units of the variance. With this value, noise
-on one upper and one lower wire (13 % of the readings) raises the estimate by 20 %."""
+"""Clipping limit for squared values in Huber's proposal 2, in units of the variance. At a limit of 1, noise
+on one upper and one lower wire (13 % of the readings) raises the noise estimate by 20 %."""
 _CLIPPED_MEAN: Final = 0.5160585
 """Mean of min(z², 1) for a normal z: 1 − 2 φ(1)."""
 _STD: Final = 2.03
@@ -122,10 +122,10 @@ def _contrasts(
 ) -> tuple[int, int, int, float, float, float]:
     """Write the squared contrasts of the readings that changed, divided by the stated variances.
 
-    The arguments are those of :func:`assess_block`. Returns the number of changed readings, the number of
-    repeated readings, the number of compared pairs of neighbouring contrasts, the number of pairs with equal
-    signs minus the number with opposite signs, the fraction of the stated variance that is not due to
-    rounding, and the largest squared contrast in units of the rounding variance.
+    The arguments have the same meaning as in :func:`assess_block`. Returns six values: the numbers of changed
+    and of repeated readings; the number of pairs of neighbouring contrasts, and the sum of the signs of their
+    products; the fraction of the stated variance that is not due to rounding; and the largest squared
+    contrast, in units of the rounding variance.
     """
     count, silent, pairs, signs, share, largest = 0, 0, 0, 0.0, 0.0, 0.0
     for u in range(frames.shape[1]):

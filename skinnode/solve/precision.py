@@ -1,10 +1,10 @@
 """Precision of a field: whether its standard deviations are within the user's limits.
 
-The default limit for the displacement depends on the layout, the noise and the tolerances. The limit is the
-root of the sum of two squares: :data:`MULTIPLE` times the standard deviation of the exact inverse at rest,
-and a term for the tolerances. It is at most :data:`MOST` times the clearance. The standard deviations of a
-healthy patch are below the default limit; if readings are lost or the noise is higher than stated, they can
-exceed it.
+The default limit for the displacement depends on the layout, the noise and the tolerances. The default limit
+is the root sum square of two terms: :data:`MULTIPLE` times the standard deviation of the exact inverse at
+rest, and a term for the tolerances. The limit never exceeds :data:`MOST` times the clearance. The standard
+deviations of a healthy patch are below the default limit; if readings are lost or the noise is higher than
+stated, they can exceed it.
 """
 
 from __future__ import annotations
@@ -30,16 +30,16 @@ standard deviation was 12.2 times this RMS."""
 MOST: Final = 0.3
 """Maximum standard deviation, in clearances, for layouts and noise levels at which the displacement mainly
 depends on the prior. Of the 2,640 fields described at :data:`MULTIPLE`, only fields of thick patches (h = 1)
-with a relative noise of 1e-3 exceeded this limit."""
+with a relative noise of 1e-3 exceeded the limit of 0.3 clearances."""
 TOLERANCE_SHARE: Final = 0.06
-"""Contribution of ordinary manufacturing tolerances to the limit, in clearances; scaled with the largest
-tolerance. In presses with a relative noise of at most 1e-5, ordinary tolerances caused standard deviations of
-up to 0.028 clearances."""
+"""Contribution of ordinary manufacturing tolerances to the limit, in clearances. For other tolerances, the
+contribution is scaled with the largest tolerance. In presses with a relative noise of at most 1e-5, ordinary
+tolerances caused standard deviations of up to 0.028 clearances."""
 FORCE_SHARE: Final = 0.3
 """Maximum standard deviation of a normal force, divided by the product of modulus, clearance and pitch.
 
-In the fields described at :data:`MULTIPLE`, this ratio was at most 0.1; in presses of 50 % that were half
-outside the patch, it reached 0.26.
+In the fields described at :data:`MULTIPLE`, the force ratio was at most 0.1. In presses of 50 % that were
+half outside the patch, the force ratio reached 0.26.
 """
 
 

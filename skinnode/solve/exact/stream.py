@@ -28,8 +28,8 @@ from skinnode.solve.wires.problem import PatchProblem
 TOLERANCE: Final = 1e-9
 """Tolerance of a solve for the residual r, and for the positions x in pitches.
 
-The value is four orders of magnitude below the relative noise of a 24-bit converter. One Newton step from an
-error of 1e-5 reaches this tolerance.
+The tolerance is four orders of magnitude below the relative noise of a 24-bit converter. A single Newton step
+reduces an error of 1e-5 to less than 1e-9.
 """
 FRAME_STEPS: Final = 12
 """Maximum number of steps per solve; Newton's method takes 3 to 6 steps within the trust region."""

@@ -41,8 +41,8 @@ from skinnode.solve.wires.stages import DEADLINE
 UNIT_S: Final = 10e-6
 """Upper bound on the time for one evaluation of F and J and one step, s.
 
-Each call of the solver includes all wires that are certain to finish before the deadline. Ten calls instead
-of one would take as much additional time as solving ten more wires.
+Each call of the solver includes all wires that are certain to finish before the deadline. Splitting one
+solver call into ten would take as much additional time as solving ten more wires.
 """
 WIRE_UNITS: Final = FRAME_STEPS + 1 + COVARIANCE_UNITS
 """Maximum computing time for one wire in one frame, as a number of evaluations of F and J."""
@@ -154,10 +154,10 @@ class ExactTracker:
                 them.
 
         No resistance value raises an exception. A wire with fewer usable resistances than unknowns is
-        ILL_CONDITIONED, or NON_FINITE if resistances not marked as missing were unusable. Such a wire, and
-        any wire for which no solve finds a root, keeps its last trusted position with an infinite standard
-        deviation. The residual of an unsolved wire is computed at its last trusted position; after the
-        deadline, the residual is set to inf. Raises ValueError if a shape is wrong.
+        ILL_CONDITIONED, or NON_FINITE if resistances not marked as missing were unusable. A wire that cannot
+        be solved keeps its last trusted position with an infinite standard deviation. The residual of an
+        unsolved wire is computed at its last trusted position; if the deadline has passed, the residual is
+        inf. Raises ValueError if a shape is wrong.
         """
         start = perf_counter()
         arrays = self.arrays

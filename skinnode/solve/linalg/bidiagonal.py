@@ -1,7 +1,7 @@
 """Bidiagonal form of a small matrix, from which a damped step can be computed in O(n) operations.
 
-Levenberg-Marquardt tries several damping parameters per Jacobian. With the bidiagonal form, each trial takes
-O(n) operations; with J itself, it would take O(n³).
+Levenberg-Marquardt tries several damping parameters per Jacobian. For each damping parameter, the step takes
+O(n) operations with the bidiagonal form, and O(n³) with J itself.
 """
 
 from __future__ import annotations

@@ -124,7 +124,8 @@ class Attempt:
     def _is_root(self, tol_f: float) -> bool:
         """Return whether the solve ended at a root.
 
-        Sets the error estimate, and sets the status to ILL_CONDITIONED if x is too inaccurate.
+        The method also estimates the error of x; if the error is too large, the status becomes
+        ILL_CONDITIONED.
         """
         w, system = self._w, self._system
         square = system.m == system.n

@@ -28,10 +28,10 @@ INVALID_START: Final = int(Status.INVALID_START)
 
 EPS: Final = float(np.finfo(np.float64).eps)
 ROOT_SHARE: Final = EPS ** (1 / 2)
-"""Maximum estimated error of a root x, relative to max(1, ‖x‖∞). At this limit, half of the digits of x are
-correct."""
+"""Maximum estimated error of a root x, relative to max(1, ‖x‖∞). An error of √eps means that half of the
+digits of x are correct."""
 MINIMUM_SHARE: Final = EPS ** (1 / 3)
-"""Maximum estimated error of a minimum x of ‖r‖, relative to max(1, ‖x‖∞). The limit is larger than for a
+"""Maximum estimated error of a minimum x of ‖r‖, relative to max(1, ‖x‖∞). The limit is larger than that of a
 root, because rounding of ‖r‖² hides relative changes of √eps in x."""
 STATIONARY: Final = 1e-6
 """Component j of the gradient Jᵀr is treated as zero below this fraction of ‖J_j‖ ‖r‖, because of rounding

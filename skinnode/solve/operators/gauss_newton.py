@@ -29,9 +29,10 @@ from skinnode.solve.operators.work import (
 
 @njit_part
 def factor(w: Work) -> bool:
-    """Factor J, by LU if square and by QR if tall; set FACTORED, SINGULAR, SIGN, ERROR and ``newton``.
+    """Factor J (by LU if J is square, else by QR), and compute the Newton step.
 
-    Returns whether J has full rank.
+    Sets ``newton`` and the entries FACTORED, SINGULAR, SIGN and ERROR of the workspace. Returns whether J has
+    full rank.
     """
     n, flag = w.x.size, w.flag
     flag[FACTORED] = 1
@@ -110,8 +111,9 @@ def rounding(w: Work, x: Float) -> float:
 def estimate_error(w: Work, inverse: Float) -> float:
     """Write J⁺ into ``inverse`` (n, m), using the last factors; return a converged solve's error estimate.
 
-    The estimate is relative to max(1, ‖x‖∞). It is the sum of the last Newton correction and the error due to
-    rounding of x, which grows with the condition number of J. The estimate is inf if J is singular.
+    The error estimate is relative to max(1, ‖x‖∞). The error estimate is the sum of the last Newton
+    correction and the error due to rounding of x, which grows with the condition number of J. If J is
+    singular, the estimate is inf.
     """
     n, m = w.jt.shape
     if w.flag[SINGULAR] == 1:

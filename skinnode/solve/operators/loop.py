@@ -1,4 +1,4 @@
-"""Iteration loop shared by all operators. It uses reverse communication: the caller evaluates r and J.
+"""Iteration loop shared by all operators. The loop uses reverse communication: the caller evaluates r and J.
 
 - ``begin`` starts from x, r and J in the workspace.
 - ``propose`` factors J and, unless x is a root, makes the Newton step the next ``trial``.

@@ -34,9 +34,9 @@ class Solution:
     x: Float
     """(n,) best iterate."""
     status: Status
-    """Status of the solve. CONVERGED at a root and, if there are more equations than unknowns, at a
-    minimum. ILL_CONDITIONED at a minimum of a square system that is not a root, and at any point that the
-    equations do not determine."""
+    """Status of the solve. The status is CONVERGED at a root and, if there are more equations than unknowns,
+    at a minimum. The status is ILL_CONDITIONED at a point that the equations do not determine, and at a
+    minimum of a square system with r ≠ 0."""
     kind: PointKind
     """Type of the point: root, minimum or neither."""
     residual_norm: float
@@ -46,7 +46,7 @@ class Solution:
     error_estimate: float
     """Estimate of max |x − x*|; inf unless CONVERGED.
 
-    The estimate is the sum of the last Newton correction and the error due to rounding of x, which grows with
-    the condition number of J or, at a minimum, of the Hessian.
+    The error estimate is the sum of the last Newton correction and the error due to rounding of x, which
+    grows with the condition number of J or, at a minimum, of the Hessian.
     """
     stats: SolveStats

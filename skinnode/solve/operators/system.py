@@ -2,10 +2,10 @@
 
 Levenberg-Marquardt and dogleg make up to three attempts from the same start, with different trust regions.
 The first attempt uses Moré's column scaling with a radius of 100 ‖D x₀‖, as in MINPACK. The second uses D = I
-with a radius of ‖x₀‖, and the third uses D = I with a radius of 0.1 ‖x₀‖. Neither scaling is best for every
-system. Column scaling is suitable for unknowns with different units, but a column of J with a large norm near
-the start restricts all later steps. The attempts therefore take turns of 100, 200, 400, … steps each, until
-one attempt finds a root or minimum.
+with a radius of ‖x₀‖, and the third uses D = I with a radius of 0.1 ‖x₀‖. Neither column scaling nor D = I is
+best for every system. Column scaling is suitable for unknowns with different units, but a column of J with a
+large norm near the start restricts all later steps. The attempts therefore take turns of 100, 200, 400, …
+steps each, until one attempt finds a root or minimum.
 """
 
 from __future__ import annotations
@@ -34,8 +34,8 @@ With column scaling, the operators converged from 90 of 138 starts on 46 problem
 In 79 (dogleg) or 72 (Levenberg-Marquardt) of these 90 cases, 100 steps were enough.
 """
 RADII: Final = (1.0, 0.1)
-"""Initial trust radii of the attempts with D = I, relative to ‖x₀‖. Both values are used because each
-succeeds from some starts from which the other fails."""
+"""Initial trust radii of the attempts with D = I, relative to ‖x₀‖. Each radius is used because it succeeds
+from some starting points from which the other radius fails."""
 
 
 def operator_code(name: str) -> int:

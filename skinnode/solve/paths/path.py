@@ -38,13 +38,13 @@ from skinnode.solve.wires.problem import PatchProblem
 SELECTION: Final = Accuracy(tolerance=1e-12, max_steps=100)
 """Accuracy of a solve that starts from the posterior.
 
-The values are those of the paper: the tolerance for the last sample, and the maximum number of steps for
-earlier samples.
+The tolerance is that of the paper for the last sample; the maximum number of steps is that of the paper for
+all earlier samples.
 """
 STARTS: Final = 12
 """Number of random starting points in the search for other roots of F = b.
 
-The points are drawn from the posterior with a fixed random seed.
+The starting points are drawn from the posterior with a fixed random seed.
 """
 
 
@@ -52,9 +52,9 @@ The points are drawn from the posterior with a fixed random seed.
 class PathResult:
     """Solution at the end of a path, and a log of the solver calls on the path.
 
-    Row s of ``position``, ``steps``, ``evaluations`` and ``optimality`` describes solver call s. If the call
-    skipped a wire, the position and the optimality of this wire are NaN. Calls after the first solve of the
-    last sample are second attempts and checks.
+    Row s of ``position``, ``steps``, ``evaluations`` and ``optimality`` belongs to solver call number s. If
+    the call skipped a wire, the position and the optimality of this wire are NaN. Calls after the first solve
+    of the last sample are second attempts and checks.
     """
 
     upper_m: Float
@@ -102,8 +102,8 @@ def solve_path(
 
     - the determinant of its Jacobian changed sign on the path;
     - an electrode crossed the lower layer;
-    - there is an equally smooth root on the other side of a nearby fold;
-    - the path ended smoothly at another root; this root is then reported.
+    - an equally smooth root exists on the other side of a nearby fold;
+    - the path ended smoothly at a different root, which is then reported instead.
 
     The skin itself can cross a fold. A root across a fold is therefore accepted if both the path and the
     posterior of the patch lead to this root.

@@ -163,7 +163,7 @@ class PathTracker:
     def walk(self, todo: Mask, samples: list[int], accuracy: Accuracy) -> None:
         """Follow the given wires (U,) from rest along ``samples``, and store where their paths end.
 
-        The samples are in time order and include the last sample of the press. The method does not change the
+        ``samples`` is in time order and includes the last sample of the press. The method does not change the
         positions of the wires or :attr:`end`.
         """
         x = self.solver.x.copy()

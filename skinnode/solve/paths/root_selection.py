@@ -24,8 +24,8 @@ from skinnode.solve.starts import guided_start, near_twin
 from skinnode.solve.wires import arrays as wires
 
 GUIDED_STEPS: Final = 100
-"""Maximum number of steps of a solve that starts at the smoothest displacement (:func:`guide`). Solves near a
-root take 1 to 20 steps; the others do not converge at all."""
+"""Maximum number of steps of a solve that starts at the smoothest displacement (:func:`guide`). A solve that
+starts near a root takes 1 to 20 steps; all other solves never converge."""
 TWIN: Final = Accuracy(tolerance=1e-9, max_steps=30)
 """Accuracy of roots that are only compared with other roots.
 
@@ -55,8 +55,8 @@ def doubtful(tracker: PathTracker) -> Mask:
 def guide(tracker: PathTracker, todo: Mask, accuracy: Accuracy) -> None:
     """Solve the last sample from the smoothest displacement that explains it; keep the smoother root.
 
-    If the new root is across a fold, this function also solves for its twin on the same side as the rest
-    position. If neither solve finds a root for a wire, the wire's status is not CONVERGED.
+    If the new root is across a fold, :func:`guide` also solves for its twin on the side of the rest position.
+    If neither solve finds a root for a wire, the wire's status is not CONVERGED.
 
     Args:
         tracker: Tracker at the end of its path.
@@ -204,9 +204,9 @@ def heed_samples(tracker: PathTracker, accuracy: Accuracy) -> None:
     """Reject roots that differ from the end of a smooth path; move their wires back to that end.
 
     If the skin itself crosses a fold, a root on the near side of the fold can be smoother and likelier than
-    the true root. :func:`guide` and the posterior then both find the wrong root; only the path leads to the
-    true root. If the posterior is wrong on one wire, the roots of all other wires that moved away from the
-    end of their paths are rejected too.
+    the true root. :func:`guide` and the posterior both find the wrong root in this case; only the path leads
+    to the true root. If the posterior is wrong on one wire, the roots of all other wires that moved away from
+    the end of their paths are rejected too.
     """
     if not tracker.second_tries:
         return  # without second tries, every wire is already at the end of its path

@@ -62,7 +62,7 @@ class Uniform:
     Args:
         steps: Number of samples to solve; by default, or if there are fewer samples, all samples are solved.
         plain: Whether to start each sample at the last solution, as the paper does (Lahaye), and to leave
-            each wire at the outcome of the last sample. Otherwise, each sample starts on the secant through
+            each wire at the outcome of the last sample. If False, each sample starts on the secant through
             the last two solutions, and a wire without a plausible root at the last sample is solved again,
             starting from the smoothest displacement. In tests with presses of 50 %, starting on the secant
             reduced the number of unsolved wires from 7 of 197 to 0, and the number of evaluations per sample
@@ -104,19 +104,19 @@ class Uniform:
 class Periodic:
     """Schedule that solves one sample per cycle of T samples (section 5.2 of the paper).
 
-    The samples between two solves are skipped, because the last solution satisfies their equations within the
+    The other samples of a cycle are skipped, because the last solution satisfies their equations within the
     tolerance.
 
     The cycle is determined from the samples themselves. The path is followed from the rest position with a
     tolerance of 1e-6, then 1e-5, and so on. Samples are skipped while their first-order optimality is below
     the tolerance. T is the median number of samples from one solve to the next, for the wire that is solved
-    most often. With the first tolerance for which T is at least 2, the path then restarts from rest and
-    solves every T-th sample. The last sample is always solved. A cycle must have at least two samples and
-    occur at least twice. If no tolerance yields a cycle, every sample is solved with a tolerance of 1e-6.
+    most often. If T is at least 2, the path restarts from rest and solves every T-th sample with the same
+    tolerance. The last sample is always solved. A cycle must have at least two samples and occur at least
+    twice. If no tolerance yields a cycle, every sample is solved with a tolerance of 1e-6.
 
-    The tolerances of the paper are not directly comparable. The paper solves an unscaled problem, in which
-    ‖Jᵀr‖∞ is larger by a factor of F² than here, where r = a F − 1 and lengths are in pitches. The value of F
-    depends on the unit of length, which the paper does not state.
+    The tolerances of this class and of the paper are not directly comparable. The paper solves an unscaled
+    problem, in which ‖Jᵀr‖∞ is larger by a factor of F² than here, where r = a F − 1 and lengths are in
+    pitches. The value of F depends on the unit of length, which the paper does not state.
 
     Args:
         cycle: Cycle T in samples, if known from an earlier press of the same size and rate; None to search
@@ -145,7 +145,7 @@ class Periodic:
         _require(self, "intermediate_tolerance", "final_tolerance", "intermediate_steps", "final_steps")
 
     def follow(self, tracker: PathTracker) -> None:
-        """Find the cycle, return to the rest position, and solve the sample at the end of each cycle."""
+        """Find the cycle, return to the rest position, and solve the last sample of each cycle."""
         tracker.cycle, tolerance = self.cycle, self.intermediate_tolerance
         if tracker.cycle is None:
             tracker.cycle, tolerance = self._search(tracker)
@@ -160,7 +160,7 @@ class Periodic:
         _finish(tracker, self)
 
     def _search(self, tracker: PathTracker) -> tuple[int | None, float]:
-        """Return the cycle and the tolerance for which it was found; the cycle is None if there is none."""
+        """Return the cycle (None if the solves have no period) and the tolerance for which it was found."""
         for tolerance in RELAXED_TOLERANCES:
             tracker.restart()
             accuracy = Accuracy(tolerance, self.intermediate_steps)
@@ -192,22 +192,22 @@ def shortest_cycle(solved: NDArray[np.bool_]) -> int | None:
 class Adaptive:
     """Schedule that minimises the number of points solved per wire; interpolates R between samples.
 
-    Each wire has its own step length. From each point, the wire takes an Euler step along ∂X/∂R, computed
-    from the factors of the last Jacobian, and then operator steps. The next step length is chosen to maintain
-    the contraction ratio of Newton's method. The error of an Euler step grows with the square of its length
-    (Deuflhard 2004, section 5.1.3), and F is smooth on the scale of the clearance between the layers. A step
-    that does not reach a root on the branch of the rest position is undone and halved.
+    Each wire has its own step length. Each step starts with an Euler step along ∂X/∂R, computed from the
+    factors of the last Jacobian; operator steps then correct the position. The next step length is chosen to
+    maintain the contraction ratio of Newton's method. The error of an Euler step grows with the square of its
+    length (Deuflhard 2004, section 5.1.3), and F is smooth on the scale of the clearance between the layers.
+    A step that does not reach a root on the branch of the rest position is undone and halved.
 
     The interpolated resistances do not belong to a real deformation, so the path can reach a fold (det J = 0)
     even if the press does not. If a wire cannot pass such a fold, or if its root is implausibly rough, the
     wire is solved again by Levenberg-Marquardt, starting from the smoothest displacement that explains the
-    last sample (:func:`skinnode.solve.starts.guided_start`). If this solve finds another root, the smoother
-    root is kept.
+    last sample (:func:`skinnode.solve.starts.guided_start`). If Levenberg-Marquardt finds a second root, the
+    smoother root is kept.
 
     The path leads from the patch at rest to the frame to solve, so one sample is enough. If there are more
     samples, each wire with a doubtful root is also followed sample by sample, and so is each wire that moved
-    far enough to have crossed a fold. The smoother root of such a wire can be wrong, and only the samples
-    show this.
+    far enough to have crossed a fold. After a fold has been crossed, the smoother root can be wrong, and only
+    the samples show this.
 
     Args:
         points: Maximum number of path points to attempt per wire.

@@ -6,16 +6,15 @@ of a neighbouring peak. Two peaks with adjacent areas are separate contacts only
 is much smaller than at both peaks, and the difference is significant (topological persistence).
 
 A peak is a contact if one of three values is significant: its load sum, the χ² of the loads of the same
-cells, or the sum of the loads over its area. The strongest peak is also a contact if the skin is
-significantly indented there. Significant indentation indicates a touch even if the loads cannot be located.
+cells, or the sum of the loads over its area. The strongest peak is also a contact if the skin at this peak is
+significantly indented. Significant indentation indicates a touch even if the loads cannot be located.
 
 Only cells with an electrode are tested. Beyond the outermost electrodes, a small load nearby and a large load
 farther away cause nearly the same displacement. Cells beyond the outermost electrodes are added to the
 adjacent contact.
 
-The thresholds have hysteresis, so that contacts do not appear and disappear because of noise. With
-hysteresis, the load sum between two peaks must change by a third before one contact is split or two are
-merged.
+The thresholds have hysteresis, so that contacts do not appear and disappear because of noise. To split a
+contact in two, or to merge two contacts, the load sum between the peaks must change by a third.
 """
 
 from __future__ import annotations
@@ -31,14 +30,14 @@ from skinnode.model.layout import Float
 from skinnode.solve.linalg.vectors import Index
 
 SIGNIFICANT: Final = 5.0
-"""Minimum significance of a load, in standard deviations, for the load to be a contact. If each frame has 100
-load sums, noise exceeds this threshold about once in ten thousand frames."""
+"""Minimum significance of a load, in standard deviations, for the load to be a contact. With 100 load sums
+per frame, noise exceeds five standard deviations about once in ten thousand frames."""
 SIGNIFICANT_STILL: Final = 4.0
 """Value of :data:`SIGNIFICANT` for a contact that existed in the last frame."""
 BLOCK_EXTRA: Final = 22.0
 """Amount by which the χ² of the nine loads around a peak must exceed the square of the significance
-threshold. For a threshold of 5, the limit is thus 47; with nine degrees of freedom, χ² exceeds 47 as rarely
-as a normal variable exceeds five standard deviations."""
+threshold. With nine degrees of freedom, χ² exceeds 25 + 22 as rarely as a normal variable exceeds five
+standard deviations."""
 PRESSED: Final = 6.0
 """Minimum indentation of the skin, in standard deviations, for the strongest peak to be a contact."""
 PRESSED_STILL: Final = 5.0
@@ -51,16 +50,16 @@ RELEVANT_STILL: Final = 0.15
 PART: Final = 0.1
 """Minimum load sum of the cells of a contact, as a fraction of the load sum at the contact's peak."""
 PART_SIGNIFICANT: Final = 3.0
-"""Minimum load sum of the cells of a contact, in standard deviations of the peak's load sum. Without this
-limit, noise would shift the centres of very light touches by a pitch."""
+"""Minimum load sum of the cells of a contact, in standard deviations of the peak's load sum. The limit
+prevents noise from shifting the centre of a very light touch, by up to a pitch."""
 PART_MOST: Final = 0.6
 """Load sum, as a fraction of the peak's, above which a cell belongs to the contact even if its load sum is
 not significant."""
 GAP: Final = 0.5
 """Two peaks are separate contacts only if the load sum between them is below this fraction of the smaller
-peak's load sum. With values from 0.4 to 0.6, no single body was split in
-``tests/solve/test_contact_number.py``; with 0.75, plates at the edge of the patch were split. Two spheres are
-separated if they are at least 5 pitches apart."""
+peak's load sum. Limits from 0.4 to 0.6 split no single body in ``tests/solve/test_contact_number.py``; a
+limit of 0.75 split plates at the edge of the patch. Two spheres are separated if they are at least 5 pitches
+apart."""
 GAP_ONE: Final = 0.4
 """Value of :data:`GAP` for two peaks that were one contact in the last frame."""
 GAP_TWO: Final = 0.6

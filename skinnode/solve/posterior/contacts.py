@@ -32,16 +32,16 @@ r²/a²)."""
 PULLING: Final = 0.25
 """Ratio of the sum of all loads of a contact to the sum of its pressing loads, below which pulling loads are
 left out. The half-space model needs pulling loads at the rim of a contact to reproduce the displacement of a
-supported layer; for bonded layers of 8 mm or less, this ratio was at most 0.15. For contacts on a half-space,
-the ratio was at least 0.33."""
+supported layer. Measured ratios of the two sums were at most 0.15 on bonded layers of 8 mm or less, and at
+least 0.33 on a half-space."""
 PULLED_OFF: Final = 0.1
 """Standard deviation, in cell widths, of a contact's centre along the surface if pulling loads are left out.
-On layers of 2 to 8 mm, the measured RMS error was at most 0.11. The standard deviation of the area is then at
-least as large as the area."""
+The measured RMS error of the centre on layers of 2 to 8 mm was at most 0.11 cell widths. If pulling loads are
+left out, the standard deviation of the area is at least as large as the area."""
 BEYOND: Final = 1.0
-"""Standard deviation of the loads in the outermost ring of cells, relative to these loads. The ring
-represents all loads beyond the patch. With a value of 0.5, force errors under plates larger than the patch
-reached 4.8 standard deviations."""
+"""Standard deviation of the loads in the outermost ring of cells, relative to these loads. The outermost ring
+represents all loads beyond the patch. If the value were 0.5, force errors under plates larger than the patch
+would reach 4.8 standard deviations."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -75,8 +75,8 @@ class ContactFinder:
             bonded to a rigid support.
         thickness: Tolerance of the thickness, as a fraction of the clearance.
         outermost: Whether to add the loads of the outermost ring of cells to an adjacent contact. Use False
-            if the prior expects equal loads everywhere, because such a prior moves too much load into the
-            outermost ring.
+            if the prior expects equal loads everywhere; too much load is then estimated in the outermost
+            ring.
     """
 
     def __init__(  # noqa: PLR0913 - what the patch is

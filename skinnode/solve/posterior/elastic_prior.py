@@ -28,15 +28,15 @@ from skinnode.solve.posterior.load_cells import MARGIN, LoadCells
 
 SHEAR_SHARE: Final = 0.4
 """Ratio of the expected shear loads to the expected normal loads (standard deviations). The marginal
-likelihood of the data is nearly constant for ratios from 0.25 to 0.4. With smaller ratios, the standard
-deviations are too small on layouts that are insensitive to shear (`aligned`)."""
+likelihood of the data is nearly constant for shear ratios from 0.25 to 0.4. If the prior expects less shear,
+the standard deviations are too small on layouts that are insensitive to shear (`aligned`)."""
 LAYER_SHARE: Final = 0.25
 """Size of the displacements that the data check expects on a bonded layer, relative to those on a half-space.
-With 0.1, a dent in a thin layer was reported as a faulty wire. With 0.5 or more, the data check does not
-detect an upper wire with readings that are delayed by four scans."""
+If the value is too small (0.1), a dent in a thin layer is mistaken for a faulty wire. If the value is too
+large (0.5), delayed readings of an upper wire are not detected."""
 SLACK: Final = 0.005
-"""Ratio of ε to the standard deviation of the normal displacement. A positive ε makes C invertible. With
-values from 0.001 to 0.02, the estimates are the same."""
+"""Ratio of ε to the standard deviation of the normal displacement. A positive ε makes C invertible. The
+estimates do not change for values of ε from 0.001 to 0.02."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -41,12 +41,12 @@ from skinnode.solve.wires.decode import A_MAX, A_MIN
 from skinnode.solve.wires.problem import PatchProblem
 
 NOISE_LEAST: Final = 1e-6
-"""Minimum relative noise used in a solve. The accuracy of the forward model is no better. With less noise,
-the solve would always end at a root of F = b, possibly a wrong root. On layouts with folds, wrong roots occur
-even with ten times this noise."""
+"""Minimum relative noise used in a solve. The value also represents the accuracy of the forward model. If the
+noise were smaller, every solve would end at a root of F = b, possibly a wrong root. On layouts with folds
+(det J = 0), wrong roots occur even with a noise of 1e-5."""
 LEFT_OUT: Final = 3
-"""Maximum number of wires that are left out of a frame. If the other wires are still inconsistent, all wires
-are INCONSISTENT."""
+"""Maximum number of inconsistent wires that are left out of a frame. If more wires are inconsistent, all
+wires of the frame are INCONSISTENT."""
 LEAST_STEPS: Final = 3.0
 """Minimum duration of a solve from rest, as a multiple of the time to factorise all wires and compute their
 standard deviations. In measurements, solves of presses on 1 to 10 wires took 11 to 20 times as long as this
@@ -160,7 +160,7 @@ class FrameEstimator:
             self._contacts.reset()
         self._contacts_found: tuple[Contact, ...] = ()
         self._force = np.zeros((*self.layout.upper_m.shape,))
-        self._compared = np.zeros_like(self._trusted)  # field at the last comparison with an annealed field
+        self._compared = np.zeros_like(self._trusted)  # last field that was compared with an annealed field
         self._annealed = False  # whether the current field was annealed from rest
         self._known = False  # whether the estimator's factors belong to the trusted field
         self._wires = np.arange(wires)
@@ -200,7 +200,7 @@ class FrameEstimator:
             except TimeoutError:
                 known = self._known
                 status, held = self._give_up(Status.DEADLINE)
-                self._known = known  # the next frame starts from the same field as this frame
+                self._known = known  # start the next frame from the last trusted field
             observation = self._observe(readings)
         return self._field(observation, status, held, start)
 
@@ -256,7 +256,7 @@ class FrameEstimator:
         estimate = self.noise_estimate
         if estimate is not None:
             if estimate.see(frame, noise, rounding_ohm, mask):
-                self._seen = np.zeros_like(self._seen)  # the trusted field assumed other noise
+                self._seen = np.zeros_like(self._seen)  # the noise of the trusted field was different
             if estimate.factor != 1.0:
                 noise = estimate.factor * noise
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
@@ -383,7 +383,8 @@ class FrameEstimator:
     def _anneal_and_compare(self, observation: Observation, members: Index) -> bool:
         """Anneal from rest, and keep the more likely of the tracked and the annealed field.
 
-        This comparison is made after large movements, because tracking may then have reached a wrong maximum.
+        Called after large movements, because tracking can end at a wrong maximum if the field changes
+        strongly.
         """
         estimator = self._estimator
         self._compared[:] = estimator.moved

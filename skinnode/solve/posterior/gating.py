@@ -19,7 +19,7 @@ QUIET_CHANCE: Final = 0.005
 """Probability per frame that the χ² test reports an unmoved wire as moved."""
 QUIET_DEVIATIONS: Final = 3.7
 """Maximum apparent movement of a coordinate, in standard deviations, for its wire to be considered unmoved.
-With 300 coordinates at rest, noise alone exceeds this limit in one frame in 15."""
+For 300 coordinates at rest, noise alone exceeds the limit of 3.7 in one frame in 15."""
 KEPT: Final = 50
 """Number of frames for which a wire stays in the estimate after an unexpected movement."""
 
@@ -36,7 +36,7 @@ class Fit(NamedTuple):
 
 
 class Gate:
-    """χ² tests for one patch, and the list of wires that are kept in the estimate.
+    """χ² tests for the wires of one patch, and a list of wires that moved in recent frames.
 
     Args:
         wires: Number of upper wires.

@@ -148,7 +148,7 @@ def _linearise(  # noqa: PLR0913 - a kernel: arrays by name
     normal: Float, outward: Float, placement: float, square: float, gain: float, g: Float, rows: Float,
     slopes: Float, r: Float, jt: Float, effect: Float,
 ) -> None:  # fmt: skip
-    """Write residuals, Jacobians and effects at the shifted positions ``x``, ``rest`` and ``lower``.
+    """Write the residuals, Jacobians and effects H for the shifted positions ``x``, ``rest`` and ``lower``.
 
     ``rows`` (4, K) and ``slopes`` (3, 3N, K) are work arrays.
     """
@@ -274,7 +274,7 @@ def _product(first: Float, second: Float, start: int, stop: int) -> float:
 
 @njit
 def add_covariance(members: Index, effect: Float, g: Float, y: Float, s: Float) -> None:
-    """Add H Hᵀ of the wires ``members`` to the upper triangle of ``s``, and −H g to ``y``.
+    """Add H Hᵀ to the upper triangle of ``s``, and −H g to ``y``, for the wires ``members``.
 
     ``g`` contains only the geometry nuisances. Two residuals of the same upper wire share its nuisances, as
     do two residuals of the same lower wire. All residuals share the common nuisances.

@@ -19,19 +19,19 @@ from skinnode.solve.posterior.map_estimate import MapEstimator
 from skinnode.solve.posterior.observation import Observation
 
 SCALE_WORTH: Final = 2.0
-"""Weight of the prior on s², as an equivalent number of parameters. For comparison, the data typically
-determine 100 to 200 parameters."""
+"""Weight of the prior on s², as an equivalent number of parameters. The weight is small, because the data
+typically determine 100 to 200 parameters."""
 SCALE_REST: Final = 0.005
 """Expected value of the prior scale s, in clearances; typical of presses that indent the layer by a tenth of
 its thickness."""
 SCALE_MOST: Final = 1.0
 """Maximum prior scale s, in clearances; with a larger scale, the surface could be below the lower layer."""
 SCALE_STEP: Final = math.log(1.25)
-"""Minimum change in the logarithm of the prior scale that triggers an update. The standard deviations change
-by a smaller factor than the scale."""
+"""Minimum change in the logarithm of the prior scale that triggers an update. The standard deviations of the
+field change by a smaller factor than the prior scale."""
 SCALE_LEAST: Final = 1.0
 """Minimum prior scale, relative to the scale at which the expected change in the resistances equals their
-noise. Smaller displacements cannot be detected, so the standard deviations must cover them."""
+noise. Displacements below the noise cannot be detected, so the standard deviations must cover them."""
 ADAPTIONS: Final = 5
 """Maximum number of updates of the prior or the noise per frame."""
 REFINEMENTS: Final = 3

@@ -1,9 +1,9 @@
 """Prior of the loads on a patch, and of the displacement that the loads cause.
 
 Initially, the prior expects equal loads over the whole patch, with one scale s². After loads have been found,
-the prior expects loads mainly where they were found (:meth:`LoadPrior.localise`). The skin next to a contact
-then moves only as far as the contact's loads require. In tests, this reduced displacement errors by a factor
-of two to three. Without it, errors under narrow contacts were larger than the reported standard deviations.
+the prior expects loads mainly where they were found (:meth:`LoadPrior.localise`). The estimated displacement
+of the skin next to a contact is then only as large as the contact's loads require. In tests, concentrating
+the expected loads reduced displacement errors by a factor of two to three.
 """
 
 from __future__ import annotations
@@ -24,22 +24,21 @@ from skinnode.solve.linalg.vectors import Index
 from skinnode.solve.posterior.elastic_prior import SLACK, ElasticPrior
 
 LOCAL_SPREAD: Final = 0.7
-"""Standard deviation, in cells, of the Gaussian that spreads the squared loads over neighbouring cells. With
-a smaller value, the displacement is more accurate if the rubber behaves like a half-space, but the standard
-deviations are too small if it does not. With a value of 1, the benefit of :meth:`LoadPrior.localise` is a
-quarter smaller."""
+"""Standard deviation, in cells, of the Gaussian that spreads the squared loads over neighbouring cells. A
+smaller spread improves the displacement if the rubber behaves like a half-space; if it does not, the standard
+deviations are too small. A spread of 1 reduces the benefit of :meth:`LoadPrior.localise` by a quarter."""
 LOCAL_FLOOR: Final = 0.05
-"""Mean square load expected in cells where no load was found, relative to the mean over the patch. This
+"""Mean square load expected in cells where no load was found, relative to the mean over the patch. The
 minimum allows for light touches near a press."""
 LOCAL_CHANGE: Final = 0.35
-"""The prior is rebuilt if at least this fraction of the expected loads has changed location. In tests with
-slow presses, displacement errors reached 6 standard deviations with a value of 0.5; with 0.25, the prior was
-rebuilt twice as often."""
+"""The prior is rebuilt if at least this fraction of the expected loads has changed location. In slow presses,
+displacement errors reached 6 standard deviations if the fraction was 0.5; the prior was rebuilt twice as
+often if the fraction was 0.25."""
 LOCAL_SURPRISE: Final = 16.0
 """Maximum ratio of a cell's squared load to its expected squared load; at larger ratios, the prior is rebuilt
-even if the load locations hardly changed. Without this limit, displacement errors reached 7 standard
-deviations when the depth of a press doubled in one frame. In slow presses, the limit does not increase the
-number of factorisations."""
+even if the load locations hardly changed. The limit is needed when the depth of a press doubles in one frame:
+displacement errors reached 7 standard deviations without the limit. In slow presses, the limit does not
+increase the number of factorisations."""
 
 
 class LoadPrior:

@@ -32,8 +32,8 @@ from skinnode.solve.posterior.observation import Observation, eased
 from skinnode.solve.wires.problem import PatchProblem
 
 ANNEAL_NOISE: Final = 0.03
-"""Initial relative noise for annealing. With so much noise, one Gauss-Newton step from rest nearly reaches
-the maximum."""
+"""Initial relative noise for annealing. If the assumed noise is 3 %, one Gauss-Newton step from rest nearly
+reaches the maximum."""
 ANNEAL_RATIO: Final = 4.0
 """Ratio of the noise in one annealing step to the noise in the next step. In tests with 80 presses of up to
 70 %, annealing reached the correct maximum in all cases with a ratio of 3, and in 79 cases with a ratio of
@@ -49,8 +49,8 @@ NEWTONS: Final = 12
 """Maximum number of factorisations in a solve that starts near the maximum. One or two factorisations are
 typical; more are needed if full steps oscillate."""
 NEWTONS_MADE: Final = 40
-"""Maximum number of factorisations in a solve with geometry errors. Convergence is slower because the maximum
-is at the end of a curved ridge: on one layout, 12 factorisations were not enough for one in three presses."""
+"""Maximum number of factorisations in a solve with geometry errors. Geometry errors slow down convergence,
+because the maximum of the posterior is at the end of a curved ridge."""
 FLAT: Final = 0.1
 """Convergence threshold of a solve with geometry errors: the decrease in −2 log posterior over
 :data:`FLAT_STEPS` factorisations."""
@@ -58,18 +58,18 @@ FLAT_STEPS: Final = 4
 """Number of factorisations over which the decrease in −2 log posterior is compared with :data:`FLAT`."""
 EFFECT_STEP: Final = 0.2
 """Relative change (root sum of squares) in the effects of the geometry errors above which the factors and
-standard deviations are recomputed. With smaller changes, the relative change in the standard deviations is
-also below this value."""
+standard deviations are recomputed. If the effects change by less, the relative change in the standard
+deviations is also below 0.2."""
 HALVINGS: Final = 6
 """Maximum number of halvings of a Gauss-Newton step."""
 PRIOR_DOUBT: Final = 3.0
 """Factor by which the prior's part of the variance is multiplied, because the expected loads are known only
-roughly. In tests of difficult cases, such as first touches and dents that cannot form on a half-space,
-displacement errors reached 7 standard deviations with a factor of 1, and 5.6 with a factor of 2."""
+roughly. With a factor of 1, displacement errors in difficult cases reached 7 standard deviations (first
+touches, dents that cannot form on a half-space); with a factor of 2, errors reached 5.6."""
 SMOOTH_SHARE: Final = 0.25
 """Factor by which the prior's part of the variance is multiplied for the 95 % interval. The factor is below
 1, because the loads of real bodies are smoother than the prior's independent loads. Factors computed from
-measured errors were at most 0.13 for spheres and 0.02 to 0.5 for Gaussian dents."""
+measured displacement errors were at most 0.13 for spheres and 0.5 for Gaussian dents."""
 
 
 class MapEstimator:
@@ -390,9 +390,9 @@ class MapEstimator:
     def _shorten(self, observation: Observation, moved: Float, g: Float) -> None:
         """Shorten the last step to the minimum of a parabola fitted to the objective.
 
-        The step started at ``moved`` and ``g``. Gauss-Newton neglects the curvature of F. If the data
-        determine only a few parameters, full steps can therefore oscillate about the minimum without
-        converging.
+        ``moved`` and ``g`` are the displacement and the nuisances before the step. Gauss-Newton neglects the
+        curvature of F. If the data determine only a few parameters, full steps can therefore oscillate about
+        the minimum without converging.
         """
         way = self.moved - moved, self.g - g
 

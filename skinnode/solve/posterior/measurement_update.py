@@ -13,9 +13,9 @@ With J = ∂r/∂x, block-diagonal over wires, one Gauss-Newton step from x is
 
 S is the innovation covariance, s² J C the cross-covariance and K = s² C Jᵀ S⁻¹ the Kalman gain. The posterior
 covariance at x⁺ is s² C − Vᵀ V with V = L⁻¹ (s² J C) and L Lᵀ = S (Tarantola, Inverse Problem Theory, 2005,
-3.4). All eigenvalues of S are at least 1, so rounding errors do not depend on the condition number of J. They
-are at most ε ‖S‖ standard deviations, where ε is the machine precision. For residuals of 10⁶ σ, this is a
-thousandth of a standard deviation.
+3.4). All eigenvalues of S are at least 1, so rounding errors do not depend on the condition number of J. The
+rounding errors are at most ε ‖S‖ standard deviations, where ε is the machine precision; for signals of 10⁶ σ,
+that is a thousandth of a standard deviation.
 
 Newton steps with the factors of an older J (chord steps) converge to the same maximum. At the maximum of the
 posterior, e_x = −s² C Jᵀ (r − H g) − x and e_g = d Hᵀ (r − H g) − g vanish. With the old J, H and S, a chord
@@ -26,7 +26,7 @@ step is
 A chord step requires two triangular solves.
 
 If a wire has more equations than unknowns, a QR decomposition of [J H] first reduces them to one equation per
-unknown without loss of information. This reduction is not possible with geometry errors
+unknown without loss of information. The QR reduction is not possible with geometry errors
 (:mod:`skinnode.solve.posterior.geometry_error`), because each lower wire has its own nuisances. In g, the
 geometry errors follow the other p nuisances. For the geometry errors, H is sparse, and only the non-zero
 effects on each residual are stored.

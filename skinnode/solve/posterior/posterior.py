@@ -73,11 +73,11 @@ class Posterior(FrameEstimator):
     ) -> FieldFrame:
         """Estimate the displacement field, loads and contacts of one frame.
 
-        This method never raises an exception because of a resistance value. The displacement of a wire
-        without usable resistances is estimated from its neighbours; its standard deviation is larger. A wire
-        whose resistances no deformation explains is INCONSISTENT and left out of the estimate. If a wire does
-        not converge even when solved alone, it has the status MAX_STEPS and is also left out. If the whole
-        frame cannot be solved, the last trusted field is returned with an infinite standard deviation.
+        Resistance values never raise an exception. The displacement of a wire without usable resistances is
+        estimated from its neighbours; its standard deviation is larger. A wire whose resistances no
+        deformation explains is INCONSISTENT and left out of the estimate. If a wire does not converge even
+        when solved alone, it has the status MAX_STEPS and is also left out. If the whole frame cannot be
+        solved, the last trusted field is returned with an infinite standard deviation.
 
         Args:
             frame_ohm: (U, K) resistances, ohm; values that are not positive and finite are ignored.

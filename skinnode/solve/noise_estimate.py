@@ -14,7 +14,7 @@ readings (Huber, Robust Statistics, 1981, proposal 2) limits the effect of a few
 on a few wires, on the estimate of a block. The median over the last blocks limits the effect of a bad block.
 
 Readings that repeat exactly are not used, because they do not show whether the converter has little noise or
-is frozen. If the rounding error is known, the ratio applies only to the noise before the converter. If most
+is frozen. If the rounding error is known, the ratio applies only to the noise before the converter. If many
 codes repeat and the others change by only one code, the noise is at most half a code; the estimator then
 assumes half a code.
 """
@@ -52,7 +52,7 @@ With a noise of half a code, a tenth of the readings repeat in all four frames. 
 of the codes is not the sum of the noise variance and the rounding variance.
 """
 ALIVE: Final = 4
-"""Minimum number of changed readings in a block of mostly repeated readings; 0 for a frozen converter."""
+"""Minimum number of changed readings in a usable block in which many readings repeat."""
 SAME: Final = 1e-14
 """Maximum contrast of a repeated reading, as a fraction of the reading; allows for float64 rounding."""
 DEVIATIONS: Final = 4.0

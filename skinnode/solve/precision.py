@@ -92,7 +92,7 @@ def is_precise(field: FieldFrame, limits: PrecisionLimits) -> bool:
 
 
 def _at_rest(layout: PatchLayout, options: TrackerOptions) -> float:
-    """Return the standard deviation of the exact inverse at rest, in clearances; inf if undefined."""
+    """Return the standard deviation of the exact inverse at rest, in clearances, or inf."""
     unknowns = layout.unknowns // 3 if options.normal_only else layout.unknowns
     if layout.shape[1] < unknowns:
         return math.inf

@@ -39,7 +39,7 @@ from skinnode.solve.wires.solve_wires import COVARIANCE_UNITS
 from skinnode.solve.wires.stages import DEADLINE
 
 UNIT_S: Final = 10e-6
-"""Upper bound on the time for one evaluation of F and J and one step, s.
+"""Upper bound on the time for one solver step, including an evaluation of F and J, s.
 
 Each call of the solver includes all wires that are certain to finish before the deadline. Splitting one
 solver call into ten would take as much additional time as solving ten more wires.

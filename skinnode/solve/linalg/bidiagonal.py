@@ -19,12 +19,12 @@ def bidiagonalise(  # noqa: C901, PLR0913 - four rows at a time; every result of
 ) -> None:
     """Decompose A (n, m), n ≤ m, as P Bᵀ Qᵀ with P and Q orthogonal and B (n, n) upper bidiagonal.
 
-    ``a`` (n + 3, whole lanes of m) contains A padded with zeros, so that loops over four rows and whole
-    vectors need no special cases. Writes B to ``diagonal`` (n,) and ``upper`` (n,), whose last element is 0.
-    For the reflectors I − β v vᵀ of Q, writes v to the rows of ``a`` and β to ``across`` (n,). For the
-    reflectors of P, writes v to the rows of ``left`` (n, whole lanes of n + 3) and β to ``down`` (n,). ``w``
-    is a scratch array as long as a row of ``a``. The squares of A's elements must not overflow (algorithm:
-    Golub & Van Loan, 5.4.8, rows and columns swapped).
+    ``a`` contains A padded with zeros to (n + 3, m), with m rounded up to whole SIMD vectors. Because of the
+    padding, loops over four rows and whole vectors need no special cases. Writes B to ``diagonal`` (n,) and
+    ``upper`` (n,), whose last element is 0. For the reflectors I − β v vᵀ of Q, writes v to the rows of ``a``
+    and β to ``across`` (n,). For the reflectors of P, writes v to the rows of ``left`` (n, n + 3; padded like
+    ``a``) and β to ``down`` (n,). ``w`` is a scratch array as long as a row of ``a``. The squares of A's
+    elements must not overflow (algorithm: Golub & Van Loan, 5.4.8, rows and columns swapped).
     """
     n, end = diagonal.size, a.shape[1]
     for k in range(n):
@@ -110,7 +110,7 @@ def damped_solve(  # noqa: PLR0913 - every result of the decomposition
     The factor R in BᵀB + lam I = RᵀR is bidiagonal too. Writes the reciprocal of R's diagonal to ``inverse``
     (n,) and R's superdiagonal to ``ru`` (n,). The squares of lam and of B must not both underflow.
     """
-    below, rest = lam, 0.0  # damping row below row i of B: square of its element, and right-hand side
+    below, rest = lam, 0.0  # squared element of the damping row below row i of B, and its right-hand side
     for i in range(x.size):
         radius = 1.0 / (diagonal[i] * diagonal[i] + below)
         inverse[i] = math.sqrt(radius)

@@ -20,8 +20,8 @@ from skinnode.solve.linalg.vectors import Index
 def lu_factor(a: Float, pivot: Index) -> int:  # noqa: C901 - four rows at a time
     """Factor A (n, n) in place with row exchanges in ``pivot`` (n,); return the sign of det A, 0 if singular.
 
-    ``a`` (n + 3, whole lanes of n) contains A padded with zeros. Because of the padding, four rows can be
-    processed at a time, and whole vectors need no special case.
+    ``a`` contains A padded with zeros to (n + 3, n), with n rounded up to whole SIMD vectors. Because of the
+    padding, four rows can be processed at a time, and whole vectors need no special case.
     """
     n, end = pivot.size, a.shape[1]
     sign, top, p = 1, 0.0, 0

@@ -109,7 +109,7 @@ def rounding(w: Work, x: Float) -> float:
 
 @njit_part
 def estimate_error(w: Work, inverse: Float) -> float:
-    """Write J⁺ into ``inverse`` (n, m), using the last factors; return a converged solve's error estimate.
+    """Write J⁺ into ``inverse`` (n, m), using the last factors; return an error estimate of the solution.
 
     The error estimate is relative to max(1, ‖x‖∞). The error estimate is the sum of the last Newton
     correction and the error due to rounding of x, which grows with the condition number of J. If J is

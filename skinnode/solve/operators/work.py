@@ -56,7 +56,7 @@ class Work(NamedTuple):
     jt: Annotated[Float, "n m"]
     """Jᵀ at x."""
     lu: Annotated[Float, "n+3 lanes_n"]
-    """LU factors of Jᵀ if the system is square; rows are padded to whole lanes."""
+    """LU factors of Jᵀ if the system is square; rows are padded to whole SIMD vectors."""
     qr: Annotated[Float, "m n"]
     """QR factors of J if the system is tall."""
     right: Annotated[Float, "n+3 lanes_m"]

@@ -22,12 +22,12 @@ from skinnode.solve.paths.root_selection import doubt_rough, doubtful, guide
 from skinnode.solve.roots import Mask
 
 RELAXED_TOLERANCES: Final = (1e-6, 1e-5, 1e-4, 1e-3)
-"""Intermediate tolerances in the paper's figure 10, from tight to loose."""
+"""Tolerances for intermediate samples in figure 10 of the paper, in increasing order."""
 MISS: Final = 0.2
 """Target distance between predicted and corrected point, as a multiple of the initial trust radius."""
 SHRINK: Final = 0.5
 GROW: Final = 4.0
-"""Largest growth factor of the step length per step (Allgower & Georg 1990, section 6.1, use 2 to 4)."""
+"""Maximum ratio of successive step lengths (Allgower & Georg 1990, section 6.1, use 2 to 4)."""
 SHORTEST: Final = 1 / 64
 """Minimum step length as a fraction of the path. Near a fold, steps are halved until they reach this
 minimum."""

@@ -9,7 +9,7 @@ the linear algebra of one step. ``geometry_error`` models the manufacturing erro
 tolerances.
 
 The prior combines the elasticity of the rubber (``elastic_prior``) with the expected loads (``load_prior``).
-``hyperparameters`` sets the scale of the prior and the noise from the evidence. ``load_posterior`` estimates
-the loads of a frame, ``contact_regions`` divides them into contacts, and ``contacts`` measures each contact.
+``hyperparameters`` estimates the scale of the prior and the noise. ``load_posterior`` estimates the loads of
+a frame, ``contact_regions`` divides them into contacts, and ``contacts`` measures each contact.
 ``data_share`` computes how much of a displacement is determined by the data rather than by the prior.
 """

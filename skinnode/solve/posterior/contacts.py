@@ -4,8 +4,8 @@ In the prior, the loads q ~ N(0, s² D) displace the electrodes by u = G q plus 
 posterior mean of q for a displacement u is D Gᵀ C⁻¹ u. The posterior variance of a sum wᵀ q is s² wᵀ D w −
 ‖L⁻¹ J G s² D w‖², in the notation of :mod:`skinnode.solve.posterior.measurement_update`.
 
-:mod:`skinnode.solve.posterior.contact_regions` assigns the cells to contacts. This module measures the force,
-centre, area and shear of each contact, with standard deviations.
+:mod:`skinnode.solve.posterior.contact_regions` assigns the cells to contacts. This module computes the force,
+centre, area and shear of each contact, and their standard deviations.
 """
 
 from __future__ import annotations

@@ -265,7 +265,7 @@ def add_effect(  # noqa: PLR0913 - a kernel
 
 @njit_part
 def _product(first: Float, second: Float, start: int, stop: int) -> float:
-    """Return the dot product of two residuals' effects with indices from ``start`` to ``stop`` − 1."""
+    """Return the dot product of the effects on two residuals, from ``start`` to ``stop`` − 1."""
     total = 0.0
     for q in range(start, stop):
         total += first[q] * second[q]

@@ -139,7 +139,7 @@ class MapEstimator:
 
     @property
     def equations(self) -> int:
-        """Number of equations of all wires after reduction."""
+        """Number of equations of all wires after the QR reduction."""
         return len(self._b.v)
 
     @property
@@ -436,7 +436,7 @@ class MapEstimator:
         return False
 
     def _chord(self, observation: Observation) -> bool:
-        """Take chord steps until a step is small compared with the standard deviation; return success."""
+        """Take chord steps until a step is small compared with the standard deviations; return success."""
         b, wires, prior, step = self._b, len(self.moved), self.load_prior, self._correction
         before = math.inf
         for _ in range(CHORDS):

@@ -31,7 +31,7 @@ class Rejected(IntEnum):
 
 
 class RejectedFrames:
-    """Counters of rejected frames (0x2040). *Reset node* clears the counters; they stop at their maximum.
+    """Counters of rejected frames (0x2040), which saturate at their maximum and are cleared by *reset node*.
 
     Args:
         store: object dictionary.

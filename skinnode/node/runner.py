@@ -1,4 +1,4 @@
-"""Runner of nodes on a bus, with one thread for all nodes that share a CAN port."""
+"""Runs all nodes that share a CAN port in a single thread."""
 
 from __future__ import annotations
 
@@ -28,16 +28,16 @@ _CATCH_UP_FRAMES: Final = 4096
 1 Mbit/s bus carries in half a second."""
 
 OFF_AFTER_S: Final = 0.1
-"""Duration (s) of continuous bus errors after which the nodes treat their CAN controller as bus-off. A full
-transmit queue drains in less time."""
+"""Duration (s) of continuous bus errors after which the nodes treat their CAN controller as bus-off. It is
+longer than a full transmit queue takes to drain."""
 
 REOPEN_S: Final = 1.0
-"""Duration (s) of continuous bus errors after which the CAN interface is reopened. The interface may have
-been unplugged and reconnected."""
+"""Duration (s) of continuous bus errors after which the CAN interface is reopened. Reopening restores an
+interface that was unplugged and reconnected."""
 
 
 class NodeRunner:
-    """Runner that powers on its nodes and runs these nodes until :meth:`stop`.
+    """Powers on a group of nodes and runs them until :meth:`stop` is called.
 
     A runner can be started only once. Bus errors do not stop a runner. From :meth:`start` to :meth:`stop`,
     only the runner's thread may use the nodes; other threads may read the nodes' counters. The runner does
@@ -59,7 +59,7 @@ class NodeRunner:
             raise ValueError("nodes: got none, must contain at least one")
         ids = [node.node_id for node in self.nodes if node.node_id != NOT_CONFIGURED]
         if len(set(ids)) < len(ids):
-            raise ValueError(f"nodes: got node-IDs {sorted(ids)}, must differ")
+            raise ValueError(f"nodes: got node-IDs {sorted(ids)}, must all be different")
         self._slack_ns = min(node.pacing.slack_ns for node in self.nodes)
         self.bus_errors = 0
         """Number of bus errors since the runner was created."""
@@ -68,7 +68,8 @@ class NodeRunner:
         error."""
         self._heard = 0
         self._bus_state = BusState.ACTIVE
-        # Number of frames sent before bus-off; a larger number shows that the bus has recovered.
+        # Number of frames that the port had sent when bus-off began; if it has since sent more, the bus has
+        # recovered.
         self._sent_before = 0
         self._powered, self._stopping = clock.event(), clock.event()
         self._error: BaseException | None = None
@@ -80,7 +81,7 @@ class NodeRunner:
         return self._error is not None
 
     def start(self) -> None:
-        """Start the thread; return when all nodes have been powered on and have loaded their memories.
+        """Start the thread; return when all nodes have been powered on and have loaded their saved values.
 
         An error that terminates the thread is raised by :meth:`stop`.
         """
@@ -150,7 +151,7 @@ class NodeRunner:
                     with contextlib.suppress(BusError):
                         self._port.reopen()
                 self._stopping.wait(_RETRY_S)
-            # Only the sending or reception of a frame proves that the bus works.
+            # The bus is known to work only if a frame has been sent or received.
             if self._port.sent + self._heard > moved:
                 failing_since_s = None
             if self._bus_state is BusState.OFF and self._port.sent > self._sent_before:
@@ -199,8 +200,8 @@ class NodeRunner:
     def _catch_up(self, now_ns: int) -> BusError | None:
         """Process the queued frames that were received before ``now_ns``.
 
-        After a delay of this thread, a heartbeat that arrived in time may still be in the queue. Without this
-        method, the heartbeat would be reported as missed.
+        If this thread is delayed, a heartbeat that arrived in time may still be in the queue. It must be
+        processed before the timers; otherwise, it would be reported as missed.
         """
         failure: BusError | None = None
         for _ in range(_CATCH_UP_FRAMES):

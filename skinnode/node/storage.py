@@ -1,7 +1,8 @@
-"""Saving of parameters by 0x1010 (store), 0x1011 (restore defaults) and 0x1020 (verify); CiA 301 v4.2.
+"""Saves and restores parameters: objects 0x1010 (store), 0x1011 (restore defaults) and 0x1020 (verify).
 
-This module also saves the baseline and the LSS configuration of a node. A *parameter* is an object that a
-client can write and read back; commands and computed objects are not parameters.
+The objects are defined in CiA 301 v4.2. This module also saves the baseline and the LSS configuration of a
+node. A *parameter* is an object that a client can write and read back; commands and computed objects are not
+parameters.
 """
 
 from __future__ import annotations
@@ -33,10 +34,10 @@ Rows = tuple[tuple[float, ...], ...]
 
 
 class Storage:
-    """Storage of the values that survive a power cycle, including the store and restore objects.
+    """Saves and restores a node's non-volatile values, and implements the store and restore objects.
 
     If a value cannot be saved or restored, the node sends EMCY 0x6300. The first manufacturer-specific byte
-    is a :class:`~skinnode.node.memory.Fault`.
+    of this message is a :class:`~skinnode.node.memory.Fault`.
 
     Args:
         services: resources that all services of the node share.
@@ -87,7 +88,7 @@ class Storage:
         if kept is not None and kept.patch != patch:
             self.note(
                 Fault.FOREIGN,
-                why=f"the content belongs to another patch, {kept.patch!r}; this patch is {patch!r}",
+                why=f"the content belongs to the patch {kept.patch!r}, but this patch is {patch!r}",
             )
         elif kept is not None:
             self._kept = kept
@@ -111,8 +112,8 @@ class Storage:
     def report(self, t_ns: int) -> None:
         """Send emergency messages for the faults recorded since the last call.
 
-        A fault of the whole memory remains active in the error register until the memory is reliable again,
-        even across resets.
+        If the fault affects the whole memory, its bit in the error register remains set, even across resets,
+        until the memory is reliable again.
         """
         for fault, detail in self._lasting.items():
             self._emcy.report(EmcyCode.DATA_SET, detail, t_ns, fault)
@@ -167,7 +168,7 @@ class Storage:
         self._settle(Fault.NOT_SAVED)
 
     def _settle(self, *faults: Fault) -> None:
-        """Report the end of memory faults, because the memory is reliable again."""
+        """Clear the given memory faults and report that they have ended."""
         for fault in faults:
             if self._lasting.pop(fault, None) is not None:
                 self._emcy.clear(EmcyCode.DATA_SET, self._now(), fault)
@@ -182,8 +183,8 @@ class Storage:
                 self._keep(command(subindex))
             except OSError:
                 raise Refused(AbortCode.HARDWARE) from None
-            # A save command means that the user accepts the current parameters, so the memory faults end.
-            # Automatic saving of the baseline does not end memory faults.
+            # By giving the command, the user accepts the current parameters, so memory faults are cleared.
+            # Automatic saving of the baseline does not clear them.
             self._settle(Fault.UNREADABLE, Fault.DAMAGED, Fault.FOREIGN)
 
         return guard
@@ -196,8 +197,8 @@ class Storage:
         if subindex in (_ALL, _APPLICATION_ONLY):
             application_kept = Parameters(node_id, application)
             kept = replace(kept, application=application_kept, baseline_ohm=self.baseline_ohm())
-        # Object 0x1020 verifies the whole configuration, so 0x1020 is saved only if the memory then contains
-        # the whole configuration.
+        # Object 0x1020 identifies a whole configuration, so it is saved only together with the whole
+        # configuration.
         whole = kept.communication.values == communication and kept.application.values == application
         return kept if whole else _unverified(kept)
 
@@ -224,7 +225,7 @@ class Storage:
         return {key: value for key, value in changed.items() if key not in od.COMMANDS}
 
     def _for_this_node(self, key: Key, value: bytes, node_id: int) -> bytes:
-        """Convert a saved value: a COB-ID that is the default for ``node_id`` becomes this node's default."""
+        """Return the saved value; if it is the default COB-ID for ``node_id``, adapt it to this node's ID."""
         if not self._store.has(*key):
             return value
         entry = self._store.find(*key)

@@ -24,7 +24,7 @@ SHORTEST_PERIOD_US: Final = 100
 """Minimum cycle period (0x1006) in µs: twice the duration of a SYNC message at 1 Mbit/s."""
 
 _DO_NOT_CARE_BIT: Final = 1 << 31
-"""Bit in 0x1005 that has no effect, but that a client may set (CiA 301 v4.2, table 44)."""
+"""Bit in 0x1005 that clients may set but that has no effect (CiA 301 v4.2, table 44)."""
 
 
 class SyncWindow:
@@ -40,7 +40,7 @@ class SyncWindow:
         self._sync_ns = t_ns
 
     def forget(self, t_ns: int) -> None:
-        """Reset the synchronous window and its errors, because the NMT state has changed."""
+        """Reset the synchronous window and clear its errors when the NMT state changes."""
         self._sync_ns = None
         for number in tuple(self._missed):
             self._clear(number, t_ns)
@@ -53,7 +53,8 @@ class SyncWindow:
     def lets_out(self, number: int, t_ns: int) -> bool:
         """Return whether a synchronous TPDO may be sent; if not, the caller must discard it.
 
-        An emergency message reports a discarded TPDO once, until this TPDO is again sent within the window.
+        The first time a TPDO is discarded, the node sends an emergency message. The error ends when this TPDO
+        is next sent within the window.
 
         Args:
             number: number of the TPDO, counted from 0.
@@ -73,7 +74,7 @@ class SyncWindow:
 
 
 class Sync:
-    """SYNC consumer, which checks message lengths, and SYNC producer, if enabled by 0x1005.
+    """Consumer of SYNC messages and, if 0x1005 enables production, also their producer.
 
     A SYNC producer also consumes its own SYNC messages: the caller must treat a SYNC returned by
     :meth:`on_timer` like a SYNC accepted by :meth:`accept`.
@@ -134,7 +135,10 @@ class Sync:
         self.deadline_ns = self._now() + self._period_ns if runs else NO_DEADLINE_NS
 
     def on_timer(self, t_ns: int) -> bytes | None:
-        """Send and return the SYNC if one is due. Missed SYNCs are skipped without drift."""
+        """If a SYNC is due, send it and return its payload; otherwise, return None.
+
+        After a delay of several periods, the missed SYNCs are skipped and the schedule stays the same.
+        """
         if t_ns < self.deadline_ns:
             return None
         self.deadline_ns += (t_ns - self.deadline_ns) // self._period_ns * self._period_ns + self._period_ns
@@ -148,7 +152,7 @@ class Sync:
     def accept(self, message: bytes, t_ns: int) -> bool:
         """Return whether a SYNC message has the length that 0x1019 requires.
 
-        An incorrect length is reported once, until a different length is received.
+        Successive SYNC messages with the same incorrect length cause only one emergency message.
 
         Args:
             message: payload of the SYNC message.

@@ -1,8 +1,8 @@
 """TIME consumer, which receives the time of day (CiA 301 v4.2, 7.2.6 and object 0x1012).
 
-A node has no real-time clock. The node stores the last time of day received, and the simultaneous time on its
-own clock. The node computes the current time of day (0x2022) from these two times. A host can also use them
-to convert the device time of a scan to a date.
+A node has no real-time clock. It stores the last time of day received, together with the time of reception on
+its own clock. From these two times, the node computes the current time of day (0x2022), and a host can
+convert the device time of a scan to a date.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _MS_MASK: Final = (1 << 28) - 1
 
 
 class TimeConsumer:
-    """Consumer of TIME messages, which provides the time of day in object 0x2022.
+    """Receives TIME messages and provides the time of day in object 0x2022.
 
     Args:
         store: object dictionary.
@@ -35,8 +35,7 @@ class TimeConsumer:
 
     def __init__(self, store: ObjectStore, now: Clock) -> None:
         self._store, self._now = store, now
-        # Last time of day received, as the time since 1984-01-01. The time of reception on the node's clock
-        # is _received_ns.
+        # Last time of day received, in ms since 1984-01-01, and its time of reception on the node's clock.
         self._received_ms = 0
         self._received_ns = 0
         self._messages = 0
@@ -70,7 +69,7 @@ class TimeConsumer:
         return True
 
     def reset(self) -> None:
-        """Discard the time received, because of power-on or *reset node*."""
+        """Discard the received time of day, as required after power-on and *reset node*."""
         self._received_ms = self._received_ns = self._messages = 0
 
     def _read(self, subindex: int) -> bytes:

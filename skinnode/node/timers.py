@@ -1,4 +1,4 @@
-"""Collection of timers, one per key, which elapse in order of time."""
+"""Collection of timers with one timer per key."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ class Timers:
 
     def __init__(self) -> None:
         self._due: dict[int, int] = {}
-        self._heap: list[tuple[int, int]] = []  # includes stale entries of changed or cancelled timers
+        self._heap: list[tuple[int, int]] = []  # may contain stale entries of changed or cancelled timers
 
     @property
     def deadline_ns(self) -> int:

@@ -1,4 +1,4 @@
-"""Restoring of a saved configuration, with values written in an order that CiA 301 permits."""
+"""Restores a saved configuration by writing its values in an order that CiA 301 permits."""
 
 from __future__ import annotations
 
@@ -14,10 +14,12 @@ Key = tuple[int, int]
 
 _PDO_END: Final = 0x1C00
 _LATE: Final = (od.CYCLE_PERIOD, od.COB_ID_SYNC, od.VERIFY_CONFIGURATION)
-"""Indices of the objects that must be written last, in writing order. The cycle period follows the SYNC
-counter overflow, because the overflow cannot change while a cycle period is set. The COB-ID of SYNC follows
-the cycle period, because writing it starts the SYNC producer. Object 0x1020 must be the last, because any
-other write clears 0x1020."""
+"""Indices of the objects that must be written last, in writing order.
+
+The cycle period is written after the SYNC counter overflow, which cannot be changed while a cycle period is
+set. The COB-ID of SYNC is written after the cycle period, because it starts the SYNC producer. Object 0x1020
+is written last, because any other write clears it.
+"""
 
 
 def write_configuration(store: ObjectStore, values: Mapping[Key, bytes]) -> list[Key]:
@@ -57,8 +59,8 @@ def write_configuration(store: ObjectStore, values: Mapping[Key, bytes]) -> list
 def _write_pdo(store: ObjectStore, values: Mapping[Key, bytes], pdo: int, default: bytes) -> Iterator[Key]:
     """Write both records of a PDO, and yield the index and sub-index of each refused value.
 
-    The argument ``pdo`` is the index of the communication record. The argument ``default`` is the PDO's
-    COB-ID for the case that ``values`` does not contain one.
+    The argument ``pdo`` is the index of the communication record. The argument ``default`` is the
+    COB-ID of the PDO if ``values`` does not contain one.
     """
     cob_id, count = (pdo, od.PDO_COB_ID), (pdo + od.PDO_MAPPING_OFFSET, 0)
     own = sorted(item for item in values.items() if item[0][0] == pdo and item[0] != cob_id)

@@ -106,7 +106,7 @@ def monotonic() -> float:
 
 
 def perf_counter() -> float:
-    """Return the time for measuring durations, s; a virtual clock does not advance during computation."""
+    """Return the performance counter, s; on a virtual clock, computation takes no time."""
     clock = _here.clock
     return system_time.perf_counter() if clock is _SYSTEM else clock.monotonic_ns() * 1e-9
 

@@ -13,9 +13,9 @@ from types import FrameType
 class SignalEvent(threading.Event):
     """Event that a signal handler can safely set.
 
-    ``threading.Event.set`` acquires a lock. If a signal interrupts a thread that holds this lock in ``wait``,
-    a handler that calls ``set`` blocks forever. ``SimpleQueue.put``, which this class uses instead, is
-    reentrant.
+    Both ``wait`` and ``set`` of ``threading.Event`` acquire the event's lock. If a signal interrupts ``wait``
+    while it holds the lock, a signal handler that calls ``set`` blocks forever. This class uses
+    ``SimpleQueue.put`` instead, which is reentrant.
     """
 
     def __init__(self) -> None:
@@ -37,13 +37,13 @@ class SignalEvent(threading.Event):
         if not self._is_set:
             with suppress(Empty):
                 self._wake.get(timeout=None if timeout is None else max(0.0, timeout))
-                self._wake.put(None)  # so that other waiting threads also wake up
+                self._wake.put(None)  # wake up the next waiting thread
         return self._is_set
 
 
 @contextmanager
 def stop_on_signal() -> Iterator[threading.Event]:
-    """Yield an event that stop signals set; afterwards restore the previous signal handlers.
+    """Yield an event that is set by any stop signal; restore the previous signal handlers on exit.
 
     The stop signals are SIGINT (Ctrl-C), SIGTERM and SIGHUP (terminal closed). SIGHUP remains ignored if it
     was already ignored on entry, as under nohup.

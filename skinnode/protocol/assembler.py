@@ -1,38 +1,37 @@
-"""Assembly of one patch's chunks and summaries into scans. The code is not thread-safe and reads no clock.
+"""Assembles one patch's chunks and summaries into scans; not thread-safe.
 
 **Scans are never mixed.** A scan contains only frames with the scan's own counter that arrived within the
 *timeout* after its first frame. The scan is closed permanently as soon as a frame of a newer scan arrives.
 Frames of two scans can therefore be mixed only if both scans have the same counter and the frames arrive
 within the timeout. The age of a frame is the time from its scan's SYNC to its arrival. Mixing is impossible
 if counter range × period is longer than the timeout plus the maximum age. The timeout is three periods, or
-less if the counter range is short. With the usual counter range of 240 scans, a frame may therefore be up to
-237 periods old.
+less if the counter range is short. With the usual counter range of 240 scans, mixing is impossible if all
+frames are less than 237 periods old.
 
 **Two scans with the same counter.** Two scans have the same counter if a node did not increment it, or if two
 nodes have the same node-ID. The assembler detects the conflict if two frames with the same index and
 different content arrive. The remaining frames then cannot be assigned to one of the two scans, so the
 assembler discards the whole scan. The assembler also discards an incomplete scan whose chunks arrived more
-than two periods apart. The first chunk of such a scan had the counter of a later scan, whose own chunks may
-arrive after the timeout. If the frames of two mixed scans have no chunk index in common, only the scan check
-detects the mixing.
+than two periods apart, because they may belong to two scans. If the frames of two mixed scans have no chunk
+index in common, only the scan check detects the mixing.
 
 **The check.** A summary with :attr:`~skinnode.protocol.summary.SummaryFlag.CHECKED` carries a CRC over all
-codes at the receiver after the scan (:mod:`skinnode.protocol.scan_check`). A failed check does not identify
-the wrong chunk. The assembler therefore discards the whole scan, and the stored codes of unsent chunks. A
-stream is *checked* from the first check that passes, or from a :meth:`ScanAssembler.reset` with ``checked``.
-In a checked stream, a scan is complete only if its check passed, and a summary without a check is rejected. A
-scan is published as *unchecked* if its summary was lost, or if the codes of chunks that were not sent are
-unknown. Patches of revision 1.0 send no checks, so their scans are complete as soon as all chunks have been
-received.
+codes of the patch, including those of unsent chunks (:mod:`skinnode.protocol.scan_check`). A failed check
+does not identify the wrong chunk. The assembler therefore discards the whole scan, and the stored codes of
+unsent chunks. A stream becomes *checked* when a check passes for the first time, or when
+:meth:`ScanAssembler.reset` is called with ``checked=True``. In a checked stream, a scan is complete only if
+its check passed, and a summary without a check is rejected. A scan is published as *unchecked* if its summary
+was lost, or if the codes of chunks that were not sent are unknown. Patches of revision 1.0 send no checks, so
+their scans are complete as soon as all chunks have been received.
 
-**Order of counters.** A counter that leads the last scan's counter by at most half the counter range
-indicates a newer scan. Frames with other counters are late and are dropped. After a silence as long as the
-timeout, a frame with any counter is accepted, because the node or the SYNC producer may have restarted.
+**Order of counters.** If a frame's counter is ahead of the last scan's counter by at most half the counter
+range, the frame belongs to a newer scan. Frames with other counters are late and are dropped. If no frame
+has arrived for as long as the timeout, a frame with any counter is accepted, because the node or the SYNC
+producer may have restarted.
 
 **Chunks that were not sent.** If the summary indicates that only changed chunks were sent, the other chunks
-keep their last codes (:mod:`skinnode.protocol.partial_scan`). A lost, torn or overrun scan may have changed
-the codes of unsent chunks, and so may a scan during a long silence. These codes are then invalid until their
-chunks are sent again.
+keep their last codes (:mod:`skinnode.protocol.partial_scan`). After a lost or incomplete scan, or a pause
+longer than the timeout, the codes of unsent chunks are unknown until these chunks are sent again.
 """
 
 from __future__ import annotations
@@ -54,9 +53,9 @@ from skinnode.text.words import counted
 
 _CHUNK_INDICES: Final = 256
 _NOT_EXPECTED: Final = b""
-"""Placeholder payload for chunk numbers beyond the patch's last chunk, which saves a bounds check per
-received chunk."""
-_NONE_OPEN: Final = -1  # negative, and therefore different from every scan counter
+"""Placeholder payload for chunk numbers beyond the patch's last chunk. With this placeholder, the range of
+each received chunk number need not be checked."""
+_NONE_OPEN: Final = -1  # scan counters are never negative
 _NEVER: Final = -1
 # Testing an enum flag takes as long as processing a whole chunk; testing an int is ten times as fast.
 _CHANGED_ONLY, _OVERRUN = int(SummaryFlag.CHANGED_ONLY), int(SummaryFlag.OVERRUN)
@@ -72,8 +71,8 @@ class ScanAssembler:
 
     Args:
         profile: sizes of the patch.
-        counter_overflow: value of 0x1019 if SYNC counters from 1 to this value number the scans; 0 if the
-            patch numbers its scans from 0 to 255.
+        counter_overflow: SYNC counter overflow value (0x1019) if the scan counter is the SYNC counter; 0 if
+            the patch itself counts its scans from 0 to 255.
         period_ns: scan period (ns), which determines the timeout.
         grace_ns: maximum wait (ns) for late frames after the summary or the last missing chunk has arrived.
         node_id: node-ID shown in the errors passed to ``on_reject``.
@@ -129,7 +128,7 @@ class ScanAssembler:
         self._checked = False
         self._device_time = DeviceTimeTracker()
         self._expires_ns = self._t_first_ns = self._t_last_ns = 0
-        self._t_chunk_ns = self._t_summary_ns = 0  # reception of the frame before the summary, of the summary
+        self._t_chunk_ns = self._t_summary_ns = 0  # times of reception: last chunk, summary
 
         self._held = HeldChunks(profile)
         self._follows = False  # whether the open scan follows the last scan without a gap
@@ -151,7 +150,7 @@ class ScanAssembler:
             t_ns: time of reception, ns.
 
         Returns:
-            The scan that the chunk ended; None if the chunk did not end a scan.
+            The scan that the chunk closed; None if the chunk did not close a scan.
         """
         if len(data) != self._chunk_bytes:
             self._reject_length(chunk_cob_id(self._node_id), data, self._chunk_bytes, "chunk")
@@ -177,7 +176,7 @@ class ScanAssembler:
             t_ns: time of reception, ns.
 
         Returns:
-            The scan that the summary ended; None if the summary did not end a scan.
+            The scan that the summary closed; None if the summary did not close a scan.
         """
         if len(data) != PDO_BYTES:
             self._reject_length(summary_cob_id(self._node_id), data, PDO_BYTES, "scan summary")
@@ -315,7 +314,7 @@ class ScanAssembler:
             self._on_reject(CodecError(cob_id, data, allowed))
 
     def _is_news(self, counter: int, t_ns: int, *, known: bool) -> bool:
-        """Return whether a frame outside the open scan starts a new scan; if not, count the frame.
+        """Return whether a frame starts a new scan; if not, count it as late, duplicate or invalid.
 
         The argument ``known`` indicates whether the last scan contains an identical frame.
         """

@@ -1,4 +1,4 @@
-"""Packing and unpacking of chunks: the parts of a scan, which are sent in TPDO1."""
+"""Packs and unpacks chunks, the parts of a scan that a patch sends in TPDO1."""
 
 from __future__ import annotations
 
@@ -144,9 +144,9 @@ def unpack_scan_with_check(frames: bytes, profile: PatchProfile) -> tuple[Codes,
 def _places_of_codes(profile: PatchProfile) -> NDArray[np.intp]:
     """Return the position of each code in the concatenated payloads of a scan.
 
-    For 16-bit codes the result has shape (U, K) and counts 16-bit words. For 24-bit codes the result has
-    shape (U, K, 4) and counts bytes. The fourth position of each code refers to a zero byte appended to the
-    payloads.
+    For 16-bit codes, the result has the shape (U, K) and contains positions in units of 16 bits. For 24-bit
+    codes, the result has the shape (U, K, 4) and contains the position of each byte. The fourth byte of each
+    code is a zero byte appended to the payloads.
     """
     width, per, head = profile.code_bits // 8, profile.codes_per_chunk, profile.chunk_head_bytes
     lines, shape = profile.lines, (profile.rows, profile.columns)
@@ -172,8 +172,8 @@ def chunk_of_code(profile: PatchProfile) -> NDArray[np.intp]:
 def chunk_indexer(profile: PatchProfile) -> Callable[[bytes], int]:
     """Return a function that maps a chunk's payload to the chunk's number (:func:`chunk_of_code`).
 
-    For a chunk that the patch does not have, the returned function yields ``n_chunks`` or more. The function
-    does not check the payload length.
+    If the payload does not identify a chunk of the patch, the returned function returns ``n_chunks`` or more.
+    The function does not check the payload length.
     """
     if profile.bus == "classic":
         return operator.itemgetter(0)

@@ -22,7 +22,7 @@ from skinnode.protocol.objects import DEFAULT_CODE_HI, DEFAULT_CODE_LO
 Codes = NDArray[np.uint32]
 
 MISSING: Final = 0xFFFF_FFFF
-"""Marker for a code that was not received, greater than any valid code."""
+"""Value that represents a code that was not received; greater than any valid code."""
 
 CODE_BITS: Final = (16, 24)
 """Allowed code widths, bits."""
@@ -33,7 +33,7 @@ class CodeScale:
     """Mapping of R/R0 to codes. The limits ``lo`` and ``hi`` have REAL32 precision, as on the bus.
 
     Raises:
-        ConfigError: if the code width is not 16 or 24 bits, or if 0 ≤ lo < hi < ∞ is not true.
+        ConfigError: if the code width is not 16 or 24 bits, or if the limits do not satisfy 0 ≤ lo < hi < ∞.
     """
 
     bits: int = 16
@@ -64,12 +64,12 @@ class CodeScale:
 
     @property
     def short(self) -> int:
-        """Reserved code for a short circuit between upper and lower wire."""
+        """Reserved code for a short circuit between the upper and the lower wire."""
         return self.steps + 2
 
     @property
     def open(self) -> int:
-        """Reserved code for no connection between upper and lower wire."""
+        """Reserved code for an open circuit between the upper and the lower wire."""
         return self.steps + 3
 
     @functools.cached_property

@@ -1,4 +1,4 @@
-"""Packing and unpacking of commands, which a host sends to a patch in RPDO1."""
+"""Packs and unpacks the commands that a host sends to a patch in RPDO1."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def pack_command(
     Args:
         tare: whether to make the current resistances the baseline.
         single_scan: whether to take one scan immediately.
-        send_mode: send mode until the next command; every command sets the send mode.
+        send_mode: send mode of the patch, which remains in effect until the next command.
     """
     return _COMMAND.pack(od.TARE_SIGNATURE if tare else 0, single_scan, send_mode)
 

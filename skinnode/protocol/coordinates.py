@@ -1,4 +1,4 @@
-"""Packing and unpacking of a patch's electrode coordinates (object 0x2300).
+"""Packs and unpacks a patch's electrode coordinates (object 0x2300).
 
 Coordinates are signed 32-bit integers in nanometres, little-endian: x, y, z of every upper electrode, wire by
 wire, then x, y, z of every lower electrode. The layout hash is also computed from coordinates rounded to

@@ -1,4 +1,4 @@
-"""Reconstruction of a node's 32-bit device time (µs) from the 16-bit time in a checked summary."""
+"""Reconstructs a node's 32-bit device time (µs) from the 16-bit time in a checked summary."""
 
 from __future__ import annotations
 
@@ -35,15 +35,15 @@ class DeviceTimeTracker:
         self._time_us = self._t_time_ns = 0
 
     def reset(self) -> None:
-        """Discard the last device time, because the node may have restarted."""
+        """Discard the last device time, for example after a restart of the node."""
         self._time_us = self._t_time_ns = 0
 
     def restore_us(self, low_us: int, t_ns: int) -> int:
         """Return the 32-bit device time (µs), with upper bits predicted from the last device time.
 
-        The prediction is the last device time plus the time that has since elapsed on the host's clock. The
-        upper bits of the first device time come from the host's clock. The first upper bits are correct if
-        node and host share a clock and the summary arrives within three seconds of the scan.
+        The prediction is the last device time plus the time that has since elapsed on the host's clock. For
+        the first summary, the upper bits are predicted from the host's clock alone. They are correct if node
+        and host share a clock and the summary arrives within three seconds of the scan.
 
         Args:
             low_us: device time from a checked summary, without its upper bits, µs.

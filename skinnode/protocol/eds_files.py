@@ -1,4 +1,4 @@
-"""Generation of EDS and DCF files (CiA 306) for patches, and of the reference files in ``eds/``."""
+"""Generates EDS and DCF files (CiA 306) for patches, and the reference files in ``eds/``."""
 
 from __future__ import annotations
 
@@ -18,12 +18,14 @@ def eds_name(profile: PatchProfile) -> str:
 
 
 def eds_text(profile: PatchProfile) -> str:
-    """Return the text of a patch's electronic data sheet (EDS, CiA 306), the same for equal profiles."""
+    """Return the text of a patch's electronic data sheet (EDS, CiA 306). Equal profiles yield equal texts."""
     return render_eds(_device_info(profile, eds_name(profile)), profile.objects())
 
 
 def dcf_text(profile: PatchProfile, node_id: int, bitrate_bps: int) -> str:
-    """Return the text of a patch's device configuration file (DCF, CiA 306), the same for equal arguments.
+    """Return the text of a patch's device configuration file (DCF, CiA 306).
+
+    Equal arguments yield equal texts.
 
     Args:
         profile: sizes of the patch.

@@ -23,9 +23,9 @@ DEFAULT_CODE_HI: Final = 1.25
 """Default R/R0 value of the highest measurement code. The range extends above 1, because sliding moves some
 electrodes apart and increases R, whereas a press reduces R."""
 DEFAULT_REFRESH_SCANS: Final = 10
-"""Default interval between full scans, as a number of scans, if only changed chunks are sent. At the default
-period, lost codes are sent again within 0.8 s. The resulting traffic is a tenth of that of continuous full
-scans."""
+"""Default number of scans from one full scan to the next in the send mode for changed chunks. Lost codes are
+thus sent again within 0.8 s at a scan period of 80 ms. Full scans at this interval cause a tenth of the
+traffic of continuous full scans."""
 
 
 def patch_objects(profile: PatchProfile) -> tuple[Object, ...]:

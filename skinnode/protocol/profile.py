@@ -2,8 +2,8 @@
 
 A patch sends its U×K codes in *chunks*: TPDO1 carries a u8 chunk index, a u8 scan counter and 3 codes of 16
 bits (or 2 codes of 24 bits). The codes are in row-major order: all codes of upper wire 0 first, then those of
-upper wire 1, and so on. TPDO2 carries the *summary*, which ends each scan and contains a check over all codes
-of the matrix (:mod:`skinnode.protocol.scan_check`).
+upper wire 1, and so on. TPDO2 carries the *summary*, which ends each scan and contains a checksum of all
+codes (:mod:`skinnode.protocol.scan_check`).
 
 Over CAN FD, a chunk carries codes of a single upper wire: u8 wire, u8 scan counter, u16 first column and up
 to 30 codes of 16 bits (or 20 codes of 24 bits). All chunks of a patch have the same length: the total length
@@ -32,8 +32,8 @@ if TYPE_CHECKING:
     from skinnode.config import BusConfig, PatchConfig
 
 DEFAULT_PERIOD_MS: Final = 80
-"""SYNC period (ms) for which the default settings are chosen. With this period, four 10×30 patches load a 1
-Mbit/s bus to about 2/3."""
+"""SYNC period (ms) for which the default settings are chosen. With this period, four 10×30 patches cause
+a load of about 2/3 on a 1 Mbit/s bus."""
 
 BusType = Literal["classic", "fd"]
 """Type of the frames that carry PDOs: classic CAN with up to 8 bytes, or CAN FD with up to 64 bytes."""
@@ -109,7 +109,7 @@ class PatchProfile:
 
     @classmethod
     def from_config(cls, patch: PatchConfig, bus: BusConfig) -> PatchProfile:
-        """Return the profile of a patch, based on the configurations of patch and bus in the hand file."""
+        """Return the profile of a patch from the configurations of the patch and its bus in the hand file."""
         return cls.from_layout(patch.layout.build(), patch.code_bits, "fd" if bus.fd else "classic")
 
     @property
@@ -133,19 +133,19 @@ class PatchProfile:
 
     @property
     def lines(self) -> int:
-        """Number of code sequences to split into chunks: 1 on classic CAN, one per upper wire on CAN FD."""
+        """Number of code sequences per scan: 1 on classic CAN, one per upper wire on CAN FD."""
         return 1 if self.bus == "classic" else self.rows
 
     @property
     def chunks_per_line(self) -> int:
-        """Number of chunks per code sequence. Unused codes in the last chunk are sent as 0 and ignored."""
+        """Number of chunks per code sequence. Unused codes in its last chunk are sent as 0 and ignored."""
         return -(-self.n_codes // self.lines // self._most_codes)
 
     @property
     def codes_per_chunk(self) -> int:
         """Number of codes per chunk.
 
-        Classic CAN: 3 (16-bit codes) or 2 (24-bit codes); CAN FD: up to 30 or 20.
+        A chunk carries 3 codes (16-bit) or 2 codes (24-bit) on classic CAN, and up to 30 or 20 on CAN FD.
         """
         return self._most_codes if self.bus == "classic" else -(-self.columns // self.chunks_per_line)
 

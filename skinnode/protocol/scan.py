@@ -89,18 +89,18 @@ class AssemblerStats:
     duplicates: int
     """* Frames identical to an earlier frame of the same scan."""
     conflicts: int
-    """* Frames that repeat an earlier frame of the same scan with different content; the scan is
+    """* Frames with the same index as an earlier frame of the same scan, but different content; the scan is
     discarded."""
     late: int
     """* Frames that arrived after their scan had been closed, or after a newer scan had started."""
     bad_length: int
     """* Frames with the wrong length for a chunk or a summary."""
     bad_index: int
-    """* Chunks with an index beyond the patch's last chunk, and summaries with an excessive number of
-    chunks."""
+    """* Chunks with an index beyond the patch's last chunk, and summaries that state a number of chunks
+    larger than the patch has."""
     bad_counter: int
     """* Frames whose scan counter is outside the range of the SYNC counter."""
     bad_form: int
     """* Summaries without a check in a checked stream."""
     resyncs: int
-    """Number of silences of a stream after which the scan counter resumed out of sequence."""
+    """Number of pauses in a stream after which the scan counter resumed out of sequence."""

@@ -30,7 +30,7 @@ class SelfTestFault(enum.IntFlag):
 
 
 class SelfTest(NamedTuple):
-    """Findings of a self-test, in the order of the sub-indices of 0x2023 from 2 on."""
+    """Findings of a self-test, in the order of sub-indices 2 and above of 0x2023."""
 
     faults: SelfTestFault
     readings: int

@@ -1,4 +1,4 @@
-"""Packing and unpacking of the scan summary, which is sent in TPDO2 at the end of each scan."""
+"""Packs and unpacks the summary, which a patch sends in TPDO2 at the end of each scan."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _SUMMARY: Final = struct.Struct("<BBHI")
 _HEAD: Final = struct.Struct("<BBHH")
 
 HEAD_BYTES: Final = _HEAD.size
-"""Number of bytes at the beginning of a summary covered by the scan check."""
+"""Number of bytes of a summary that the scan check covers, counted from the first byte."""
 
 
 class SummaryFlag(enum.IntFlag):
@@ -39,7 +39,7 @@ class SummaryFlag(enum.IntFlag):
     Without this flag, as in patches of revision 1.0, bytes 4 to 7 contain the u32 device time in µs."""
     CONVERSIONS = 0xC0
     """Conversion phase, a two-bit number. The phase is 0 if the patch does not supply a phase. Otherwise, the
-    phase cycles from 1 to 3. It advances with a scan if the converter has completed a new conversion of all
+    phase cycles from 1 to 3. The phase advances if the converter has completed a new conversion of all
     crossings since the previous scan. Two successive scans with the same phase therefore contain the same
     conversion."""
 
@@ -106,8 +106,8 @@ def pack_checked_summary(
         flags: bits of :class:`SummaryFlag`.
         chunks: number of chunks sent in this scan.
         device_time_us: time on the node's clock, µs; wraps at 2³².
-        check_of_codes: result of :func:`~skinnode.protocol.scan_check.check_of_codes` for the codes at a
-            receiver after this scan.
+        check_of_codes: result of :func:`~skinnode.protocol.scan_check.check_of_codes` for all codes after
+            this scan, including those of unsent chunks.
 
     Raises:
         ValueError: if the scan counter, the flags or the number of chunks do not fit their fields.

@@ -1,7 +1,7 @@
 """Reads and writes a recording's journal, the file that contains everything except the frames.
 
 The journal is a JSON Lines file next to the log. The first line contains the hand and the offset of the
-host's clock (:class:`Header`). Each further line describes an event that affected how the host decoded the
+host's clock (:class:`Header`). Every other line describes an event that affected how the host decoded the
 frames. In an event, ``at`` is the number of frames previously received on ``bus``, and ``t_ns`` is the time
 of the event on the host's monotonic clock.
 
@@ -45,8 +45,8 @@ COMPLAINTS_KEPT: Final = 100
 
 _MOST: Final = 2**63 - 1
 _LONGEST_LINE: Final = 2 << 20
-"""Maximum length of a line in bytes, sufficient for the facts about the largest patch. A longer line is
-read as several lines."""
+"""Maximum length of a line in bytes, sufficient for an event with the baseline and layout of the largest
+patch. A longer line is read as several lines."""
 _OF_PATCHES: Final = ("resumed", "withheld", "polled", "overtaken")
 
 
@@ -68,7 +68,7 @@ class Header:
 
 
 def _without_paths(value: Any) -> Any:
-    """Remove file names, because the journal contains the data that was read from those files."""
+    """Remove file names; the journal contains the data from the named files instead."""
     if isinstance(value, Mapping):
         kept = {key: item for key, item in value.items() if not isinstance(item, Path)}
         return {key: _without_paths(item) for key, item in kept.items()}
@@ -78,7 +78,7 @@ def _without_paths(value: Any) -> Any:
 
 
 def facts_table(facts: NodeFacts) -> dict[str, Any]:
-    """Convert NodeFacts to a JSON table without loss of numerical precision."""
+    """Convert NodeFacts to a JSON object without loss of numerical precision."""
     layout, planned = facts.layout, facts.config.layout.build()
     same = np.array_equal(layout.upper_m, planned.upper_m) and np.array_equal(layout.lower_m, planned.lower_m)
     own = {"upper_m": layout.upper_m.tolist(), "lower_m": layout.lower_m.tolist(), "name": layout.name}
@@ -98,7 +98,7 @@ def facts_of(table: Mapping[str, Any], patch: PatchConfig, bus: BusConfig) -> No
     """Rebuild NodeFacts from the result of :func:`facts_table`.
 
     Args:
-        table: The table from a journal line.
+        table: JSON object from a line of the journal.
         patch: Configuration of the patch.
         bus: Configuration of the patch's bus.
 
@@ -125,7 +125,7 @@ def facts_of(table: Mapping[str, Any], patch: PatchConfig, bus: BusConfig) -> No
             own["name"],
         )
     scale = CodeScale(patch.code_bits, table["lo"], table["hi"])
-    checked = table.get("checked", False)  # missing in old journals; nodes sent no checks at that time
+    checked = table.get("checked", False)  # missing from journals older than the check
     if not isinstance(checked, bool):
         raise TypeError(f"checked: got {checked!r}, must be true or false")
     return NodeFacts(
@@ -183,7 +183,7 @@ def _read_lines(path: Path, file: BinaryIO) -> tuple[Header, list[dict[str, Any]
                 what = "no event" if line.endswith(b"\n") else "truncated"
                 complaints.append(f"{path.name} line {number}: {what}")
     if bad > COMPLAINTS_KEPT:
-        complaints.append(f"{bad - COMPLAINTS_KEPT} more lines like these")
+        complaints.append(f"{bad - COMPLAINTS_KEPT} more unreadable lines")
     return header, events, complaints
 
 
@@ -198,7 +198,7 @@ def _event(line: bytes, hand: HandConfig) -> dict[str, Any]:
         case "dropped":
             _whole(event["frames"])
         case "ended":
-            _whole(event.get("frames", 0))  # missing in old journals
+            _whole(event.get("frames", 0))  # missing from old journals
 
         case kind if kind in _OF_PATCHES and hand.patch(event["patch"]).bus == event["bus"]:
             if kind == "overtaken":

@@ -31,11 +31,11 @@ _log = logging.getLogger(__name__)
 FLUSH_S: Final = 0.25
 """Interval between flushes to the kernel, s.
 
-If this process crashes, at most the entries of one interval are lost.
+If this process crashes, the recording lacks at most the last 0.25 s.
 """
 
 SYNC_S: Final = 1.0
-"""Interval between fsync calls, s. If power fails, at most the entries of about one interval are lost.
+"""Interval between fsync calls, s. After a power failure, the recording lacks about the last second at most.
 Each call blocks the writer thread for about 10 ms."""
 
 CAPACITY: Final = 50_000
@@ -194,7 +194,8 @@ class Recorder:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
-        if error is not None and not self._log.frames:  # otherwise a retry would fail because the files exist
+        # Delete an empty recording; otherwise, a retry would fail because the files exist.
+        if error is not None and not self._log.frames:
             self.path.unlink(missing_ok=True)
             self.path.with_suffix(SUFFIX).unlink(missing_ok=True)
             if self._made is not None:
@@ -242,7 +243,9 @@ class Recorder:
         try:
             job()
         except OSError as error:
-            self._failure = f"{self.path}: recording ended: cannot write to the disk ({error.strerror})"
+            self._failure = (
+                f"{self.path}: recording ended, because writing to the disk failed ({error.strerror})"
+            )
             _log.warning("%s", self._failure)
         except Exception as error:
             self._lost += 1

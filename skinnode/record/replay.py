@@ -3,11 +3,15 @@
 The replay uses the host's dispatcher, assembler, decoder, stream, solver and publisher, but no threads: each
 scan is solved when its last frame is dispatched.
 
-Replayed fields are identical to the live fields, bit for bit, if the recording is complete and began before
-the host started, software and processor are the same, and no live solve was cut short by its deadline. Times
-refer to the recording host's clock and have a resolution of 1 µs, as in log files. If frames are missing or
-damaged, the replay orders journal events by time instead of frame count, and uses the times of later frames
-to time out incomplete scans.
+Replayed fields are identical to the live fields, bit for bit, if these conditions are met:
+
+- the recording is complete and began before the host started;
+- the software and the processor are the same;
+- no live solve was cut short by its deadline.
+
+Times refer to the recording host's clock and have a resolution of 1 µs, as in log files. If frames are
+missing or damaged, the frame counts in the journal are not usable. Journal events are then ordered by time,
+and the times of later frames determine when incomplete scans time out.
 """
 
 from __future__ import annotations
@@ -99,7 +103,7 @@ class Replay:
         self._first_ns: int | None = None
         self._journal = path.with_suffix(SUFFIX).name
         self.incomplete: str | None = None
-        """Description of the frames missing from the log; None if none are missing, or not known yet."""
+        """Description of the frames missing from the log; None if no missing frames have been detected."""
         self.dropped = sum(e["frames"] for e in events if e["event"] == "dropped")
         """Number of frames that the recorder could not write."""
         self._now_ns = 0
@@ -172,12 +176,12 @@ class Replay:
         return found
 
     def stop(self) -> None:
-        """End the iteration within :data:`_SLICE_S`; can be called from any thread."""
+        """End the iteration within 0.1 s; can be called from any thread."""
         self._stopped = True
 
     @property
     def stopped(self) -> bool:
-        """Whether the iteration has been stopped, or must stop, before the end of the recording."""
+        """Whether :meth:`stop` has been called or the ``cancelled`` function requests a stop."""
         return self._stopped or self._cancelled()
 
     def health(self, patch: str) -> PatchHealth:
@@ -243,7 +247,7 @@ class _PollerlessDispatcher(Dispatcher):
 
 
 class _Bus:
-    """Receiver for one bus of a recording, which contains the streams of the patches on the bus."""
+    """Receiver for one bus of a recording; contains the streams of all patches on this bus."""
 
     def __init__(self, config: BusConfig, replay: Replay, events: list[dict[str, Any]]) -> None:
         self._config, self._replay = config, replay
@@ -285,7 +289,7 @@ class _Bus:
         self._dispatcher.dispatch((frame,))
         if frame.can_id in self._stood_by:
             monitor = self._of_heartbeat[frame.can_id]
-            if monitor.nmt_state == NmtState.PRE_OPERATIONAL:  # not a fault, but the host's command
+            if monitor.nmt_state == NmtState.PRE_OPERATIONAL:  # commanded by the host; not a fault
                 monitor.nmt_state = NmtState.OPERATIONAL
         if not whole:
             for heard in self.patches.values():
@@ -293,7 +297,7 @@ class _Bus:
         self._dispatcher.measure(frame.t_ns)
 
     def _on_command(self, data: bytes) -> None:
-        """Process an NMT command of the host, which sets nodes pre-operational on exit."""
+        """Process an NMT command that the host sent; on exit, the host sets its nodes pre-operational."""
         if len(data) != 2:
             return
         cob_id = od.heartbeat_cob_id(data[1])
@@ -331,7 +335,7 @@ class _Bus:
                     stream.resume(solver, stream.withholdings, anew=bool(event.get("anew")))
 
     def _solver(self, event: dict[str, Any]) -> ScanSolver | None:
-        """Return the solver for a journal event; None if the facts about the node are unknown or unusable."""
+        """Return the solver for a journal event; None if the node's NodeFacts are unknown or unusable."""
         name, replay = event["patch"], self._replay
         if "facts" in event:
             self._solvers[name] = None

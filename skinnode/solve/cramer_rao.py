@@ -1,4 +1,4 @@
-"""Cramér-Rao bound J⁺ diag(σ²) J⁺ᵀ on the precision of a wire's rest position.
+"""Cramér-Rao bound J⁺ diag(σ²) J⁺ᵀ on the covariance of a wire's position, evaluated at rest.
 
 J is the Jacobian of the relative residual a F − 1 at rest, and σ is the relative noise in each resistance.
 Standard deviations are in clearances; the clearance is the smallest distance at rest between an upper and a
@@ -40,7 +40,7 @@ def wire_std(layout: PatchLayout, relative_noise: ArrayLike, normal_only: bool =
     return _std(layout, np.broadcast_to(relative_noise, layout.shape), normal_only)
 
 
-@functools.lru_cache(maxsize=64)  # cached, because the Jacobians of a layout take 3 ms
+@functools.lru_cache(maxsize=64)  # computing the Jacobians of a layout takes 3 ms
 def _unit_std(layout: PatchLayout, normal_only: bool) -> Float:
     return _std(layout, np.ones(layout.shape), normal_only)
 

@@ -571,7 +571,7 @@ def test_a_node_on_a_bus_of_can_fd(virtual: BusConfig, layout: PatchLayout) -> N
 
 def test_nodes_must_differ(virtual: BusConfig, layout: PatchLayout) -> None:
     with CanPort(virtual) as port:
-        with pytest.raises(ValueError, match=r"node-IDs \[4, 4\], must differ"):
+        with pytest.raises(ValueError, match=r"node-IDs \[4, 4\], must all be different"):
             NodeRunner(port, nodes_on(port, layout, 4, 4))
         with pytest.raises(ValueError, match="got none"):
             NodeRunner(port, [])

@@ -247,7 +247,7 @@ def test_a_full_disk_is_one_line_and_nobody_is_held_up(tmp_path: Path, suffix: s
     )
     assert done.returncode == 0, done.stderr
     assert len(done.stderr.splitlines()) == 1
-    assert "recording ended: cannot write to the disk" in done.stderr
+    assert "recording ended, because writing to the disk failed" in done.stderr
     assert list(replay(path)) == []
 
 

@@ -168,7 +168,7 @@ def test_noise_larger_than_stated_is_not_taken_for_wrong_readings(method: str) -
         field = tracker.update(rest * rng.normal(1.0, 10 * NOISE, LAYOUT.shape))
         assert field.faults == ()
         if field.noise_factor == 1.0:
-            assert field.distrust == "the readings are noisier than stated"
+            assert field.distrust == "the readings are noisier than relative_noise states"
         else:
             assert field.trusted
     assert field.noise_factor == pytest.approx(10.0, rel=0.2)

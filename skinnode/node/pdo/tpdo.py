@@ -11,12 +11,12 @@ type       sent
            never before the inhibit time has passed
 =========  =======================================================================================
 
-An application can *claim* an object. The application then sends all TPDOs whose first mapped object is the
-claimed object. SYNC and events do not trigger claimed TPDOs. The engine still counts SYNCs, answers remote
-frames and runs the event timers for claimed TPDOs.
+An application can *claim* an object of the object dictionary. The application then sends all TPDOs whose
+first mapped object is the claimed object. SYNC and events do not trigger claimed TPDOs. The engine still
+counts SYNCs, answers remote frames and runs the event timers for claimed TPDOs.
 
-The processing time of a SYNC depends only on the number of enabled TPDOs that are sent or sampled at SYNC.
-The processing time of a timer event depends only on the number of TPDOs that are due.
+The time needed to process a SYNC depends only on the number of enabled TPDOs that a SYNC sends or samples.
+The time needed to process a timer event depends only on the number of TPDOs that are due.
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ class Tpdo:
             self.start_timer(t_ns)
 
     def start(self, t_ns: int) -> None:
-        """Reset the TPDO's state and start its event timer, because the node has entered OPERATIONAL."""
+        """Reset the TPDO's state and start its event timer when the node enters OPERATIONAL."""
         self.waiting, self.last, self._in_step, self._syncs = False, None, False, 0
         self.start_timer(t_ns)
 
@@ -92,7 +92,7 @@ class Tpdo:
         self.timer_ns = t_ns + parameters.event_timer_ns if timed else NO_DEADLINE_NS
 
     def elapse(self, t_ns: int) -> None:
-        """Restart an elapsed event timer, without drift unless the delay exceeds one period."""
+        """Restart an elapsed event timer one period after its due time, or after ``t_ns`` if very late."""
         self.timer_ns += self.parameters.event_timer_ns
         if self.timer_ns <= t_ns:
             self.start_timer(t_ns)
@@ -104,14 +104,14 @@ class Tpdo:
             counter: SYNC counter; None if the SYNC message contains no counter.
 
         Returns:
-            Whether this synchronous TPDO is due at the SYNC.
+            Whether this synchronous TPDO must be sent after this SYNC.
         """
         parameters = self.parameters
         if not self._in_step and parameters.sync_start and counter is not None:
             if counter != parameters.sync_start:
                 return False
             self._in_step, self._syncs = True, 0
-            return True  # the SYNC with the start value is the first SYNC of the TPDO
+            return True  # counting begins at the SYNC whose counter has the start value
         self._syncs += 1
         if self._syncs < parameters.kind:
             return False
@@ -120,10 +120,10 @@ class Tpdo:
 
 
 class Owner(Protocol):
-    """Part of an application that has claimed objects and sends the corresponding TPDOs."""
+    """Sender of the TPDOs that carry claimed objects; usually a part of the application."""
 
     def sends(self, tpdo: Tpdo) -> bool:
-        """Return whether the owner will send this TPDO soon, without a request."""
+        """Return whether the owner will soon send this TPDO without a trigger from the TPDO engine."""
         ...
 
     def on_reload(self, tpdo: Tpdo) -> None:
@@ -207,8 +207,8 @@ class TpdoEngine:
         self._plan(tpdo)
 
     def _taken(self, cob_id: int) -> bool:
-        # The object dictionary is read directly, because during a restore its new values have not been
-        # applied yet.
+        # Read the COB-IDs from the object dictionary: when parameters are restored, the TPDOs still have
+        # their previous COB-IDs.
         numbers = range(od.TPDO1_PARAMETER, od.TPDO1_PARAMETER + len(self._tpdos))
         words = [self._store.integer(index, od.PDO_COB_ID) for index in numbers]
         return any(not word & INVALID_BIT and word & COB_ID_MASK == cob_id for word in words)
@@ -216,14 +216,14 @@ class TpdoEngine:
     # --- events
 
     def start(self, t_ns: int) -> None:
-        """Start all TPDOs, because the node has entered OPERATIONAL."""
+        """Start all TPDOs when the node enters OPERATIONAL."""
         self._running = True
         for tpdo in self._tpdos:
             tpdo.start(t_ns)
             self._plan(tpdo)
 
     def stop(self) -> None:
-        """Stop all TPDOs, because the node has left OPERATIONAL."""
+        """Stop all TPDOs when the node leaves OPERATIONAL."""
         self._running = False
         self._timers.clear()
 
@@ -260,7 +260,7 @@ class TpdoEngine:
                     self._transmit(tpdo, payload, t_ns)
 
     def trigger(self, t_ns: int) -> None:
-        """Send all event-driven TPDOs that have no owner, because an event has occurred."""
+        """Signal an event: send all event-driven TPDOs that have no owner."""
         for number in tuple(self._eventful):
             self.request(self._tpdos[number], t_ns)
 
@@ -327,7 +327,7 @@ class TpdoEngine:
         if timer:
             tpdo.start_timer(t_ns)
         self._plan(tpdo)
-        # The frame is sent after the state has been updated, because the bus may refuse the frame.
+        # The state is updated before the frame is sent, because sending may raise a bus error.
         self._send(tpdo.parameters.cob_id, payload)
 
     def _plan(self, tpdo: Tpdo) -> None:
@@ -335,7 +335,7 @@ class TpdoEngine:
 
 
 def _keep(numbers: list[int], number: int, wanted: bool) -> None:
-    """Add ``number`` to the ascending list if ``wanted`` is true; otherwise, remove ``number``."""
+    """Add ``number`` to the sorted list ``numbers`` if ``wanted`` is true; otherwise, remove ``number``."""
     at = bisect_left(numbers, number)
     there = at < len(numbers) and numbers[at] == number
     if wanted and not there:

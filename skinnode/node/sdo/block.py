@@ -22,21 +22,21 @@ from skinnode.node.sdo.transfer import MULTIPLEXER_U32, Channel, Incoming, Targe
 SEGMENT_NS: Final = 500_000
 """Minimum mean interval between segments, in ns.
 
-PDOs may cause a bus load of 70 %. At 1 Mbit/s, the remaining capacity is at least 2200 frames/s. Block
-transfers use 2000 frames/s, so the transmit queue does not fill up. A block takes 64 ms, or 100 ms if the
-thread wakes up late. Clients wait longer than one block for a frame: at least 300 ms (canopen library).
-Each time the bus refuses a segment, for example because of a lower bit rate, the interval is doubled for the
-remainder of the transfer.
+PDOs may cause a bus load of 70 %. A 1 Mbit/s bus then has a remaining capacity of at least 2200 frames/s.
+Block transfers use 2000 frames/s, so the transmit queue does not fill up.
+
+A block of 127 segments takes 64 ms, or 100 ms if the thread wakes up late. Clients tolerate this delay; the
+canopen library waits 300 ms for a response. Each time a segment cannot be sent, for example at a lower bit
+rate, the interval is doubled for the rest of the transfer.
 """
 SLOWEST_SEGMENT_NS: Final = 8 * SEGMENT_NS
-"""Maximum mean interval between segments, in ns. At this interval, the segments use a quarter of the capacity
-of a 125 kbit/s bus. If the bus still refuses segments, a longer interval would not help."""
+"""Maximum mean interval between segments, in ns. At this interval, the segments use only a quarter of the
+capacity of a 125 kbit/s bus."""
 SEGMENTS_AT_ONCE: Final = 4
-"""Maximum number of segments sent per timer event. Sending several segments compensates for late wake-ups of
-the thread, by default up to 2 ms late.
+"""Maximum number of segments sent per timer event.
 
-The transmit queue of a Linux CAN interface has space for 10 frames, and a delayed thread may handle two timer
-events in succession.
+Several segments are sent if the thread has woken up late, by default by up to 2 ms. Two timer events in
+succession must not overflow the transmit queue, which holds 10 frames on Linux.
 """
 TWICE_NS: Final = 3_000_000
 """Maximum interval (ns) between the two receptions of a duplicated frame: the duration of two maximum-length
@@ -154,7 +154,7 @@ class BlockUpload(Transfer):
         head = self._sent + 1 | (_LAST if last else 0)
         try:
             self._channel.send(bytes((head,)) + segment.ljust(SEGMENT_BYTES, b"\0"))
-        except BusError:  # the bus refused the segment, which is therefore sent again later
+        except BusError:  # the segment was not sent and will be retried at the longer interval
             self._pace_ns = min(2 * self._pace_ns, SLOWEST_SEGMENT_NS)
             raise
         self._sent += 1
@@ -162,7 +162,7 @@ class BlockUpload(Transfer):
             self._waits_for = _Upload.ACKNOWLEDGEMENT
 
     def _acknowledge(self, received: int, block_size: int, t_ns: int) -> None:
-        """Continue after segment ``received`` of the current block, the last that the client received."""
+        """Continue after segment number ``received`` of this block, the last that the client received."""
         if received > self._sent:
             raise Refused(AbortCode.INVALID_SEQUENCE)
         self._block_size = _checked(block_size)
@@ -201,10 +201,9 @@ class BlockDownload(Transfer):
         self._incoming = Incoming(channel.store, target, announced)
         self._crc = crc
         self._received = 0  # number of segments of the current block received without a gap
-        self._last: bytes | None = (
-            None  # last segment of the transfer; its number of data bytes follows in the end request
-        )
-        self._previous = b""  # the last request if it was acknowledged, so that its repetition can be ignored
+        # last segment of the transfer; the end request states how many of its bytes are data
+        self._last: bytes | None = None
+        self._previous = b""  # the last acknowledged request; if it is received again, it is ignored
         channel.send(MULTIPLEXER_U32.pack(0xA0 | crc << 2, target.index, target.subindex, MAX_BLOCK_SEGMENTS))
 
     def wants(self, request: bytes) -> bool:

@@ -139,7 +139,9 @@ class SdoServer:
     def _block_upload(self, request: bytes, target: Target, t_ns: int) -> None:
         data = self._read(target)
         block_size, switch_threshold, crc = request[4], request[5], bool(request[0] & 4)
-        if 0 < len(data) <= switch_threshold:  # the client prefers segmented transfers up to this size
+        if (
+            0 < len(data) <= switch_threshold
+        ):  # up to this size, the client prefers a transfer that is not a block transfer
             self._start_upload(target, data, t_ns)
         else:
             self._transfer = BlockUpload(self._channel, target, Upload(data, block_size, crc), t_ns)

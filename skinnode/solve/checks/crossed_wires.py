@@ -3,8 +3,8 @@
 If two wires were already crossed when the readings at rest were measured, the error is invisible until the
 skin moves. The displacements of each crossed wire are then attributed to the other wire. Exchanging the
 readings of two wires changes the log evidence of a frame by −αᵀδ − ½ δᵀPδ. Here P is the precision of the
-readings z, α = P z, and δ is the change of z due to the exchange. The test has no fitted parameters, so a
-difference of a few nats is significant.
+readings z, α = P z, and δ is the change of z due to the exchange. The exchange fits no parameters to
+the frame, so an increase by a few nats is significant.
 
 In 108 healthy frames with six kinds of presses (staggered layout, h = 0.5, noise 1e-4), the log evidence
 changed by at most 2.8 nats. The median change was 125 nats with two upper wires crossed, and 43 nats with two
@@ -58,7 +58,7 @@ def likeliest(
         z: (U, K) changes of the readings since rest, in units of their noise.
         present: (U, K) mask of the available readings; unavailable readings are not exchanged.
         far: Whether to compare all pairs of wires; by default, only neighbours are compared. Comparing all
-            pairs takes ten times as long.
+            pairs takes ten times as long as comparing neighbours.
     """
     upper_wires, lower_wires = z.shape
     longest = max(upper_wires, lower_wires)

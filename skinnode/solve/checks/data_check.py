@@ -1,7 +1,8 @@
 """Data check: find readings of a frame that contradict the others, solve without them, and assess trust.
 
-Each frame is first solved with all readings except those with confirmed faults. The field is converted to
-readings linearised at rest, and the model in :mod:`skinnode.solve.checks.reading_model` tests these readings.
+Each frame is first solved with all readings except those with confirmed faults. The displacements are then
+converted to changes of the readings, linearised at rest. The model in
+:mod:`skinnode.solve.checks.reading_model` tests these changes.
 If a reading or a wire contradicts the others, the frame is solved again without it; at most :data:`ROUNDS`
 groups of readings are left out.
 """
@@ -39,39 +40,40 @@ WRONG: Final = 0.1
 """Expected relative error of a wrong reading. This value is not tuned; a value of 0.01 would change the cost
 of a wrong reading by only 2 nats."""
 SUSPICIOUS: Final = 5.0
-"""Threshold (nats) for the gain in log evidence from a fault; above the threshold, a frame is suspicious, and
-the check looks for explanations."""
+"""Gain in log evidence (nats) from assuming a fault, above which a frame is suspicious. The check examines
+suspicious frames, i.e. it searches for explanations."""
 OFFSETS: Final = (0, 1, 3, 5)
-"""Values subtracted from the index of the best-fitting κ; single readings are tested at each resulting κ."""
+"""Differences between the index of the best-fitting κ and those of the κ at which single readings are
+tested."""
 CLEAR: Final = -30.0
-"""Threshold (nats) for the log evidence of faults minus that of loads; below the threshold, loads clearly
-explain the frame, and subsequent similar frames are not examined."""
+"""Log evidence of faults minus that of loads (nats), below which loads clearly explain a frame. Subsequent
+similar frames are then not examined."""
 EXCUSED: Final = 10.0
-"""Increase of the gain (nats) since the last examination that makes a similar frame suspicious again."""
+"""Increase of the gain (nats) since the last examination, above which a similar frame is examined again."""
 EXCUSED_FRAMES: Final = 8
 """Number of frames after an examination during which similar frames are not examined again; an examination
 takes 9 ms."""
 PATIENCE: Final = 4
-"""Number of suspicious frames without time for an examination, of which the last is examined despite its
-deadline. A fault makes all subsequent frames suspicious; a press rarely does."""
+"""If the deadline leaves no time to examine suspicious frames, one in this number of frames is examined
+anyway. A fault makes all subsequent frames suspicious; a press rarely does."""
 EXAMINATION_S: Final = 3e-3
 """Expected duration of the first examination, s. Later examinations use measured durations."""
 CROSSED_FRAMES: Final = 5
-"""Number of frames after the detection of two crossed wires during which the detection of one of them is
-reported as a detection of both."""
+"""If only one of two crossed wires is found within this number of frames after both were detected, both are
+reported."""
 NOISE_RATIOS: Final = (2.0, 4.0, 8.0, 16.0)
 """Ratios of actual to stated noise that are tried as explanations of a suspicious frame."""
 COARSE: Final = 0.1
-"""Assumed error of the linearised readings if several upper wires have no solution, relative to the readings'
-largest change since rest."""
+"""Assumed error of the linearised readings if several upper wires have no solution, as a fraction of the
+90 % quantile of the readings' changes since rest."""
 COARSE_GROUPS: Final = 3
 """Maximum number of groups of readings that are left out at once if several upper wires have no solution. If
 the search finds more groups, only the first is left out."""
 UNSOLVED: Final = 1
-"""Maximum number of upper wires without a solution that are reported as faulty. If more upper wires have no
-solution, none is reported, because a lower wire may be the cause."""
+"""If no more than this number of upper wires have no solution, they are reported as faulty. If there are
+more, none is reported, because a lower wire may be the cause."""
 SPARED: Final = 3
-"""Maximum number of upper wires left out by the solver that are reported as faulty; if the solver left out
+"""If the solver left out no more than this number of upper wires, they are reported as faulty. If it left out
 more, none is reported."""
 
 Mask = NDArray[np.bool_]
@@ -91,7 +93,7 @@ class Solved:
 
 
 class DataCheck:
-    """Data check of one patch, frame by frame. Do not share an instance between owners.
+    """Data check of one patch, frame by frame. Each stream needs its own instance.
 
     Args:
         problem: The patch.
@@ -101,8 +103,8 @@ class DataCheck:
         drift: Gain errors that are expected and not reported as faults: ``none``, ``patch`` or ``wire``.
 
     Attributes:
-        scan: Scan number of the next frame, for its reported faults; if None, the number of checked frames is
-            reported.
+        scan: Scan number of the next frame, shown in reported faults; None to show the number of checked
+            frames instead.
     """
 
     def __init__(
@@ -141,14 +143,15 @@ class DataCheck:
         """Discard the state of the stream, including all faults."""
         self._list.reset()
         self._frame, self._doubtful, self._noisy = 0, False, False
-        self._lead = 0.0  # if the last frame was noisy: gain in log evidence from more noise; else 0
+        self._lead = 0.0  # gain in log evidence from more noise if the last frame was noisy; else 0
         self._excused, self._excused_where, self._excused_until = -math.inf, -1, 0
         self._where = -1
         self._crossed: tuple[Group, ...] = ()
         self._crossed_until = 0
         self._last: FieldFrame | None = None
         self._unexamined, self._overdue, self._waiting = False, False, 0
-        self._faultless = 0.0, -1, -EXCUSED_FRAMES  # gain, reading and frame of the last examination
+        # last examined frame without a fault: gain, reading, number
+        self._faultless = 0.0, -1, -EXCUSED_FRAMES
 
     @property
     def left_out(self) -> Mask | None:
@@ -165,9 +168,9 @@ class DataCheck:
             solve_without: Function that solves the frame without the given readings (U, K) and without those
                 in :attr:`left_out`.
             until: Deadline as a value of :func:`skinnode.process.clock.perf_counter`, s; −inf if the solver
-                ran out of time before all wires were solved, which does not indicate a fault. A suspicious
-                frame that cannot be examined before the deadline is not trusted. Every :data:`PATIENCE`-th
-                suspicious frame without time for an examination is examined despite its deadline.
+                ran out of time. In that case, unsolved wires do not indicate a fault. A suspicious frame that
+                cannot be examined before the deadline is not trusted. If this happens repeatedly, every
+                :data:`PATIENCE`-th such frame is examined despite the deadline.
         """
         self._frame += 1
         last = self._last
@@ -239,11 +242,11 @@ class DataCheck:
         return self._needs_no_explanation(max(self._largest_gains(self._present, best, cost, sigma)))
 
     def _needs_no_explanation(self, gain: float) -> bool:
-        """Return whether a frame with this gain from a fault is accepted without further examination.
+        """Return whether a frame needs no examination; ``gain`` is the gain from assuming a fault, nats.
 
-        A frame is accepted if the gain is small, or if loads clearly explained a recent frame with a similar
-        gain and the same suspected reading. A frame with a different suspected reading is not accepted,
-        because a reading may become wrong during a press. After a noisy frame, no frame is accepted.
+        A frame needs no examination if ``gain`` is small, or if loads clearly explained a recent frame with a
+        similar gain and the same suspected reading. A frame with a different suspected reading is examined,
+        because a reading may become wrong during a press. The frame after a noisy frame is always examined.
         """
         excused = (
             self._frame < self._excused_until
@@ -316,8 +319,7 @@ class DataCheck:
     def _in_time(self, seconds: float, until: float) -> bool:
         """Return whether the check may spend ``seconds`` on a suspicious frame.
 
-        The check may spend this time if the deadline permits, or if the frame is the :data:`PATIENCE`-th
-        suspicious frame without time for an examination.
+        The deadline is ignored for every :data:`PATIENCE`-th suspicious frame that would exceed it.
         """
         if self._overdue or perf_counter() + seconds <= until:
             return True
@@ -328,7 +330,7 @@ class DataCheck:
         return self._overdue
 
     def _noisier(self) -> float:
-        """Return the log evidence of the frame if all its readings are noisier than stated.
+        """Return the log evidence of the frame if all its readings have more than the stated noise.
 
         If the noise is ``ratio`` times the stated noise, the log evidence is that of z / ratio, minus
         ln(ratio) for each reading.
@@ -344,7 +346,7 @@ class DataCheck:
         return most - math.log(len(NOISE_RATIOS))
 
     def _with_both_crossed(self, found: tuple[Group, ...]) -> tuple[Group, ...]:
-        """Replace ``found`` with both recently crossed wires if ``found`` contains only one of them."""
+        """Return both recently crossed wires if one of them was found; otherwise, return ``found``."""
         if any(group.kind is FaultKind.CROSSED for group in found):
             self._crossed, self._crossed_until = found, self._frame + CROSSED_FRAMES
         elif self._frame <= self._crossed_until:
@@ -411,7 +413,7 @@ class DataCheck:
         return best
 
     def _largest_gains(self, present: Mask, best: int, cost: float, sigma: float) -> tuple[float, float]:
-        """Return the largest gains: from a wrong reading or crossed wires, and from a faulty wire."""
+        """Return the largest gain from a wrong reading or crossed wires, and that from a faulty wire."""
         most, of_wires, z = -math.inf, -math.inf, self._z.ravel()
         for offset in OFFSETS:
             number = best - offset
@@ -433,8 +435,8 @@ class DataCheck:
         """Return the most likely wrong readings if several upper wires have no solution.
 
         If several upper wires have no solution, loads cannot explain the frame, so the search omits loads.
-        Before :meth:`check` reports wrong readings, it compares them with the field that was solved without
-        them.
+        The method :meth:`check` later solves the frame without these readings, and reports only those that
+        disagree with the resulting field.
         """
         with np.errstate(divide="ignore", invalid="ignore"):
             np.log(self._problem.a_rest / solved.a, out=self._z)
@@ -469,7 +471,7 @@ class DataCheck:
         return np.where(known, deviation, np.inf), known
 
     def _contradicting(self, groups: list[Group], solved: Solved) -> list[Group]:
-        """Return the groups, except those found by the coarse search that agree with the field."""
+        """Return the groups; omit those that the coarse search found but that agree with the field."""
         if not self._coarse:
             return groups
         deviation, known = self._deviations(solved)
@@ -495,6 +497,6 @@ def _spared(solved: Solved) -> tuple[Solved, list[Group]]:
 
 
 def _still(solved: Solved, last: FieldFrame) -> bool:
-    """Return whether every wire was held in this frame and its status is the same as in the last field."""
+    """Return whether no wire was solved again, and every status is the same as in the last field."""
     held = solved.field.held
     return held is not None and bool(held.all()) and solved.field.status == last.status

@@ -27,25 +27,24 @@ from skinnode.solve.checks.wire_tests import GAIN_STD, LEAST, WireFinding, least
 from skinnode.solve.linalg.cholesky import multiply_vector
 
 MARGIN: Final = 20.0
-"""Margin in log evidence (nats) by which an explanation with faults must beat loads alone before the faults
-are reported. With this margin, no fault was falsely reported in 6,800 frames of deep slides at a noise of
+"""Minimum margin (nats) for faults to be reported: log evidence of an explanation with faults minus that of
+loads alone. With this margin, no fault was falsely reported in 6,800 frames of deep slides at a noise of
 3e-6, nor in 270 frames with six kinds of presses at a noise of 1e-5."""
 MARGIN_OF_READING: Final = 50.0
-"""Margin in log evidence (nats) by which an explanation with a single wrong reading must beat loads alone
-before the reading is reported. Single readings are tested at every prior scale. Under a narrow load at the
-edge of a patch, a correct reading reached a margin of 29 nats in 36,000 frames (``bench trust --seed 1 --only
-hours``)."""
+"""Minimum margin (nats) for a single wrong reading to be reported. Single readings are tested at every prior
+scale. In 36,000 frames with correct readings, a narrow load at the edge of a patch produced a margin of up to
+29 nats (``bench trust --seed 1 --only hours``)."""
 DOUBT: Final = 5.0
-"""Margin in log evidence (nats) by which an explanation with faults must beat loads alone before a frame is
-marked doubtful. In 144 healthy frames, explanations with faults never beat explanations by up to 8 loads."""
+"""Minimum margin (nats) for a frame to be marked doubtful. In 144 healthy frames, no explanation with faults
+had a higher log evidence than the best explanation by up to 8 loads."""
 SCALES: Final = 4
 """Number of prior scales searched for explanations: the best-fitting scale and smaller scales. A wrong
 reading can inflate the best-fitting scale by a factor of up to 2⁴, and a narrow contact by up to 2³."""
 STRIDE: Final = 2
 """Step in log2 κ between the prior scales that are searched for explanations."""
 HOPELESS: Final = 150.0
-"""Margin in log evidence (nats) by which loads alone must beat faults at one prior scale before the search
-for faults at that scale stops. In 163 frames with a fault, loads beat faults by at most 114 nats."""
+"""Log evidence of loads minus that of faults at one prior scale (nats), above which smaller scales are not
+searched for faults. In 163 frames with a fault, the difference was at most 114 nats."""
 
 _PARTS: Final = {CROSSING: FaultyPart.CROSSING, LOWER: FaultyPart.LOWER, UPPER: FaultyPart.UPPER}
 
@@ -72,7 +71,7 @@ class Group:
 
 
 class Explainer:
-    """Search for the most likely explanation of a frame. Do not share an instance between owners.
+    """Finds the most likely explanation of a frame. Each stream needs its own instance.
 
     Args:
         model: Joint distribution of the readings.
@@ -83,7 +82,7 @@ class Explainer:
         self._search = GreedySearch(model)
         self._alpha, self._row = np.empty(len(model.response)), np.empty(max(model.shape) + 1)
         self.margin = -math.inf
-        """Margin (nats) by which the evidence of faults beat that of loads or noise in the last frame."""
+        """Log evidence of faults minus that of loads or noise in the last frame, nats."""
         self.is_noisier = False
         """Whether the last frame was explained better by noise above the stated level than by loads."""
 
@@ -135,16 +134,16 @@ class Explainer:
             if by_pair > by_faults:
                 by_faults, groups = by_pair, _crossed(pair, by_pair - by_loads)
             by_reading, number = self._by_reading(z, present, evidence, best, cost)
-            # A narrow load at the edge of a patch resembles a wrong reading, so a smaller difference does not
-            # make the frame doubtful.
+            # A narrow load at the edge of a patch resembles a wrong reading, so a reading with a smaller
+            # margin does not make the frame doubtful.
             if by_reading > max(by_faults, by_loads + MARGIN_OF_READING):
                 by_faults, groups = by_reading, (self._reading(number, by_reading - by_loads),)
         self.margin = by_faults - by_loads
         finding = least_fitting(level.wires, z, alpha, present, sigma, self._row)
         if finding.gain > DOUBT:
             by_wire = self._by_wire(z, present, cost, finding, alpha, best, GAIN_STD / sigma)
-            # A load on only one wire also makes this wire inconsistent with the others, so a smaller
-            # difference does not make the frame doubtful.
+            # A load on only one wire also makes this wire inconsistent with the others, so a wire with a
+            # smaller margin does not make the frame doubtful.
             if by_wire > max(by_faults, by_loads + MARGIN):
                 self.margin, groups = by_wire - by_loads, (self._wire(finding.wire, by_wire - by_loads),)
         return groups if self.margin > MARGIN else ()
@@ -226,7 +225,7 @@ class Explainer:
         tables = self._model.level(best).wires
         of_p = tables.upper_p[wire] if wire < upper else tables.lower_p[wire - upper]
         error = np.linalg.solve(of_p @ of_p.T, alpha.reshape(z.shape)[rows].ravel())
-        z[rows] = (own - error).reshape(z[rows].shape)  # prediction from the other wires
+        z[rows] = (own - error).reshape(z[rows].shape)  # readings predicted from the other wires
         present[rows] = False
 
         def alone(level: Level) -> float:

@@ -33,7 +33,7 @@ Mask = NDArray[np.bool_]
 
 
 def agree(deviation: Float) -> bool:
-    """Return whether readings agree with a field, given their deviations in standard deviations."""
+    """Return whether readings agree with a field; ``deviation`` is in standard deviations."""
     return float(np.mean(deviation**2)) <= AGREE**2
 
 
@@ -46,7 +46,7 @@ class _Named:
 
 
 class FaultList:
-    """Faults of one patch, updated frame by frame. Do not share an instance between owners.
+    """Faults of one patch, updated frame by frame. Each stream needs its own instance.
 
     Args:
         shape: Number of upper and lower wires.
@@ -83,7 +83,7 @@ class FaultList:
         Args:
             groups: Groups of wrong readings.
             frame: Number of the frame, counted by the data check.
-            scan: Scan number of the frame, for the fault reported to the user.
+            scan: Scan number of the frame, shown in reported faults.
         """
         passing = []
         for group in groups:

@@ -31,14 +31,14 @@ all healthy frames of a deep slide."""
 ENOUGH: Final = 1.0
 """Minimum gain in log evidence (nats) from a load or fault that the search adds to an explanation."""
 LOAD, CROSSING, LOWER, UPPER = range(4)
-"""Kinds of a search step: add a load, leave out the reading of a crossing, or leave out all readings of a
+"""Kinds of search steps: add a load, leave out the reading of a crossing, or leave out all readings of a
 lower or an upper wire."""
 
 Mask = NDArray[np.bool_]
 
 
 class GreedySearch:
-    """Greedy search and its work arrays. Do not share an instance between owners.
+    """Greedy search and its work arrays. Each stream needs its own instance.
 
     Args:
         model: Distribution of the readings.
@@ -166,7 +166,7 @@ def _best_group(  # noqa: PLR0913 - a kernel: arrays by name
 def _gram_row(  # noqa: PLR0913 - a kernel: arrays by name
     item: int, p: Float, moved: Float, gram: Float, response_t: Float, row: Float
 ) -> None:
-    """Write row ``item`` of E into ``row`` (m + 4Q,), from ``moved`` and ``gram`` unless these are empty."""
+    """Write row ``item`` of E into ``row`` (m + 4Q,); use the tables ``moved`` and ``gram`` if not empty."""
     m = len(p)
     if item < m:
         for j in range(m):

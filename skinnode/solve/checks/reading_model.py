@@ -7,11 +7,11 @@ tests follow from the precision P = S⁻¹: with α = P z, the χ² of predictin
 others is α_Gᵀ P_GG⁻¹ α_G (Rasmussen and Williams, Gaussian Processes for Machine Learning, 2006, section
 5.4.2).
 
-The loads act on two supports of the rubber: a half-space, as in the elastic prior (three loads per cell), and
-a thin bonded layer (one normal load per cell). With the half-space alone, readings of a healthy patch with a
-thin layer were reported as contradictory: in ``tests/solve/test_trust_on_a_thin_layer.py``, 91 of 210 fields
-were not trusted, and 88 faults were reported. With both supports, only 1 of the 210 fields was not trusted,
-and no faults were reported.
+The response to loads is computed for two models of the rubber: a half-space, as in the elastic prior (three
+loads per cell), and a thin bonded layer (one normal load per cell). With the half-space alone, correct
+readings of a patch with a thin layer were reported as contradictory: in
+``tests/solve/test_trust_on_a_thin_layer.py``, 91 of 210 fields were not trusted, and 88 faults were reported.
+With both models, only 1 of the 210 fields was not trusted, and no faults were reported.
 """
 
 from __future__ import annotations
@@ -32,8 +32,8 @@ from skinnode.solve.posterior.elastic_prior import SLACK, ElasticPrior, bonded_r
 USUAL: Final = (-17, -3)
 """Range of log2 s for which load tables are precomputed; s is the prior scale in pitches."""
 MOST_USUAL: Final = 9
-"""Number of prior scales, counted from the largest in :data:`USUAL`, whose tables are precomputed for a large
-patch."""
+"""Number of prior scales for which tables are precomputed if the patch is large: the largest scales in
+:data:`USUAL`."""
 STORED: Final = 125_000_000
 """Maximum size of precomputed tables, in bytes. Computing the tables during the stream would delay the first
 touch by up to 0.1 s. The tables of the reference patch take 122 MB. For larger patches, the products with the
@@ -44,7 +44,7 @@ OCTAVES: Final = (-7, 21)
 
 @dataclass(frozen=True, eq=False)
 class Level:
-    """Distribution of the m = U K readings at one κ, for Q cells that may be loaded."""
+    """Distribution of the m = U K readings at one κ."""
 
     precision: Float
     """(m, m) precision P of the readings."""
@@ -56,7 +56,7 @@ class Level:
 
 @dataclass(frozen=True, eq=False)
 class LoadTables:
-    """Products of the precision P at one κ with the matrix B, the responses of the readings to the loads."""
+    """Products of the precision P at one κ with B, the responses of the readings to loads on Q cells."""
 
     diagonal: Float
     """(m + 4Q,) diagonals of P and of Bᵀ P B."""

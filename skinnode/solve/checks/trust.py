@@ -1,4 +1,4 @@
-"""Trust in a field: decide whether the field is trusted and, if it is not, state the reason.
+"""Decides whether a field is trusted and, if it is not, states the reason.
 
 A field is trusted if all upper wires in use converged, if sufficient readings and upper wires are in use, and
 if the readings do not contradict each other. The host additionally requires the patch to be alive.
@@ -28,7 +28,7 @@ CONTRADICTION: Final = (
 UNEXAMINED: Final = (
     "the readings seem to contradict each other, and the deadline left no time to examine them"
 )
-NOISIER: Final = "the readings are noisier than stated"
+NOISIER: Final = "the readings are noisier than relative_noise states"
 
 Mask = NDArray[np.bool_]
 

@@ -1,4 +1,4 @@
-"""Tests of whole wires: whether a wire's readings fit the other wires, and whether its gain is correct.
+"""Tests whether the readings of a wire are consistent with the other wires, and whether its gain is correct.
 
 If a wire's readings are delayed or belong to another wire, each reading deviates only slightly from the
 prediction by the other wires. A test of single readings does not detect these small deviations. Let G be the

@@ -1,4 +1,4 @@
-"""Estimation of contacts and loads from exact fields.
+"""Estimates contacts and loads from exact fields.
 
 The displacement field u from the exact inverse is modelled as u = G q + slack + e. The loads q ~ N(0, s²) of
 the elastic prior move the electrodes by G q. The inverse's error is e ~ N(0, ν² Σ). Here Σ is the error
@@ -130,10 +130,10 @@ class ExactContacts:
         self._without: tuple[bytes, float, float, Float] | None = None
 
     def add(self, field: FieldFrame) -> FieldFrame:
-        """Return the field with its contacts, and with its forces unless the paper's law determines them.
+        """Return the field with its contacts and, unless the option ``stiffness_n_per_m`` is set, its forces.
 
-        Wires with an infinite standard deviation are ignored. A field without other wires has no contacts,
-        and zero forces.
+        Wires with an infinite standard deviation are ignored. A field in which all standard deviations are
+        infinite has no contacts and zero forces.
 
         Args:
             field: Exact field, after the checks of its roots and data.
@@ -245,7 +245,8 @@ def _factors(layout: PatchLayout, rubber: Rubber | None, noise: Float, normal_on
     every = np.arange(3 * wires * electrodes)
     free = every[2::3] if normal_only else every
     n = weighted.shape[2]
-    least = 1.0 / float(problem.clearance.min())  # because no electrode moves farther than the clearance
+    # The standard deviations are limited to the clearance, because no electrode moves farther.
+    least = 1.0 / float(problem.clearance.min())
     root, std = np.zeros((free.size, free.size)), np.empty((wires, n))
     for u in range(wires):
         _, singular, turn = np.linalg.svd(weighted[u])
@@ -274,10 +275,11 @@ def _judge(  # noqa: PLR0913 - a kernel: field, factors and outputs by name
     ratio: Float,
     ordered: Float,
 ) -> tuple[float, float, bool]:
-    """Compare a field (2, 3UN) of displacements and standard deviations, m, with the rest position.
+    """Find the largest displacement in a field, and wires with unusually large standard deviations.
 
-    Writes the free displacements (n,) in pitches to ``moved``. Writes the mean ratio of each wire's variances
-    to its variances at rest to ``ratio`` (U,); inf if a variance is infinite. ``ordered`` (U,) is scratch.
+    The argument ``field`` (2, 3UN) contains displacements and standard deviations, m. Writes the free
+    displacements (n,) in pitches to ``moved``. Writes the mean ratio of each wire's variances to its
+    variances at rest to ``ratio`` (U,); inf if a variance is infinite. ``ordered`` (U,) is scratch.
 
     Returns:
         The largest displacement in standard deviations, the median ratio of the wires with finite ratios,

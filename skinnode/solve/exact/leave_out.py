@@ -6,15 +6,16 @@ wire are fixed. While χ² rejects the fit, the electrode that explains most of 
 together with its neighbours. If more than half of the electrodes have become unknowns, all electrodes become
 unknowns. As soon as the rest position explains a frame, all electrodes are fixed at rest again. The standard
 deviation of an omitted coordinate is the smallest movement that χ² would detect if no other electrode moved.
-To first order at rest, this movement is √(quantile − degrees of freedom) σ / ‖component of the coordinate's
-column of J outside the range of the unknowns and of the electrode's other columns‖.
+To first order at rest, this movement is √(quantile − degrees of freedom) σ / ‖c‖. Here c is the component of
+the coordinate's column of J that is orthogonal to the columns of the unknowns and to the electrode's other
+columns.
 
 Each option rests on an assumption about the skin, and the standard deviations of the unknowns are valid only
-if the assumption holds. A χ² test detects violations of the assumption of active_only reliably. The test is
-less sensitive for normal_only, because smooth shear resembles a gradient of z. On the staggered layout, h =
-0.5, noise 1e-5, the test rejects a strong Hertzian press whose shear is 30 % of its depth. The test accepts a
-weaker press, with errors in z of up to 16 standard deviations (only 0.2 % of h). Increasing the standard
-deviations to cover these errors would cost more accuracy than solving for the shear.
+if the assumption holds. A χ² test reliably detects frames that violate the assumption of active_only. The
+test is less sensitive for normal_only, because smooth shear resembles a gradient of z. On the staggered
+layout (h = 0.5, noise 1e-5), the test rejects a strong Hertzian press whose shear is 30 % of its depth. A
+weaker press passes the test, although the errors in z reach 16 standard deviations (only 0.2 % of h).
+Increasing the standard deviations to cover these errors would cost more accuracy than solving for the shear.
 """
 
 from __future__ import annotations
@@ -39,14 +40,14 @@ from skinnode.solve.wires.stages import DEADLINE, STALE
 Z_WIDEN: Final = 3.719
 """Normal quantile of the χ² probability 1 − 1e-4, above which an electrode becomes an unknown.
 
-At 100 frames/s, chance adds an electrode to a long press about once every 100 s.
+At 100 frames/s, noise alone adds an electrode about once every 100 s during a long press.
 """
 TINY: Final = 1e-200
-"""Minimum squared slope used as a divisor: far below real slopes, yet large enough to avoid overflow."""
+"""Minimum squared slope used as a divisor: smaller than any real one, but large enough to avoid overflow."""
 
 
 class LeftOut:
-    """Electrodes omitted from the unknowns of a stream, and the sizes of their undetectable movements."""
+    """Electrodes omitted from the unknowns of a stream, and their smallest detectable movements."""
 
     def __init__(self, stream: StreamState, active_only: bool) -> None:
         problem = stream.problem
@@ -56,7 +57,8 @@ class LeftOut:
         # ∂r/∂x at rest with respect to every coordinate, (U, 3N, K)
         slopes = jacobian(layout, layout.upper_m).reshape(*layout.shape, -1) * layout.pitch_m**2
         self._slopes = np.ascontiguousarray((slopes * problem.a_rest[:, :, None]).transpose(0, 2, 1))
-        # (U, 3N) undetectable movement of each coordinate, pitches per unit of σ, and its weights (U, K)
+        # (U, 3N) smallest detectable movement of each coordinate, pitches per unit of σ, and the (U, K)
+        # weights of the readings for which it was computed
         self._unnoticed = np.zeros((layout.shape[0], layout.unknowns))
         self._unnoticed_weight = np.zeros(layout.shape)
         # maximum χ², indexed by degrees of freedom
@@ -78,7 +80,7 @@ class LeftOut:
             self._set_electrodes(u, np.arange(self._layout.unknowns // 3))
 
     def leave_out(self, sigma: float) -> None:
-        """Fix wires at rest if the rest position explains the frame; write the std of omitted coordinates."""
+        """Fix wires whose rest position explains the frame; write the omitted coordinates' deviations."""
         solver, arrays = self._stream.solver, self._stream.arrays
         if self._active_only:
             a_rest = self._stream.problem.a_rest
@@ -112,12 +114,12 @@ class LeftOut:
         solver, arrays, problem = self._stream.solver, self._stream.arrays, self._stream.problem
         solver.set_electrodes(u, electrodes)
         arrays.predictable[u] = len(electrodes) == 0
-        if arrays.predictable[u]:  # a wire without unknowns is at rest, and has no noise
+        if arrays.predictable[u]:  # a wire without unknowns is fixed at its rest position
             arrays.x[u], arrays.a_solved[u] = problem.rest[u], problem.a_rest[u]
             solver.a_solved[u], solver.noise[u] = arrays.a_solved[u], 0.0
 
     def _measure_unnoticed(self, u: int, weight: Float) -> None:
-        """Write the undetectable movement of each omitted coordinate, pitches per unit of σ."""
+        """Write the smallest detectable movement of each omitted coordinate, pitches per unit of σ."""
         solver, (_, lower) = self._stream.solver, self._layout.shape
         self._unnoticed_weight[u] = weight
         unnoticed = self._unnoticed[u].reshape(-1, 3)
@@ -191,7 +193,7 @@ class LeftOut:
 
 
 def _changed(weight: Float, before: Float) -> NDArray[np.bool_]:
-    """Return a mask (U,) of the wires on which a weight changed by more than a factor of ``STALE``."""
+    """Return a mask (U,) of wires with a reading whose weight changed by more than a factor of ``STALE``."""
     return np.asarray(((weight > STALE * before) | (before > STALE * weight)).any(axis=1))
 
 

@@ -23,12 +23,12 @@ from skinnode.solve.wires.arrays import solve_options
 from skinnode.solve.wires.stages import DEADLINE
 
 BRIDGES: Final = (3, 5, 10)
-"""Number of substeps in each successive bridge. If a press of 50 % starts from rest between two frames
-(staggered layout, h = 0.5), 3 substeps solve every wire. For a press of 70 %, 5 substeps solve 23 of 24
+"""Number of substeps in each successive bridge. If the skin is pressed by 50 % of h between two frames
+(staggered layout, h = 0.5), 3 substeps solve every wire. For a press by 70 % of h, 5 substeps solve 23 of 24
 wires. Adaptive steps restricted to the trusted branch solve fewer wires, because the straight line in R
 crosses singular points that the press avoids."""
 BRIDGE_TOLERANCE: Final = 1e-6
-"""Tolerance for the substeps of a bridge, equal to the paper's intermediate tolerance."""
+"""Tolerance for all substeps of a bridge except the last: the intermediate tolerance in the paper."""
 BRIDGE_STEPS: Final = 20
 """Maximum steps per substep."""
 RECOVERY_STEPS: Final = 300
@@ -36,7 +36,7 @@ RECOVERY_STEPS: Final = 300
 
 This limit prevents a corrupt frame from stalling the stream.
 """
-# Regardless of the stream's operator, bridges use Levenberg-Marquardt: it crosses large gaps most reliably.
+# Bridges use Levenberg-Marquardt, which converges most reliably from a distant starting point.
 _ACROSS: Final = solve_options(op.LEVENBERG_MARQUARDT, 0, BRIDGE_TOLERANCE, BRIDGE_TOLERANCE, BRIDGE_STEPS)
 _LAST: Final = solve_options(op.LEVENBERG_MARQUARDT, TASKS, TOLERANCE, TOLERANCE, BRIDGE_STEPS)
 
@@ -64,11 +64,11 @@ def recover_lost(
         ended = int(solver.report[u, wires.STATUS])
         status[u] = op.ILL_CONDITIONED if ended == op.CONVERGED and not good[u] else ended
     solver.std[~good] = np.inf
-    arrays.predictable &= ~(lost | exhausted)  # all other wires keep their inverse
+    arrays.predictable &= ~(lost | exhausted)  # the inverses of all other wires remain valid
 
 
 def recover(stream: StreamState, u: int, frame: Frame) -> bool:
-    """Bridge wire u from its last trusted position, then from rest; return whether it reached a root."""
+    """Bridge wire u from its last trusted position, then from rest; return whether a root was found."""
     solver, arrays, problem = stream.solver, stream.arrays, stream.problem
     starts = [(arrays.x[u].copy(), arrays.a_solved[u].copy())]
     rest = problem.rest[u], problem.a_rest[u]
@@ -91,9 +91,9 @@ def _bridge(  # noqa: PLR0913 - both ends of the bridge
 ) -> bool:
     """Solve wire u along a straight line from the resistances ``a_from`` (K,) to the frame's resistances.
 
-    Only the last point's branch is checked: the line in R is not a deformation of rubber, so intermediate
-    points may be on any branch. The outcome is in the solver's report on the wire. Returns False if the
-    deadline interrupts the bridge.
+    Only the branch of the last point is checked: intermediate points do not correspond to deformations of the
+    rubber and may be on any branch. The outcome is written to the solver's report for the wire. Returns False
+    if the deadline interrupts the bridge.
     """
     todo, a_to = stream.only(u), stream.arrays.a[u]
     between = stream.arrays.a.copy()

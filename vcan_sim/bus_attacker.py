@@ -1,7 +1,7 @@
-"""Bus faults as plain data, and a rogue device that sends the frames that some of them need.
+"""Faults of a CAN bus, and a rogue device that causes some of these faults by sending frames.
 
-The rogue device has its own endpoint on the bus. Nodes and hosts receive the rogue frames and compete with
-them in arbitration.
+The rogue device has its own endpoint on the bus. Its frames take part in arbitration and are received by all
+nodes and hosts.
 """
 
 from __future__ import annotations
@@ -22,45 +22,45 @@ from vcan_sim.timed_bus import CanFrame
 from vcan_sim.timed_bus.wire_frame import wire_frame
 
 FLOOD_COB_ID: Final = 0x001
-"""Identifier of the flood frames of the fault ``starved``; only NMT commands have a higher priority."""
+"""COB-ID of the frames that starve the bus. Only NMT commands have a higher priority."""
 FLOOD_DATA: Final = bytes([0x55] * 8)
 _INTERMISSION_BITS: Final = 3
 _TICK_NS: Final = 1_000_000
 """Minimum time between two batches of rogue frames, ns."""
 _AHEAD_NS: Final = 2 * _TICK_NS
-"""Lead time (ns) of the queued flood frames; it prevents idle gaps on a completely starved bus."""
+"""Time by which flood frames are queued in advance, ns, to prevent gaps on a completely starved bus."""
 _MOST_AT_ONCE: Final = 256
-"""Maximum number of overdue rogue frames of one kind to send at once; further overdue frames are dropped."""
+"""Maximum number of overdue rogue frames of one kind in a batch. Further overdue frames are never sent."""
 _RETRY_S: Final = 0.05
-"""Pause of the rogue device after a bus error, s."""
+"""Time after which the rogue device reopens its endpoint following a bus error, s."""
 _SHARES: Final = ("starved", "disturbed")
 _RATES: Final = ("rogue_nmt_per_s", "rogue_sync_per_s")
 _COUNTERS: Final = 240
-"""Highest SYNC counter value that the rogue master sends."""
+"""Maximum value of the counter in the rogue SYNC messages."""
 
 
 @dataclass(frozen=True, slots=True)
 class BusFaults:
-    """Faults of one bus; by default there are none.
+    """Faults of one bus. The default values mean no faults.
 
     Raises:
         ConfigError: If a fraction is not between 0 and 1, or a rate is negative.
     """
 
     seed: int = 1
-    """Seed of the random draws of faults."""
+    """Seed of the random numbers that decide when faults occur."""
     bus_off: bool = False
-    """Whether the nodes' controller is bus-off; the nodes then send and receive no frames."""
+    """Whether the nodes' CAN controller is bus-off, so that the nodes neither send nor receive frames."""
     starved: float = 0.0
-    """Fraction of the bus time that a rogue device occupies with frames of COB-ID 0x001, which has the
-    highest priority after NMT."""
+    """Bus load caused by a rogue device, as a fraction. Its frames have COB-ID 0x001, the highest priority
+    after NMT."""
     rogue_nmt_per_s: float = 0.0
-    """Number of random NMT commands per second from a second master, to all nodes or to one node."""
+    """Rate of random NMT commands from a second master to one or all nodes, 1/s."""
     rogue_sync_per_s: float = 0.0
-    """Number of SYNC messages per second from a second master."""
+    """Rate of SYNC messages from a second master, 1/s."""
     disturbed: float = 0.0
-    """Fraction of the transmission attempts that an error frame destroys; only on the interface ``timed``.
-    The sender retransmits the frame."""
+    """Fraction of all transmissions that are aborted by an error frame and repeated by the sender. Only the
+    interface ``timed`` supports this fault."""
 
     def __post_init__(self) -> None:
         for name in _SHARES:
@@ -72,31 +72,31 @@ class BusFaults:
 
     @property
     def needs_attacker(self) -> bool:
-        """Whether the faults require a rogue device that sends frames."""
+        """Whether a rogue device must send frames to cause these faults."""
         return bool(self.starved or self.rogue_nmt_per_s or self.rogue_sync_per_s)
 
 
 @dataclass(slots=True)
 class InjectedOnBus:
-    """Number of times that each fault has been injected into one bus."""
+    """Counts of the faults that have been injected into one bus."""
 
     bus_off: int = 0
     """Number of times that the nodes' controller went bus-off."""
     starved: int = 0
-    """Number of flood frames sent to occupy the bus."""
+    """Number of flood frames sent."""
     rogue_nmt: int = 0
     """Number of NMT commands sent by the second master."""
     rogue_sync: int = 0
     """Number of SYNC messages sent by the second master."""
     disturbed: int = 0
-    """Number of transmission attempts destroyed by an error frame."""
+    """Number of transmissions aborted by an error frame."""
 
 
 NO_BUS_FAULTS: Final = BusFaults()
 
 
 def check_bus(faults: BusFaults, bus: BusConfig) -> None:
-    """Check that a bus can have the given faults.
+    """Check that a bus supports the given faults.
 
     Args:
         faults: Faults to check.
@@ -111,12 +111,12 @@ def check_bus(faults: BusFaults, bus: BusConfig) -> None:
 
 
 class BusAttacker:
-    """Rogue device on a bus; its thread starts with the first fault that needs it and ends in :meth:`stop`.
+    """Rogue device on a bus. Its thread starts with the first fault that requires the device.
 
     Args:
         bus: Configuration of the bus.
         node_ids: Node-IDs on the bus.
-        counts: Counts of the injected faults, which the thread increases.
+        counts: Counts of the injected faults; the thread updates these counts.
     """
 
     def __init__(self, bus: BusConfig, node_ids: Sequence[int], counts: InjectedOnBus) -> None:
@@ -130,14 +130,14 @@ class BusAttacker:
         self._syncs = 0
 
     def set(self, faults: BusFaults) -> None:
-        """Replace the faults. The first fault that requires the rogue device starts its thread."""
+        """Replace the faults, and start the thread if it is needed for the first time."""
         self._faults = faults
         self._changed.set()
         if faults.needs_attacker and self._thread.ident is None:
             self._thread.start()
 
     def stop(self) -> None:
-        """Stop the thread. Call this method only once."""
+        """Stop the thread. This method must be called only once."""
         self._stopping = True
         self._changed.set()
         if self._thread.ident is not None:
@@ -152,11 +152,11 @@ class BusAttacker:
             try:
                 with CanPort(self._bus) as port:
                     self._attack(port)
-            except BusError:  # another fault may have made the bus unavailable
+            except BusError:  # for example because another fault made the bus unavailable
                 clock.sleep(_RETRY_S)
 
     def _attack(self, port: CanPort) -> None:
-        """Send rogue frames until the faults end."""
+        """Send rogue frames until no fault requires them any more."""
         chance = random.Random(self._faults.seed)
         due_ns: dict[str, float] = {}
         while not self._stopping and self._faults.needs_attacker:
@@ -166,7 +166,7 @@ class BusAttacker:
             for name, period_ns in periods_ns.items():
                 ahead_ns = _AHEAD_NS if name == "starved" else 0
                 due_ns[name] = self._send_due(port, name, chance, due_ns[name], period_ns, now_ns + ahead_ns)
-            while port.recv(0.0) is not None:  # keeps the receive queue from filling up
+            while port.recv(0.0) is not None:  # prevents the receive queue from filling up
                 pass
             first_ns = min(due_ns[name] - (_AHEAD_NS if name == "starved" else 0) for name in due_ns)
             wait_ns = max(first_ns - clock.monotonic_ns(), _TICK_NS if "starved" in due_ns else 0)
@@ -174,7 +174,7 @@ class BusAttacker:
             self._changed.clear()
 
     def _periods_ns(self) -> dict[str, float]:
-        """Return the interval (ns) between rogue frames of each kind."""
+        """Return the period (ns) of each kind of rogue frame."""
         faults, found = self._faults, {}
         if faults.starved:
             found["starved"] = self._flood_ns / faults.starved
@@ -193,7 +193,7 @@ class BusAttacker:
         period_ns: float,
         until_ns: float,
     ) -> float:
-        """Send all due rogue frames of one kind, and return the time (ns) at which the next one is due."""
+        """Send all due rogue frames of one kind; return the time (ns) at which the next frame is due."""
         make: Callable[[random.Random], tuple[int, bytes]] = getattr(self, f"_{name}")
         for _ in range(_MOST_AT_ONCE):
             if due_ns > until_ns:

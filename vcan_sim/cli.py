@@ -1,6 +1,7 @@
 """Entry point of ``vcan-sim``.
 
-The commands are defined in :mod:`vcan_sim.commands`, the exit statuses in :mod:`skinnode.cli._exit_status`.
+The commands are defined in :mod:`vcan_sim.commands`. The exit statuses are defined in
+:mod:`skinnode.cli._exit_status`.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from skinnode.cli._exit_status import main_of
 
 
 def main(argv: Sequence[str] | None = None) -> NoReturn:
-    """Run ``vcan-sim`` with ``argv``, or with the process's arguments if ``argv`` is None."""
+    """Run ``vcan-sim`` with the arguments ``argv``; default: the command-line arguments of the process."""
     main_of("vcan_sim.commands._app", argv)
 
 

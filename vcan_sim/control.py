@@ -1,7 +1,7 @@
-"""Control of a running simulator from another process, by JSON lines on a Unix socket.
+"""Control of a running simulator from another process, with JSON messages on a Unix socket.
 
-Each simulator has its own socket, ``PID.sock``, in a folder that only its user can access. Each request and
-each answer is one line::
+Each simulator has its own socket, ``PID.sock``, in a folder that only the user can access. Each request and
+each response is one line::
 
     {"faults": ["palm:unplugged"]}
     {"hand": "gripper", "now": ["palm:unplugged"], "counts": {"palm": {"unplugged": 1}, "can0": {}}}
@@ -27,40 +27,40 @@ from skinnode.errors import ConfigError, SkinError
 
 _LONGEST_LINE: Final = 1 << 16
 _ANSWER_S: Final = 10.0
-"""Maximum time to wait for a simulator's answer, s."""
+"""Maximum time to wait for a simulator's response, s."""
 _POLL_S: Final = 0.2
-"""Interval (s) between a server thread's checks whether it must stop."""
+"""Interval at which a server thread checks whether it must stop, s."""
 KEY: Final = "inject"
-"""Name under which error messages refer to the faults."""
+"""Name of the requested faults in error messages."""
 
 
 class ControlError(SkinError):
-    """No simulator is running, or the simulator does not answer."""
+    """A simulator cannot be controlled, for example because it is not running."""
 
 
 class Controlled(Protocol):
-    """Interface through which a control socket reads and changes a fleet's faults."""
+    """Interface of a fleet whose faults can be read and changed through a control socket."""
 
     @property
     def faults(self) -> Any:
         """Faults of the fleet."""
 
     def counts(self) -> dict[str, dict[str, int]]:
-        """Return the counts of injected faults that are not zero, by patch and bus."""
+        """Return the nonzero counts of injected faults, by patch and bus."""
 
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """State of a simulator's faults."""
+    """Response of a simulator: its current faults and the counts of injected faults."""
 
     hand: str
     now: tuple[str, ...]
-    """Current faults: one text for each patch or bus that has faults."""
+    """Current faults in text form, one string for each patch or bus that has faults."""
     counts: dict[str, dict[str, int]]
     """Counts of the faults injected so far, by patch and bus."""
 
     def lines(self) -> list[str]:
-        """Return one line per patch and bus, with its current faults and the counts so far."""
+        """Return a line for each patch and bus: its current faults and its counts of injected faults."""
         now = dict(text.rpartition(":")[::2] for text in self.now)
         return [
             f"{place}: {now.get(place, 'none')} now; {_listed(counts)} so far"
@@ -73,10 +73,10 @@ def _listed(counts: dict[str, int]) -> str:
 
 
 def control_folder() -> Path:
-    """Return the folder of the control sockets, which only this user can access; create it if necessary.
+    """Return the folder for control sockets, and create it if necessary. Only this user can access it.
 
     Raises:
-        ControlError: If the folder belongs to another user or cannot be created.
+        ControlError: If the folder cannot be created, or other users can access it.
     """
     base, user = os.environ.get("XDG_RUNTIME_DIR"), os.getuid()
     folder = Path(base) / "vcan-sim" if base else Path(tempfile.gettempdir()) / f"vcan-sim-{user}"
@@ -85,7 +85,7 @@ def control_folder() -> Path:
             folder.mkdir(mode=0o700, parents=False)
         found = folder.lstat()
     except OSError as error:
-        raise ControlError(f"{folder}: cannot hold control sockets ({error.strerror})") from None
+        raise ControlError(f"{folder}: cannot be used for control sockets ({error.strerror})") from None
     if not stat.S_ISDIR(found.st_mode) or found.st_uid != user or stat.S_IMODE(found.st_mode) & 0o077:
         raise ControlError(f"{folder}: must be a folder of user {user} with mode 700, for control sockets")
     return folder
@@ -111,14 +111,16 @@ class ControlServer:
 
     def __enter__(self) -> Self:
         self._path = control_folder() / f"{os.getpid()}.sock"
-        self._path.unlink(missing_ok=True)  # left over from an earlier process with this ID
+        self._path.unlink(missing_ok=True)  # socket of an earlier process with the same ID
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
         try:
             self._socket.bind(str(self._path))
             self._socket.listen(8)
         except OSError as error:
             self._socket.close()
-            raise ControlError(f"{self._path}: no control socket ({error.strerror or error})") from None
+            raise ControlError(
+                f"{self._path}: cannot create the control socket ({error.strerror or error})"
+            ) from None
         self._socket.settimeout(_POLL_S)
         self._thread.start()
         return self
@@ -141,7 +143,7 @@ class ControlServer:
                 continue
             except OSError:
                 return
-            with connection, contextlib.suppress(OSError):  # the client may disconnect early
+            with connection, contextlib.suppress(OSError):  # the client may have disconnected
                 connection.settimeout(_ANSWER_S)
                 _send(connection, self._answer(_receive(connection)))
 
@@ -160,13 +162,13 @@ class ControlServer:
 
 
 def running_simulator(wanted: str | None = None) -> Path:
-    """Return the control socket of the running simulator.
+    """Return the control socket of a running simulator.
 
     Args:
         wanted: Process-ID of the simulator, or name of its hand; None if only one simulator is running.
 
     Raises:
-        ControlError: If no simulator is running, none matches ``wanted``, or several match.
+        ControlError: If no simulator is running, or not exactly one simulator matches ``wanted``.
     """
     found = dict(_running())
     if not found:
@@ -180,17 +182,17 @@ def running_simulator(wanted: str | None = None) -> Path:
 
 
 def request(path: Path, faults: list[str]) -> Answer:
-    """Change a running simulator's faults by a request to its control socket.
+    """Change the faults of a running simulator, or only read them.
 
     Args:
         path: Control socket of the simulator.
-        faults: Changes in text form; if empty, the faults do not change.
+        faults: Changes in text form; an empty list leaves the faults unchanged.
 
     Returns:
-        Current faults and their counts after the change.
+        Faults after the change, and counts of injected faults.
 
     Raises:
-        ControlError: If the simulator refuses a text, or does not answer.
+        ControlError: If the simulator rejects a change or does not respond.
     """
     try:
         with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as connection:
@@ -206,7 +208,7 @@ def request(path: Path, faults: list[str]) -> Answer:
 
 
 def _running() -> Iterator[tuple[Path, str]]:
-    """Yield each running simulator's socket and hand; delete the sockets of ended processes."""
+    """Yield the socket and the hand of each running simulator; delete sockets of ended processes."""
     for path in sorted(control_folder().glob("*.sock")):
         try:
             yield path, request(path, []).hand

@@ -1,4 +1,4 @@
-"""Event loop for :mod:`asyncio` that uses the clock of its thread: a virtual clock or the system clock."""
+""":mod:`asyncio` event loop that runs in virtual time."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ Ts = TypeVarTuple("Ts")
 
 
 def run(main: Coroutine[Any, Any, T]) -> T:
-    """Run a coroutine like :func:`asyncio.run`, with the clock of the current thread.
+    """Run a coroutine like :func:`asyncio.run`, with the thread's clock: the system clock or a virtual clock.
 
-    In virtual time, the event loop waits only for timers and for callbacks from other threads of the program.
-    The loop polls its sockets and pipes each time it runs, but does not wait for them.
+    In virtual time, the event loop waits only for timers and for callbacks from other threads. It polls
+    sockets and pipes in each iteration, but does not wait for them.
 
     Args:
         main: Coroutine to run.
@@ -32,27 +32,27 @@ def run(main: Coroutine[Any, Any, T]) -> T:
 
 
 class VirtualEventLoop(asyncio.SelectorEventLoop):
-    """:mod:`asyncio` event loop for a thread that runs in virtual time."""
+    """Event loop for a thread that runs in virtual time."""
 
     def __init__(self) -> None:
         self._woken = clock.event()
         super().__init__(_Selector(self._woken.wait, self._woken.clear))
 
     def time(self) -> float:
-        """Return the monotonic time, s."""
+        """Return the time of the thread's monotonic clock, s."""
         return clock.monotonic()
 
     def call_soon_threadsafe(
         self, callback: Callable[[*Ts], object], *args: *Ts, context: Context | None = None
     ) -> asyncio.Handle:
-        """Schedule a function call in this event loop; callable from any thread."""
+        """Schedule a callback from any thread, and wake the event loop."""
         handle = super().call_soon_threadsafe(callback, *args, context=context)
         self._woken.set()
         return handle
 
 
 class _Selector(selectors.DefaultSelector):
-    """Selector that waits for an event instead of waiting for its file descriptors."""
+    """Selector that waits for an event, instead of waiting for file descriptors."""
 
     def __init__(self, wait: Callable[[float | None], bool], clear: Callable[[], None]) -> None:
         super().__init__()

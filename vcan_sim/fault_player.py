@@ -10,17 +10,17 @@ from vcan_sim.fleet_faults import FleetFaults
 
 
 class FaultPlayer:
-    """Player that applies a fault schedule to a fleet, from :meth:`begin` to :meth:`stop`.
+    """Thread that applies the fault schedule of a scene to a fleet.
 
     Args:
         schedule: Faults of the scene and their times.
-        faults: Faults of the fleet, which the player changes.
+        faults: Current faults of the fleet, which the thread changes.
     """
 
     def __init__(self, schedule: FaultSchedule, faults: FleetFaults) -> None:
         self._schedule, self._faults = schedule, faults
         self._inbox = clock.queue()
-        """Queue that receives the scene's monotonic start time (ns), and None to stop the thread."""
+        """Queue for the monotonic start time of the scene, ns; None stops the thread."""
         self._active: tuple[TimedFault, ...] = ()
         self._thread = clock.thread(self._run, "faults of the scene")
 
@@ -29,7 +29,7 @@ class FaultPlayer:
         self._thread.start()
 
     def begin(self, origin_ns: int) -> None:
-        """Start the schedule at scene time 0. Call this method only once.
+        """Begin the schedule. This method must be called only once.
 
         Args:
             origin_ns: Monotonic time (ns) that corresponds to scene time 0.
@@ -59,7 +59,7 @@ class FaultPlayer:
         self._inbox.get()
 
     def _follow(self, t_s: float) -> None:
-        """Start and end faults as scheduled for scene time ``t_s``."""
+        """Start and end the faults that are scheduled for scene time ``t_s``."""
         before, self._active = self._active, self._schedule.active(t_s)
         ended = [each for each in before if each not in self._active]
         started = [each for each in self._active if each not in before]

@@ -1,4 +1,4 @@
-"""Schedule of faults that start and end at given scene times, as pure data."""
+"""Schedule of faults that start and end at given scene times."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from typing import Final
 from vcan_sim.fault_text import Value
 
 CLOSE_S: Final = 1e-9
-"""Tolerance (s) for rounded scene times; a fault that starts within the tolerance is already active."""
+"""Tolerance for rounding errors in scene times, s."""
 
 
 @dataclass(frozen=True, slots=True)
 class TimedFault:
-    """Faults of one patch or bus that are active from a start time to an end time."""
+    """Faults of one patch or bus, with their start and end times."""
 
     number: int
     """Index of the fault among the scene's ``[[faults]]`` tables."""
@@ -25,7 +25,7 @@ class TimedFault:
     from_s: float
     """Scene time at which the fault starts, s."""
     to_s: float
-    """Scene time at which the fault ends, s; infinity if it does not end."""
+    """Scene time at which the fault ends, s; infinity if the fault does not end."""
     values: Mapping[str, Value] = field(hash=False)
     """Values of the faults, by name."""
 
@@ -39,10 +39,10 @@ class FaultSchedule:
     """Period of the scene, s; None if the scene plays once."""
 
     def active(self, t_s: float) -> tuple[TimedFault, ...]:
-        """Return the faults that are active at a scene time, in the order of the scene.
+        """Return the faults that are active at a scene time, in the order of the scene file.
 
         Args:
-            t_s: Scene time, s; no fault is active before 0.
+            t_s: Scene time, s. No faults are active before time 0.
         """
         if t_s < -CLOSE_S:
             return ()
@@ -50,10 +50,10 @@ class FaultSchedule:
         return tuple(each for each in self.faults if each.from_s - CLOSE_S <= at_s < each.to_s - CLOSE_S)
 
     def next_change_s(self, t_s: float) -> float | None:
-        """Return the scene time (s) of the first fault start or end after ``t_s``; None if no fault changes.
+        """Return the next scene time (s) at which any fault starts or ends; None if there is none.
 
         Args:
-            t_s: Scene time, s.
+            t_s: Current scene time, s.
         """
         at_s = self._within(t_s) if t_s >= 0.0 else t_s
         times = {time for each in self.faults for time in (each.from_s, each.to_s) if math.isfinite(time)}
@@ -63,7 +63,7 @@ class FaultSchedule:
         return (t_s - at_s) + min(later) if later else None
 
     def _within(self, t_s: float) -> float:
-        """Map a scene time to the first period of the scene."""
+        """Return the corresponding time in the first period of the scene, s."""
         if self.repeat_s is None:
             return t_s
         at_s = math.fmod(max(t_s, 0.0), self.repeat_s)

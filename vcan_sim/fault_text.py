@@ -2,10 +2,11 @@
 
 ::
 
-    text     [PLACE:]FAULT[,FAULT...]    PLACE is a patch or a bus; without it, every patch or every bus
-    FAULT    NAME | NAME=VALUE | none    none ends all faults of the place
+    text     [PLACE:]FAULT[,FAULT...]    PLACE is a patch or a bus; default: all patches or all buses
+    FAULT    NAME | NAME=VALUE | none    none ends all faults of the patch or bus
 
-The options ``--fault`` and ``vcan-sim inject`` and the ``[[faults]]`` of a scene share this form.
+This form is used by the option ``--fault``, by the command ``vcan-sim inject``, and in ``[[faults]]`` tables
+of scene files.
 """
 
 from __future__ import annotations
@@ -20,20 +21,20 @@ from vcan_sim.bus_attacker import NO_BUS_FAULTS, BusFaults
 from vcan_sim.faults import NO_FAULTS, Faults
 
 NONE: Final = "none"
-"""Keyword that ends all faults of a patch or bus; as the value of a wire fault, it ends this fault."""
+"""Keyword that ends all faults of a patch or bus. As the value of a wire fault, it ends only this fault."""
 
 Value = int | float | bool | None
 AnyFaults = TypeVar("AnyFaults", Faults, BusFaults)
 
 OF_PATCHES: Final = {each.name: each.default for each in dataclasses.fields(Faults)}
-"""Default values of a patch's faults, by name."""
+"""Default value of each fault of a patch, by name."""
 OF_BUSES: Final = {each.name: each.default for each in dataclasses.fields(BusFaults)}
-"""Default values of a bus's faults, by name."""
+"""Default value of each fault of a bus, by name."""
 
 
 @dataclass(frozen=True, slots=True)
 class FaultChange:
-    """Change of the faults of one patch or bus."""
+    """Change to the faults of one patch or bus."""
 
     place: str
     """Name of the patch or bus whose faults change."""
@@ -44,29 +45,29 @@ class FaultChange:
     """Whether the change first ends all current faults of the patch or bus."""
 
     def of(self, faults: AnyFaults) -> AnyFaults:
-        """Apply this change to ``faults`` and return the result.
+        """Return ``faults`` after this change.
 
         Raises:
-            ConfigError: If a value is out of range, or the values contradict each other.
+            ConfigError: If a value is out of range, or two values are inconsistent.
         """
-        kept = type(faults)(seed=faults.seed) if self.clears else faults  # the field `seed` is not a fault
+        kept = type(faults)(seed=faults.seed) if self.clears else faults  # the seed is not a fault
         return dataclasses.replace(kept, **self.values)  # type: ignore[arg-type]  # types match
 
 
 def parse_changes(
     texts: Sequence[str], patches: Sequence[str], buses: Sequence[str], key: str = "--fault"
 ) -> list[FaultChange]:
-    """Parse texts that describe faults, and return the changes in the same order.
+    """Parse faults in text form, and return the changes in the same order.
 
     Args:
-        texts: Texts such as ``palm:lost=0.1,frozen``, ``can0:bus_off``, ``palm:none`` or ``none``.
-        patches: Names of the hand's patches. If a patch and a bus share a name, the name refers to the patch.
+        texts: Strings such as ``palm:lost=0.1,frozen``, ``can0:bus_off``, ``palm:none`` or ``none``.
+        patches: Names of the hand's patches. If a patch and a bus have the same name, the name refers to the
+            patch.
         buses: Names of the hand's buses.
         key: Name of the command-line option, for error messages.
 
     Raises:
-        ConfigError: If the hand has no such patch or bus, a fault is unknown for it, or a value has the wrong
-            type.
+        ConfigError: If a patch, bus or fault is unknown, or a value has the wrong type.
     """
     changes = []
     for text in texts:
@@ -84,10 +85,10 @@ def parse_changes(
 
 
 def parse_values(text: str, *, on_bus: bool, key: str = "--fault") -> dict[str, Value]:
-    """Parse faults without a place, such as ``lost=0.01,silent``, and return their values by name.
+    """Parse faults that name no patch or bus, such as ``lost=0.01,silent``; return their values by name.
 
     Args:
-        text: Comma-separated faults with their values; at least one fault.
+        text: One or more faults with their values, separated by commas.
         on_bus: Whether the text describes faults of a bus.
         key: Name of the command-line option, for error messages.
 
@@ -98,7 +99,7 @@ def parse_values(text: str, *, on_bus: bool, key: str = "--fault") -> dict[str, 
 
 
 def text_of(faults: Faults | BusFaults) -> str:
-    """Return faults in the text form of :func:`parse_values`, without the seed; ``none`` if empty."""
+    """Return the text form of faults, without the seed; ``none`` if there are no faults."""
     defaults = OF_BUSES if isinstance(faults, BusFaults) else OF_PATCHES
     shown = [
         name_and_value(name, getattr(faults, name))
@@ -109,7 +110,7 @@ def text_of(faults: Faults | BusFaults) -> str:
 
 
 def name_and_value(name: str, value: Value) -> str:
-    """Return a fault in text form: its name, followed by its value unless the value is True."""
+    """Return the text form of a fault: its name, and its value unless the value is True."""
     return name if value is True else f"{name}={_shown(value)}"
 
 
@@ -134,7 +135,7 @@ def _change(place: str, listed: str, key: str, *, on_bus: bool) -> FaultChange:
 
 
 def _everywhere(listed: str, patches: Sequence[str], buses: Sequence[str], key: str) -> Iterator[FaultChange]:
-    """Yield the changes of a text without a place; the fault names decide between patches and buses."""
+    """Yield the changes to all patches and buses that have the named faults."""
     parts = _parts(listed, key)
     clears = NONE in parts
     values = _values([part for part in parts if part != NONE], OF_PATCHES | OF_BUSES, key)
@@ -177,5 +178,5 @@ def _allowed(kind: type) -> str:
 
 
 def none_of(*, on_bus: bool) -> Faults | BusFaults:
-    """Return an empty set of faults for a patch or a bus."""
+    """Return the faults of a patch or bus that has no faults."""
     return NO_BUS_FAULTS if on_bus else NO_FAULTS

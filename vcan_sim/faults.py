@@ -1,6 +1,6 @@
-"""Faults that can be injected into a node, as data, and counts of the injected faults.
+"""Faults that can be injected into a simulated node, and counts of the injected faults.
 
-Each chunk has at most one fault, so that the counts can be compared with the counters of a receiver.
+A chunk has at most one fault, so that these counts can be compared with a receiver's error counters.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ LOST_OUT: Final = {
     Kind.BOOT_UP: "boot_up_lost",
     Kind.EMCY: "emcy_lost",
 }
-"""Faults that drop frames sent by the node, by frame kind."""
+"""Fault that drops frames sent by the node, for each kind of frame."""
 LOST_IN: Final = {
     Kind.NMT: "nmt_lost",
     Kind.SDO_REQUEST: "sdo_request_lost",
@@ -29,7 +29,7 @@ LOST_IN: Final = {
     Kind.COMMAND: "command_lost",
     Kind.HEARTBEAT: "heartbeat_lost",
 }
-"""Faults that drop frames addressed to the node, by frame kind; for SYNC, see ``sync_lost``."""
+"""Fault that drops frames addressed to the node, for each kind of frame except SYNC (see ``sync_lost``)."""
 _SHARES: Final = (
     *OF_CHUNKS,
     *OF_SCANS,
@@ -52,70 +52,69 @@ OF_WIRES: Final = (
     "crossed_upper",
     "crossed_lower",
 )
-"""Faults whose value is a wire number; faults of upper and lower wires alternate."""
+"""Faults that specify a wire number, alternately of an upper wire and a lower wire."""
 _RATES: Final = ("emcy_per_s", "babble_per_s", "restart_every_s")
 _MOST: Final = {"drift_per_s": 1.0, "warmer_k": 100.0}
-"""Maximum absolute value of each fault that may be negative."""
+"""Maximum absolute value of each fault that can have a negative value."""
 
 
 @dataclass(frozen=True, slots=True)
 class Faults:
-    """Faults of one simulated node; by default there are none.
+    """Faults of one simulated node. The default values mean no faults.
 
     Raises:
-        ConfigError: If a fraction is not between 0 and 1, the fractions of chunks or of scans add up to more
-            than 1, or a rate is negative.
+        ConfigError: If a value is out of range, or if the fractions of chunks or of scans add up to more than
+            1.
     """
 
     seed: int = 1
-    """Seed of the random draws; the same seed and the same frames produce the same faults."""
+    """Seed of the random numbers. The same seed and the same frames result in the same faults."""
 
     # --- fractions of the chunks
     lost: float = 0.0
     duplicated: float = 0.0
     """Fraction of the chunks that are sent twice."""
     reordered: float = 0.0
-    """Fraction of the chunks that swap places with the next frame."""
+    """Fraction of the chunks that are sent after the next frame."""
     late: float = 0.0
-    """Fraction of the chunks that arrive after the first frame of the next scan."""
+    """Fraction of the chunks that are sent after the first frame of the next scan."""
     short: float = 0.0
     """Fraction of the chunks that are one byte too short."""
     remote: float = 0.0
     """Fraction of the chunks that are replaced by a remote frame."""
     miscounted: float = 0.0
-    """Fraction of the chunks that carry the counter of another scan."""
+    """Fraction of the chunks with a wrong scan counter."""
     miscounted_by: int | None = None
-    """Error of the scan counter in a ``miscounted`` chunk, modulo 256; None for a random error."""
+    """Value added to the scan counter of a ``miscounted`` chunk, modulo 256; None for a random value."""
     corrupted: float = 0.0
-    """Fraction of the chunks in which one code differs from the code packed by the node; length and counters
-    are correct."""
+    """Fraction of the chunks in which one code is falsified. The length and the counters of these chunks are
+    correct."""
 
     # --- fractions of the scans
     torn: float = 0.0
-    """Fraction of the scans that stop after their first half, without a summary; the next scan has the same
+    """Fraction of the scans whose second half and summary are not sent. The next scan has the same scan
     counter."""
     summary_lost: float = 0.0
     reset: float = 0.0
-    """Fraction of the scans in which the node is reset after half of the chunks, as if by a watchdog."""
+    """Fraction of the scans during which the node is reset, as if by a watchdog, after half of the chunks."""
     displaced: float = 0.0
-    """Fraction of the scans in which a chunk carries the counter of the next scan; the chunk with the same
-    index in the next scan is lost."""
+    """Fraction of the scans in which a chunk has the scan counter of the next scan. In the next scan, the
+    chunk with the same index is lost."""
     understated: float = 0.0
-    """Fraction of the scans in which a chunk is lost, and the summary claims that only changed chunks were
-    sent and counts one chunk fewer. If the summary carries a check, the check is correct for the falsified
-    summary. In a scan in which the node sends only changed chunks, the chunk is lost but the summary is not
-    falsified."""
+    """Fraction of the scans in which a chunk is lost and the summary conceals this loss. The falsified
+    summary has a valid check, a chunk count reduced by one, and the flag for scans with only the changed
+    chunks. If the node itself sends only changed chunks, the summary is not falsified."""
     unchecked: float = 0.0
-    """Fraction of the scans whose summary carries no check, as in protocol revision 1.0."""
+    """Fraction of the scans whose summary contains no check, as in protocol revision 1.0."""
     struck: int | None = None
-    """Index of the chunk that ``displaced`` and ``understated`` affect; None for a random chunk."""
+    """Index of the chunk to which ``displaced`` or ``understated`` applies; None for a random chunk."""
 
     # --- fractions of other frames
     sync_lost: float = 0.0
-    """Fraction of the SYNCs that the node does not receive."""
+    """Fraction of the SYNC messages that the node does not receive."""
     long: float = 0.0
-    """Fraction of the heartbeats that are one byte too long. (A chunk or summary cannot be lengthened,
-    because it already fills its frame.)"""
+    """Fraction of the heartbeats that are one byte too long. Chunks and summaries already have the maximum
+    length."""
     nmt_lost: float = 0.0
     """Fraction of the NMT commands that the node does not receive."""
     sdo_request_lost: float = 0.0
@@ -127,77 +126,78 @@ class Faults:
     lss_response_lost: float = 0.0
     """Fraction of the LSS responses that are lost."""
     heartbeat_lost: float = 0.0
-    """Fraction of the heartbeats, sent by the node or received by it, that are lost."""
+    """Fraction of the heartbeats to and from the node that are lost."""
     boot_up_lost: float = 0.0
     """Fraction of the boot-up messages that are lost."""
     emcy_lost: float = 0.0
-    """Fraction of the emergency messages, including *error reset*, that are lost."""
+    """Fraction of the emergency messages that are lost, including *error reset* messages."""
     command_lost: float = 0.0
-    """Fraction of the command PDOs, such as a tare, that the node does not receive."""
+    """Fraction of the command PDOs, such as tare commands, that the node does not receive."""
 
-    # --- active while they are set
+    # --- faults of the node, the converter and the wires
     silent: bool = False
-    """Whether the node is silent: none of its frames reaches the bus."""
+    """Whether the node is silent: its frames do not reach the bus."""
     deaf: bool = False
-    """Whether the node is deaf: it receives no frames, because its receiver is stuck."""
+    """Whether the node is deaf: it does not receive any frames."""
     frozen: bool = False
-    """Whether the converter is frozen: it keeps returning the same values and counts no conversions."""
+    """Whether the converter is frozen: it repeats its last values and does not count conversions."""
     uncounted: bool = False
-    """Whether the converter does not count its conversions, so that the host must infer from the codes
-    whether the converter is running."""
+    """Whether the converter provides no count of its conversions. A host can then detect a stopped converter
+    only by its constant codes."""
     unplugged: bool = False
-    """Whether the node is disconnected from the bus and its supply; the node boots when the fault ends."""
+    """Whether the node is disconnected from the bus and from its power supply. The node boots when the fault
+    ends."""
     wrong_identity: bool = False
     """Whether the node reports a wrong product code."""
     wrong_layout: bool = False
     """Whether the node reports a wrong layout hash."""
     open_upper: int | None = None
-    """Number of a broken upper wire. Wires are numbered from 0 and are intact during the tare at power-on."""
+    """Number of a broken upper wire. Wires are numbered from 0. All wires are intact during the tare at
+    power-on."""
     open_lower: int | None = None
     """Number of a broken lower wire."""
     shorted_upper: int | None = None
-    """Number of an upper wire that touches all lower wires."""
+    """Number of an upper wire that is shorted to all lower wires."""
     shorted_lower: int | None = None
-    """Number of a lower wire that touches all upper wires."""
+    """Number of a lower wire that is shorted to all upper wires."""
     noisy_upper: int | None = None
-    """Number of an upper wire with a bad contact, which adds noise of 0.3 % to each of its resistances."""
+    """Number of an upper wire with a bad contact. Its resistances have additional noise of 0.3 %."""
     noisy_lower: int | None = None
-    """Number of a lower wire with a bad contact, which adds noise of 0.3 % to each of its resistances."""
+    """Number of a lower wire with a bad contact. Its resistances have additional noise of 0.3 %."""
     frozen_upper: int | None = None
-    """Number of an upper wire with frozen resistances, which keep their values from the start of the
-    fault."""
+    """Number of an upper wire whose resistances remain constant from the start of the fault."""
     frozen_lower: int | None = None
-    """Number of a lower wire with frozen resistances, which keep their values from the start of the fault."""
+    """Number of a lower wire whose resistances remain constant from the start of the fault."""
     stuck_upper: int | None = None
-    """Number of the upper wire of a stuck crossing; ``stuck_lower`` is the lower wire. The crossing's
-    resistance keeps its value from the start of the fault."""
+    """Number of the upper wire at a stuck crossing, whose resistance remains constant from the start of the
+    fault. The lower wire is ``stuck_lower``."""
     stuck_lower: int | None = None
-    """Number of the lower wire of the stuck crossing; see ``stuck_upper``."""
+    """Number of the lower wire at the stuck crossing; see ``stuck_upper``."""
     crossed_upper: int | None = None
-    """Number of an upper wire that is exchanged with the next upper wire."""
+    """Number of an upper wire whose connection is exchanged with that of the next upper wire."""
     crossed_lower: int | None = None
-    """Number of a lower wire that is exchanged with the next lower wire."""
+    """Number of a lower wire whose connection is exchanged with that of the next lower wire."""
     flipped: float = 0.0
-    """Fraction of the readings in which one bit of one code is flipped before the node computes its check."""
+    """Fraction of the readings in which one bit of one code is flipped. The check of the scan covers the
+    wrong code."""
     drift_per_s: float = 0.0
-    """Relative drift of every resistance per second, from -1 to 1. The accumulated drift is zero when the
-    fault starts, and returns to zero when the fault ends. Drift changes a resistance by at most a factor of
-    10."""
+    """Relative drift of all resistances per second, from -1 to 1. The drift accumulates up to a factor of 10
+    or 0.1, and is reset to zero when the fault ends."""
     warmer_k: float = 0.0
-    """Step change in the temperature of the patch, K, from -100 to 100. Every resistance changes according to
-    the temperature coefficient of the patch, ``Imperfections.temperature_per_k``."""
+    """Sudden temperature change of the patch, K, from -100 to 100. All resistances change according to the
+    temperature coefficient ``Imperfections.temperature_per_k`` of the patch."""
     error_passive: bool = False
-    """Whether the node's controller is error-passive, which the node reports as emergency 0x8120."""
+    """Whether the node's CAN controller is error-passive. The node reports this state as emergency 0x8120."""
     duplicate_node_id: bool = False
-    """Whether a second node with the same node-ID is on the bus. The second node boots, responds to all
-    commands, and reports skin at rest; it disappears when the fault ends."""
+    """Whether there is a second node with the same node-ID on the bus. The second node boots, responds to all
+    commands, and reports a skin at rest. It disappears when the fault ends."""
     restart_every_s: float = 0.0
     """Time between spontaneous resets of the node, s; 0 for no resets."""
     emcy_per_s: float = 0.0
-    """Number of emergency messages per second; after the last of them, a further message reports *error
-    reset*."""
+    """Rate of additional emergency messages, 1/s. When the fault ends, the node sends an *error reset*
+    message."""
     babble_per_s: float = 0.0
-    """Number of frames per second with COB-ID 0x3F0, which no device uses."""
+    """Rate of additional frames with the unused COB-ID 0x3F0, 1/s."""
 
     def __post_init__(self) -> None:
         for name in _SHARES:
@@ -230,7 +230,7 @@ class Faults:
 
 @dataclass(slots=True)
 class Injected:
-    """Number of times that each fault has been injected into one node."""
+    """Counts of the faults that have been injected into one node."""
 
     lost: int = 0
     duplicated: int = 0
@@ -241,7 +241,7 @@ class Injected:
     miscounted: int = 0
     torn: int = 0
     torn_chunks: int = 0
-    """Number of chunks sent in scans with the fault ``torn``."""
+    """Number of chunks sent in ``torn`` scans."""
     summary_lost: int = 0
     reset: int = 0
     """Number of resets in the middle of a scan."""
@@ -266,34 +266,34 @@ class Injected:
     unheard: int = 0
     """Number of frames that the node missed because it was deaf or unplugged."""
     frozen: int = 0
-    """Number of readings that repeated the previous reading."""
+    """Number of readings that repeated the previous reading due to a frozen converter."""
     uncounted: int = 0
-    """Number of readings by a converter that does not count its conversions."""
+    """Number of readings without a count of conversions."""
     miswired: int = 0
-    """Number of readings with a faulty wire or crossing: open, shorted, noisy, frozen, stuck or crossed."""
+    """Number of readings with at least one faulty wire or crossing."""
     flipped: int = 0
     """Number of readings in which one bit of one code was flipped."""
     drifted: int = 0
-    """Number of readings with resistance drift."""
+    """Number of readings affected by ``drift_per_s``."""
     warmed: int = 0
-    """Number of readings at a changed temperature."""
+    """Number of readings affected by ``warmer_k``."""
     unplugged: int = 0
     error_passive: int = 0
     """Number of times that the controller became error-passive."""
     twins: int = 0
-    """Number of times that a second node with the same node-ID appeared."""
+    """Number of second nodes with the same node-ID that have been started."""
     twin_frames: int = 0
     """Number of frames sent by second nodes with the same node-ID."""
     restarts: int = 0
     """Number of resets caused by ``restart_every_s``."""
     impostures: int = 0
-    """Number of falsified responses about identity or layout."""
+    """Number of SDO responses with a falsified product code or layout hash."""
     emergencies: int = 0
     babbled: int = 0
     scans_spoilt: int = 0
     """Number of scans with missing or wrong chunks: lost, late, short, remote, miscounted or corrupted."""
     pdos: int = 0
-    """Number of data frames with the COB-ID of a chunk or summary put on the bus, including those of second
+    """Number of data frames sent with the COB-ID of a chunk or summary, including frames from second
     nodes."""
 
 
@@ -301,7 +301,7 @@ NO_FAULTS: Final = Faults()
 
 
 def check_wires(faults: Faults, patch: str, shape: tuple[int, int]) -> None:
-    """Check that a patch has the wires named by its faults.
+    """Check that a patch has the wires to which its faults refer.
 
     Args:
         faults: Faults of the patch.
@@ -309,9 +309,9 @@ def check_wires(faults: Faults, patch: str, shape: tuple[int, int]) -> None:
         shape: Numbers of upper and lower wires of the patch.
 
     Raises:
-        ConfigError: If the patch does not have a named wire.
+        ConfigError: If a wire number is too large for the patch.
     """
     for number, name in enumerate(OF_WIRES):
-        wires = shape[number % 2] - name.startswith("crossed")  # no wire follows the last one
+        wires = shape[number % 2] - name.startswith("crossed")  # the last wire has no successor
         if (wire := getattr(faults, name)) is not None and wire >= wires:
             raise ConfigError(f"{patch}: {name}", wire, f"an integer from 0 to {wires - 1}")

@@ -1,4 +1,4 @@
-"""Faulty bus as seen by the nodes: the nodes' port, frame counts, and faults of the bus."""
+"""Simulated bus with faults, and the port through which the simulated nodes use the bus."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ from vcan_sim.virtual_time import VirtualClock
 
 
 class Passed:
-    """Counts of data and remote frames that passed through an interface to a bus, by kind."""
+    """Counts of the data and remote frames that passed through a port, by kind of frame."""
 
     def __init__(self) -> None:
         self.sent: Counter[Kind] = Counter()
         self.heard: Counter[Kind] = Counter()
-        """Frames received and passed to the nodes."""
+        """Frames received and delivered to the nodes."""
         self.missed: Counter[Kind] = Counter()
         """Frames missed because the controller was bus-off."""
 
 
 class FaultyPort(CanPort):
-    """Port whose controller may go bus-off, and then neither sends frames nor delivers received frames."""
+    """Port with a simulated bus-off state, in which the port neither sends nor delivers frames."""
 
     off = False
 
@@ -78,7 +78,7 @@ class FaultyBus:
         self._rule: RandomShare | None = None
 
     def connect(self, port: FaultyPort) -> None:
-        """Set the nodes' port after it has been opened, and apply the faults."""
+        """Apply the faults to the nodes' ``port``, which must be open."""
         self._port = port
         self._attacker = BusAttacker(self._config, self._node_ids, self._counts)
         virtual = clock.current()
@@ -90,7 +90,7 @@ class FaultyBus:
         self._apply()
 
     def stop(self) -> None:
-        """End all faults that affect the bus itself, so that they no longer affect its other users."""
+        """End all faults that affect the bus itself, and stop using the port."""
         if self._attacker is not None:
             self._attacker.stop()
             self._attacker = None
@@ -101,7 +101,7 @@ class FaultyBus:
         self._port = None
 
     def check(self, faults: BusFaults) -> None:
-        """Check faults. Raises ConfigError if this bus cannot have the faults."""
+        """Raise ConfigError if this bus does not support the faults."""
         check_bus(faults, self._config)
 
     def inject(self, faults: BusFaults) -> None:
@@ -112,7 +112,7 @@ class FaultyBus:
             self._apply()
 
     def injected(self) -> InjectedOnBus:
-        """Return how often each fault has been injected into the bus."""
+        """Return the counts of the faults that have been injected into the bus."""
         return replace(self._counts)
 
     def _apply(self) -> None:
@@ -123,7 +123,7 @@ class FaultyBus:
         self._disturb(self._faults.disturbed)
 
     def _disturb(self, share: float) -> None:
-        """Destroy a given fraction of all transmission attempts by error frames from now on."""
+        """From now on, abort the fraction ``share`` of all transmissions by error frames."""
         if self._segment is None or share == (0.0 if self._rule is None else self._rule.share):
             return
         if self._rule is not None:

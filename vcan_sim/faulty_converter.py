@@ -15,25 +15,25 @@ from vcan_sim.injector import Injector
 from vcan_sim.skin.imperfections import EXACT
 
 MOST_DRIFT: Final = 10.0
-"""Maximum factor by which drift raises or lowers a resistance."""
+"""Maximum factor by which drift increases or decreases a resistance."""
 WIRE_NOISE: Final = 3e-3
 """Relative standard deviation of a resistance measured through a bad contact."""
 
 
 class FaultyConverter:
-    """Converter with faults: its readings may be frozen or wrong, or the wires may be faulty.
+    """Analogue-to-digital converter with faults of its readings and of the wires of the patch.
 
-    The wires are intact while the node boots, so that the tare at power-on is valid. Drift and temperature
-    also affect the tare. Drift and temperature scale the readings; with an ideal read-out, this is equivalent
-    to scaling every path of the patch.
+    While the node boots, the wires are intact, so that the tare at power-on is valid. Drift and temperature
+    changes affect all readings, including the tare.
 
     Args:
         source: Resistances that an intact converter would measure.
         injector: The node's faults, random generator and counts.
         booting: Function that returns whether the node is booting.
-        baseline_ohm: Function that returns the node's baseline R0 (U, K) in ohm, used for computing codes.
+        baseline_ohm: Function that returns the node's baseline R0 (U, K) in ohm, from which codes are
+            computed.
         scale: Scale of the node's codes.
-        temperature_per_k: Relative change in every resistance per kelvin.
+        temperature_per_k: Temperature coefficient of all resistances, 1/K.
     """
 
     def __init__(  # noqa: PLR0913 - all parts of a node's converter
@@ -52,15 +52,15 @@ class FaultyConverter:
         self._drift, self._drifted_to_ns = 0.0, 0
         self._reading: Float | None = None
         self._conversions: int | None = None
-        self._held: dict[tuple[str, object], Float] = {}  # reading at the start of each fault
+        self._held: dict[tuple[str, object], Float] = {}  # readings stored at the start of each fault
 
     @property
     def conversions(self) -> int | None:
-        """Number of completed conversions, constant while the converter is frozen; None if not counted."""
+        """Number of completed conversions; None if the converter does not count its conversions."""
         return None if self._injector.faults.uncounted else self._conversions
 
     def read(self, t_ns: int) -> Float:
-        """Return the resistances (U, K) in ohm at ``t_ns``, or the previous reading while frozen."""
+        """Return the resistances (U, K) in ohm at time ``t_ns``; the previous reading if frozen."""
         self._injector.injected.uncounted += self._injector.faults.uncounted
         if self._injector.faults.frozen and self._reading is not None:
             self._injector.injected.frozen += 1
@@ -70,7 +70,7 @@ class FaultyConverter:
         return self._reading
 
     def _shifted(self, read: Float, t_ns: int) -> Float:
-        """Apply drift and a change of temperature to a reading."""
+        """Apply drift and the temperature change to a reading."""
         faults, injected = self._injector.faults, self._injector.injected
         factor = 1.0
         if faults.drift_per_s:
@@ -111,7 +111,7 @@ class FaultyConverter:
         return read
 
     def _hold(self, read: Float, faults: Faults) -> None:
-        """Replace the readings of frozen wires and stuck crossings by those at the start of the fault."""
+        """Replace the resistances of frozen wires and stuck crossings by those at the start of the fault."""
         stuck = None if faults.stuck_upper is None else (faults.stuck_upper, faults.stuck_lower)
         held: dict[tuple[str, object], Float] = {}
         for name, place, ohm in (
@@ -126,7 +126,7 @@ class FaultyConverter:
         self._held = held
 
     def _flip(self, read: Float) -> Float:
-        """Flip one bit of one code in a reading, with the probability ``flipped``."""
+        """With probability ``flipped``, flip one bit of one code in a reading."""
         if not self._injector.draw(self._injector.faults.flipped) or self._booting():
             return read
         random, scale, baseline_ohm = self._injector.random, self._scale, self._baseline_ohm()

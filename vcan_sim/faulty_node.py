@@ -1,7 +1,8 @@
 """Node with injected faults. Every frame between the node and its bus passes through this module.
 
-Reading faults are in :mod:`vcan_sim.faulty_converter`, scan faults in :mod:`vcan_sim.faulty_scans`. Except
-for periodic events, faults depend only on a seed and the order of the frames, not on the clock.
+Faults of readings are implemented in :mod:`vcan_sim.faulty_converter`, and faults of scans in
+:mod:`vcan_sim.faulty_scans`. All faults except periodic events depend only on a seed and on the sequence of
+frames.
 """
 
 from __future__ import annotations
@@ -30,22 +31,23 @@ from vcan_sim.tally import Kind, Tally, kind_of
 
 BABBLE_COB_ID: Final = 0x3F0
 SIMULATED: Final = Pacing(slack_ns=THRIFTY.slack_ns, catch_up_ns=40_000_000)
-"""Pacing of a simulated node. The node may stall for half a SYNC period of the reference hand and still
-finish its scan in time, so that a busy machine does not appear as a fault of the node. After such a stall,
-four nodes send bursts of up to 270 frames, which fit into a socket's default receive buffer."""
+"""Timing tolerances of a simulated node. After a delay on a busy machine, the node sends the delayed chunks
+in one burst, so that it need not skip the next scan."""
 
 _STORM: Final = bytes.fromhex("0fff810000000000")
-"""EMCY 0xFF0F with the generic and manufacturer-specific bits of the error register set."""
+"""Emergency message with error code 0xFF0F. In its error register, the generic bit and the
+manufacturer-specific bit are set."""
 _MOST_AT_ONCE: Final = 32
-"""Maximum number of overdue periodic events of one kind to execute at once; the others are dropped."""
+"""Maximum number of overdue periodic events of one kind that are executed at once. Further overdue events are
+dropped."""
 
 
 TWIN_SERIAL: Final = 0x8000_0000
-"""Bit in which the serial numbers of the node and of the second node of ``duplicate_node_id`` differ."""
+"""Bit that is inverted in the serial number of the second node of the fault ``duplicate_node_id``."""
 
 
 class Resting:
-    """Source of constant resistances, for an untouched patch.
+    """Source of constant resistances, as measured on an untouched patch.
 
     Args:
         baseline_ohm: (U, K) resistances at rest, ohm; values that are not positive are replaced by 1 ohm.
@@ -63,22 +65,22 @@ class Emit(Protocol):
     """Function that puts a frame on the bus, like :meth:`skinnode.transport.CanPort.send`."""
 
     def __call__(self, can_id: int, data: bytes, *, remote: bool = False) -> None:
-        """Put a frame on the bus. Raises BusError if the bus refuses it."""
+        """Put a frame on the bus. Raises BusError if the bus rejects the frame."""
 
 
 class FaultyNode(PatchNode):
-    """:class:`PatchNode` with injected :attr:`faults`, which any thread can replace at any time.
+    """:class:`PatchNode` with injected faults. Any thread may replace the :attr:`faults` at any time.
 
     Args:
         node_id: Node-ID.
         layout: Layout of the patch.
         source: Resistances that the node's converter measures.
         emit: Function that puts a frame on the bus.
-        on_sent: Function called with the COB-ID of each frame from the node, after it was sent or lost.
+        on_sent: Function called with the COB-ID of each frame after the frame has been sent or lost.
         serial: Serial number.
         profile: Protocol profile of the node.
-        faults: Initial faults; their seed remains in use when the faults are replaced.
-        temperature_per_k: Relative change in every resistance per kelvin.
+        faults: Initial faults. Their seed remains in use if the faults are replaced.
+        temperature_per_k: Temperature coefficient of all resistances, 1/K.
     """
 
     def __init__(  # noqa: PLR0913 - the arguments of PatchNode and three more
@@ -138,18 +140,18 @@ class FaultyNode(PatchNode):
 
     @property
     def injected(self) -> Injected:
-        """Live counts of the injected faults."""
+        """Counts of the injected faults, which continue to change."""
         return self._injector.injected
 
     @property
     def tally(self) -> Tally:
-        """Live counts of the node's frames, by kind."""
+        """Counts of the node's frames by kind, which continue to change."""
         return self._injector.tally
 
-    # --- frames and time passed to the node
+    # --- input to the node: frames and time
 
     def on_frame(self, can_id: int, data: bytes, t_ns: int, remote: bool = False) -> None:
-        """Pass a received frame to the node, unless a fault drops it, and to any second node."""
+        """Pass a received frame to the node, unless a fault drops it, and to the second node."""
         self._hear(can_id, data, t_ns, remote)
         if self._twin is not None:
             self._twin.on_frame(can_id, data, t_ns, remote)
@@ -176,13 +178,13 @@ class FaultyNode(PatchNode):
         self._reset_if_due(t_ns)
 
     def _concerns(self, kind: Kind, can_id: int) -> bool:
-        """Return whether a frame is addressed to the node; only such a frame is counted as lost."""
+        """Return whether a frame is addressed to this node, so that a fault can drop the frame."""
         if kind is Kind.SDO_REQUEST:
             return can_id == od.sdo_request_cob_id(self.node_id)
         return kind is not Kind.COMMAND or can_id == od.command_cob_id(self.node_id)
 
     def on_timer(self, t_ns: int) -> None:
-        """Process all node timers and periodic events that are due at ``t_ns``."""
+        """Process all timers of the node and periodic events that are due at ``t_ns``."""
         self._meet_twin(t_ns)
         if self.faults.unplugged != self._unplugged:
             self._plug(t_ns)
@@ -197,7 +199,7 @@ class FaultyNode(PatchNode):
         self._do_due_events(t_ns)
 
     def next_deadline_ns(self) -> int | None:
-        """Return the time at which :meth:`on_timer` is due; None if nothing is due before the next frame."""
+        """Return the time (ns) at which :meth:`on_timer` must be called; None if it need not be called."""
         faults = self.faults
         if faults.unplugged != self._unplugged or faults.duplicate_node_id != (self._twin is not None):
             return 0
@@ -206,7 +208,7 @@ class FaultyNode(PatchNode):
         return min((each for each in (own, of_twin) if each is not None), default=None)
 
     def _own_deadline_ns(self, faults: Faults) -> int | None:
-        """Return the time (ns) of the node's next timer or periodic event; None if there is none."""
+        """Return the time (ns) of the next timer or periodic event of this node; None if there is none."""
         if faults.error_passive != self._passive:
             return 0
         own = super().next_deadline_ns()
@@ -218,7 +220,7 @@ class FaultyNode(PatchNode):
         return min(due) if own is None else min(own, *due)
 
     def on_bus(self, state: BusState, t_ns: int) -> None:
-        """Pass the CAN controller's state to the node; a fault may replace the state with error-passive."""
+        """Pass the state of the CAN controller to the node, or error-passive if this fault is active."""
         self._controller = state
         passive = self._passive and state is not BusState.OFF
         super().on_bus(BusState.PASSIVE if passive else state, t_ns)
@@ -266,7 +268,7 @@ class FaultyNode(PatchNode):
             if not period_ns:
                 self._due_ns[name] = 0
                 continue
-            if not self._due_ns[name]:  # the fault is new, so its period starts now
+            if not self._due_ns[name]:  # the first period begins when the fault starts
                 self._due_ns[name] = t_ns + period_ns
             for _ in range(_MOST_AT_ONCE):
                 if self._due_ns[name] > t_ns:
@@ -304,7 +306,7 @@ class FaultyNode(PatchNode):
         self._on_sent(can_id)
 
     def _put_or_lose(self, can_id: int, data: bytes) -> bool:
-        """Send or drop a frame that is not a PDO, and return whether it was sent."""
+        """Send a frame that is not a PDO, unless a fault drops the frame; return whether it was sent."""
         kind = kind_of(can_id, data)
         self.tally.handed[kind] += 1
         if not self._is_cut_off and self._injector.loses(LOST_OUT.get(kind)):
@@ -317,7 +319,7 @@ class FaultyNode(PatchNode):
         return self._put(can_id, data)
 
     def _imposture(self, can_id: int, data: bytes) -> bytes:
-        """Return an outgoing frame; falsify SDO responses if a fault requires a wrong identity or layout."""
+        """Return the data of an outgoing frame, falsified if a fault requires a wrong identity or layout."""
         faults = self.faults
         if not (faults.wrong_identity or faults.wrong_layout) or can_id != od.sdo_response_cob_id(
             self.node_id
@@ -335,7 +337,7 @@ class FaultyNode(PatchNode):
         return data
 
     def _put(self, can_id: int, data: bytes, *, remote: bool = False) -> bool:
-        """Put a frame on the bus unless the node is cut off from the bus, and return whether it was sent."""
+        """Put a frame on the bus unless the node is cut off; return whether the frame was sent."""
         kind = kind_of(can_id, data, remote)
         if self._is_cut_off:
             self.injected.silenced += 1
@@ -350,7 +352,7 @@ class FaultyNode(PatchNode):
         return True
 
     def _from_twin(self, can_id: int, data: bytes) -> None:
-        """Put a frame of the second node on the bus; the first node receives the second node's heartbeats."""
+        """Put a frame from the second node on the bus, and pass its heartbeats to this node."""
         kind = kind_of(can_id, data)
         self.tally.handed[kind] += 1
         try:
@@ -366,12 +368,12 @@ class FaultyNode(PatchNode):
 
     @property
     def _is_cut_off(self) -> bool:
-        """Whether the node is cut off from the bus, so that its frames are not sent."""
+        """Whether the node cannot send frames, because it is silent, unplugged or about to be reset."""
         return self.faults.silent or self._unplugged or self._faulty_scans.reset_due
 
 
 def _periods_ns(faults: Faults) -> dict[str, int]:
-    """Return the period (ns) of each kind of periodic event; 0 for no events."""
+    """Return the period (ns) of each kind of periodic event; 0 if there are no such events."""
     rates = {"emcy": faults.emcy_per_s, "babble": faults.babble_per_s}
     periods = {name: round(1e9 / rate) if rate else 0 for name, rate in rates.items()}
     return {"restart": round(faults.restart_every_s * 1e9), **periods}

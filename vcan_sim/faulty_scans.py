@@ -1,4 +1,4 @@
-"""Faults of scans, chunks and summaries on the way from a node to its bus."""
+"""Faults of scans: applied to the chunks and summaries that a node sends."""
 
 from __future__ import annotations
 
@@ -19,17 +19,16 @@ _SUMMARY_COUNTER_BYTE: Final = 0
 
 
 class Put(Protocol):
-    """Function that puts a frame on the bus unless the node is cut off, and returns whether it was sent."""
+    """Function that puts a frame on the bus, unless the node is cut off; returns whether it was sent."""
 
     def __call__(self, can_id: int, data: bytes, *, remote: bool = False) -> bool:
-        """Put a frame on the bus. Raises BusError if the bus refuses the frame."""
+        """Put a frame on the bus. Raises BusError if the bus rejects the frame."""
 
 
 class FaultyScans:
-    """Sender that applies faults to the chunks and summaries of a node.
+    """Applies faults to the chunks and summaries of a node, and sends the resulting frames.
 
-    Each scan has at most one scan fault. A chunk has at most one chunk fault, and no chunk fault if its scan
-    has a fault.
+    A scan has either one scan fault or any number of chunk faults. A chunk has at most one fault.
 
     Args:
         injector: The node's faults, random generator and counts.
@@ -49,36 +48,36 @@ class FaultyScans:
         counter_overflow: Callable[[], int],
     ) -> None:
         self.reset_due = False
-        """Whether the node must be reset; until the reset, none of its frames reaches the bus."""
+        """Whether the node must be reset. Until the reset, its frames are not sent."""
         self._injector, self._profile = injector, profile
         self._put, self._counter_overflow = put, counter_overflow
         self._chunk_id, self._summary_id = od.chunk_cob_id(node_id), od.summary_cob_id(node_id)
-        self._counter = -1  # counter of the scan being sent, as set by the node
-        self._chunks = 0  # number of chunks of that scan so far
+        self._counter = -1  # counter of the current scan, as set by the node
+        self._chunks = 0  # number of chunks of the current scan so far
         self._half = max(1, profile.n_chunks // 2)
-        self._fate = ""  # fault of that scan: a name in OF_SCANS
+        self._fate = ""  # fault of the current scan, from OF_SCANS
         self._spoilt = False
-        self._counter_instead: int | None = None  # counter of a scan that follows a torn scan
+        self._counter_instead: int | None = None  # counter to send instead, after a torn scan
         self._index_of = chunk_indexer(profile)
-        self._packed: list[bytes] = []  # chunks of that scan, as the node packed them
-        self._struck = -1  # index of the chunk that the scan's fault affects
-        self._lost_next = -1  # index of the chunk that the next scan loses
-        self._swapped: bytes | None = None  # chunk that swaps places with the next frame
+        self._packed: list[bytes] = []  # chunks of the current scan, as packed by the node
+        self._struck = -1  # index of the chunk to which the scan's fault applies
+        self._lost_next = -1  # index of the chunk to be lost after a displaced scan
+        self._swapped: bytes | None = None  # chunk to be sent after the next frame
         self._late: list[tuple[int, bytes]] = []  # late chunks, each with the counter of its scan
 
     @property
     def needs_next_scan(self) -> bool:
-        """Whether this scan's fault also affects the next scan; if so, the next SYNC must not be lost."""
+        """Whether the current fault also affects the next scan, so that the next SYNC must not be lost."""
         return self._fate in ("torn", "displaced")
 
     def power_off(self) -> None:
-        """Drop all late and swapped chunks that have not been sent yet."""
+        """Drop all late and reordered chunks that have not been sent yet."""
         tally = self._injector.tally
         tally.silenced[Kind.CHUNK] += tally.waiting.pop(Kind.CHUNK, 0)
         self._swapped, self._late = None, []
 
     def send_chunk(self, data: bytes) -> None:
-        """Send a chunk after applying a chunk fault or the scan's fault."""
+        """Apply the fault of the current scan or a chunk fault to a chunk, and send the chunk."""
         counter = data[_CHUNK_COUNTER_BYTE]
         if counter != self._counter:
             self._begin_scan(counter)
@@ -94,11 +93,11 @@ class FaultyScans:
         swapped, self._swapped = self._swapped, None
         try:
             self._suffer_chunk(fault, changed)
-        finally:  # the bus may accept only one of the two frames
+        finally:  # send it even if the bus rejected the other frame
             self._release([] if swapped is None else [swapped])
 
     def send_summary(self, data: bytes) -> None:
-        """Send a summary after applying the scan's fault."""
+        """Apply the fault of the current scan to a summary, and send the summary."""
         injected, tally = self._injector.injected, self._injector.tally
         if data[_SUMMARY_COUNTER_BYTE] != self._counter:  # a scan without chunks
             self._begin_scan(data[_SUMMARY_COUNTER_BYTE])
@@ -135,7 +134,7 @@ class FaultyScans:
             self._struck = int(self._injector.random.integers(chunks)) if struck is None else struck
 
     def _suffer_scan(self, data: bytes) -> bytes | None:
-        """Apply a scan's fault to one of the scan's chunks; return None if the chunk is lost."""
+        """Return a chunk after applying the fault of the current scan; None if the chunk is lost."""
         injected = self._injector.injected
         if self._fate == "reset" and self._chunks > self._half and not self.reset_due:
             self.reset_due, self._fate = True, ""
@@ -167,7 +166,7 @@ class FaultyScans:
             return pack_summary(
                 said.scan, said.flags & ~SummaryFlag.CHECKED, said.chunks, said.device_time_us
             )
-        if len(self._packed) != self._profile.n_chunks:  # the codes of the unsent chunks are not available
+        if len(self._packed) != self._profile.n_chunks:  # the check requires the codes of all chunks
             return data
         injected.understated += 1
         head = said.scan, said.flags | SummaryFlag.CHANGED_ONLY, said.chunks - 1, said.device_time_us
@@ -182,13 +181,13 @@ class FaultyScans:
             self._send(self._chunk_id, data)
             return
         if not _CHUNK_FAULTS[fault](self, data):
-            return  # the node is cut off: the frame counts as silenced, not as faulty
+            return  # the node is cut off, so the frame is counted as silenced
         self._injector.count(fault)
         if fault not in ("duplicated", "reordered") and not self._spoilt:
             self._spoilt = True
             self._injector.injected.scans_spoilt += 1
 
-    # Each of these methods injects one chunk fault and returns whether it was injected.
+    # Each of these methods injects a chunk fault, and returns whether the fault was injected.
 
     def _lose(self, data: bytes) -> bool:
         self._injector.tally.lost[Kind.CHUNK] += 1
@@ -233,12 +232,12 @@ class FaultyScans:
     # --- to the bus
 
     def _send(self, can_id: int, data: bytes, *, spoilt: bool = False) -> bool:
-        """Send a chunk or summary, then late chunks of earlier scans.
+        """Send a chunk or summary, then all late chunks of earlier scans.
 
         Return whether the chunk or summary was sent.
 
-        A receiver cannot assign a ``spoilt`` frame to a scan, so a spoilt frame does not release the late
-        chunks.
+        After a ``spoilt`` frame, late chunks are not sent yet, because a receiver cannot tell from this frame
+        that a new scan has begun.
         """
         if not self._put(can_id, data):
             return False
@@ -250,7 +249,7 @@ class FaultyScans:
         return True
 
     def _release(self, chunks: Sequence[bytes]) -> None:
-        """Send all given chunks, even if the bus refuses one. Raises BusError if any chunk was refused."""
+        """Send all given chunks. Raises BusError at the end if the bus rejected any of these chunks."""
         failure: BusError | None = None
         for data in chunks:
             self._injector.tally.waiting[Kind.CHUNK] -= 1

@@ -1,4 +1,4 @@
-"""Simulated nodes of a hand, with one port and one thread per bus, started and stopped together."""
+"""Simulated nodes of a hand, with one port and one thread for each bus."""
 
 from __future__ import annotations
 
@@ -29,13 +29,13 @@ from vcan_sim.skin.imperfections import EXACT, Imperfections
 from vcan_sim.tally import Tally
 
 PREPARED_S: Final = 120.0
-"""Duration (s) of the scene that is computed before the nodes start, so that the nodes' threads need not wait
-for the contact mechanics. The other time steps of the scene are computed on first use."""
+"""Duration of the scene for which the contact mechanics are computed before the nodes start, s. The rest of
+the scene is computed when it is needed."""
 
 
 @dataclass(frozen=True, slots=True)
 class NodeReport:
-    """Counters of one simulated node since its start."""
+    """State of one simulated node, and its counters since its start."""
 
     patch: str
     node_id: int
@@ -44,38 +44,37 @@ class NodeReport:
     pdos_sent: int
     """Number of PDOs (chunks and summaries) sent."""
     scans_sent: int
-    """Number of scans sent completely."""
+    """Number of complete scans sent."""
     overruns: int
-    """Number of scans skipped because two earlier scans were still waiting to be sent."""
+    """Number of scans skipped because two previous scans had not been sent yet."""
     slow_overruns: int
     """Number of scans skipped because this machine was too busy."""
 
 
 class Fleet:
-    """Simulated patches of a hand, each with a CANopen node and a scene.
+    """Simulated patches of a hand, each with a CANopen node.
 
-    A patch's scene begins when its node has sent the first scan, so bring-up may take any time, and the patch
-    is untouched during the tare at power-on. :meth:`start` opens the buses and powers the nodes on.
-    :meth:`stop` sets the nodes to pre-operational and closes the buses. A ``with`` block calls both methods.
+    A patch remains untouched until its node has sent the first scan, so that the tare at power-on is valid.
+    :meth:`start` opens the buses and powers the nodes on. :meth:`stop` sets the nodes to pre-operational and
+    closes the buses. A ``with`` block calls both methods.
 
     Args:
         hand: Configuration with the buses, patches and simulation settings.
         interface: python-can interface that overrides the interface in the hand file.
         channel: Channel that overrides the channel in the hand file.
         faults: Initial faults of every node; see also :meth:`inject`.
-        wire_up: Function that returns the source that a patch's converter reads; default: the simulated patch
-            itself.
-        unchecked: Names of patches with protocol revision 1.0, whose summaries carry no check.
-        imperfections: Deviations from the layout, for all patches or by name of the patch. The random draws
-            of the imperfections differ from patch to patch. Default: the scene's imperfections. scene: Scene
-            that replaces the random strokes of ``[simulation]``. Scene time starts on all patches
-            simultaneously, when the first node has sent its first scan. The scene's faults start and end at
-            the scheduled scene times.
+        wire_up: Function that returns the resistance source for a patch's converter; default: the simulated
+            patch.
+        unchecked: Names of patches with protocol revision 1.0, whose summaries contain no check.
+        imperfections: Manufacturing errors, common to all patches or by patch name; default: the
+            imperfections of the scene. The random errors differ from patch to patch.
+        scene: Scene that replaces the random strokes of ``[simulation]``. It starts on all patches at the
+            same time, when the first node has sent its first scan.
 
     Raises:
-        ConfigError: If a channel is given for a hand with several buses, imperfections name a patch that the
-            hand does not have, the draws of a patch leave too small a gap between electrodes, a touch of
-            the scene is impossible on its patch, or a patch or bus cannot have one of its faults.
+        ConfigError: If a channel is given for a hand with several buses; if ``imperfections`` name an unknown
+            patch, or reduce the gap between two electrodes too much; or if the scene contains a touch or a
+            fault that is impossible on its patch or bus.
     """
 
     def __init__(  # noqa: PLR0913 - keyword arguments, most of which are rarely used
@@ -117,12 +116,12 @@ class Fleet:
             for bus in self.hand.buses
         }
         self.faults: Final = FleetFaults(self._places(), faults)
-        """Currently injected faults of the patches and buses, with a log of their changes."""
+        """Current faults of the patches and buses, with a log of all changes."""
         schedule = None if scene is None else schedule_of(scene, self.hand)
         self._player = FaultPlayer(schedule, self.faults) if schedule and schedule.faults else None
 
     def _places(self) -> Places:
-        """Return the patches and buses that can have faults."""
+        """Return the patches and buses into which faults can be injected."""
         stations, segments = self._stations, self._segments
         return Places(
             tuple(stations),
@@ -134,13 +133,13 @@ class Fleet:
         )
 
     def _skin(self, patch: PatchConfig, number: int) -> SkinMotion:
-        """Return the motion of a patch's skin, from the scene or from random strokes."""
+        """Return the motion of a patch's skin, either from the scene or as random strokes."""
         if self._scenes:
             return self._scenes[patch.name]
         return Scene(patch.layout.build(), self.hand.simulation, number)
 
     def _begin(self, source: SimulatedPatch) -> None:
-        """Start a patch's strokes or the scene of all patches, at the time of the patch's newest reading."""
+        """Start the random strokes of a patch, or the scene on all patches."""
         t_ns = source.last_read_ns
         with self._beginning:
             if self._player is not None and not source.started:
@@ -150,10 +149,10 @@ class Fleet:
                     each.start(t_ns)
 
     def start(self) -> None:
-        """Compute the first two minutes of the scene, open the buses and power the nodes on.
+        """Compute the beginning of the scene, open the buses and power the nodes on.
 
         Raises:
-            BusError: If a bus cannot be opened. No bus is left open after this error.
+            BusError: If any bus cannot be opened. The other buses are then closed.
         """
         for scene in self._scenes.values():
             scene.prepare(PREPARED_S)
@@ -177,13 +176,13 @@ class Fleet:
     def stop(self) -> None:
         """Set the nodes to pre-operational, join the threads and close the buses. Can be called repeatedly.
 
-        Raises the error of any thread that ended early.
+        Raises the error of a thread that has failed.
         """
         self._running.close()
 
     @property
     def failed(self) -> bool:
-        """Whether a bus thread has ended early with an error, which :meth:`stop` raises."""
+        """Whether the thread of any bus has failed. :meth:`stop` then raises the error."""
         return any(runner.failed for runner in self._runners)
 
     @property
@@ -196,15 +195,14 @@ class Fleet:
         return tuple(station.report() for station in self._stations.values())
 
     def inject(self, faults: Faults, patch: str | None = None) -> None:
-        """Replace the faults of one patch or of all patches. The initial seed remains in use.
+        """Replace the faults of one patch or of all patches, but keep the initial seed.
 
         Args:
             faults: New faults.
             patch: Name of the patch; None for all patches.
 
         Raises:
-            ConfigError: If the hand does not have this patch, or a fault names a wire that a patch does not
-                have.
+            ConfigError: If the patch is unknown, or if a fault refers to a wire that a patch does not have.
         """
         patches = self._stations if patch is None else (patch,)
         self.faults.set_patches(dict.fromkeys(patches, faults))
@@ -217,20 +215,20 @@ class Fleet:
             faults: New faults.
 
         Raises:
-            ConfigError: If the hand does not have this bus, or the bus cannot have these faults.
+            ConfigError: If the bus is unknown, or does not support these faults.
         """
         self.faults.set_bus(bus, faults)
 
     def injected(self, patch: str) -> Injected:
-        """Return how often each fault has been injected into a patch's node."""
+        """Return the counts of the faults that have been injected into the node of a patch."""
         return self._stations[patch].injected()
 
     def injected_bus(self, bus: str) -> InjectedOnBus:
-        """Return how often each fault has been injected into a bus."""
+        """Return the counts of the faults that have been injected into a bus."""
         return self._segments[bus].injected()
 
     def counts(self) -> dict[str, dict[str, int]]:
-        """Return the counts of injected faults that are not zero, by patch and then by bus."""
+        """Return the nonzero counts of injected faults for each patch and each bus."""
         found: dict[str, Injected | InjectedOnBus] = {
             name: self.injected_bus(name) for name in self._segments
         }
@@ -241,45 +239,44 @@ class Fleet:
         }
 
     def tally(self, patch: str) -> Tally:
-        """Return the live counts of the frames of a patch's node, by kind."""
+        """Return the counts of the frames of a patch's node by kind, which continue to change."""
         return self._stations[patch].tally()
 
     def passed(self, bus: str) -> Passed:
-        """Return the counts of the frames that passed through the nodes' interface to a bus, by kind."""
+        """Return the counts of the frames that the nodes have sent to and received from a bus, by kind."""
         return self._ports[bus].passed
 
     def bus_off(self, bus: str, *, off: bool) -> None:
-        """Put the controller of a bus's nodes into the bus-off state, or end the bus-off state."""
+        """Start or end the bus-off state of the nodes' CAN controller."""
         self.faults.set_bus(bus, replace(self.faults.bus(bus), bus_off=off))
 
     def truth_m(self, patch: str, device_time_us: int) -> Float:
-        """Return the true electrode positions in a scan.
+        """Return the true positions of the upper electrodes at the time of a scan.
 
         Args:
             patch: Name of the patch.
             device_time_us: Device time in the scan's summary, µs.
 
         Returns:
-            (U, N, 3) float64, m: actual positions of the upper electrodes, including the patch's
-            imperfections.
+            (U, N, 3) float64, m: positions including the imperfections of the patch.
 
         Raises:
-            LookupError: If the patch is not in the hand, or the scan was never sent or is too old.
+            LookupError: If the patch is unknown, or the scan was never sent or is too old.
         """
         return self._at_scan(patch, device_time_us, SimulatedPatch.truth_m)
 
     def displacement_m(self, patch: str, device_time_us: int) -> Float:
-        """Return the true displacement of the upper electrodes in a scan, which hosts estimate.
+        """Return the true displacement of the upper electrodes at the time of a scan.
 
         Args:
             patch: Name of the patch.
             device_time_us: Device time in the scan's summary, µs.
 
         Returns:
-            (U, N, 3) float64, m: :meth:`truth_m` minus the positions of the same electrodes at rest.
+            (U, N, 3) float64, m: :meth:`truth_m` minus the true positions at rest.
 
         Raises:
-            LookupError: If the patch is not in the hand, or the scan was never sent or is too old.
+            LookupError: If the patch is unknown, or the scan was never sent or is too old.
         """
         return self._at_scan(patch, device_time_us, SimulatedPatch.displacement_m)
 
@@ -291,15 +288,15 @@ class Fleet:
             raise LookupError(f"{patch}: {error}") from None
 
     def truth(self, patch: str, device_time_us: int) -> PatchTruth:
-        """Return the ground truth of a scan: displacement, contacts, pressure and wrench.
+        """Return the ground truth at the time of a scan: displacement, contacts, pressure and wrench.
 
         Args:
             patch: Name of the patch.
             device_time_us: Device time in the scan's summary, µs.
 
         Raises:
-            LookupError: If the fleet has no scene, the patch is not in the hand, or the scan was never sent
-                or is too old.
+            LookupError: If the fleet has no scene, the patch is unknown, or the scan was never sent or is too
+                old.
         """
         self._require_scene()
         source = self._stations[patch].source
@@ -310,21 +307,21 @@ class Fleet:
         return self.truth_at(patch, t_ns)
 
     def truth_at(self, patch: str, t_ns: int) -> PatchTruth:
-        """Return the ground truth at a given time, such as the time of a frame.
+        """Return the ground truth at a given time: displacement, contacts, pressure and wrench.
 
         Args:
             patch: Name of the patch.
             t_ns: Monotonic time, ns.
 
         Raises:
-            LookupError: If the fleet has no scene, or the patch is not in the hand.
+            LookupError: If the fleet has no scene, or the patch is unknown.
         """
         self._require_scene()
         t_s = self._stations[patch].source.scene_s(t_ns)
         return self._scenes[patch].truth(-1.0 if t_s is None else t_s)
 
     def scene_s(self, t_ns: int) -> float | None:
-        """Return the scene time (s) at a monotonic time; None before the scene has started.
+        """Return the scene time (s) that corresponds to a monotonic time; None before the scene starts.
 
         Args:
             t_ns: Monotonic time, ns.
@@ -349,7 +346,7 @@ class Fleet:
 def _by_patch(
     imperfections: Imperfections | Mapping[str, Imperfections], patches: list[str]
 ) -> Mapping[str, Imperfections]:
-    """Return the imperfections by patch name. Raises ConfigError if the hand does not have a named patch."""
+    """Return the imperfections of each patch. Raises ConfigError if a patch is unknown."""
     if isinstance(imperfections, Imperfections):
         return dict.fromkeys(patches, imperfections)
     for name in imperfections:
@@ -359,7 +356,7 @@ def _by_patch(
 
 
 class _Station:
-    """Simulated node with its analogue front end and the counts of its frames."""
+    """Simulated patch with its node, and the number of frames that the node has sent."""
 
     def __init__(  # noqa: PLR0913 - the parts of a node
         self,
@@ -379,7 +376,7 @@ class _Station:
         self._frames = self._pdos = 0
 
     def connect(self, emit: Emit) -> FaultyNode:
-        """Create the patch's node, which sends its frames through ``emit``."""
+        """Create the node of the patch. The node sends its frames through ``emit``."""
         config = self._config
         self._node = FaultyNode(
             config.node_id,

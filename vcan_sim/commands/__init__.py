@@ -1,1 +1,1 @@
-"""Commands of ``vcan-sim``, each in a short file. Without a command name, ``vcan-sim`` runs a hand."""
+"""Commands of ``vcan-sim``, one module for each command."""

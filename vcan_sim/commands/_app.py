@@ -10,22 +10,22 @@ from typer.core import TyperGroup
 from vcan_sim.commands import inject, list_scenes, replay, run
 
 DEFAULT: Final = "run"
-"""Name of the default command."""
+"""Command that runs if no command is named."""
 _OF_GROUP: Final = ("-h", "--help", "--install-completion", "--show-completion")
 
 
 class _Group(TyperGroup):
-    """Group of commands with a default command, whose name may be omitted."""
+    """Group of commands in which the name of the default command may be omitted."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Insert the name of the default command if no command is named."""
+        """Parse the arguments, after adding the name of the default command if no command is named."""
         completes_first_word = ctx.resilient_parsing and not args
         if not completes_first_word and (not args or args[0] not in (*self.commands, *_OF_GROUP)):
             args = [DEFAULT, *args]
         return super().parse_args(ctx, args)
 
     def shell_complete(self, ctx: Any, incomplete: str) -> Any:
-        """Offer shell completions of the first word: commands, and options of the default command."""
+        """Return completions for the first word: commands, and options of the default command."""
         own, of_default = (
             super().shell_complete(ctx, incomplete),
             self.commands[DEFAULT].shell_complete(ctx, incomplete),
@@ -37,7 +37,7 @@ class _Group(TyperGroup):
 app = typer.Typer(
     name="vcan-sim",
     cls=_Group,
-    help="Simulated patches of a robot skin as CANopen nodes. Without a command: run.",
+    help="Simulate patches of robot skin as CANopen nodes. The default command is run.",
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )

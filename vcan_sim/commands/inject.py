@@ -9,7 +9,7 @@ import typer
 Simulator = Annotated[
     str | None,
     typer.Option(
-        help="Process-ID of the simulator, or name of its hand; required if several simulators run.",
+        help="Process-ID of the simulator or name of its hand. Required if several are running.",
         metavar="PID|HAND",
     ),
 ]
@@ -20,15 +20,15 @@ def inject(
         list[str] | None,
         typer.Argument(
             help="Faults such as palm:unplugged, palm:lost=0.1, can0:starved=0.5, palm:none or none. "
-            "Default: print the faults without a change.",
+            "Default: print the current faults.",
             metavar="[[PLACE:]FAULTS]...",
         ),
     ] = None,
     simulator: Simulator = None,
 ) -> None:
-    """Change the faults of a simulator that runs in another terminal, and print all faults and their counts.
+    """Change the faults of a running simulator; print current faults and counts of injected faults.
 
-    Write faults as for `vcan-sim run --fault`. Faults that are not named do not change.
+    The faults have the same form as in `vcan-sim run --fault`. Faults that are not listed remain unchanged.
     """
     from vcan_sim.control import request, running_simulator
 

@@ -1,12 +1,12 @@
-"""``vcan-sim list``: list the scenes that are shipped with the simulator."""
+"""``vcan-sim list``: list the scenes that come with the simulator."""
 
 from __future__ import annotations
 
 
 def list_scenes() -> None:
-    """List the scenes that come with the simulator; `vcan-sim run --scene NAME` plays one.
+    """List the scenes that come with the simulator, for `vcan-sim run --scene NAME`.
 
-    The hand must have all patches that a scene names.
+    A scene can be played on a hand that has all patches named in the scene.
     """
     from vcan_sim.scenes.library import shipped_scenes
     from vcan_sim.scenes.tables import read_scene

@@ -17,7 +17,7 @@ def replay(
     recording: Annotated[
         Path,
         typer.Argument(
-            help="Folder from `vcan-sim run --record`, or a trace in the format of candump -L.",
+            help="Folder created by `vcan-sim run --record`, or a trace in candump -L format.",
             metavar="RECORDING",
         ),
     ],
@@ -25,13 +25,13 @@ def replay(
     interface: OtherInterface = None,
     channel: OtherChannel = None,
     from_nodes: Annotated[
-        bool, typer.Option("--from-nodes", help="Send only the frames that nodes send, for a host of yours.")
+        bool, typer.Option("--from-nodes", help="Send only the frames from nodes, to test a host.")
     ] = False,
 ) -> None:
-    """Replay a recorded bus trace on a bus, with its original timing.
+    """Send the frames of a recorded bus trace on a bus, with their original timing.
 
-    With --hand, the frames of each bus are sent on the bus of the hand with that name. Without --hand, all
-    frames are sent on the bus selected by --interface and --channel.
+    With --hand, the frames from each recorded bus are sent on the bus of the same name in the hand. Without
+    --hand, all frames are sent on the bus selected by --interface and --channel.
     """
     from contextlib import ExitStack
 
@@ -49,17 +49,18 @@ def replay(
         print(f"replaying {where}; press Ctrl-C to stop", flush=True)
         done = replay(FrameLogReader(trace), ports, wait=stop.wait, from_nodes=from_nodes)
     notes = [f"; {done.left_out} left out"] * bool(done.left_out)
-    notes += [f"; the bus refused {done.refused}"] * bool(done.refused)
+    notes += [f"; {done.refused} refused by the bus"] * bool(done.refused)
     print(f"sent {counted(done.sent, 'frame')} in {done.seconds:.1f} s{''.join(notes)}", flush=True)
 
 
 def _buses(
     trace: Path, hand: Path | None, interface: str | None, channel: str | None
 ) -> dict[str, BusConfig]:
-    """Return the bus on which to send the frames of each channel in a trace.
+    """Return the bus to use for each channel in a trace.
 
     Raises:
-        ConfigError: If a channel has no bus, or several channels have the same bus.
+        ConfigError: If the hand has no bus for a channel, or the trace has several channels and no hand is
+            given.
     """
     from skinnode.config import BusConfig, load_hand
     from skinnode.errors import ConfigError

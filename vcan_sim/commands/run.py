@@ -1,4 +1,4 @@
-"""``vcan-sim run hand.toml``: run the patches of a hand as CANopen nodes, pressed by a simulated indenter."""
+"""``vcan-sim run hand.toml``: run the patches of a hand as CANopen nodes."""
 
 from __future__ import annotations
 
@@ -46,26 +46,25 @@ def run(  # noqa: PLR0913 - Typer derives a command's options from its arguments
     imperfections: Annotated[
         str | None,
         typer.Option(
-            help="Imperfections of all patches: ordinary, or sizes such as ordinary,placement=0.05,seed=3.",
+            help="Imperfections of all patches: ordinary, or values such as ordinary,placement=0.05,seed=3.",
             metavar="ordinary|SIZES",
         ),
     ] = None,
     plot: Annotated[
         Path | None,
-        typer.Option(help="Plot the forces and pressures of the scene to FILE, and exit.", metavar="FILE"),
+        typer.Option(help="Plot the forces and pressures of the scene to FILE, then exit.", metavar="FILE"),
     ] = None,
     record: Annotated[
         Path | None,
         typer.Option(
-            help="Record the bus trace, ground truth, faults and scene in a new folder.", metavar="FOLDER"
+            help="Record the bus trace, ground truth, faults and scene in a new FOLDER.", metavar="FOLDER"
         ),
     ] = None,
 ) -> None:
-    """Simulate a hand's patches as CANopen nodes on a bus; a sphere presses each patch and slides over it.
+    """Simulate the patches of a hand as CANopen nodes. A sphere presses on each patch and slides over it.
 
-    With --scene, the bodies of the scene touch the patches instead of the sphere. Bring the nodes up by
-    running `skinnode host` with the same file in another terminal. While the simulator runs, `vcan-sim
-    inject` changes its faults.
+    With --scene, the bodies of the scene replace the sphere. To start the nodes, run `skinnode host` with the
+    same file in another terminal. To change the faults while the simulator is running, use `vcan-sim inject`.
     """
     from skinnode.config import load_hand
     from skinnode.process.garbage_collection import without_long_collections
@@ -130,7 +129,7 @@ def _preview(hand: HandConfig, scene: Path | None, plot: Path) -> None:
 def _watch(
     fleet: Fleet, wait: Callable[[float], bool], seconds: float | None, poll: Callable[[], None]
 ) -> None:
-    """Print a status line every second until ``wait`` returns True, time is up, or a node thread fails."""
+    """Print a status line per second until ``wait`` returns True, ``seconds`` pass or a thread fails."""
     start = clock.monotonic()
     before = fleet.report()
     silent_until_s = 0.0
@@ -159,7 +158,7 @@ def _progress(elapsed_s: float, before: Sequence[NodeReport], now: Sequence[Node
 
 
 def _too_slow(before: Sequence[NodeReport], now: Sequence[NodeReport]) -> str:
-    """Return a warning if this machine was too slow for the nodes, or an empty string."""
+    """Return a warning if scans were skipped because this machine was too busy; otherwise an empty string."""
     steps = list(zip(before, now, strict=True))
     skipped = sum(new.slow_overruns - old.slow_overruns for old, new in steps)
     if not skipped:
@@ -182,7 +181,7 @@ def _summary(reports: Sequence[NodeReport]) -> str:
 
 
 def _injected(fleet: Fleet) -> list[str]:
-    """Return one line with the counts of injected faults per patch, and per bus that had faults."""
+    """Return the counts of injected faults: one line per patch, and one per bus that had faults."""
     lines = []
     for place, counts in fleet.counts().items():
         shown = ", ".join(f"{count} {name}" for name, count in counts.items())
@@ -193,7 +192,7 @@ def _injected(fleet: Fleet) -> list[str]:
 
 @contextmanager
 def _recorded(fleet: Fleet, scene: SceneConfig | None, folder: Path | None) -> Iterator[Callable[[], None]]:
-    """Record the fleet if a folder is given; yield a function that must be called every second."""
+    """Record the fleet in ``folder``, if given; yield a function that must be called once per second."""
     if folder is None:
         yield lambda: None
         return
@@ -205,7 +204,7 @@ def _recorded(fleet: Fleet, scene: SceneConfig | None, folder: Path | None) -> I
 
 @contextmanager
 def _controlled(fleet: Fleet) -> Iterator[None]:
-    """Open the control socket for `vcan-sim inject`; if this fails, the simulator runs without the socket."""
+    """Open the control socket for `vcan-sim inject`. If this fails, print a note and continue without it."""
     from vcan_sim.control import ControlError, ControlServer
 
     with ExitStack() as entered:

@@ -2,11 +2,11 @@
 
 ::
 
-    layer (elastic response of the surface) -> grid (response of cells to each other, by FFT)
+    layer (elastic response of the surface) -> grid (response of the cells, by FFT)
         -> contact (pressure and friction under a body) -> surface displacement, force
 
-This package shares no code with the solvers or their prior, so it provides an independent ground truth for
-testing solvers. Displacements are assumed to be small: the contact is computed for bodies and cells on the
-undeformed plane. The x and y axes are along the surface, and z points outwards. A traction is the force per
-unit area on the skin; its z component is negative under a body that presses on the skin.
+This package shares no code with the solvers, so it provides an independent ground truth for testing them.
+Displacements are assumed to be small, and contacts are computed in the plane of the undeformed surface. The x
+and y axes are parallel to the surface, and the z axis points outwards. A traction is a force per unit area
+that acts on the skin. Its z component is negative where a body presses on the skin.
 """

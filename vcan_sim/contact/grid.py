@@ -1,7 +1,7 @@
-"""Grid of square cells on the surface, and the displacement of the cells under tractions, computed by FFT.
+"""Grid of square cells on the surface, with an FFT that computes the displacement due to tractions.
 
-The displacement is the convolution of the tractions with the response of one cell. Zero padding to at least
-twice the number of cells along each axis prevents wrap-around (Liu, Wang and Liu, Wear 243, 101, 2000).
+The displacement is the convolution of the tractions with the response to a single cell. Zero padding to at
+least twice the number of cells along each axis prevents wrap-around (Liu, Wang and Liu, Wear 243, 101, 2000).
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ class Grid:
     size_m: float
     _padded: tuple[int, int]
     _response: Float
-    """(3, 3, …) Fourier transform of one cell's displacement response."""
+    """(3, 3, …) Fourier transform of the displacement due to a unit traction on one cell."""
 
     @classmethod
     def of(cls, layer: Layer, shape: tuple[int, int], size_m: float) -> Grid:
@@ -49,34 +49,33 @@ class Grid:
         return cls(layer, shape, size_m, padded, fft.rfft2(turned))
 
     def centres_m(self, origin_m: Float) -> Float:
-        """Return the cell centres (X, Y, 2) in metres; ``origin_m`` (2,) is the centre of the first cell."""
+        """Return the centres of the cells (X, Y, 2) in metres; the first centre is ``origin_m`` (2,)."""
         x, y = (np.arange(n) * self.size_m for n in self.shape)
         return np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1) + origin_m
 
     def displacement_m(self, traction_pa: Float) -> Float:
-        """Return the cells' displacement (3, X, Y) in metres under tractions (3, X, Y) in Pa."""
+        """Return the displacement (3, X, Y) in metres due to tractions (3, X, Y) in Pa."""
         waves = fft.rfft2(traction_pa, self._padded)
         moved = fft.irfft2(np.einsum("ijxy,jxy->ixy", self._response, waves), self._padded)
         return np.asarray(moved[:, : self.shape[0], : self.shape[1]])
 
     def normal_m(self, pressure_pa: Float) -> Float:
-        """Return the surface indentation (X, Y) in metres under a pressure (X, Y) in Pa."""
+        """Return the indentation (X, Y) in metres due to a pressure (X, Y) in Pa."""
         waves = self._response[2, 2] * fft.rfft2(pressure_pa, self._padded)
         return np.asarray(fft.irfft2(waves, self._padded)[: self.shape[0], : self.shape[1]])
 
     def shear_m(self, traction_pa: Float) -> Float:
-        """Return the tangential displacement (2, X, Y) in metres under shear tractions (2, X, Y) in Pa."""
+        """Return the tangential displacement (2, X, Y) in metres due to shear tractions (2, X, Y) in Pa."""
         waves = fft.rfft2(traction_pa, self._padded)
         moved = fft.irfft2(np.einsum("ijxy,jxy->ixy", self._response[:2, :2], waves), self._padded)
         return np.asarray(moved[:, : self.shape[0], : self.shape[1]])
 
     @functools.cached_property
     def largest_compliance(self) -> float:
-        """Upper bound of the eigenvalues of the cells' shear compliance, m/Pa, for any subset of the cells.
+        """Upper bound on the eigenvalues of the shear compliance matrix, m/Pa.
 
-        Power iteration over all cells estimates the largest eigenvalue; a margin of 10 % is added. The
-        compliance of a subset is a principal submatrix of this symmetric matrix, so its eigenvalues are not
-        larger.
+        The largest eigenvalue is estimated by power iteration and increased by 10 %. The bound also applies
+        to every subset of the cells, because its compliance is a principal submatrix of a symmetric matrix.
         """
         vector = np.ones((2, *self.shape))
         largest = 0.0

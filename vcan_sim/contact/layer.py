@@ -1,15 +1,17 @@
-"""Elastic layer bonded to a rigid base: displacement of its surface under surface tractions.
+"""Surface displacement of an elastic layer that is bonded to a rigid base.
 
-For a wave number k and x = k h, a surface traction of unit amplitude displaces the surface by
+A sinusoidal surface traction with wave number k and unit amplitude causes displacements with these
+amplitudes, where x = k h:
 
-    normal, from normal        (1 − ν) / (G k) · (2κ sinh 2x − 4x) / D
-    along k, from along k      (1 − ν) / (G k) · (2κ sinh 2x + 4x) / D
-    along k, from normal       1 / (G k) · (κ (1 − 2ν) (cosh 2x − 1) − 2x²) / D,  a quarter wave off
-    across k, from across k    tanh x / (G k)
+    normal, due to normal traction       (1 − ν) / (G k) · (2κ sinh 2x − 4x) / D
+    along k, due to traction along k     (1 − ν) / (G k) · (2κ sinh 2x + 4x) / D
+    along k, due to normal traction      1 / (G k) · (κ (1 − 2ν) (cosh 2x − 1) − 2x²) / D, phase shift 90°
+    across k, due to traction across k   tanh x / (G k)
 
-with κ = 3 − 4ν and D = 2κ cosh 2x + 4x² + 1 + κ²: the plane-strain solution of Navier's equations with a
-surface at z = h and zero displacement at z = 0 (Johnson, Contact Mechanics, 1985, section 5.8;
-Bentall and Johnson, Int. J. Mech. Sci. 10, 637, 1968). In the limit h → ∞, the layer is a half-space.
+Here, κ = 3 − 4ν and D = 2κ cosh 2x + 4x² + 1 + κ². The formulas are the plane-strain solution of Navier's
+equations with the surface at z = h and zero displacement at z = 0 (Johnson, Contact Mechanics, 1985, section
+5.8; Bentall and Johnson, Int. J. Mech. Sci. 10, 637, 1968). In the limit h → ∞, the layer becomes a
+half-space.
 """
 
 from __future__ import annotations
@@ -26,9 +28,9 @@ from scipy.special import j0, j1
 Float = NDArray[np.float64]
 
 DEEPEST: Final = 14.0
-"""Threshold of x = k h: above it, the layer is treated as a half-space (error x² e^(−2x) < 2e-10)."""
+"""Value of x = k h above which the layer is treated as a half-space. The relative error is below 2e-10."""
 STEPS: Final = 32
-"""Number of points per layer thickness in a table of displacement versus distance."""
+"""Number of table points per layer thickness, in tables of displacement versus distance."""
 NODES: Final = 16
 """Number of Gauss-Legendre quadrature nodes per panel."""
 
@@ -67,13 +69,14 @@ class Layer:
 
     @property
     def contact_modulus_pa(self) -> float:
-        """Contact modulus E* = E / (1 − ν²) of the layer and a rigid body, Pa."""
+        """Contact modulus E* = E / (1 − ν²) between the layer and a rigid body, Pa."""
         return self.young_pa / (1.0 - self.poisson**2)
 
     def response(self, wave_number_per_m: Float) -> tuple[Float, Float, Float, Float]:
-        """Return the layer's four surface responses, as in the module's docstring, multiplied by k, 1/Pa.
+        """Return the four amplitudes in the module's docstring, multiplied by k, 1/Pa.
 
-        The order is: normal, along k from along k, along k from normal, across k.
+        The order is: normal due to normal traction, along k due to traction along k, along k due to normal
+        traction, and across k due to traction across k.
 
         Args:
             wave_number_per_m: Wave numbers k > 0, 1/m, of any shape.
@@ -81,7 +84,7 @@ class Layer:
         nu, modulus = self.poisson, self.shear_modulus_pa
         kappa = 3.0 - 4.0 * nu
         x = np.minimum(wave_number_per_m * self.thickness_m, 300.0)
-        fall = np.exp(-2.0 * x)  # the factor 2 e^(−2x) in all terms prevents overflow
+        fall = np.exp(-2.0 * x)  # all terms are multiplied by 2 e^(−2x) to prevent overflow
         sinh, cosh = 1.0 - fall**2, 1.0 + fall**2
         below = 2.0 * kappa * cosh + 2.0 * fall * (4.0 * x**2 + 1.0 + kappa**2)
         scale = (1.0 - nu) / modulus
@@ -93,9 +96,9 @@ class Layer:
 
 
 class PointResponse:
-    """Surface displacement due to a point force: the difference between a layer and a half-space.
+    """Difference between the surface displacements of a layer and a half-space due to a point force.
 
-    The difference is a smooth function of the distance from the force and is therefore tabulated.
+    The difference is tabulated, because it is a smooth function of the distance from the force.
 
     Args:
         layer: Elastic layer of finite thickness.
@@ -117,7 +120,7 @@ class PointResponse:
             for own, other in zip(layer.response(k), half.response(np.full_like(k, np.inf)), strict=True)
         )
         tables = np.empty((4, len(r)))
-        for start in range(0, len(r), 64):  # processing in blocks limits the memory use
+        for start in range(0, len(r), 64):  # in blocks, to limit memory use
             waves = np.outer(r[start : start + 64], k)
             zeroth, first = j0(waves), j1(waves)
             second = np.where(waves > 1e-4, 2.0 * first / np.maximum(waves, 1e-4) - zeroth, 0.0)
@@ -137,9 +140,9 @@ def cell_response(layer: Layer, offset_m: Float, size_m: float, reach_m: float) 
     """Return the surface displacement due to a uniform unit traction on a square cell at the origin.
 
     For a half-space, the displacement has a closed form (Love, Philosophical Transactions A 228, 377, 1929;
-    Johnson, eq. 3.25, for all directions). It contains the integrals of 1/R, x²/R³, y²/R³, xy/R³, x/R² and
-    y/R² over a rectangle. The difference between layer and half-space is smooth and is integrated over the
-    cell by Gauss-Legendre quadrature.
+    Johnson, eq. 3.25, for all directions). This form contains the integrals of 1/R, x²/R³, y²/R³, xy/R³, x/R²
+    and y/R² over a rectangle. The smooth difference between a layer and a half-space is integrated by
+    Gauss-Legendre quadrature.
 
     Args:
         layer: Elastic layer.
@@ -148,7 +151,7 @@ def cell_response(layer: Layer, offset_m: Float, size_m: float, reach_m: float) 
         reach_m: Maximum distance of a position from the centre of the cell, metres.
 
     Returns:
-        (…, 3, 3) displacement (first index) per traction (last index), m/Pa.
+        (…, 3, 3) displacement components (second to last axis) due to traction components (last axis), m/Pa.
     """
     integrals = np.zeros((6, *offset_m.shape[:-1]))
     for sign_x in (-1.0, 1.0):
@@ -198,5 +201,5 @@ def cell_response(layer: Layer, offset_m: Float, size_m: float, reach_m: float) 
 
 
 def _product(length: Float, logarithm: Float) -> Float:
-    """Return length times logarithm, with the limit 0 where the length is 0 and the logarithm is infinite."""
+    """Return the product of a length and a logarithm, or the limit 0 where the length is 0."""
     return np.where(length == 0.0, 0.0, length * logarithm)

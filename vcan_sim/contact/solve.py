@@ -1,11 +1,12 @@
-"""Pressure and friction between a rigid body and the layer.
+"""Pressure and friction between a rigid body and an elastic layer.
 
-Pressure: p ≥ 0 where the body touches the surface, and body and surface do not overlap elsewhere. This
-complementarity problem is solved by conjugate gradients on the cells in contact (Polonsky and Keer, Wear 231,
-206, 1999). Friction: each cell in contact either sticks, or slips with a shear μ p that opposes the slip
-(Coulomb). For a given p, the shear minimises a convex function on discs of radius μ p; the minimum is found
-by accelerated projected gradients (Beck and Teboulle, SIAM Journal on Imaging Sciences 2, 183, 2009).
-Pressure and shear are only weakly coupled and are solved alternately.
+The pressure p is not negative, and it is zero where the body does not touch the surface. The body and the
+surface must not overlap. This complementarity problem is solved by the conjugate gradient method of Polonsky
+and Keer (Wear 231, 206, 1999). Friction follows Coulomb's law: each cell in contact either sticks, or slips
+with a shear traction μ p that opposes the slip. For a given pressure, the shear traction minimises a convex
+function subject to the limit μ p in each cell. The minimum is found by an accelerated projected gradient
+method (Beck and Teboulle, SIAM Journal on Imaging Sciences 2, 183, 2009). Pressure and shear are weakly
+coupled, so they are computed alternately.
 """
 
 from __future__ import annotations
@@ -19,19 +20,19 @@ from vcan_sim.contact.grid import Grid
 from vcan_sim.contact.layer import Float
 
 CLOSE: Final = 1e-6
-"""Default tolerance of a contact: maximum overlap or gap of a cell in contact, relative to the maximum
-overlap of the undeformed shapes."""
+"""Default tolerance: maximum remaining overlap or gap in a contact, relative to the maximum overlap between
+the undeformed body and surface."""
 STEPS: Final = 400
 """Maximum number of iterations for the pressure or the shear."""
 TURNS: Final = 24
 """Maximum number of alternations between pressure and shear."""
 DAMPED: Final = 5
-"""Number of alternations after which only half of each change is applied, because the iteration oscillates
-with high friction on a thin layer."""
+"""Number of alternations after which the changes are halved. Without this damping, the iteration can
+oscillate if a thin layer has high friction."""
 
 
 class NoSolution(RuntimeError):
-    """The contact iteration did not reach its tolerance."""
+    """The iteration that computes a contact did not converge."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,8 +41,8 @@ class Contact:
 
     Attributes:
         traction_pa: (3, X, Y) tractions on the skin, Pa.
-        displacement_m: (3, X, Y) displacement of the surface, metres.
-        sticks: (X, Y) whether a cell is in contact and does not slip.
+        displacement_m: (3, X, Y) displacements of the surface, metres.
+        sticks: (X, Y) bool, True for cells in contact that do not slip.
     """
 
     traction_pa: Float
@@ -49,12 +50,12 @@ class Contact:
     sticks: np.ndarray
 
     def force_n(self, grid: Grid) -> Float:
-        """Return the contact's force (3,) on the skin, N."""
+        """Return the force (3,) of the body on the skin, N."""
         return np.asarray(self.traction_pa.sum(axis=(1, 2)) * grid.size_m**2)
 
 
 def untouched(grid: Grid) -> Contact:
-    """Return the state of a skin without contact."""
+    """Return the state of the skin without contact."""
     zero = np.zeros((3, *grid.shape))
     return Contact(zero, zero, np.zeros(grid.shape, bool))
 
@@ -64,11 +65,10 @@ def press(grid: Grid, overlap_m: Float, start_pa: Float | None = None, *, close:
 
     Args:
         grid: Cells on the surface.
-        overlap_m: (X, Y) depth of the undeformed body below the undeformed surface, metres; negative where
-            the body is above the surface.
-        start_pa: (X, Y) initial guess of the pressure, such as that of the preceding time step, Pa.
-        close: Tolerance: maximum overlap or gap of a cell in contact, relative to the maximum of
-            ``overlap_m``.
+        overlap_m: (X, Y) overlap between the undeformed body and the undeformed surface, metres; negative
+            where they do not overlap.
+        start_pa: (X, Y) initial guess of the pressure, such as the pressure in the previous time step, Pa.
+        close: Maximum remaining overlap or gap, relative to the maximum of ``overlap_m``.
 
     Raises:
         NoSolution: If the iteration does not converge.
@@ -91,7 +91,7 @@ def press(grid: Grid, overlap_m: Float, start_pa: Float | None = None, *, close:
         active = pressure > 0.0
         if max(float(np.abs(gap[active]).max(initial=0.0)), -float(gap.min())) < close * largest:
             return pressure
-        if not active.any():  # the initial guess was much too large and left no cell in contact
+        if not active.any():  # a much too large initial guess left no cell in contact
             pressure, conjugate = _steepest(grid, gap), 0.0
             continue
         square = float((gap[active] ** 2).sum())
@@ -109,21 +109,21 @@ def press(grid: Grid, overlap_m: Float, start_pa: Float | None = None, *, close:
 
 
 def _steepest(grid: Grid, gap_m: Float) -> Float:
-    """Return a pressure (X, Y) in Pa, proportional to the overlaps and scaled by an exact line search."""
+    """Return a pressure (X, Y) in Pa that is proportional to the overlap, scaled by an exact line search."""
     direction = np.maximum(-gap_m, 0.0)
     return np.asarray(direction * ((direction**2).sum() / (grid.normal_m(direction) * direction).sum()))
 
 
 def rub(grid: Grid, limit_pa: Float, target_m: Float, start_pa: Float, *, close: float = CLOSE) -> Float:
-    """Return the shear (2, X, Y) in Pa, limited to ``limit_pa``, for the best match of a target displacement.
+    """Return the shear traction (2, X, Y) in Pa under a body that moves with friction.
 
     Args:
         grid: Cells on the surface.
-        limit_pa: (X, Y) maximum shear μ p, Pa.
-        target_m: (2, X, Y) displacement at which a cell sticks, metres.
-        start_pa: (2, X, Y) initial guess of the shear, Pa.
-        close: Tolerance: ten times the maximum change of shear in the last iteration, relative to the maximum
-            of ``limit_pa``.
+        limit_pa: (X, Y) maximum shear traction μ p, Pa.
+        target_m: (2, X, Y) displacement that a cell would have without slip, metres.
+        start_pa: (2, X, Y) initial guess of the shear traction, Pa.
+        close: Tolerance. The iteration ends if no shear traction changes by more than 0.1 ``close`` times the
+            maximum of ``limit_pa``.
 
     Raises:
         NoSolution: If the iteration does not converge.
@@ -163,17 +163,17 @@ def advance(  # noqa: PLR0913 - the last two control the search
     start: Contact | None = None,
     close: float = CLOSE,
 ) -> Contact:
-    """Return the contact after a small move of the body.
+    """Return the state of a contact after a small movement of the body.
 
     Args:
         grid: Cells on the surface.
-        last: State of the contact before the move.
-        overlap_m: (X, Y) overlap of the undeformed shapes after the move, metres.
-        slide_m: Displacement of the body's surface along the skin, metres: (2,) without rotation, (2, X, Y)
-            with rotation of the body.
+        last: State of the contact before the movement.
+        overlap_m: (X, Y) overlap between the undeformed body and surface after the movement, metres.
+        slide_m: Tangential movement of the body's surface, metres, of shape (2,), or (2, X, Y) if the body
+            rotates.
         friction: Coefficient of friction μ.
-        start: Initial guess of the contact; default: ``last``. The result does not depend on this guess.
-        close: Tolerance of :func:`press` and :func:`rub`.
+        start: Initial guess of the new state, which does not affect the result; default: ``last``.
+        close: Tolerance, as in :func:`press` and :func:`rub`.
 
     Raises:
         NoSolution: If the iteration does not converge.

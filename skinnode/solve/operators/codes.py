@@ -1,4 +1,4 @@
-"""Numbers that identify operators and statuses in compiled code, and limits set by rounding."""
+"""Numbers that identify operators and statuses in compiled code, and tolerances for rounding errors."""
 
 from __future__ import annotations
 

@@ -25,7 +25,7 @@ from skinnode.solve.wires import arrays as wires
 
 GUIDED_STEPS: Final = 100
 """Maximum number of steps of a solve that starts at the smoothest displacement (:func:`guide`). A solve that
-starts near a root takes 1 to 20 steps; all other solves never converge."""
+starts near a root takes 1 to 20 steps; no other solve converges."""
 TWIN: Final = Accuracy(tolerance=1e-9, max_steps=30)
 """Accuracy of roots that are only compared with other roots.
 

@@ -121,8 +121,8 @@ class Periodic:
     Args:
         cycle: Cycle T in samples, if known from an earlier press of the same size and rate; None to search
             for the cycle.
-        plain: As in :class:`Uniform`. The search is always plain, since the cycle is a property of Lahaye's
-            starting points.
+        plain: As in :class:`Uniform`. The search for the cycle always starts each sample at the last solution
+            (``plain=True``).
         intermediate_tolerance: Tolerance if ``cycle`` is given; the default is the paper's 1e-4.
         final_tolerance: Tolerance at the last sample.
         intermediate_steps: Maximum operator steps at all samples except the last.

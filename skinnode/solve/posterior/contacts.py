@@ -200,8 +200,8 @@ def _prepare(  # noqa: PLR0913 - a kernel: loads, field and outputs by name
 ) -> None:
     """Write pressing loads (Q,), depths (Q,) in m, depths (Q,) in standard deviations, and forces (UN, 3), N.
 
-    ``field`` (2, UN, 3) contains the displacement and its standard deviations, m. A depth with an infinite
-    standard deviation is written as 0. Depths of cells without an electrode are not written.
+    ``field`` (2, UN, 3) contains the displacement and its standard deviations, m. If the standard deviation
+    of a depth is infinite, 0 is written. Depths of cells without an electrode are not written.
     """
     for cell in range(press.size):
         press[cell] = -q[cell, 2]

@@ -132,7 +132,7 @@ class FrameEstimator:
         a = 1.0 / (potential * self._problem.gain)
         self.estimate(a, np.ones(self.layout.shape, bool), 1e-4)
         self._seconds = seconds
-        self._estimator.gamma()  # compile gamma before the first untouched frame
+        self._estimator.gamma()  # compile the kernel of gamma() before the first frame
         if self._contacts is not None:
             self._contacts.warm_up(self._hyper.loads.estimate())
         self._forget()
@@ -440,7 +440,7 @@ class FrameEstimator:
         displacement = problem.displacement_m(problem.rest + self._trusted)
         std, core = np.zeros_like(self._trusted), np.zeros_like(self._trusted)
         std[:, self._free], core[:, self._free] = estimator.std, estimator.core
-        if held.all():  # cover displacements that are too small for the gate
+        if held.all():  # cover displacements that the gate does not detect
             for each in (std, core):
                 each[:, self._free] = np.maximum(each[:, self._free], 0.5 * self._overlooked)
         if self._contacts is not None and self._known and not held.all():

@@ -140,7 +140,7 @@ class Hyperparameters:
         return observation
 
     def _set_scale(self, *, local: bool, refine: bool) -> bool:
-        """Set the scale and the load locations from the evidence; return whether the prior changed."""
+        """Estimate the scale and the load locations from the evidence; return whether the prior changed."""
         prior, changed = self._prior, False
         if local:
             variance = np.minimum(self.loads.expected(self._least), self._most)

@@ -436,7 +436,10 @@ class MapEstimator:
         return False
 
     def _chord(self, observation: Observation) -> bool:
-        """Take chord steps until a step is small compared with the standard deviations; return success."""
+        """Take chord steps; return whether they converged.
+
+        The steps have converged if the last step is small compared with the standard deviations.
+        """
         b, wires, prior, step = self._b, len(self.moved), self.load_prior, self._correction
         before = math.inf
         for _ in range(CHORDS):

@@ -253,7 +253,7 @@ def _sheared() -> Iterator[Case]:
     """Yield deep presses with a friction coefficient of 0.8; the wires pass through folds of the potential F.
 
     For some wires, the posterior and the live trackers then converge to a smooth but wrong root. Only path
-    methods use the intermediate samples that reveal this error.
+    methods also use the intermediate samples, which reveal a wrong root.
     """
     for name, height in (("aligned", 0.5), ("aligned", 1.0), ("staggered", 1.0)):
         for contacts in (1, 2):

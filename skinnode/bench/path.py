@@ -2,8 +2,8 @@
 
 Each experiment uses one upper wire of 10 electrodes (30 unknowns), without the other wires of the patch. A
 sphere with a radius of 6 to 12 mm presses into the rubber at a random point near the middle of the patch. The
-displacement is computed from Hertz's closed-form solution with friction. The wire nearest to that point is
-solved. The press consists of 1000 samples; a path of n steps uses n evenly spaced samples.
+displacement is computed from Hertz's closed-form solution with friction. Only the wire nearest to the centre
+of the press is solved. The press consists of 1000 samples; a path of n steps uses n evenly spaced samples.
 
 The paper counts the calls of the potential function F. The paper's Jacobians are finite differences, so each
 Jacobian requires 30 additional calls. Our code evaluates F and an analytic Jacobian J together, at about

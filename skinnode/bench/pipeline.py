@@ -37,8 +37,8 @@ CLASSIC_MS: Final = 50
 8,080 frames/s."""
 FD_MS: Final = 25
 STAGGER_MS: Final = 3.0
-"""Offset between the SYNCs of successive buses in scenes with staggered SYNCs, ms. The offset is long enough
-to solve the four patches on a bus before the scans on the next bus are complete."""
+"""Offset between the SYNCs of successive buses in scenes with staggered SYNCs, ms. Within this time, the host
+solves the four patches of a bus before the scans of the next bus are complete."""
 SCENES: Final = (
     (False, True, 0.0),
     (False, True, STAGGER_MS),

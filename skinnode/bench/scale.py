@@ -3,9 +3,9 @@
 The simulated hands have four patches per bus, and spheres press on some of the patches. The hands run in
 virtual time, on buses that simulate the duration of each frame. The CPU time of each thread is read from the
 thread's CPU clock: node threads belong to the simulator, all other threads to the host. A bus has no thread
-of its own: when all threads are waiting, the last of them simulates the bus. The CPU time of the bus is
-therefore measured separately and subtracted from the CPU time of that thread. Because time is virtual, each
-patch sends every scan even on a slow machine.
+of its own: when all threads are waiting, the last of them simulates the bus. The CPU time of each bus is
+measured separately and subtracted from the CPU time of the thread that simulated the bus. Because time is
+virtual, each patch sends every scan even on a slow machine.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ from vcan_sim.timed_interface import Segment, segment
 from vcan_sim.virtual_time import VirtualClock
 
 PATCHES: Final = (1, 4, 16, 64)
-"""Default numbers of patches in the hands with one touched patch."""
+"""Numbers of patches to measure by default; in each hand, one patch is touched."""
 FIXED: Final = 16
 """Number of patches in the hand in which the number of touched patches is varied."""
 TOUCHED: Final = (0, 1, 4, 16)
-"""Numbers of touched patches to measure in the hand with :data:`FIXED` patches."""
+"""Numbers of touched patches to measure, in a hand of :data:`FIXED` patches."""
 PATCHES_PER_BUS: Final = 4
 PERIOD_MS: Final = 100
 _SETTLED_S: Final = 1.0
@@ -46,7 +46,7 @@ def run(patches: Sequence[int] = PATCHES, scans: int = 20) -> dict[str, Any]:
     """Measure the CPU time versus skin area and versus number of touched patches.
 
     Args:
-        patches: Numbers of patches in the hands with one touched patch.
+        patches: Numbers of patches to measure; in each hand, one patch is touched.
         scans: Number of scans per measurement.
 
     Returns:
@@ -117,7 +117,7 @@ def physics() -> dict[str, float]:
 
 
 class _Reading:
-    """Reads a simulated patch at a new time in every call."""
+    """Reads a simulated patch; the simulated time advances with every call."""
 
     def __init__(self, scene: PatchScene) -> None:
         self._patch, self._t_ns = SimulatedPatch(scene), 1_500_000_000

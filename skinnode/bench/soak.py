@@ -2,7 +2,7 @@
 
 The host and the simulated nodes run in the same process and communicate over two virtual buses. Each round of
 the test injects one to three kinds of fault, such as dropped frames, into one or all patches. Subscribers
-join and leave during each round. At the end of the round, the faults are removed, and the test waits until
+join and leave during each round. At the end of each round, the faults are removed, and the test waits until
 every patch is operational and publishes fields again. In some rounds, additional child processes keep all
 processors busy. Memory use is measured without faults, after a warm-up and at the end. The measurements are
 the resident memory and the number of blocks allocated by Python (:func:`sys.getallocatedblocks`). The number
@@ -170,7 +170,9 @@ def run(minutes: float, seed: int, report: Callable[[str], None]) -> dict[str, A
     try:
         fleet = Fleet(hand, faults=Faults(seed=seed))
         for source in fleet.patches.values():
-            for k in range(REMEMBERED_READINGS):  # fill the history, so that it no longer grows
+            for k in range(
+                REMEMBERED_READINGS
+            ):  # fill the history of readings now, so that it does not grow later
                 source.read(-1000 * TIME_STEP_US * (k + 1))
         with fleet:
             before = {bus.name: Counter(fleet.passed(bus.name).sent) for bus in hand.buses}
@@ -330,7 +332,7 @@ def _tare(host: Host, name: str) -> str:
     """Try to tare a patch, and return a description of the result."""
     try:
         host.tare(name)
-    except BusError:  # includes NodeError, which is raised if the patch is not operational
+    except BusError:  # also NodeError, which is raised if the patch is not operational
         return f"{name} could not be tared"
     return f"{name} tared"
 
@@ -366,7 +368,7 @@ def _wait_for_patches(host: Host, names: list[str]) -> tuple[float, str]:
 
 
 def _not_operational(host: Host) -> list[str]:
-    """Return a line of text for each patch that is not operational, stating the reason."""
+    """Return a line of text with the reason for each patch that is not operational."""
     healths = (host.health(patch.name) for patch in host.hand.patches)
     return [f"{health.patch}, {health.condition}: {health.reason}" for health in healths if health.reason]
 

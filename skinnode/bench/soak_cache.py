@@ -44,7 +44,7 @@ def environment(folder: Path) -> dict[str, str]:
 
 
 def damage(folder: Path, seed: int) -> list[str]:
-    """Damage random cache files in ``folder``, alternately by truncation and with random bytes.
+    """Alternately truncate random cache files in ``folder`` and fill them with random bytes.
 
     The choice of files depends only on the seed and the folder's contents. Returns one line of text per
     damaged file.

@@ -27,7 +27,7 @@ from skinnode.solve.wires.patch_solver import PatchSolver
 from skinnode.solve.wires.problem import PatchProblem
 
 ACCURACY: Final = 1e-9
-"""Maximum coordinate error, relative to the wire's largest displacement."""
+"""Maximum permissible coordinate error, relative to the wire's largest displacement."""
 TOLERANCES: Final = (1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-9, 1e-10, 1e-11, 1e-12, 1e-13, 1e-14, 1e-15)
 
 Solve = Callable[["Case", float], Float]
@@ -166,7 +166,7 @@ def ceres() -> Solve:
 
     def solve(case: Case, tolerance: float) -> Float:
         x = case.start.copy()
-        options.function_tolerance = tolerance**2  # Ceres compares this tolerance with a sum of squares
+        options.function_tolerance = tolerance**2  # squared, because Ceres compares it with a sum of squares
         options.gradient_tolerance = tolerance
         options.parameter_tolerance = tolerance
         problem = pyceres.Problem()

@@ -47,7 +47,7 @@ def run(
     jobs: int = 1,
     report: Callable[[dict[str, Any]], object] = lambda row: None,
 ) -> dict[str, Any]:
-    """Solve the hard cases and judge the results.
+    """Solve the hard cases and assign verdicts to the results.
 
     Args:
         seeds: Number of streams per case.
@@ -92,7 +92,7 @@ def _rows(case: Case, only: Sequence[str] | None, seeds: int) -> list[dict[str, 
     solvers = {name: methods.set_up(case, name) for name in chosen}
     tallies = {name: Tally(case.converter.exact) for name in chosen}
     twins = [other for other in ("exact", "posterior") if "auto" in chosen and other in chosen]
-    name_code = zlib.crc32(case.name.encode())  # seeds do not depend on the other cases
+    name_code = zlib.crc32(case.name.encode())  # the seeds of a case do not depend on the other cases
     for seed in range(seeds):
         stream = case.make(np.random.default_rng([seed, name_code]))
         tracked = stream.every(case.stride)

@@ -209,7 +209,7 @@ def run(  # noqa: PLR0913 - options of a command
             solved again.
 
     Returns:
-        The report's rows and targets, as plain values.
+        The report's rows and targets, as built-in types.
     """
     chosen = all_settings() if settings is None else settings
     work = [

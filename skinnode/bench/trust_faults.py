@@ -154,7 +154,7 @@ def _stick(constant: bool) -> InPlace:
     def sent(signal: Signal) -> None:
         t, (u, k) = _at_rest(signal), _crossing(signal)
         value = signal.codes[t, u, k]
-        if constant:  # the stuck value is an R/R₀ between 0.6 and 1.1
+        if constant:  # the stuck value is a ratio R/R₀ between 0.6 and 1.1
             value = np.uint32(round((float(signal.rng.uniform(0.6, 1.1)) - SCALE.lo) / SCALE.step))
         signal.codes[t + 1 :, u, k] = value
         signal.bad[t + 1 :, u, k] = True
@@ -249,7 +249,7 @@ def _two_shorted(axis: int) -> InPlace:
 
 
 def _crossed(axis: int, *, tared: bool) -> InPlace:
-    """Return a function that swaps adjacent wires before (``tared``) or after the baseline is measured."""
+    """Return a function that swaps two adjacent wires before (``tared``) or after the baseline is measured."""
 
     def wired(signal: Signal) -> None:
         at = _pressed_wire(signal, axis)

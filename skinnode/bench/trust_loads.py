@@ -253,7 +253,7 @@ def draw(kind: str, layout: PatchLayout, rng: np.random.Generator, depth: float 
         middle = 0.5 * (low + high)
         tilt = 0.2 * tilts / (high - low)
         return Plate((float(middle[0]), float(middle[1])), sunk, (float(tilt[0]), float(tilt[1])), traction)
-    if kind == "edge":  # centre on an outermost column of electrodes or an outermost wire
+    if kind == "edge":  # the centre is on an outermost column of electrodes or on an outermost wire
         border = (low, high)[side // 2]
         center = (float(border[0]), center[1]) if side % 2 else (center[0], float(border[1]))
     elif kind != "sphere":

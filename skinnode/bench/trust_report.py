@@ -117,7 +117,7 @@ def lines(figures: dict[str, Any]) -> Iterator[str]:
 
 
 def _parts(figures: dict[str, Any]) -> Iterator[str]:
-    """Yield the report lines of the additional parts: table, speed, and faults over a bus."""
+    """Yield the report lines of the additional parts of the benchmark."""
     for name, title, head, text in (
         ("table", "scenes whose fields were trusted but wrong in an earlier version", "", trust_table.text),
         (

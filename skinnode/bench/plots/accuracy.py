@@ -43,7 +43,7 @@ def draw(file: Path, figures: dict[str, Any]) -> None:
     _time(grid[2, 2], figures["time"])
     reached = sum(row["reached"] for row in figures["must"])
     figure.suptitle(
-        f"skinnode bench accuracy, {figures['scenes']} random scenes per line: "
+        f"skinnode bench accuracy, {figures['scenes']} random scenes per row: "
         f"{reached} of {len(figures['must'])} requirements met"
     )
     save_figure("--plot", file, figure, 100)

@@ -13,7 +13,7 @@ COLOURS: Final = ("tab:blue", "tab:orange", "tab:green", "tab:red")
 
 
 def draw(file: Path, figures: dict[str, Any]) -> None:
-    """Plot cost per step (top row), optimality along the path (middle), and recovered surface (bottom)."""
+    """Plot the cost per step (top), the optimality along the path (middle) and the surface (bottom)."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -73,7 +73,7 @@ def _draw_iterations(axes: Any, setting: dict[str, Any], paper: dict[str, Any]) 
 
 
 def _draw_table(axes: Any, setting: dict[str, Any], paper: dict[str, Any]) -> None:
-    """Plot the time per path versus the number of steps, for our solvers and for the paper."""
+    """Plot the time per path versus the number of steps, for our solvers and the paper's."""
     table = paper["table4_dogleg"]
     axes.loglog(table["steps"], table["runtime_s"], "s-", color="0.5", label="paper (dogleg)")
     for colour, key, label in (

@@ -30,14 +30,14 @@ def draw(file: Path, figures: dict[str, Any]) -> None:
     latency.axvline(LATENCY_MS, color="black", linestyle=":", label="limit for p99")
     latency.set_yticks(heights, names, fontsize="small")
     latency.invert_yaxis()
-    latency.set_xlabel("last frame of a scan to field, ms")
+    latency.set_xlabel("time from the last frame of a scan to its field, ms")
     latency.legend(fontsize="small")
     left = [0.0] * len(rows)
     for group, colour in _GROUPS.items():
         shares = [100 * row["cpu"].get(group, 0.0) for row in rows]
         cpu.barh(heights, shares, left=left, color=colour, label=group)
         left = [a + b for a, b in zip(left, shares, strict=True)]
-    cpu.set_xlabel("CPU of the host's threads, % of a core")
+    cpu.set_xlabel("CPU time of the host's threads, % of a core")
     cpu.legend(fontsize="small")
     machine = ", ".join(f"{key} {value}".strip() for key, value in figures["machine"].items())
     figure.supxlabel("\n".join(textwrap.wrap(machine, 150)), fontsize="x-small", color="0.35")

@@ -51,7 +51,7 @@ def _bars(axes: Any, rows: list[dict[str, Any]], heights: list[float], ours: lis
 
 
 def draw_kernel(file: Path, figures: dict[str, Any]) -> None:
-    """Plot a group of bars for each operation; ratios compare each time with the compiled kernel's."""
+    """Plot a group of bars for each operation; ratios are relative to the compiled kernel."""
     heights, rows, heads = [], figures["rows"], []
     height = 0.0
     for what, group in groupby(rows, key=lambda row: row["what"]):

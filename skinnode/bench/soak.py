@@ -332,7 +332,7 @@ def _tare(host: Host, name: str) -> str:
     """Try to tare a patch, and return a description of the result."""
     try:
         host.tare(name)
-    except BusError:  # also NodeError, which is raised if the patch is not operational
+    except BusError:  # also catches NodeError, which is raised if the patch is not operational
         return f"{name} could not be tared"
     return f"{name} tared"
 

@@ -249,7 +249,7 @@ def _two_shorted(axis: int) -> InPlace:
 
 
 def _crossed(axis: int, *, tared: bool) -> InPlace:
-    """Return a function that swaps two adjacent wires before (``tared``) or after the baseline is measured."""
+    """Return a function that swaps two adjacent wires before (``tared``) or after a baseline measurement."""
 
     def wired(signal: Signal) -> None:
         at = _pressed_wire(signal, axis)

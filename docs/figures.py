@@ -90,9 +90,9 @@ def path(figures: dict[str, Any]) -> str:
     parts = [
         f"{machine(figures)} Each setting has {figures['experiments']} random presses of one wire with 30 "
         "unknowns. *Plain* is the paper's tracker, `Uniform(plain=True)`; *ours* is `Uniform()`. One call "
-        "evaluates F with J, and the tables list calls per step; with finite differences, as in the paper, "
-        "each call counts as 31. A wire is *lost* if it is not CONVERGED; the error is the mean over the "
-        "other wires."
+        "evaluates F and J; the tables show the number of calls per step. The paper counts 31 calls for the "
+        "same work, because it uses finite differences. A wire is *lost* if it is not CONVERGED; the error "
+        "is the mean over the other wires."
     ]
     for setting in figures["settings"]:
         rows = []
@@ -116,11 +116,11 @@ def path(figures: dict[str, Any]) -> str:
     ten = "; ".join(f"{row['what']}: {row['ms']:.2f} ms" for row in figures["ten_steps"])
     worst = max(row["error"] for row in figures["ten_steps"])
     parts.append(
-        f"Time for a ten-step path of one wire at the first setting, to an error of {percent(worst)}: {ten}. "
-        "The paper reports 2.03 s."
+        "For one wire, a ten-step path at the first setting to an error of "
+        f"{percent(worst)} took these times: {ten}. The paper reports 2.03 s."
     )
     wrong = sum(row["wrong"] for setting in figures["settings"] for row in _all_rows(setting))
-    parts.append(f"Wires CONVERGED but wrong, over all settings and schedules: {wrong}.")
+    parts.append(f"Number of wires that are CONVERGED but wrong, in all settings and schedules: {wrong}.")
     return "\n\n".join(parts)
 
 
@@ -180,7 +180,7 @@ def front(figures: dict[str, Any]) -> str:
                 [f"`{panel['scene']}`" if i == 0 else "", name, row["how"], f"{row['us']:.0f}", error]
             )
     found = table(["scene", "who", "how", "µs per wire", "error"], rows)
-    return f"{machine(figures)} **Bold**: on the Pareto front of all rows.\n\n{found}"
+    return f"{machine(figures)} Results on the Pareto front of all rows are in **bold**.\n\n{found}"
 
 
 def noise(figures: dict[str, Any], only: float | None = None) -> str:
@@ -281,12 +281,12 @@ def _pair(row: dict[str, Any]) -> str:
 
 def stability(figures: dict[str, Any]) -> str:
     parts = [
-        f"{machine(figures)} {figures['seeds']} seeds per row, {len(figures['rows'])} rows, "
-        f"**{figures['wrong']} wires CONVERGED and wrong**. A wire is wrong if it is CONVERGED "
-        "with an error that exceeds 5 standard deviations and cannot be explained by chance or, with exact "
-        "data, exceeds 1e-6. "
-        "The table lists the rows with noise, solved by the method that `auto` chose; errors and standard "
-        "deviations are medians over the seeds, in the deepest frame."
+        f"{machine(figures)} There were {figures['seeds']} seeds per row and {len(figures['rows'])} rows; "
+        f"**{figures['wrong']} wires were CONVERGED but wrong**. A CONVERGED wire is wrong if its error "
+        "exceeds 5 standard deviations and chance cannot explain it. With noise-free data, it is wrong if "
+        "its error exceeds 1e-6. "
+        "The table shows the rows with noise, solved by the method that `auto` chose. Errors and standard "
+        "deviations are medians over the seeds in the deepest frame."
     ]
     rows = [
         [
@@ -322,17 +322,15 @@ def exact_data(figures: dict[str, Any]) -> str:
         for name, some in totals.items()
     ]
     summary = (
-        f"{figures['seeds']} seeds per row, {len(figures['rows'])} rows: **{figures['wrong']} wires "
-        "CONVERGED and wrong**. With exact data, all hard cases together:"
+        f"There were {figures['seeds']} seeds per row and {len(figures['rows'])} rows; "
+        f"**{figures['wrong']} wires were CONVERGED but wrong**. "
+        "Totals over all hard cases with noise-free data:"
     )
     return f"{summary}\n\n" + table(["method", "wires", "accurate", "flagged", "wrong"], rows)
 
 
 def trust(figures: dict[str, Any]) -> str:
-    command = (
-        f"The results below are the output of `skinnode bench trust --seed {figures['seed']}`. "
-        f"{machine(figures)}"
-    )
+    command = f"This is the output of `skinnode bench trust --seed {figures['seed']}`. {machine(figures)}"
     return f"{command}\n\n```text\n" + "\n".join(trust_report.lines(figures)) + "\n```"
 
 

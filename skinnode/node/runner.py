@@ -24,12 +24,12 @@ _RETRY_S: Final = 0.02
 """Pause after a bus error, in seconds, which is long enough to drain a full transmit queue."""
 
 _CATCH_UP_FRAMES: Final = 4096
-"""Maximum number of queued frames to process before a heartbeat is declared missed: as many as a fully loaded
-1 Mbit/s bus carries in half a second."""
+"""Maximum number of queued frames to process before a heartbeat is declared missed. A fully loaded 1 Mbit/s
+bus carries this number of frames in half a second."""
 
 OFF_AFTER_S: Final = 0.1
-"""Duration (s) of continuous bus errors after which the nodes treat their CAN controller as bus-off. It is
-longer than a full transmit queue takes to drain."""
+"""Duration (s) of continuous bus errors after which the nodes treat their CAN controller as bus-off. A full
+transmit queue drains in a shorter time."""
 
 REOPEN_S: Final = 1.0
 """Duration (s) of continuous bus errors after which the CAN interface is reopened. Reopening restores an
@@ -68,8 +68,8 @@ class NodeRunner:
         error."""
         self._heard = 0
         self._bus_state = BusState.ACTIVE
-        # Number of frames that the port had sent when bus-off began; if it has since sent more, the bus has
-        # recovered.
+        # Number of frames that the port had sent when the bus-off state began. The bus has recovered as soon
+        # as the port has sent more frames.
         self._sent_before = 0
         self._powered, self._stopping = clock.event(), clock.event()
         self._error: BaseException | None = None
@@ -200,8 +200,8 @@ class NodeRunner:
     def _catch_up(self, now_ns: int) -> BusError | None:
         """Process the queued frames that were received before ``now_ns``.
 
-        If this thread is delayed, a heartbeat that arrived in time may still be in the queue. It must be
-        processed before the timers; otherwise, it would be reported as missed.
+        If this thread is delayed, a heartbeat that arrived in time may still be in the queue. The queue
+        must be processed before the timers; otherwise, such a heartbeat would be reported as missed.
         """
         failure: BusError | None = None
         for _ in range(_CATCH_UP_FRAMES):

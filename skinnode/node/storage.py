@@ -124,8 +124,8 @@ class Storage:
     def restore(self, first: int, last: int) -> None:
         """Set the objects from index ``first`` to index ``last`` to their power-on values.
 
-        A saved value must pass the same checks as a value written by a client. An object is set to its
-        default if it has no saved value, or if its saved value is not allowed.
+        A saved value must pass the same checks as a value written by a client. An object without a
+        saved value, or with a saved value that is not allowed, is set to its default.
         """
         self._store.restore(first, last)
         values: dict[Key, bytes] = {}
@@ -184,7 +184,7 @@ class Storage:
             except OSError:
                 raise Refused(AbortCode.HARDWARE) from None
             # By giving the command, the user accepts the current parameters, so memory faults are cleared.
-            # Automatic saving of the baseline does not clear them.
+            # Automatic saving of the baseline does not clear memory faults.
             self._settle(Fault.UNREADABLE, Fault.DAMAGED, Fault.FOREIGN)
 
         return guard
@@ -197,8 +197,8 @@ class Storage:
         if subindex in (_ALL, _APPLICATION_ONLY):
             application_kept = Parameters(node_id, application)
             kept = replace(kept, application=application_kept, baseline_ohm=self.baseline_ohm())
-        # Object 0x1020 identifies a whole configuration, so it is saved only together with the whole
-        # configuration.
+        # Object 0x1020 identifies a whole configuration, so 0x1020 is saved only if the memory contains the
+        # whole configuration.
         whole = kept.communication.values == communication and kept.application.values == application
         return kept if whole else _unverified(kept)
 
@@ -225,7 +225,7 @@ class Storage:
         return {key: value for key, value in changed.items() if key not in od.COMMANDS}
 
     def _for_this_node(self, key: Key, value: bytes, node_id: int) -> bytes:
-        """Return the saved value; if it is the default COB-ID for ``node_id``, adapt it to this node's ID."""
+        """Return the value; change a COB-ID that is the default of ``node_id`` to this node's default."""
         if not self._store.has(*key):
             return value
         entry = self._store.find(*key)

@@ -51,7 +51,7 @@ class SyncWindow:
         return not length_us or self._sync_ns is None or t_ns - self._sync_ns <= length_us * 1000
 
     def lets_out(self, number: int, t_ns: int) -> bool:
-        """Return whether a synchronous TPDO may be sent; if not, the caller must discard it.
+        """Return whether a synchronous TPDO may be sent; if not, the caller must discard the TPDO.
 
         The first time a TPDO is discarded, the node sends an emergency message. The error ends when this TPDO
         is next sent within the window.
@@ -135,7 +135,7 @@ class Sync:
         self.deadline_ns = self._now() + self._period_ns if runs else NO_DEADLINE_NS
 
     def on_timer(self, t_ns: int) -> bytes | None:
-        """If a SYNC is due, send it and return its payload; otherwise, return None.
+        """If a SYNC is due, send the SYNC and return its payload; otherwise, return None.
 
         After a delay of several periods, the missed SYNCs are skipped and the schedule stays the same.
         """

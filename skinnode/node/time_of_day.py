@@ -1,8 +1,8 @@
 """TIME consumer, which receives the time of day (CiA 301 v4.2, 7.2.6 and object 0x1012).
 
-A node has no real-time clock. It stores the last time of day received, together with the time of reception on
-its own clock. From these two times, the node computes the current time of day (0x2022), and a host can
-convert the device time of a scan to a date.
+A node has no real-time clock. Instead, the node stores the last time of day received, together with the time
+of reception on its own clock. From these two times, the node computes the current time of day (0x2022), and a
+host can convert the device time of a scan to a date.
 """
 
 from __future__ import annotations

@@ -9,7 +9,7 @@ from skinnode.node.clock import NO_DEADLINE_NS
 
 
 class Timers:
-    """Collection of timers, one per key, stored in a heap. Operations take amortised O(log n) time."""
+    """Heap of timers with one timer per key. Operations take amortised O(log n) time."""
 
     def __init__(self) -> None:
         self._due: dict[int, int] = {}
@@ -48,7 +48,7 @@ class Timers:
         """Yield the keys of the timers that are due at ``t_ns``, earliest first.
 
         A timer is removed when its key is yielded, so an exception in the caller's loop does not affect the
-        other timers. If the caller resets a timer to a time no later than ``t_ns``, the key is yielded again.
+        other timers. If the caller sets a timer to a time no later than ``t_ns``, the key is yielded again.
         """
         while self.deadline_ns <= t_ns:
             _, key = heapq.heappop(self._heap)

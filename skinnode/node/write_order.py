@@ -17,8 +17,8 @@ _LATE: Final = (od.CYCLE_PERIOD, od.COB_ID_SYNC, od.VERIFY_CONFIGURATION)
 """Indices of the objects that must be written last, in writing order.
 
 The cycle period is written after the SYNC counter overflow, which cannot be changed while a cycle period is
-set. The COB-ID of SYNC is written after the cycle period, because it starts the SYNC producer. Object 0x1020
-is written last, because any other write clears it.
+set. The COB-ID of SYNC is written after the cycle period, because this write starts the SYNC producer. Object
+0x1020 is written last, because any other write clears 0x1020.
 """
 
 
@@ -33,8 +33,8 @@ def write_configuration(store: ObjectStore, values: Mapping[Key, bytes]) -> list
         values: saved bytes, by index and sub-index.
 
     Returns:
-        Index and sub-index of each refused value. An object with a refused value keeps its default; for a
-        mapping entry, the whole mapping keeps its default.
+        Index and sub-index of each refused value. An object with a refused value keeps its default. If a
+        mapping entry is refused, the whole mapping keeps its default.
     """
     known = {key: value for key, value in values.items() if store.has(*key)}
     refused = [key for key in values if key not in known]

@@ -29,7 +29,7 @@ def starting_children() -> Iterator[None]:
     with _signals_deferred():
         before = signal.pthread_sigmask(signal.SIG_BLOCK, _TERMINAL_SIGNALS)
         try:
-            resource_tracker.ensure_running()  # this call unblocks SIGINT, so it is blocked again
+            resource_tracker.ensure_running()  # this call unblocks SIGINT
             signal.pthread_sigmask(signal.SIG_BLOCK, _TERMINAL_SIGNALS)
             yield
         finally:

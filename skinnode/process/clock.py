@@ -17,7 +17,7 @@ from typing import Any, Protocol
 
 
 class Clock(Protocol):
-    """Time source, and factory for threads and for the synchronisation objects that threads wait on."""
+    """Source of time, of threads, and of the synchronisation objects that threads wait on."""
 
     def monotonic_ns(self) -> int:
         """Return the monotonic time, ns."""

@@ -14,7 +14,7 @@ class SignalEvent(threading.Event):
     """Event that a signal handler can safely set.
 
     Both ``wait`` and ``set`` of ``threading.Event`` acquire the event's lock. If a signal interrupts ``wait``
-    while it holds the lock, a signal handler that calls ``set`` blocks forever. This class uses
+    while the lock is held, a signal handler that calls ``set`` blocks forever. This class uses
     ``SimpleQueue.put`` instead, which is reentrant.
     """
 

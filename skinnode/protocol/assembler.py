@@ -1,6 +1,6 @@
-"""Assembles one patch's chunks and summaries into scans; not thread-safe.
+"""Assembles one patch's chunks and summaries into scans. The assembler is not thread-safe.
 
-**Scans are never mixed.** A scan contains only frames with the scan's own counter that arrived within the
+**Scans are never mixed.** A scan contains only frames that have the scan's counter and arrived within the
 *timeout* after its first frame. The scan is closed permanently as soon as a frame of a newer scan arrives.
 Frames of two scans can therefore be mixed only if both scans have the same counter and the frames arrive
 within the timeout. The age of a frame is the time from its scan's SYNC to its arrival. Mixing is impossible
@@ -8,16 +8,16 @@ if counter range × period is longer than the timeout plus the maximum age. The 
 less if the counter range is short. With the usual counter range of 240 scans, mixing is impossible if all
 frames are less than 237 periods old.
 
-**Two scans with the same counter.** Two scans have the same counter if a node did not increment it, or if two
-nodes have the same node-ID. The assembler detects the conflict if two frames with the same index and
-different content arrive. The remaining frames then cannot be assigned to one of the two scans, so the
+**Two scans with the same counter.** Two scans have the same counter if a node did not increment the counter,
+or if two nodes have the same node-ID. The assembler detects the conflict if two frames with the same index
+and different content arrive. The remaining frames then cannot be assigned to one of the two scans, so the
 assembler discards the whole scan. The assembler also discards an incomplete scan whose chunks arrived more
 than two periods apart, because they may belong to two scans. If the frames of two mixed scans have no chunk
 index in common, only the scan check detects the mixing.
 
 **The check.** A summary with :attr:`~skinnode.protocol.summary.SummaryFlag.CHECKED` carries a CRC over all
 codes of the patch, including those of unsent chunks (:mod:`skinnode.protocol.scan_check`). A failed check
-does not identify the wrong chunk. The assembler therefore discards the whole scan, and the stored codes of
+does not show which chunk is wrong. The assembler therefore discards the whole scan, and the stored codes of
 unsent chunks. A stream becomes *checked* when a check passes for the first time, or when
 :meth:`ScanAssembler.reset` is called with ``checked=True``. In a checked stream, a scan is complete only if
 its check passed, and a summary without a check is rejected. A scan is published as *unchecked* if its summary
@@ -146,7 +146,7 @@ class ScanAssembler:
         """Process a chunk.
 
         Args:
-            data: payload of TPDO1; the assembler keeps a reference to it.
+            data: payload of TPDO1; the assembler keeps a reference to this object.
             t_ns: time of reception, ns.
 
         Returns:
@@ -232,8 +232,8 @@ class ScanAssembler:
         """Discard the open scan, the last codes and the scan counter, as after a boot-up of the node.
 
         Args:
-            under_way: whether the node may already be sending scans. If so, chunks missing at the start of
-                the first scan are not counted as lost.
+            under_way: whether the node may already be sending scans. If the node may be sending, chunks
+                missing at the start of the first scan are not counted as lost.
             checked: whether the node is known to send a check in every summary; if false, a passed check
                 makes all subsequent checks mandatory.
         """
@@ -314,7 +314,7 @@ class ScanAssembler:
             self._on_reject(CodecError(cob_id, data, allowed))
 
     def _is_news(self, counter: int, t_ns: int, *, known: bool) -> bool:
-        """Return whether a frame starts a new scan; if not, count it as late, duplicate or invalid.
+        """Return whether a frame starts a new scan; if not, count the frame as late, duplicate or invalid.
 
         The argument ``known`` indicates whether the last scan contains an identical frame.
         """

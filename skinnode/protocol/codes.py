@@ -99,9 +99,9 @@ def encode(resistance_ohm: ArrayLike, baseline_ohm: ArrayLike, scale: CodeScale)
     """Encode resistances.
 
     Resistances of +inf and NaN become the code for open; zero and negative resistances become the code for
-    short. R/R0 values outside ``lo`` to ``hi`` become the over-range code, except that values up to half a
-    step outside are rounded to the nearest limit. A measurement without a baseline (R0 not positive and
-    finite) also becomes the over-range code.
+    short. R/R0 values outside the range from ``lo`` to ``hi`` are rounded to the nearest limit if they are at
+    most half a step outside; otherwise, they become the over-range code. A measurement without a valid
+    baseline (R0 must be positive and finite) also becomes the over-range code.
 
     Args:
         resistance_ohm: resistances, ohm; any shape.

@@ -42,8 +42,8 @@ class DeviceTimeTracker:
         """Return the 32-bit device time (µs), with upper bits predicted from the last device time.
 
         The prediction is the last device time plus the time that has since elapsed on the host's clock. For
-        the first summary, the upper bits are predicted from the host's clock alone. They are correct if node
-        and host share a clock and the summary arrives within three seconds of the scan.
+        the first summary, the upper bits are predicted from the host's clock alone. These upper bits are
+        correct if node and host share a clock and the summary arrives within three seconds of the scan.
 
         Args:
             low_us: device time from a checked summary, without its upper bits, µs.

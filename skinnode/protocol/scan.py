@@ -46,12 +46,12 @@ class Scan:
 
     @property
     def phase(self) -> int:
-        """Conversion phase, 1 to 3; 0 if the patch does not supply it or the summary was lost."""
+        """Conversion phase, 1 to 3; 0 if the patch does not supply a phase or the summary was lost."""
         return conversion_phase(self.flags)
 
     @property
     def empty(self) -> bool:
-        """Whether the node sent chunks of this scan but none of them arrived."""
+        """Whether the node sent chunks of this scan, but none of these chunks arrived."""
         return self.chunks_received == 0 < self.chunks_expected
 
 

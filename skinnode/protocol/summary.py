@@ -61,8 +61,8 @@ class Summary(NamedTuple):
 
 
 PHASES: Final = 3
-"""Number of conversion phases. After missed scans, the conversion phase of the next scan is not meaningful,
-because the phase may have advanced by any number of steps."""
+"""Number of conversion phases. After missed scans, the phase of the next scan does not show how many
+conversions took place, because the phase may have advanced by any number of steps."""
 _PHASE_SHIFT: Final = 6
 
 _CHECKED: Final = int(SummaryFlag.CHECKED)  # testing an int is ten times as fast as testing an enum flag

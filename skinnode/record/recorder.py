@@ -65,10 +65,10 @@ def name_in(folder: Path, hand: HandConfig, kind: LogFormat, now: datetime.datet
 
 
 def make_folder(path: Path) -> Path | None:
-    """Create the folder ``path`` and any missing parents, and return it; return None if it already existed.
+    """Create the folder ``path`` and its parents; return ``path``, or None if the folder already existed.
 
     Raises ConfigError if the folder cannot be created. A name with a suffix also raises ConfigError, because
-    it is probably a misspelt file name.
+    such a name is probably a misspelt file name.
     """
     if path.is_dir():
         return None

@@ -82,7 +82,7 @@ def replay(path: Path | str, *, speed: float | None = None, cancelled: Callable[
 
 
 class Replay:
-    """Replay of a recording, created by :func:`replay`; it can be iterated only once."""
+    """Replay of a recording, created by :func:`replay`. A replay can be iterated only once."""
 
     def __init__(self, path: Path, speed: float | None, cancelled: Callable[[], bool] = _never) -> None:
         if speed is not None and not 0 < speed < float("inf"):

@@ -4,7 +4,7 @@
 and ``posterior`` estimates the whole patch. ``root_gate`` uses the posterior to check doubtful wires of the
 exact inverse, according to the rules and thresholds in ``roots``. ``checks`` finds readings that contradict
 other readings, and determines whether a field is trusted. ``noise_estimate`` corrects the configured noise if
-the stream contradicts it; ``precision`` compares standard deviations with the user's limits. ``paths`` tracks
-the displacements through a recorded press. All of these packages and modules use ``operators``, ``linalg``
-and ``wires``.
+the stream contradicts this value; ``precision`` compares standard deviations with the user's limits.
+``paths`` tracks the displacements through a recorded press. All of these packages and modules use
+``operators``, ``linalg`` and ``wires``.
 """

@@ -35,7 +35,7 @@ from skinnode.node.timers import Timers
 
 
 class Tpdo:
-    """State of one TPDO: parameters, earliest sending time and event timer.
+    """Parameters and state of one TPDO.
 
     Args:
         number: number of the TPDO, counted from 0.
@@ -92,7 +92,11 @@ class Tpdo:
         self.timer_ns = t_ns + parameters.event_timer_ns if timed else NO_DEADLINE_NS
 
     def elapse(self, t_ns: int) -> None:
-        """Restart an elapsed event timer one period after its due time, or after ``t_ns`` if very late."""
+        """Restart an elapsed event timer.
+
+        The new period begins at the end of the elapsed period. If the delay exceeds a whole period, the new
+        period begins at ``t_ns`` instead.
+        """
         self.timer_ns += self.parameters.event_timer_ns
         if self.timer_ns <= t_ns:
             self.start_timer(t_ns)
@@ -104,7 +108,7 @@ class Tpdo:
             counter: SYNC counter; None if the SYNC message contains no counter.
 
         Returns:
-            Whether this synchronous TPDO must be sent after this SYNC.
+            Whether this synchronous TPDO is due after this SYNC.
         """
         parameters = self.parameters
         if not self._in_step and parameters.sync_start and counter is not None:
@@ -127,12 +131,12 @@ class Owner(Protocol):
         ...
 
     def on_reload(self, tpdo: Tpdo) -> None:
-        """Handle a change of a TPDO's parameters, which may also change the TPDO's owner."""
+        """Handle a change of a TPDO's parameters or of its owner."""
         ...
 
 
 class TpdoEngine:
-    """Engine for all TPDOs of a node.
+    """Sends the TPDOs of a node.
 
     Args:
         services: resources that all services of the node share.
@@ -270,7 +274,7 @@ class TpdoEngine:
         self._let_out(tpdo, t_ns)
 
     def on_remote(self, cob_id: int, t_ns: int) -> None:
-        """Send the TPDO that a remote frame requests, unless it is synchronous (CiA 301, 7.2.2.3)."""
+        """Send the TPDO that a remote frame requests, unless the TPDO is synchronous (CiA 301, 7.2.2.3)."""
         tpdo = self._by_cob_id.get(cob_id)
         if tpdo is None or not tpdo.parameters.answers_rtr or self._sent_anyway(tpdo):
             return
@@ -308,7 +312,7 @@ class TpdoEngine:
         self._send(tpdo.parameters.cob_id, payload)
 
     def transmit(self, tpdo: Tpdo, t_ns: int) -> None:
-        """Send a synchronous TPDO now, or discard it if the synchronous window (0x1007) is closed."""
+        """Send a synchronous TPDO if the synchronous window (0x1007) is open; otherwise, discard the TPDO."""
         if self.window.lets_out(tpdo.number, t_ns):
             self._transmit(tpdo, self.payload(tpdo), t_ns)
         else:

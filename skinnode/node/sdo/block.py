@@ -1,9 +1,9 @@
 """SDO block transfer, with one acknowledgement per block of segments (CiA 301 v4.2, 7.2.4.3.9 to 7.2.4.3.15).
 
-CAN may deliver a frame twice if the last bit of its end-of-frame field is disturbed (ISO 11898-1). Frames
-contain no block number, so a repeated acknowledgement could be mistaken for that of the next block, and
-segments would be skipped. A frame identical to the previous frame is therefore ignored, unless the protocol
-allows two identical frames in succession.
+CAN may deliver a frame twice if the last bit of its end-of-frame field is disturbed (ISO 11898-1). If this
+happens to an acknowledgement, the copy could be mistaken for the acknowledgement of the next block, because
+frames contain no block number. Segments would then be skipped. A frame identical to the previous frame is
+therefore ignored, unless the protocol allows two identical frames in succession.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ SEGMENT_NS: Final = 500_000
 PDOs may cause a bus load of 70 %. A 1 Mbit/s bus then has a remaining capacity of at least 2200 frames/s.
 Block transfers use 2000 frames/s, so the transmit queue does not fill up.
 
-A block of 127 segments takes 64 ms, or 100 ms if the thread wakes up late. Clients tolerate this delay; the
-canopen library waits 300 ms for a response. Each time a segment cannot be sent, for example at a lower bit
-rate, the interval is doubled for the rest of the transfer.
+A block of 127 segments takes 64 ms, or 100 ms if the thread wakes up late. Clients wait longer than
+this for a frame; the canopen library, for example, waits 300 ms. Each time a segment cannot be sent, for
+example at a lower bit rate, the interval is doubled for the rest of the transfer.
 """
 SLOWEST_SEGMENT_NS: Final = 8 * SEGMENT_NS
 """Maximum mean interval between segments, in ns. At this interval, the segments use only a quarter of the
@@ -106,7 +106,7 @@ class BlockUpload(Transfer):
         self._waits_for = _Upload.START
         self._previous, self._previous_ns = b"", t_ns
         # The server offers a CRC only if the client supports one: some clients expect a CRC whenever the
-        # server offers it, even without having requested it.
+        # server offers it, even if they did not request one.
         channel.send(MULTIPLEXER_U32.pack(0xC2 | crc << 2, target.index, target.subindex, len(data)))
 
     def wants(self, request: bytes) -> bool:
@@ -186,7 +186,7 @@ class BlockDownload(Transfer):
     Args:
         channel: SDO server channel.
         target: object to read or write.
-        announced: size announced by the client, bytes; None if it announced no size.
+        announced: size announced by the client, bytes; None if the client announced no size.
         t_ns: time at which the initiate request was received, ns.
         crc: whether the client supports a CRC.
 
@@ -203,7 +203,7 @@ class BlockDownload(Transfer):
         self._received = 0  # number of segments of the current block received without a gap
         # last segment of the transfer; the end request states how many of its bytes are data
         self._last: bytes | None = None
-        self._previous = b""  # the last acknowledged request; if it is received again, it is ignored
+        self._previous = b""  # the last acknowledged request; a copy of this request is ignored
         channel.send(MULTIPLEXER_U32.pack(0xA0 | crc << 2, target.index, target.subindex, MAX_BLOCK_SEGMENTS))
 
     def wants(self, request: bytes) -> bool:

@@ -43,8 +43,8 @@ _NAMELESS: Final = (0, 3, 5, 6)
 class SdoServer:
     """SDO server with one channel, which performs one transfer at a time.
 
-    A new initiate request ends an unfinished transfer, because the client has evidently abandoned it. Errors
-    raised by ``send`` propagate to the caller; the transfer continues with the next call.
+    A new initiate request ends an unfinished transfer, because the client has evidently abandoned it. An
+    error raised by ``send`` propagates to the caller but does not end the transfer.
 
     Args:
         store: object dictionary.
@@ -139,9 +139,8 @@ class SdoServer:
     def _block_upload(self, request: bytes, target: Target, t_ns: int) -> None:
         data = self._read(target)
         block_size, switch_threshold, crc = request[4], request[5], bool(request[0] & 4)
-        if (
-            0 < len(data) <= switch_threshold
-        ):  # up to this size, the client prefers a transfer that is not a block transfer
+        # For values up to the switch threshold, the client does not want a block transfer.
+        if 0 < len(data) <= switch_threshold:
             self._start_upload(target, data, t_ns)
         else:
             self._transfer = BlockUpload(self._channel, target, Upload(data, block_size, crc), t_ns)
@@ -154,7 +153,7 @@ class SdoServer:
             self._transfer = _Download(self._channel, target, announced, t_ns)
             return
         store = self._channel.store
-        # For a request without a size, the object's length is used, limited to four bytes.
+        # If the request states no size, use the object's length, but at most four bytes.
         index, subindex = target.index, target.subindex
         size = 4 - (command >> 2 & 3) if size_given else min(store.lengths(index, subindex).most, 4)
         store.write(index, subindex, request[4 : 4 + size])

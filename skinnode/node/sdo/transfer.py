@@ -40,7 +40,7 @@ class Target:
 
 
 class Transfer(ABC):
-    """Base class of transfers with several requests. A transfer aborts itself by raising Refused.
+    """Base class for transfers that consist of several requests. A transfer aborts itself by raising Refused.
 
     Args:
         channel: SDO server channel.
@@ -81,7 +81,7 @@ class Incoming:
     Args:
         store: object dictionary.
         target: object to read or write.
-        announced: size announced by the client, bytes; None if it announced no size.
+        announced: size announced by the client, bytes; None if the client announced no size.
 
     Raises:
         Refused: if the object is not writable or does not accept a value of the announced size.

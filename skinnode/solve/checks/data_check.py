@@ -3,8 +3,8 @@
 Each frame is first solved with all readings except those with confirmed faults. The displacements are then
 converted to changes of the readings, linearised at rest. The model in
 :mod:`skinnode.solve.checks.reading_model` tests these changes.
-If a reading or a wire contradicts the others, the frame is solved again without it; at most :data:`ROUNDS`
-groups of readings are left out.
+If a reading or a wire contradicts the others, the frame is solved again without this reading or wire. At
+most :data:`ROUNDS` groups of readings are left out.
 """
 
 from __future__ import annotations
@@ -54,8 +54,8 @@ EXCUSED_FRAMES: Final = 8
 """Number of frames after an examination during which similar frames are not examined again; an examination
 takes 9 ms."""
 PATIENCE: Final = 4
-"""If the deadline leaves no time to examine suspicious frames, one in this number of frames is examined
-anyway. A fault makes all subsequent frames suspicious; a press rarely does."""
+"""If the deadline leaves no time to examine suspicious frames, every n-th suspicious frame is examined
+anyway; this constant is n. A fault makes all subsequent frames suspicious; a press rarely does."""
 EXAMINATION_S: Final = 3e-3
 """Expected duration of the first examination, s. Later examinations use measured durations."""
 CROSSED_FRAMES: Final = 5
@@ -70,11 +70,11 @@ COARSE_GROUPS: Final = 3
 """Maximum number of groups of readings that are left out at once if several upper wires have no solution. If
 the search finds more groups, only the first is left out."""
 UNSOLVED: Final = 1
-"""If no more than this number of upper wires have no solution, they are reported as faulty. If there are
-more, none is reported, because a lower wire may be the cause."""
+"""If no more than this number of upper wires have no solution, they are reported as faulty. If more
+upper wires have no solution, none is reported, because a lower wire may be the cause."""
 SPARED: Final = 3
-"""If the solver left out no more than this number of upper wires, they are reported as faulty. If it left out
-more, none is reported."""
+"""If the solver left out no more than this number of upper wires, they are reported as faulty. If the
+solver left out more wires, none is reported."""
 
 Mask = NDArray[np.bool_]
 
@@ -169,8 +169,8 @@ class DataCheck:
                 in :attr:`left_out`.
             until: Deadline as a value of :func:`skinnode.process.clock.perf_counter`, s; −inf if the solver
                 ran out of time. In that case, unsolved wires do not indicate a fault. A suspicious frame that
-                cannot be examined before the deadline is not trusted. If this happens repeatedly, every
-                :data:`PATIENCE`-th such frame is examined despite the deadline.
+                cannot be examined before the deadline is not trusted. However, every :data:`PATIENCE`-th
+                such frame is examined despite the deadline.
         """
         self._frame += 1
         last = self._last
@@ -346,7 +346,7 @@ class DataCheck:
         return most - math.log(len(NOISE_RATIOS))
 
     def _with_both_crossed(self, found: tuple[Group, ...]) -> tuple[Group, ...]:
-        """Return both recently crossed wires if one of them was found; otherwise, return ``found``."""
+        """Return both recently crossed wires if one of the two was found; otherwise, return ``found``."""
         if any(group.kind is FaultKind.CROSSED for group in found):
             self._crossed, self._crossed_until = found, self._frame + CROSSED_FRAMES
         elif self._frame <= self._crossed_until:

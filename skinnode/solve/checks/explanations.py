@@ -167,7 +167,7 @@ class Explainer:
     def _by_reading(
         self, z: Float, present: Mask, evidence: Float, best: int, cost: float
     ) -> tuple[float, int]:
-        """Return the log evidence of the best explanation by loads and one wrong reading, and the reading.
+        """Return the highest log evidence for loads and one wrong reading, and the number of this reading.
 
         A single wrong reading needs its own search, because at small prior scales the greedy search would
         first leave out the whole wire.
@@ -196,7 +196,7 @@ class Explainer:
     def _by_exchange(
         self, z: Float, present: Mask, cost: float, alpha: Float, level: Level
     ) -> tuple[float, WirePair]:
-        """Return the log evidence of the best explanation by exchanged wires and loads, and the wires."""
+        """Return the highest log evidence for two exchanged wires and loads, and these two wires."""
         gain, pair = likeliest(level.precision, alpha, z, present, far=True)
         if gain < DOUBT:
             return -math.inf, pair
@@ -207,7 +207,7 @@ class Explainer:
     def _by_wire(  # noqa: PLR0913 - the frame, and what was found in it
         self, z: Float, present: Mask, cost: float, finding: WireFinding, alpha: Float, best: int, tau: float
     ) -> float:
-        """Return the log evidence of the best explanation by loads and a faulty wire."""
+        """Return the highest log evidence for loads and a faulty wire."""
         upper, lower = self._model.shape
         wire, choice = finding.wire, math.log(2.0 * (upper + lower))
         rows = (slice(wire, wire + 1), slice(None)) if wire < upper else (slice(None), wire - upper)
@@ -237,7 +237,7 @@ class Explainer:
         return self._by_loads(z, present, cost, alone)
 
     def _by_loads(self, z: Float, present: Mask, cost: float, extra: Callable[[Level], float]) -> float:
-        """Return the log evidence of the best explanation by loads, plus ``extra``."""
+        """Return the highest log evidence for loads alone, plus ``extra``."""
         model = self._model
         evidence, scratch = np.empty(len(model.kappa)), np.empty(z.size)
         best = evidences(model.vectors_t, model.shrink, model.log_det, z.ravel(), scratch, evidence)

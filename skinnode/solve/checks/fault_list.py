@@ -18,13 +18,13 @@ from skinnode.model.layout import Float
 from skinnode.solve.checks.explanations import Group
 
 FRAMES: Final = 3
-"""Number of frames, out of :data:`WITHIN` successive frames, in which a fault must be found before it is
+"""Number of frames, out of :data:`WITHIN` successive frames, in which a fault must be found in order to be
 confirmed. Not tuned."""
 WITHIN: Final = 10
 """Number of successive frames over which detections are counted to confirm a fault."""
 ADMIT: Final = 64
 """Number of consecutive frames in which readings with a confirmed fault must agree with the field before they
-are used again. The number doubles each time the fault returns. Not tuned."""
+are used again. The required number doubles each time the fault returns. Not tuned."""
 AGREE: Final = 3.0
 """Maximum RMS difference between readings and a field, in standard deviations, for the readings to agree with
 the field."""

@@ -200,8 +200,8 @@ def _update(  # noqa: PLR0913 - a kernel: arrays by name
 ) -> None:
     """Update the search vectors for step ``count``, which leaves out a reading or adds a load.
 
-    An added load is assigned its most likely variance, (b² − h) / h². Elements before ``first`` are not
-    updated.
+    An added load is assigned its most likely variance, (b² − h) / h²; here b is the load's element of
+    Aᵀ P z, and h is its diagonal element of E. Elements before ``first`` are not updated.
     """
     row = vectors[count]
     _gram_row(item, p, moved, gram, response_t, row)

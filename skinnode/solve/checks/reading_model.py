@@ -11,7 +11,7 @@ The response to loads is computed for two models of the rubber: a half-space, as
 loads per cell), and a thin bonded layer (one normal load per cell). With the half-space alone, correct
 readings of a patch with a thin layer were reported as contradictory: in
 ``tests/solve/test_trust_on_a_thin_layer.py``, 91 of 210 fields were not trusted, and 88 faults were reported.
-With both models, only 1 of the 210 fields was not trusted, and no faults were reported.
+With both models of the rubber, only 1 of the 210 fields was not trusted, and no faults were reported.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ STORED: Final = 125_000_000
 touch by up to 0.1 s. The tables of the reference patch take 122 MB. For larger patches, the products with the
 loads are computed when they are needed."""
 OCTAVES: Final = (-7, 21)
-"""Range of log2 κ; it covers noise from 1e-6 to 1e-2 and prior scales from 1e-4 to 1 pitch."""
+"""Range of log2 κ, which covers noise from 1e-6 to 1e-2 and prior scales from 1e-4 to 1 pitch."""
 
 
 @dataclass(frozen=True, eq=False)

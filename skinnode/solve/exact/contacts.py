@@ -45,7 +45,8 @@ UNTOUCHED: Final = 4.0
 Noise alone exceeds this limit in 2 % of frames; those frames are searched for contacts.
 """
 WILD: Final = 16.0
-"""Maximum ratio of a wire's variances to the other wires' variances; a wire above this limit is left out."""
+"""Maximum ratio of a wire's variances to the other wires' variances; a wire with a larger ratio is left
+out."""
 SCALE_STEPS: Final = 30
 """Maximum number of iterations for the scale s²."""
 SCALE_CLOSE: Final = 0.01
@@ -323,7 +324,7 @@ def _solve_loads(  # noqa: PLR0913, C901 - a kernel: field, matrices and outputs
 ) -> float:
     """Estimate s² and the loads that explain a displacement; return s².
 
-    Writes z (n,), the factors (s² S² + ν²)^(−1/2) to ``weight`` (n,), and the mean loads (3Q,).
+    Writes ``z`` (n,), the factors (s² S² + ν²)^(−1/2) to ``weight`` (n,), and the mean ``loads`` (3Q,).
     """
     for j in range(z.size):
         z[j] = 0.0

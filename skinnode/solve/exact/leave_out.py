@@ -13,8 +13,8 @@ columns.
 Each option rests on an assumption about the skin, and the standard deviations of the unknowns are valid only
 if the assumption holds. A χ² test reliably detects frames that violate the assumption of active_only. The
 test is less sensitive for normal_only, because smooth shear resembles a gradient of z. On the staggered
-layout (h = 0.5, noise 1e-5), the test rejects a strong Hertzian press whose shear is 30 % of its depth. A
-weaker press passes the test, although the errors in z reach 16 standard deviations (only 0.2 % of h).
+layout (h = 0.5, noise 1e-5), the test rejected a strong Hertzian press whose shear was 30 % of its depth. A
+weaker press passed the test, although the errors in z reached 16 standard deviations (only 0.2 % of h).
 Increasing the standard deviations to cover these errors would cost more accuracy than solving for the shear.
 """
 
@@ -38,12 +38,14 @@ from skinnode.solve.wires.hold import Z_HOLD, chi2_quantile
 from skinnode.solve.wires.stages import DEADLINE, STALE
 
 Z_WIDEN: Final = 3.719
-"""Normal quantile of the χ² probability 1 − 1e-4, above which an electrode becomes an unknown.
+"""Normal quantile for the probability 1 − 1e-4. If χ² exceeds the corresponding quantile,
+an electrode becomes an unknown.
 
 At 100 frames/s, noise alone adds an electrode about once every 100 s during a long press.
 """
 TINY: Final = 1e-200
-"""Minimum squared slope used as a divisor: smaller than any real one, but large enough to avoid overflow."""
+"""Minimum squared slope used as a divisor: smaller than any real slope, but large enough to prevent
+overflow."""
 
 
 class LeftOut:
@@ -142,7 +144,7 @@ class LeftOut:
                 unnoticed[group, :most] = least * np.sqrt((direction**2 / power[:, None]).sum(axis=2))
 
     def _explained(self) -> NDArray[np.bool_]:
-        """Return a mask (U,) of wires whose residual is noise, or whose electrodes are all unknowns."""
+        """Return a mask (U,) of wires whose residual is within the noise, or that have no fixed electrode."""
         solver = self._stream.solver
         spare = solver.report[:, wires.SPARE]
         limit = np.where(solver.free > 0, self._chi2_widen[spare], self._chi2_hold[spare])
@@ -151,7 +153,7 @@ class LeftOut:
         return np.asarray(whole | (self._stream.roots() & content))
 
     def _widen(self, u: int, frame: Frame) -> None:
-        """Add unknown electrodes to wire u until the frame is explained; remove them if there is no root."""
+        """Add unknowns to wire u until the frame is explained; remove these unknowns if no root is found."""
         stream, solver, most = self._stream, self._stream.solver, self._layout.unknowns // 3
         before = solver.electrodes(u).copy()
         while stream.solvable()[u] and not self._explained()[u]:
@@ -160,9 +162,8 @@ class LeftOut:
                 break
             electrodes = np.arange(most)
             near = not stream.problem.out_of_reach(solver.x)[u]
-            if (
-                near and solver.measure[u, wires.CHI2] < np.inf
-            ):  # the solve found a minimum, but its χ² is too large
+            # the solve found a minimum, but its χ² is too large
+            if near and solver.measure[u, wires.CHI2] < np.inf:
                 joined = np.union1d(solver.electrodes(u), self._most_explaining(u))
                 electrodes = electrodes if 2 * len(joined) > most else joined
             self._set_electrodes(u, electrodes)

@@ -238,7 +238,11 @@ class Dispatcher:
             self.first_malformed = error
         if error.cob_id not in self._complained:
             self._complained.add(error.cob_id)
-            _log.warning("%s: %s; this and similar frames are rejected", self.config.name, error)
+            _log.warning(
+                "%s: %s; further malformed frames with this COB-ID are counted but not logged",
+                self.config.name,
+                error,
+            )
 
     def count(self, port: PortCounters = PortCounters()) -> BusStats:
         """Return all counters. Any thread.

@@ -68,7 +68,9 @@ def _ohm(word: str, key: str, allowed: str, where: str) -> float:
 
 
 def check_eds(path: Path, profile: PatchProfile) -> None:
-    """Check that an EDS file matches a patch's wire format, either with or without the scan check.
+    """Check that an EDS file matches a patch's wire format.
+
+    The summary may be described with or without the check over the codes.
 
     Raises:
         ConfigError: if the file cannot be read.

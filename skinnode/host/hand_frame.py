@@ -35,13 +35,13 @@ class HandFrame:
     """
 
     scan: int
-    """Number of the SYNC since the host started, which is also the scan number of every field. The number
-    does not wrap.
+    """Number of the SYNC, counted from the start of the host. All fields have this scan number, which does
+    not wrap around.
     """
     t_sync_ns: int
-    """Monotonic time (ns) at which SYNC was sent or received on the last of the buses; 0 if unknown. SYNC may
-    be staggered between buses (``sync.stagger_ms``); a field therefore records the SYNC time of its own
-    bus.
+    """Monotonic time (ns) of the SYNC message that was sent or received last among all buses; 0 if unknown.
+    Because SYNC may be staggered between buses (``sync.stagger_ms``), each field records the SYNC time of its
+    own bus.
     """
     fields: Mapping[str, FieldFrame]
     """Fields by patch name."""
@@ -127,7 +127,7 @@ class HandFrame:
             ValueError: if ``hand`` is listed; the hand's frame is the reference frame and has no pose.
         """
         if HAND in link_poses:
-            raise ValueError(f"link_poses: got {HAND!r}, must be links that move in the hand")
+            raise ValueError(f"link_poses: got {HAND!r}, must be names of links; the hand has no pose")
         poses = {**self.skeleton.link_poses, **link_poses}
         return replace(self, skeleton=Skeleton(self.skeleton.mounts, poses))
 
@@ -149,8 +149,8 @@ class HandGatherer:
 
     A hand frame is ready as soon as every awaited patch has delivered its field for the frame or a newer
     field. A patch whose fields were missing in :data:`~skinnode.host.health.SCANS_MISSED` consecutive hand
-    frames is not awaited again until its next field arrives. At the latest, a hand frame is ready
-    ``patience_ns`` after its first field.
+    frames is not awaited again until its next field arrives. A hand frame is also ready
+    ``patience_ns`` after its first field, even if awaited fields are missing.
 
     Args:
         patches: Names of the patches.

@@ -31,7 +31,7 @@ SCANS_MISSED: Final = 3
 
 SYNCS_MISSED: Final = 5
 """Number of SYNC periods without a SYNC message after which missing SYNC is reported on a bus that another
-master runs. The patches on the bus become stale earlier.
+master runs. By then, the patches on the bus are already stale (:data:`SCANS_MISSED`).
 """
 
 
@@ -114,8 +114,8 @@ class PatchHealth:
     bring-up.
     """
     slow_overruns: int = 0
-    """Number of EMCY messages with code 0x8110; the node sends the message if the computer or bus is too slow
-    for its scans.
+    """Number of EMCY messages with code 0x8110 that report skipped scans because the node's computer or the
+    bus was too slow.
     """
     baselines: int = 0
     """Number of times the host has read a changed baseline, for example after a tare."""
@@ -196,13 +196,13 @@ class BusHealth:
     other_syncs: int
     """Number of SYNC messages from another producer on a bus whose master is the host."""
     other_masters: int
-    """Number of frames from other senders that only the host should send: NMT commands, SDO requests to the
-    hand's nodes, and heartbeats with the host's node-ID.
+    """Number of received frames that only the host should send: NMT commands, SDO requests to the hand's
+    nodes, and heartbeats with the host's node-ID.
     """
     controller: BusState | None = None
     """Most recently reported state of the CAN controller; None if no state has been reported."""
     no_sync: bool = False
-    """Whether another master runs the bus and no SYNC message has arrived for :data:`SYNCS_MISSED`
+    """Whether another master runs the bus and no SYNC message has arrived for :data:`SYNCS_MISSED` SYNC
     periods.
     """
 
@@ -211,7 +211,8 @@ class BusHealth:
 class Evidence:
     """Evidence that determines a patch's condition.
 
-    Ages are counted in periods, and are None before the first frame.
+    The fields ``late_heartbeats`` and ``late_scans`` state the age of the newest heartbeat and scan in
+    heartbeat periods and scan periods; None if no heartbeat or scan has been received.
     """
 
     nmt_state: int | None

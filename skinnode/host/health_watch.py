@@ -29,7 +29,9 @@ _PATCH_COUNTERS: Final = {
     "baselines": ("new baseline in use", "new baselines in use"),
     "conflicts": ("conflict", ""),
 }
-"""Counters of :class:`PatchHealth`, and the noun that each counts: singular, and plural if irregular."""
+"""Counters of :class:`PatchHealth`, each with the noun used in event texts: singular, and plural if
+irregular.
+"""
 _BUS_COUNTERS: Final = {
     "bus_offs": ("bus-off", ""),
     "error_frames": ("error frame", ""),
@@ -41,7 +43,9 @@ _BUS_COUNTERS: Final = {
     "other_syncs": ("SYNC of another producer", "SYNCs of another producer"),
     "other_masters": ("command of another master", "commands of another master"),
 }
-"""Counters of :class:`BusHealth`, and the noun that each counts: singular, and plural if irregular."""
+"""Counters of :class:`BusHealth`, each with the noun used in event texts: singular, and plural if
+irregular.
+"""
 
 
 def _is_frozen_part(fault: DataFault) -> bool:
@@ -146,13 +150,13 @@ class HealthWatch:
         self._compare_counters(name, before, now, _PATCH_COUNTERS)
 
     def _compare_frozen_parts(self, name: str, before: PatchHealth, now: PatchHealth) -> None:
-        """Publish an event when a frozen wire or crossing is left out of the fields or used again."""
+        """Publish an event when a frozen wire or crossing is left out of the solve or used again."""
         was, are = (
             {each.place: each for each in health.faults if _is_frozen_part(each)} for health in (before, now)
         )
         for place in are.keys() - was.keys():
             sure = f"{are[place].deviations:.0f} deviations"
-            self._publish(name, "left out", f"{place} repeats its codes and is left out ({sure})")
+            self._publish(name, "left out", f"{place} repeats its codes; left out of the solve ({sure})")
         for place in was.keys() - are.keys():
             self._publish(name, "readmitted", f"{place} no longer repeats its codes")
 

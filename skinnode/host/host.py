@@ -153,13 +153,14 @@ class Host:
             open_port: Function that opens a bus, for interfaces that python-can does not provide.
 
         Raises:
-            ConfigError: if an option, EDS file or baseline file does not match the hand, or a layout cannot
-                be solved.
+            ConfigError: if an option, EDS file or baseline file does not match the hand, or the solver cannot
+                compute displacements for a layout.
             BusLoadError: if the planned traffic exceeds the load limit of a bus.
             BusError: if an interface cannot be opened, or no node on a bus responds and ``bring_up.missing``
                 is not ``wait``.
             NodeTimeout: if a node does not respond and ``bring_up.missing`` is not ``wait``.
-            NodeError: if a node is not the patch described in ``hand``, or does not keep its configuration.
+            NodeError: if a node does not match ``hand``, or a parameter read back from the node differs from
+                the value written.
             BringUpCancelled: if ``cancelled`` returned True.
             ValueError: if ``boot_deadline_s`` is negative, infinite or not a number.
         """
@@ -182,8 +183,8 @@ class Host:
         Args:
             timeout_s: Maximum time (s) to wait for a field before the iteration raises TimeoutError; None for
                 no limit.
-            capacity: Capacity of the subscriber's queue; when the queue is full, the oldest field is dropped.
-                Default: the hand file's capacity.
+            capacity: Capacity of the subscriber's queue, in fields; the hand file's capacity by default. When
+                the queue is full, the oldest field is dropped.
             patch: Patch whose fields are delivered; all patches by default.
 
         Raises:
@@ -297,7 +298,7 @@ class Host:
         producers = len(others) + ours
         if producers > 1 or self.hand.sync.counter_overflow == 0:
             got = "none with a counter" if producers == 1 else f"{producers}"
-            raise ValueError(f"SYNC producers: got {got}, must be one that all patches follow")
+            raise ValueError(f"SYNC producers: got {got}, must be a single producer with a counter")
 
     def _all_health(self) -> dict[str, PatchHealth]:
         return {patch: self.health(patch) for patch in self._nodes}

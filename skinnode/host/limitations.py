@@ -23,9 +23,9 @@ from skinnode.solve.tracker import choose_method
 from skinnode.solve.wires.problem import PatchProblem
 
 BY_PRIOR: Final = 0.3
-"""Maximum useful standard deviation of the exact inverse at rest, as a fraction of the clearance. Above this
-value, neighbouring crossings and the elastic model mostly determine the displacement. Few presses indent the
-layer by more than this fraction.
+"""Standard deviation (fraction of the clearance) above which the resistances alone do not determine a
+displacement at rest. Few presses indent the layer by more than this fraction. Above the limit, neighbouring
+crossings and the elastic model mostly determine the displacement.
 """
 
 
@@ -84,19 +84,20 @@ def _of_results(patch: PatchConfig, solver: SolverConfig) -> Iterator[tuple[str,
         yield (
             "solver.method",
             "the exact inverse cannot include the tolerances of the patch: its standard deviations are "
-            'correct only for a patch that equals its layout; method = "auto" uses the posterior',
+            'correct only if all electrodes are exactly at their nominal positions; method = "auto" uses the '
+            "posterior",
         )
     if not patch.calibration.force_calibrated:
         yield (
             "patches.calibration",
-            "no calibrated forces: their standard deviations cover the range from a half-space to a layer "
-            "bonded to metal (force_calibrated)",
+            "no calibrated forces: the standard deviations of normal forces are large enough to cover rubber "
+            "bonded to a rigid support (force_calibrated)",
         )
     if solver.normal_only:
         yield "solver.normal_only", "no shear displacements and no shear forces"
     reached_m = share * float(PatchProblem.of(layout).clearance.min()) * layout.pitch_m
     if solver.max_std_m is not None and method == "exact" and solver.max_std_m < reached_m:
-        text = f"no field will be precise: at rest the standard deviation is already {1e6 * reached_m:.2g} µm"
+        text = f"no field will be precise: even at rest, the standard deviation is {1e6 * reached_m:.2g} µm"
         yield "solver.max_std_m", text
     if solver.deadline_us is not None:
         yield from _of_deadline(layout, options, solver.deadline_us)

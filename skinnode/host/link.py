@@ -40,8 +40,8 @@ class BusLink(Dispatcher):
         config: Configuration of the bus.
         handlers: Handlers by COB-ID; each is called on the mainline with the data frames that have its
             COB-ID.
-        on_defect: Function called when a distinct exception first occurs, on the thread that raised the
-            exception.
+        on_defect: Function called with each exception whose message has not occurred before, on the thread
+            that raised the exception.
         open_port: Function that opens the interface.
 
     Raises:
@@ -61,7 +61,7 @@ class BusLink(Dispatcher):
         self._sent_listeners: tuple[Callable[[Frame], None], ...] = ()
         self._jobs: deque[tuple[Callable[[], object], Defects]] = deque()
         self.failure: BusError | None = None
-        """Error because of which the bus is unavailable; None while the bus is available."""
+        """Error that made the bus unavailable; None while the bus is available."""
         self._due_s = 0.0  # time after which a reopened interface is considered to be working
         self._outages = 0
         self.t_dispatched_ns = 0
@@ -109,7 +109,7 @@ class BusLink(Dispatcher):
             node_id: Node-ID of the node.
             on_answer: Function called on the mainline with the monotonic time (ns) of each SDO response.
             defects: Collector of the response handler's exceptions, as in :meth:`handle`. If ``defects`` is
-                given, exceptions after which a transfer is retried are reported to the bus's collector.
+                given, unexpected exceptions during a transfer are reported to the bus's collector.
         """
 
         def on_response(data: bytes, t_ns: int) -> None:
@@ -172,7 +172,7 @@ class BusLink(Dispatcher):
         )
 
     def close(self) -> None:
-        """Close the interface. The mainline must be ended before this method is called."""
+        """Close the interface. Call only after the mainline has ended."""
         self._port.close()
 
     def __enter__(self) -> Self:
@@ -236,7 +236,7 @@ class BusLink(Dispatcher):
             except Exception as error:
                 owner.report("a job on the mainline", error)
         # While frames wait in the queue or the interface, pollers receive the time of the newest dispatched
-        # frame instead of the current time, so that a delay in the host does not make nodes appear late.
+        # frame. With the current time, a delay in the host would make nodes appear late.
         if batch:
             self.dispatch(batch)
             self.t_dispatched_ns = batch[-1].t_ns
@@ -248,7 +248,7 @@ class BusLink(Dispatcher):
         return bool(batch)
 
     def _rest(self) -> None:
-        """End an elapsed pause, or restart the reopening thread if the thread failed to start."""
+        """Resume dispatching after a pause, or restart the reopening thread if the thread failed to start."""
         if not self._opening:
             self._rests = clock.monotonic() < self._rest_end_s
         elif (
@@ -280,7 +280,7 @@ class BusLink(Dispatcher):
     def _reopen(self) -> None:
         """Try repeatedly to reopen the interface.
 
-        After an unexpected exception, the pause before the next attempt is longer.
+        Unexpected exceptions lengthen the pauses between attempts.
         """
         keep_on(self._reopens_not, self.defects, "reopening the interface")
 

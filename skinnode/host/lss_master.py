@@ -39,8 +39,8 @@ memory or syncs a file to disk. For comparison, CANopenNode's LSS master waits 1
 """
 
 _SCAN_ANSWERS_S: Final = (0.03, 0.15)
-"""Timeouts (s) for the requests of a first and a second fastscan. Every negative result takes a full timeout,
-so the longer timeout is used only if the first fastscan found no node.
+"""Timeouts (s) for each request of the first and of the second fastscan. The second fastscan is slow, and is
+used only if the first fastscan has found no node.
 """
 
 _TRIES: Final = 2
@@ -49,18 +49,19 @@ response to a single request.
 """
 
 _SETTLE: Final = 0.2
-"""Maximum time between the first and last slave's response to the same request, as a fraction of the
-timeout.
+"""Pause after the first response to a fastscan request, as a fraction of the timeout. During the pause, other
+slaves may respond to the same request.
 """
 
 _UNDER_WAY_S: Final = 0.4
-"""Time (s) to wait after a timeout, until a late response can no longer arrive."""
+"""Pause (s) after a timeout, during which a late response may still arrive."""
 
 _PARTS: Final = 4
 _REVISIONS: Final = od.REVISION_NUMBER, od.UNCHECKED_REVISION_NUMBER
 _LIKELY: Final = (od.VENDOR_ID,), (od.PRODUCT_CODE,), _REVISIONS
 """First parts of the LSS address of a skinnode patch: vendor-ID, product code and revision number. A fastscan
-tries these values first; if they match, three or four requests are enough for these parts instead of 96.
+tries these values first. If they match, the fastscan finds the three parts with three or four requests; a
+search bit by bit needs 96 requests.
 """
 
 
@@ -152,7 +153,7 @@ class LssMaster:
         return None
 
     def _scan_part(self, part: int, answer_s: float) -> int | None:
-        """Find one part of an LSS address by fastscan; return None if no node responds any more."""
+        """Find one part of an LSS address by fastscan; return None if the node stops responding."""
         following = (part + 1) % _PARTS
         for likely in _LIKELY[part] if part < len(_LIKELY) else ():
             if self._scan(likely, 0, part, following, answer_s) is not None:
@@ -187,7 +188,7 @@ class LssMaster:
         return False
 
     def select_patch(self, serial: int) -> LssAddress | None:
-        """Switch the patch with this serial number to configuration state, whatever its revision number.
+        """Switch the patch with this serial number and any known revision number to configuration state.
 
         Returns:
             LSS address of the patch, or None if the patch was not found.

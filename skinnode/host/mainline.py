@@ -22,8 +22,8 @@ class Mainline:
 
     A failure on one bus does not affect the others.
 
-    Threads: a single thread serves all buses, because frames arrive on all buses at about the same time and
-        waking another thread would take as long as handling twenty frames.
+    Threads: a single thread serves all buses. Frames arrive on all buses at about the same time, and waking a
+        second thread would take as long as handling twenty frames.
 
     Args:
         links: Connections to the buses.

@@ -25,8 +25,8 @@ class NodeFacts:
     heartbeat_s: float
     """Heartbeat period of the node, s."""
     checked: bool = False
-    """Whether the node sends a check with every scan; False if the node's revision number could not be
-    read.
+    """Whether the node sends a check over all codes with every scan; False if the node's revision number
+    could not be read.
     """
 
     def with_baseline(self, baseline_ohm: Float) -> NodeFacts:

@@ -25,25 +25,24 @@ from skinnode.host.health import (
 _log = logging.getLogger(__name__)
 
 RESTART_MEMORY_NS: Final = 5_000_000_000
-"""Time (ns) after the last restart for which a restart loop is still reported."""
+"""Time (ns) for which a restart loop is still reported after the last restart."""
 
 SETTLED_NS: Final = 500_000_000
-"""Time (ns) after the last restart in a loop for which a node's condition remains *restarting*, even if the
-node is operational again.
+"""Time (ns) for which the condition of a node remains *restarting* after the last restart in a loop, even if
+the node is operational again.
 """
 
 LOOP_RESTARTS: Final = 3
 LOOP_NS: Final = 10_000_000_000
-"""Minimum number of spontaneous restarts that are reported as a loop, and the time (ns) within which they
-must occur.
+"""A node is in a restart loop if it has restarted at least ``LOOP_RESTARTS`` times without a command within
+``LOOP_NS`` (ns).
 """
 
 BEATS: Final = 12
 BEATS_TOO_OFTEN: Final = 0.7
-"""Test for two nodes with the same node-ID: number of heartbeats examined, and the ratio of actual to
-expected duration below which a second node must be sending. Two nodes with the same node-ID send two
-heartbeats per period, a ratio of 0.5. A single node that catches up after a delay stays well above the
-limit.
+"""Test for two nodes with the same node-ID: ``BEATS`` heartbeats arrive in less than ``BEATS_TOO_OFTEN``
+times the expected time. Two nodes send twice as many heartbeats as one, and therefore need only half of the
+expected time.
 """
 
 

@@ -1,4 +1,4 @@
-"""Run the state machine of the supervised nodes: actions in each phase, and phase transitions."""
+"""Run a state machine for each supervised node, and perform the actions of each phase."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ _SEARCH_NS: Final = 1_000_000_000
 """Interval (ns) between LSS searches for an absent node."""
 
 _FORGET_NS: Final = 2_000_000_000
-"""Time (ns) without a frame from a node after which the node is no longer reported as refused or faulty."""
+"""Time (ns) for which a node is still reported as refused or faulty after its last frame."""
 
 _MUTE_NS: Final = 1_000_000_000
 """Minimum interval (ns) between two reads of a node's configuration while the node sends no scans."""
@@ -265,7 +265,7 @@ def _search(remote: RemoteNode) -> bool:
 
 
 def _not_started(remote: RemoteNode, *, silent: bool) -> str:
-    """Return a message that explains why a node is considered not to have started."""
+    """Return the error message for a node that did not start in time."""
     node = f"node {remote.patch.node_id}"
     if silent:
         return f"{node}: got no heartbeat within {START_DEADLINE_S:g} s of the start command"

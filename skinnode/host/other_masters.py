@@ -17,8 +17,8 @@ from skinnode.config import BusConfig
 _log = logging.getLogger(__name__)
 
 QUIET_NS: Final = 10_000_000_000
-"""Minimum time (ns) without another master's frame of a given type, after which the next frame of this type
-is logged again.
+"""Time (ns) after which a frame from another master is logged again if no frame of the same type has arrived
+in between.
 """
 
 SYNC, NMT, SDO, HEARTBEAT = "SYNC", "NMT commands", "SDO requests to the hand's nodes", "the host's heartbeat"

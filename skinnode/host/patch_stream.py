@@ -69,7 +69,7 @@ class StreamStats:
 
 
 class StreamTap(Protocol):
-    """Recorder of the events, apart from received frames, that determine which scans are solved.
+    """Recorder of the events other than received frames that affect which scans are solved.
 
     Mainline only.
     """
@@ -125,7 +125,7 @@ class StreamOptions:
     partial: Partial = "pass"
     """Handling of incomplete scans: ``pass`` or ``withhold``."""
     under_way: bool = False
-    """Whether another master starts the node, which may therefore already be sending scans when the stream is
+    """Whether another master starts the node. If so, the node may already be sending scans when the stream is
     resumed.
     """
 
@@ -158,7 +158,7 @@ class PatchStream:
         self.withholdings = 0
         """Number of times that :meth:`withhold` has been called."""
         self.doubtful = False
-        """Whether a summary was lost or discarded that may have announced a new baseline."""
+        """Whether the stream may have missed a new baseline, because a summary was lost or discarded."""
         self._frames = self._withheld = self._partial = 0
         self._offered = self._taken = self._solved = self._failed = self._untrusted = self._invalid = 0
         self._newest = 0
@@ -220,8 +220,8 @@ class PatchStream:
 
         Args:
             solver: Solver for the scans.
-            withholdings: Value of ``withholdings`` known to the caller. If ``withholdings`` has a different
-                value by now, the call has no effect.
+            withholdings: Newest value of ``withholdings`` known to the caller. If :meth:`withhold` has been
+                called again since, the call has no effect.
             anew: Whether the node has been restarted, so that all earlier frames must be ignored.
         """
         if withholdings != self.withholdings:
@@ -356,14 +356,14 @@ class PatchStream:
         self._publisher.publish(field, stamp.patch)
 
     def _work_failed(self, error: Exception) -> None:
-        """Handle an exception that a worker raised while not solving a scan."""
+        """Handle an exception that a worker raised before or after solving a scan."""
         self._report(error)
         self._leave()
 
     def _leave(self) -> None:
-        """Return the worker's token, and schedule another worker immediately if a scan is waiting.
+        """Put back the worker's token, and call another worker if a scan is waiting.
 
-        The method never raises an exception, because the token must be returned exactly once.
+        The method never raises an exception, because the token must be put back exactly once.
         """
         self._token.append(None)
         try:

@@ -120,7 +120,7 @@ class Subscription:
         self._subscribed = frozenset()
 
     def end(self) -> None:
-        """Stop accepting fields; the reader's loop ends after the fields already queued. Any thread."""
+        """Stop accepting fields; the reader's loop ends after the last queued field. Any thread."""
         self.close()
         self.offer(End(), "")
 
@@ -163,7 +163,7 @@ class Subscription:
         self.close()
 
     def offer(self, item: FieldFrame | End, patch: str) -> None:
-        """Queue an end marker or a field; ignore fields of other patches than the subscribed patch.
+        """Queue an end marker or a field of a subscribed patch; ignore the fields of other patches.
 
         Never blocks. Any thread.
         """

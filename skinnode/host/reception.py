@@ -25,9 +25,8 @@ from skinnode.protocol.profile import PatchProfile
 from skinnode.protocol.scan import Scan
 
 LEAST_GRACE_NS: Final = 5_000_000
-"""Minimum time (ns) to wait for a scan's summary after its last chunk. The host waits for half a SYNC period
-if that is longer, because on a fully loaded bus the summary loses arbitration to all other patches'
-chunks.
+"""Minimum time (ns) to wait for a scan's summary after its last chunk. The host waits at least half a SYNC
+period, because the chunks of all patches have a higher priority on the bus than the summary.
 """
 
 

@@ -28,7 +28,7 @@ times a second unless the node's bus is unavailable.
 
 _ANSWER_S: Final = 0.05
 """Time (s) to wait for all responses to one SDO request when checking for a second node with the same
-node-ID. Because of the check, a failed bring-up takes longer by at least twice this time.
+node-ID. The check prolongs a failed bring-up by at least twice this time.
 """
 
 _MUTE_S: Final = 0.4
@@ -67,7 +67,7 @@ class RemoteNode:
         self.t_answer_ns = 0
         """Monotonic time (ns) of the node's newest SDO response."""
         self._answers = 0
-        """Number of SDO responses received under the node's node-ID."""
+        """Number of SDO responses received from the node's node-ID."""
         self._hand, self._lss = hand, bus.lss
         self._profile = PatchProfile.from_config(patch, self.bus)
         self._remote = self.link.remote_od(patch.node_id, self._on_answer, defects)
@@ -191,8 +191,8 @@ class RemoteNode:
     def is_mute(self, since_ns: int) -> bool:
         """Return whether an operational node sends no scans, possibly because it has lost its configuration.
 
-        The result is always False if another master runs the bus, because only that master may restore the
-        configuration.
+        On a bus that another master runs, the result is always False, because the host must not restore the
+        configuration there.
 
         Args:
             since_ns: Monotonic time (ns) at which the node became operational.
@@ -269,7 +269,7 @@ class RemoteNode:
 
     @property
     def searchable(self) -> bool:
-        """Whether the host can find the node by LSS: it is the bus master and has the serial number."""
+        """Whether the host can find the node by LSS: only a bus master that knows the serial number can."""
         return not self.has_other_master and self.patch.serial is not None
 
     def search(self) -> bool:

@@ -1,12 +1,12 @@
-"""Compute the probability that a live converter with a given noise repeats its codes.
+"""Compute the probability that a running converter with a given noise repeats its codes.
 
-The probability that a reading falls into the same code again is at most 2Φ(1/2σ) − 1, where σ is the standard
-deviation of the noise in codes. This bound is reached if the true value is in the middle of a quantization
-step, as for skin at rest after a tare. Under a press, each crossing has a different value, so the position of
-the value within its quantization step is practically random. For a random position, the probability that n +
-1 readings of one crossing all fall into the same code is E max(0, 1 − σ R), where R is the range of n + 1
-standard normal variables. For random positions, the probability of repeated codes is much lower than the
-bound, even for a converter with little noise.
+The probability that a reading has the same code as the previous reading is at most 2Φ(1/2σ) − 1, where σ is
+the standard deviation of the noise in codes. This bound is reached if the true value is in the middle of a
+quantization step, as for skin at rest after a tare. Under a press, each crossing has a different value, so
+the position of the value within its quantization step is practically random. For a random position, the
+probability that n + 1 readings of one crossing all fall into the same code is E max(0, 1 − σ R), where R is
+the range of n + 1 standard normal variables. For random positions, the probability of repeated codes is much
+lower than the bound, even for a converter with little noise.
 """
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ import math
 from typing import Final
 
 _EDGES: Final = 0.1
-"""Maximum σ, used in place of larger values. Up to this σ, σ R is less than 1 for all relevant runs, so that
-E max(0, 1 − σ R) = 1 − σ E R.
+"""Upper limit of σ; larger values are replaced by the limit. Up to the limit, σ R is less than 1 for all
+relevant runs, so that E max(0, 1 − σ R) = 1 − σ E R.
 """
 
 
 def log_stay(sigma: float) -> float:
-    """Return the natural logarithm of the maximum probability that a code repeats once.
+    """Return the natural logarithm of the maximum probability that a reading repeats the previous code.
 
     Args:
         sigma: Standard deviation of the noise, codes.
@@ -34,7 +34,9 @@ def log_stay(sigma: float) -> float:
 
 
 def log_stay_anywhere(sigma: float, run: int) -> float:
-    """Return the log probability of ``run`` repeats for a random position within the code's step.
+    """Return the log probability that a code repeats ``run`` times.
+
+    The true value is assumed to be at a random position within the quantization step.
 
     Args:
         sigma: Standard deviation of the noise, codes.

@@ -61,7 +61,7 @@ class ScanSolver:
         return ResistanceFrame(resistance_ohm, valid, stamp)
 
     def solve(self, scan: Scan, stamp: ScanStamp) -> tuple[FieldFrame, int]:
-        """Solve a scan; the assumed noise combines converter noise and code rounding.
+        """Solve a scan, assuming noise from the converter and from the rounding of the codes.
 
         Returns:
             Field (time-stamped, with read-only arrays), and the number of codes that are not measurements.
@@ -75,7 +75,7 @@ class ScanSolver:
 def tracker_options(
     patch: PatchConfig, config: SolverConfig, *, relative_noise: float, baseline_ohm: Float | None = None
 ) -> TrackerOptions:
-    """Return the options for a patch's tracker.
+    """Return the options with which a :class:`Tracker` solves the scans of a patch.
 
     Args:
         patch: Configuration of the patch.
@@ -104,12 +104,12 @@ def tracker_options(
 
 
 def check_solvable(patch: PatchConfig, config: SolverConfig) -> None:
-    """Check that a patch's layout can be solved, and prepare the solver's kernels and tables.
+    """Check that the solver supports a patch's layout, and prepare the solver's kernels and tables.
 
     Preparation is slow; call this function before starting any node.
 
     Raises:
-        ConfigError: if the layout cannot be solved.
+        ConfigError: if the solver cannot compute displacements for the layout.
     """
     layout = patch.layout.build()
     try:

@@ -1,6 +1,6 @@
 """Read and write the object dictionary of a remote node as an SDO client.
 
-While canopen's SDO client blocks the requesting thread, the mainline passes responses to the client through
+canopen's SDO client blocks the requesting thread until the mainline passes the response to the client through
 :meth:`SkinNetwork.notify`. This module limits the length and the duration of a transfer. canopen's client has
 no such limits, so a faulty node could fill the memory or block a thread forever.
 
@@ -58,8 +58,8 @@ _MAX_NUMBER_BYTES: Final = 8
 
 _TRANSFER_S: Final = 5.0
 _SEGMENT_S: Final = 0.02
-"""Terms of the maximum duration (s) of a transfer: ``_TRANSFER_S``, plus ``_SEGMENT_S`` for each segment of
-the longest permitted value.
+"""The maximum duration (s) of a transfer is ``_TRANSFER_S`` plus ``_SEGMENT_S`` for each segment of the
+longest permitted value.
 """
 
 _PLAIN: Final = {"u8": "<B", "u16": "<H", "u32": "<I", "f32": "<f"}
@@ -281,7 +281,7 @@ class RemoteOd:
                 raise Abandoned
             if clock.monotonic() > end_s:
                 raise _UploadTooLong(
-                    f"{counted(len(data), 'byte')} without an end, expected the end within {limit_s:.1f} s"
+                    f"{counted(len(data), 'byte')} after {limit_s:.1f} s, expected the end of the transfer"
                 )
         if stream.size is not None and len(data) != stream.size:
             raise SdoCommunicationError(f"{len(data)} of {stream.size} bytes")

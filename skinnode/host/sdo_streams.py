@@ -114,9 +114,9 @@ class Client(SdoClient):
 class BlockUpload(BlockUploadStream):
     """Block upload that tolerates late segments.
 
-    If a segment is late, canopen 2.4 requests the segment twice and drops the first response, so the CRC is
-    wrong after any pause longer than canopen's timeout. canopen requests an out-of-order segment only once.
-    This class therefore presents a late segment to canopen as an out-of-order segment.
+    canopen 2.4 requests a late segment twice and drops the first response, so the CRC is wrong after any
+    pause longer than canopen's timeout. An out-of-order segment, in contrast, is requested only once. This
+    class therefore presents a late segment to canopen as an out-of-order segment.
     """
 
     def read(self, size: int = -1) -> bytes:

@@ -48,8 +48,8 @@ class ServedBus:
     def sync_is_late(self, t_up_ns: int, period_ns: int) -> bool:
         """Return whether another master's SYNC has been absent for :data:`SYNCS_MISSED` periods.
 
-        The SYNC time is compared with the time of the newest dispatched frame instead of the current time, so
-        that a delay in the host is not reported as missing SYNC.
+        The SYNC time is compared with the time of the newest dispatched frame. With the current time, a delay
+        in the host would be reported as missing SYNC.
 
         Args:
             t_up_ns: Monotonic time (ns) at which bring-up was completed.

@@ -23,7 +23,7 @@ BRING_UP_THREADS: Final = 16
 
 _BRING_UPS: Final = 3
 """Maximum number of attempts to configure a node. The configuration is repeated after an unexpected
-exception, or if the node boots in the meantime, as a node just found by LSS does.
+exception, or if the node boots during its configuration, for example because LSS has set its node-ID.
 """
 
 _START_AGAIN_NAPS: Final = 50

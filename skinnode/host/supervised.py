@@ -15,7 +15,7 @@ from skinnode.model.layout import Float
 from skinnode.process import clock
 
 JOIN_DEADLINE_S: Final = 1.0
-"""Maximum time (s) that a node may take to respond by SDO or to tare itself, after it has sent any frame."""
+"""Maximum time (s) to wait for the SDO response or the tare of a node that has already sent a frame."""
 
 LEAST_NS: Final = 300_000_000
 """Minimum time (ns) between two bring-ups of a node that restarts in a loop."""

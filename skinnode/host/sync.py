@@ -83,7 +83,7 @@ class SyncFollower:
         if not overflow:
             return
         newest = self._ticks.newest
-        ahead = (data[0] - newest - 1) % overflow + 1  # the step is 1 if no SYNC was lost
+        ahead = (data[0] - newest - 1) % overflow + 1  # 1 if no SYNC was lost
         if newest == 0:
             self._ticks.note(data[0], t_ns)
             return

@@ -164,7 +164,7 @@ def test_frozen_part_is_named_left_out_and_readmitted(
         it.inject(NO_FAULTS)
         assert eventually(lambda: not named(), 10.0)
         found = {event.what: event.text for event in iter(lambda: events.get(0.2), None)}
-        assert found["left out"].startswith(f"{fault.place} repeats its codes and is left out")
+        assert found["left out"].startswith(f"{fault.place} repeats its codes; left out of the solve")
         assert found["readmitted"] == f"{fault.place} no longer repeats its codes"
 
 

@@ -148,9 +148,9 @@ def test_pdo_of_wrong_length_is_rejected_counted_and_said_once(
     assert stats.patches["p0"].assembler.bad_length == 3
     assert stats.patches["p1"].assembler.bad_length == 1
     assert [record.getMessage() for record in caplog.records] == [
-        f"can0: {line}; this and similar frames are rejected",
+        f"can0: {line}; further malformed frames with this COB-ID are counted but not logged",
         "can0: COB-ID 0x286: got 0 bytes (nothing), allowed: 8 bytes (scan summary); "
-        "this and similar frames are rejected",
+        "further malformed frames with this COB-ID are counted but not logged",
     ]
 
 

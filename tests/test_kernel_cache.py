@@ -130,7 +130,9 @@ def test_a_damaged_file_is_removed_and_compiled_anew(cache: Cache, damage: Calla
     damage(cache.files()[0])
     hits, lines = cache.run()
     assert hits == 1  # the other is whole
-    assert [line.partition(": ")[2] for line in lines] == ["1 of 2 files were damaged; removed, recompiling"]
+    assert [line.partition(": ")[2] for line in lines] == [
+        "1 of 2 files were damaged and have been removed; recompiling"
+    ]
     assert str(cache.folder) in lines[0]
     assert cache.run() == (2, [])
 
@@ -140,7 +142,9 @@ def test_the_damage_of_many_files_is_one_line(cache: Cache) -> None:
         flip(file, file.stat().st_size // 2)
     hits, lines = cache.run()
     assert hits == 0
-    assert [line.partition(": ")[2] for line in lines] == ["2 of 2 files were damaged; removed, recompiling"]
+    assert [line.partition(": ")[2] for line in lines] == [
+        "2 of 2 files were damaged and have been removed; recompiling"
+    ]
     assert cache.run() == (2, [])
 
 
@@ -172,8 +176,8 @@ def test_what_is_whole_but_cannot_be_loaded_is_compiled_anew(cache: Cache) -> No
     hits, lines = cache.run()
     assert hits == 1
     assert [line.partition(": ")[2] for line in lines] == [
-        "a file could not be loaded (ModuleNotFoundError(\"No module named 'no_such_module'\")); "
-        "removed, recompiling"
+        "a file could not be loaded (ModuleNotFoundError(\"No module named 'no_such_module'\")) "
+        "and was removed; recompiling"
     ]
     assert cache.run() == (2, [])
 

@@ -1,7 +1,7 @@
 """Identity values, COB-IDs, indices and sub-indices of a patch.
 
-The objects at these indices are declared in :mod:`skinnode.canopen.communication` (CiA 301) and
-:mod:`skinnode.protocol.objects` (manufacturer objects).
+The CiA 301 objects are declared in :mod:`skinnode.canopen.communication`, the manufacturer objects in
+:mod:`skinnode.protocol.objects`.
 """
 
 from __future__ import annotations
@@ -10,15 +10,14 @@ from typing import Final
 
 # --- identity (0x1018)
 VENDOR_ID: Final = 0
-"""Vendor-ID of a patch. The value 0, which CiA assigns to no vendor, means that this project has no
-vendor-ID."""
+"""Vendor-ID of a patch: 0, because CiA has not assigned a vendor-ID to this project."""
 PRODUCT_CODE: Final = 0x534B494E
 """Product code of a patch: 'SKIN' in ASCII."""
 REVISION_NUMBER: Final = 0x0001_0001
 """Revision number of a patch: major revision (CANopen behaviour) in the upper 16 bits, minor revision in the
 lower 16 bits."""
 UNCHECKED_REVISION_NUMBER: Final = 0x0001_0000
-"""Revision number of patches that send scan summaries without a scan check."""
+"""Revision number of a patch whose TPDO2 contains no check value for the scan."""
 DEVICE_NAME: Final = "skinnode patch"
 
 MAX_NODE_ID: Final = 127
@@ -44,12 +43,12 @@ def emcy_cob_id(node_id: int) -> int:
 
 
 def tpdo_cob_id(number: int, node_id: int) -> int:
-    """Return the default COB-ID of a node's TPDO ``number``, 0 to 3."""
+    """Return the default COB-ID of a node's TPDO; ``number`` is 0 for TPDO1 and 3 for TPDO4."""
     return 0x180 + 0x100 * number + node_id
 
 
 def rpdo_cob_id(number: int, node_id: int) -> int:
-    """Return the default COB-ID of a node's RPDO ``number``, 0 to 3."""
+    """Return the default COB-ID of a node's RPDO; ``number`` is 0 for RPDO1 and 3 for RPDO4."""
     return 0x200 + 0x100 * number + node_id
 
 
@@ -126,7 +125,7 @@ TPDO1_PARAMETER: Final = 0x1800
 TPDO2_PARAMETER: Final = 0x1801
 TPDO1_MAPPING: Final = 0x1A00
 TPDO2_MAPPING: Final = 0x1A01
-"""Index of TPDO2's mapping record. The mapping records of consecutive TPDOs have consecutive indices."""
+"""Index of the TPDO2 mapping record. The mapping records of consecutive TPDOs have consecutive indices."""
 MAX_PDOS: Final = 512
 """Maximum number of RPDOs and of TPDOs: the number of indices in each PDO index range, such as 0x1400 to
 0x15FF."""
@@ -150,16 +149,16 @@ DESCRIPTOR: Final = 0x2000
 ROWS, COLUMNS, UPPER_ELECTRODES, LOWER_ELECTRODES, CODE_BITS = 1, 2, 3, 4, 5
 CODE_LO, CODE_HI, RESISTIVITY, LAYOUT_ID, LAYOUT_HASH, SERIAL = 6, 7, 8, 9, 10, 11
 PDO_BYTES: Final = 12
-"""Sub-index of the maximum PDO length: 8 bytes, or 64 bytes over CAN FD."""
+"""Sub-index of the maximum PDO length in bytes (8, or 64 over CAN FD) in the patch descriptor."""
 CHUNK: Final = 0x2010
 CHUNK_INDEX, CHUNK_SCAN = 1, 2
-"""Sub-indices of the chunk index and the scan counter. Over CAN FD, sub-index 1 contains the upper wire
-instead of the chunk index, and sub-index 3 contains the first column."""
+"""Sub-indices of the chunk index and the scan counter. Over CAN FD, sub-index 1 contains the number of the
+upper wire instead of the chunk index, and sub-index 3 the number of the first lower wire."""
 SUMMARY: Final = 0x2011
 SUMMARY_SCAN, SUMMARY_FLAGS, SUMMARY_CHUNKS, SUMMARY_TIME = 1, 2, 3, 4
 SUMMARY_TIME_64US, SUMMARY_CHECK = 5, 6
-"""Sub-indices of the 16-bit device time and the scan check. From revision 1.1 on, TPDO2 carries these two
-objects instead of the device time in µs."""
+"""Sub-indices of the 16-bit device time (in units of 64 µs) and the check value of a scan. Since revision
+1.1, TPDO2 carries this time and check value instead of the device time in µs."""
 SEND_POLICY: Final = 0x2020
 SEND_MODE, SEND_THRESHOLD, SEND_REFRESH = 1, 2, 3
 ACQUISITION: Final = 0x2021
@@ -174,16 +173,16 @@ TEST_STATUS, TEST_FAULTS, TEST_READINGS, TEST_NOISE = 1, 2, 3, 4
 TEST_OPEN_WIRES, TEST_SHORTED_WIRES, TEST_OUT_OF_RANGE, TEST_UNTARED = 5, 6, 7, 8
 UPPER_WIRE_FAULTS: Final = 0x2030
 LOWER_WIRE_FAULTS: Final = 0x2031
-"""Index of the fault masks for the lower wires, with 32 wires per mask. For lower wires 32 i to 32 i + 31,
-sub-index 2 i + 1 is the mask of open wires, and sub-index 2 i + 2 the mask of shorted wires."""
+"""Index of the fault masks for the lower wires; one mask covers 32 wires. For lower wires 32 i to 32 i + 31,
+the mask of open wires has sub-index 2 i + 1, and the mask of shorted wires has sub-index 2 i + 2."""
 REJECTED_FRAMES: Final = 0x2040
 """Index of the counters of rejected frames; see :class:`skinnode.node.rejected.Rejected`."""
 CODES: Final = 0x2100
-"""Index of the array of upper wire 0's latest codes, with one code per sub-index. The codes of upper wire r
-have index CODES + r."""
+"""Index of an array that contains the latest codes of upper wire 0, one code per sub-index. The array for
+upper wire r has index CODES + r."""
 BASELINE: Final = 0x2200
-"""Index of the array of upper wire 0's R0 values in ohms (0 if unknown), with one value per sub-index. The R0
-values of upper wire r have index BASELINE + r."""
+"""Index of an array that contains the R0 values of upper wire 0 in ohms (0 if unknown), one value per
+sub-index. The array for upper wire r has index BASELINE + r."""
 COORDINATES: Final = 0x2300
 """Index of the electrode coordinates, a DOMAIN; see
 :func:`skinnode.protocol.coordinates.pack_coordinates`."""

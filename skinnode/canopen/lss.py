@@ -6,7 +6,7 @@ from enum import IntEnum
 from typing import Final, NamedTuple
 
 NOT_CONFIGURED: Final = 0xFF
-"""Value that represents a missing node-ID."""
+"""Node-ID of a device that has not been assigned a node-ID."""
 
 BIT_RATES_BPS: Final = {
     0: 1_000_000,
@@ -22,18 +22,19 @@ BIT_RATES_BPS: Final = {
 9 selects automatic bit rate detection."""
 
 LSS_DONE: Final = 0
-"""Error code that reports the success of a configuration request."""
+"""Error code in the response to a successful configuration request."""
 
 LSS_MANUFACTURER_ERROR: Final = 0xFF
-"""Error code that announces a manufacturer-specific error code in the next byte of the response."""
+"""Error code which indicates that the next byte of the response contains a manufacturer-specific error
+code."""
 
 RESET_SCAN: Final = 0x80
-"""Fastscan bit-check value to which every node without a node-ID responds. The search then restarts at the
-vendor-ID."""
+"""Fastscan bit-check value to which every node without a node-ID responds. A request with this value restarts
+the fastscan at the vendor-ID."""
 
 
 class LssCommand(IntEnum):
-    """LSS command specifiers. A response repeats the request's specifier unless it has its own."""
+    """LSS command specifiers. Most responses repeat the command specifier of the request."""
 
     SWITCH_GLOBAL = 0x04
     CONFIGURE_NODE_ID = 0x11

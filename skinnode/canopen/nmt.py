@@ -71,7 +71,7 @@ AFTER_COMMAND: Final = {
     NmtCommand.STOP: NmtState.STOPPED,
     NmtCommand.ENTER_PRE_OPERATIONAL: NmtState.PRE_OPERATIONAL,
 }
-"""NMT state that a node enters after each command, for the commands other than resets."""
+"""NMT state that a node enters after each command, excluding the two reset commands."""
 
 
 def state_name(state: int) -> str:
@@ -104,5 +104,5 @@ def parse(data: bytes, node_id: int) -> NmtCommand | None:
         ValueError: if the payload is not two bytes long, or if the command specifier is unknown.
     """
     if len(data) != 2:
-        raise ValueError(f"NMT: got {counted(len(data), 'byte')}, must be 2")
+        raise ValueError(f"NMT command: got {counted(len(data), 'byte')}, must be 2 bytes")
     return NmtCommand(data[0]) if data[1] in (0, node_id) else None

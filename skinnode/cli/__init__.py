@@ -1,5 +1,6 @@
-"""Subcommands of ``skinnode``, one per file: each parses options, prints its result and sets the exit status.
+"""Subcommands of ``skinnode``, one per file.
 
-A file imports its dependencies only when its command runs, so that ``--help`` responds at once. Several
-commands share the files with a leading underscore in their names.
+Every subcommand parses its options, prints its result and sets the exit status. A file imports its
+dependencies only when its command runs, so that ``--help`` prints without delay. Files whose names start with
+an underscore contain code shared by several commands.
 """

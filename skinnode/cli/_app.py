@@ -28,7 +28,7 @@ from skinnode.cli import (
 
 app = typer.Typer(
     name="skinnode",
-    help="Robot skin on a CAN bus: measures how pressed patches deform, and reports displacement fields.",
+    help="Run robot skin on a CAN bus: measure how skin patches deform when they are pressed.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},

@@ -95,7 +95,7 @@ def find_bus(
 
 
 def _of_one_bus(plan: HandConfig, bus: str | None) -> HandConfig:
-    """Return the hand reduced to ``bus``, or the whole hand if ``bus`` is None."""
+    """Return the hand with only ``bus`` and its patches, or the whole hand if ``bus`` is None."""
     from skinnode.errors import ConfigError
 
     if bus is None:
@@ -126,7 +126,7 @@ def find_node(
     hand: Path | None,
     bus: str | None,
 ) -> tuple[Place, int]:
-    """Return the bus and node-ID of NODE, which is a node-ID or the name of a patch on any bus of the hand.
+    """Return the bus and node-ID of NODE: a node-ID, or the name of a patch on any bus of the hand.
 
     The other arguments are those of :func:`find_buses`.
 
@@ -170,6 +170,4 @@ def node_among(node: str, places: list[Place], key: str) -> tuple[Place, int]:
     if not found:
         raise ConfigError(key, node_id, f"a node-ID in the hand, or any node-ID with {buses}")
     which = " and ".join(f"{patch.name} on {place.bus.name}" for place, patch in found)
-    raise ConfigError(
-        key, node_id, f"a node-ID found on only one bus; this one is {which}; name the patch, or add {buses}"
-    )
+    raise ConfigError(key, node_id, f"a patch name, or a node-ID with {buses}; node-ID {node_id} is {which}")

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from rich.table import Table
 
 UNBOUNDED: Final = 10_000
-"""Console width for piped output, in columns; no printed line is longer."""
+"""Console width for output to a pipe or file, in columns: so large that no line is wrapped."""
 
 
 def print_json(value: Any) -> None:

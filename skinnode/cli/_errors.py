@@ -73,7 +73,7 @@ def _wants_help(error: Any) -> bool:
 def usage_line(error: Any) -> str:
     """Return a usage error as one line, such as ``skinnode scan: --bitrate: got 'x', allowed: an integer``.
 
-    Replaces Typer's own text for missing and invalid values, because that text omits the argument's meaning,
+    This line replaces Typer's own message for a missing or invalid value, which omits the argument's meaning,
     the value given or the allowed range.
     """
     message = " ".join(error.format_message().split()).rstrip(".")

@@ -44,11 +44,11 @@ class Stopped(SystemExit):
 def main_of(module: str, argv: Sequence[str] | None = None) -> NoReturn:
     """Run a typer application and exit with its status.
 
-    After the call, the termination signals end the process.
+    Before and after the application runs, a termination signal ends the process immediately.
 
     BLAS libraries are limited to one thread unless the environment sets their number of threads. BLAS threads
-    wait by spinning, and under a real-time policy (``chrt -f``), threads that spin on every processor block a
-    host permanently.
+    busy-wait. Under a real-time policy (``chrt -f``), threads that busy-wait on every processor prevent all
+    other threads of a host from running.
 
     Args:
         module: Name of the module that defines the application as ``app``.
@@ -72,7 +72,7 @@ def main_of(module: str, argv: Sequence[str] | None = None) -> NoReturn:
 
 
 def _handle(handler: Callable[[int, FrameType | None], object] | signal.Handlers) -> None:
-    """Install ``handler`` for the signals if this is the main thread; in other threads, Python forbids it."""
+    """Install a signal handler; do nothing outside the main thread, where Python does not allow it."""
     import threading
 
     if threading.current_thread() is threading.main_thread():

@@ -18,7 +18,8 @@ if TYPE_CHECKING:
     from skinnode.model.frames import FieldFrame
 
 _OVERRUN_S, _OVERRUN_SYNCS = 1.0, 3
-"""Limits, in s and in SYNC periods, on the wait for overruns to clear at the end; the longer one applies."""
+"""Maximum time to wait at the end of a run for nodes to clear overrun emergencies: 1 s or three SYNC periods,
+whichever is longer."""
 
 _POLL_S = 0.01
 
@@ -63,8 +64,8 @@ def faults_and_notes(running: Host) -> tuple[list[str], list[str]]:
     """Return the faults and the notes of the run, one line each.
 
     A node that skips scans because the computer running it is too slow sends EMCY 0x8110. If a node has sent
-    EMCY 0x8110, its missing and late frames are reported as notes, and so is an emergency that is still
-    active at the end. Wrong frames remain faults.
+    EMCY 0x8110, its missing and late frames are notes, not faults. An EMCY 0x8110 that is still active at the
+    end is also a note. Wrong frames remain faults.
     """
     _let_overruns_end(running)
     stats = running.stats()
@@ -127,7 +128,7 @@ def _patch_faults_and_notes(
 
 
 def _noise(running: Host, name: str) -> str:
-    """Return a comparison of the measured noise with the hand file as text; empty if the two agree."""
+    """Return the measured noise and the noise stated in the hand file, as text; empty if they agree."""
     field = running.latest(name)
     if field is None or field.noise_factor == 1.0:
         return ""
@@ -136,7 +137,7 @@ def _noise(running: Host, name: str) -> str:
 
 
 def reason(health: PatchHealth, before: str = "") -> str:
-    """Return ``before`` followed by the reason why a patch is faulty or refused; otherwise an empty text."""
+    """Return ``before`` and the reason why a patch is faulty or refused; empty for any other patch."""
     if health.condition == "refused" and health.refusal:
         return f"{before}{health.refusal}"
     if health.condition == "faulty" and health.defect is not None:
@@ -152,7 +153,7 @@ def reason(health: PatchHealth, before: str = "") -> str:
 
 
 def _let_overruns_end(running: Host) -> None:
-    """Wait briefly for nodes on slow computers to clear their emergencies, which last one scan."""
+    """Wait briefly for nodes on slow computers to clear their overrun emergencies."""
     end_s = time.monotonic() + max(_OVERRUN_S, _OVERRUN_SYNCS * running.hand.sync.period_s)
     while time.monotonic() < end_s:
         healths = [running.health(patch.name) for patch in running.hand.patches]
@@ -281,7 +282,7 @@ def _patch_text(name: str, facts: Mapping[str, object]) -> str:
 
 
 def _doubts(facts: Mapping[str, object]) -> str:
-    """Return, as text, the limitations of a trusted field: low precision and excluded readings."""
+    """Return, as text, whether a trusted field is imprecise, and how many faults its readings have."""
     doubts, faults = "  imprecise" if facts["precise"] is False else "", facts["data_faults"]
     if isinstance(faults, list) and faults:
         doubts += f"  {counted(len(faults), 'fault')} in the readings, excluded"

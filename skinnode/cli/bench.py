@@ -1,6 +1,6 @@
 """``skinnode bench``: runs the benchmarks.
 
-Ratios are computed within one run, because absolute times depend on the machine.
+Each ratio compares two times from the same run, because absolute times depend on the machine.
 """
 
 from __future__ import annotations
@@ -25,7 +25,10 @@ Rounds = Annotated[int, typer.Option(min=1, help="Number of measurements per imp
 
 @app.command()
 def kernel(json: JsonFile = None, plot: PlotFile = None, rounds: Rounds = 31) -> None:
-    """Compare the speed of F + J and the operators with NumPy's, and the dense kernels' with LAPACK's."""
+    """Compare the speed of the compiled kernels with NumPy and LAPACK.
+
+    The kernels are F with its Jacobian J, one step of each operator, and dense linear algebra.
+    """
     from skinnode.bench import kernel as bench
 
     _prepare(json, plot)
@@ -35,8 +38,9 @@ def kernel(json: JsonFile = None, plot: PlotFile = None, rounds: Rounds = 31) ->
     for row in figures["rows"]:
         typer.echo(f"{row['what']:28}{row['who']:22}{row['us']:10.1f}{row['ratio']:8.1f}")
     typer.echo(
-        "F + J and steps are timed per wire. A step includes its evaluations; the trust radius is so short\n"
-        "that the operator must search for a step within it. skinnode, LAPACK and BLAS use one thread."
+        "The times of F + J and of steps are for one wire. A step includes evaluations of F and J. The\n"
+        "trust radius is so short that every operator must shorten its step. skinnode, LAPACK and BLAS use\n"
+        "one thread."
     )
     _write(json, figures)
     if plot is not None:
@@ -47,7 +51,10 @@ def kernel(json: JsonFile = None, plot: PlotFile = None, rounds: Rounds = 31) ->
 
 @app.command()
 def solve(json: JsonFile = None, plot: PlotFile = None, rounds: Rounds = 31) -> None:
-    """Solve one wire to 1e-9 with skinnode, SciPy and Ceres, from the same start near the solution."""
+    """Solve one wire with skinnode, SciPy and Ceres, from the same initial guess near the solution.
+
+    Every solver is timed with the loosest tolerance that leads to a displacement error of at most 1e-9.
+    """
     from skinnode.bench import solve as bench
 
     _prepare(json, plot)
@@ -57,7 +64,9 @@ def solve(json: JsonFile = None, plot: PlotFile = None, rounds: Rounds = 31) -> 
     for row in figures["rows"]:
         spent = "not reached".rjust(18) if row["us"] is None else f"{row['us']:10.1f}{row['ratio']:8.2f}"
         typer.echo(f"{row['who']:42}{spent}{row['error']:10.0e}{row['tolerance']:11.0e}")
-    typer.echo("ratio: relative to skinnode dogleg; tolerance: the loosest setting that reaches 1e-9.")
+    typer.echo(
+        "ratio: time relative to skinnode dogleg; tolerance: the loosest with an error of at most 1e-9."
+    )
     if not any("pyceres" in row["who"] for row in figures["rows"]):
         typer.echo("Ceres is not installed; to measure it too, run sh install.sh bench.")
     _write(json, figures)
@@ -74,7 +83,7 @@ def stability(
     seeds: Annotated[int, typer.Option(min=1, help="Number of seeds for each hard case.")] = 50,
     jobs: Annotated[int, typer.Option(min=1, help="Number of processes that solve cases in parallel.")] = 1,
 ) -> None:
-    """Solve every hard case with many seeds; report error, standard deviation, status and verdict.
+    """Solve every hard case with many random seeds; print errors, standard deviations and statuses.
 
     The exit status is 1 if any wire is CONVERGED but wrong.
     """
@@ -107,14 +116,15 @@ def stability(
 @app.command()
 def trust(
     json: JsonFile = None,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of all streams and of the pairs of faults.")] = 1,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the random numbers.")] = 1,
     short: Annotated[
-        bool, typer.Option("--short", help="Run one layout at two noise levels, and 20 pairs of faults.")
+        bool,
+        typer.Option("--short", help="Measure only one layout at two noise levels, and 20 pairs of faults."),
     ] = False,
     table: Annotated[
         bool,
         typer.Option(
-            "--table", help="Measure only the scenes that earlier versions solved wrongly but trusted."
+            "--table", help="Measure only the scenes in which earlier versions trusted a wrong result."
         ),
     ] = False,
     only: Annotated[
@@ -123,17 +133,19 @@ def trust(
     ] = None,
     hours: Annotated[
         float,
-        typer.Option(min=0, help="Duration of the search for false alarms, in patch-hours at 100 scans/s."),
+        typer.Option(
+            min=0, help="Simulated time in which to count false alarms, in patch-hours at 100 scans/s."
+        ),
     ] = 0.1,
-    jobs: Annotated[int, typer.Option(min=1, help="Number of processes that solve streams.")] = 1,
+    jobs: Annotated[int, typer.Option(min=1, help="Number of processes that solve scans in parallel.")] = 1,
     resume: Annotated[
         bool, typer.Option("--resume", help="Continue an interrupted run with the same --json and --seed.")
     ] = False,
 ) -> None:
-    """Solve presses with and without faults; check that trusted fields are correct and sound patches trusted.
+    """Solve simulated presses with and without faults, and check which fields are trusted.
 
-    The exit status is 1 if a target is missed. Sections: healthy, single (faults), pair, hours, table, speed,
-    road.
+    Trusted fields must be correct, and patches without faults must be trusted. The exit status is 1 if a
+    target is missed. The sections are healthy, single (faults), pair, hours, table, speed and road.
     """
     from skinnode.bench import trust as bench
     from skinnode.bench.trust_report import lines
@@ -158,7 +170,7 @@ def trust(
     _print_machine(figures)
     _write(json, figures)
     if kept is not None:
-        kept.unlink(missing_ok=True)  # deleted last, so that an interrupted run can be continued
+        kept.unlink(missing_ok=True)  # an interrupted run needs this file in order to continue
     if not all(row["reached"] for row in figures["must"]):
         raise typer.Exit(1)
 
@@ -172,9 +184,10 @@ def accuracy(
     ] = 200,
     rounds: Rounds = 31,
 ) -> None:
-    """Measure the error versus time, noise and code width, the coverage of intervals, and the time per frame.
+    """Measure the displacement error as a function of solve time, noise and code width.
 
-    The exit status is 1 if a requirement is not met. No requirement limits a time, because times depend on
+    The benchmark also measures the coverage of confidence intervals and the solve time per scan. The exit
+    status is 1 if a requirement is not met. No requirement limits a time, because times depend on
     the machine.
     """
     from skinnode.bench import accuracy as bench
@@ -223,7 +236,7 @@ def scale(
     ] = None,
     scans: Annotated[int, typer.Option(min=1, max=10_000, help="Number of scans per measurement.")] = 20,
 ) -> None:
-    """Measure the CPU time of simulator and host as a function of skin area and of contact.
+    """Measure how the CPU time of simulator and host grows with skin area and touched area.
 
     Hands run in virtual time. Each patch takes about 20 MB of memory.
     """
@@ -242,7 +255,7 @@ def scale(
     reading = figures["physics"]
     share = 100 * reading["untouched_us"] / reading["touched_us"]
     typer.echo(
-        f"physics of one reading, without frames: touched {reading['touched_us']:.0f} µs, "
+        f"time to simulate one reading, without frames: touched {reading['touched_us']:.0f} µs, "
         f"untouched {reading['untouched_us']:.1f} µs ({share:.1f} %)"
     )
     _write(json, figures)
@@ -285,8 +298,8 @@ def node(
     for row in figures["handling"]:
         typer.echo(f"{row['what']:30}{row['us']:8.1f}")
     typer.echo(
-        "\nexact pacing is for a board; thrifty pacing is for many nodes on one machine, with bursts\n"
-        "at the same mean rate. The figures include the effect of other work on this machine."
+        "\nExact pacing is for a board. Thrifty pacing is for many nodes on one machine; it sends bursts of\n"
+        "frames at the same mean rate. Other processes on this machine affect the measured times."
     )
     _write(json, figures)
 
@@ -305,7 +318,7 @@ def pipeline(
         bool, typer.Option("--all-cores", help="Allow the host and the load generator to use all cores.")
     ] = False,
 ) -> None:
-    """Feed a host from four fully loaded buses with sixteen patches; measure losses, latency and CPU load.
+    """Run a host with sixteen patches on four fully loaded buses; measure losses, latency and CPU load.
 
     The exit status is 1 if a frame was lost or the frame counts do not add up. The measured times do not
     affect the exit status.
@@ -351,9 +364,9 @@ def soak(
     """Run a simulated hand under random faults for minutes or hours.
 
     CAN frames of every kind are dropped, other processes occupy the processors, and the kernel cache is
-    damaged at the start. The host must survive, every patch must recover, all frame counts must add up, and
-    memory, threads and file descriptors must not grow. The exit status is 1 if any of these requirements is
-    not met.
+    damaged at the start. The host must keep running, every patch must recover, all frame counts must add up,
+    and memory, threads and file descriptors must not grow. The exit status is 1 if any of these requirements
+    is not met.
     """
     from skinnode.bench import soak as bench
 

@@ -40,12 +40,12 @@ def conformance(
         bool, typer.Option("--list", help="Print the IDs, titles and clauses of the cases, and exit.")
     ] = False,
 ) -> None:
-    """Test a node against CiA 301 with raw frames: 127 cases, one line each.
+    """Test a node against CiA 301 with raw frames; print one line for each of 127 cases.
 
     The command RESETS the node many times, starts and stops it, remaps its PDOs, and stores and restores its
     parameters. The node's configuration is read first and restored at the end. The command addresses some
     messages to all nodes, and sends frames that appear to come from other nodes. Use a bus without another
-    master and preferably without any other node, in a machine that can be stopped safely.
+    master and preferably without any other node, on a machine that can be stopped safely.
 
     The exit status is 0 if no case failed, 1 if any failed, 2 if the tests could not run.
     """

@@ -30,15 +30,17 @@ def demo(
     ] = None,
     plot: Annotated[
         Path | None,
-        typer.Option(help="Write a plot of truth, field and error to this file.", metavar="FILE.png"),
+        typer.Option(
+            help="Plot the true field, the measured field and the error to this file.", metavar="FILE.png"
+        ),
     ] = None,
 ) -> None:
     """Press simulated patches and decode their scans from real CANopen traffic.
 
-    Each patch is a CANopen node on an embedded virtual bus. A spherical indenter presses and slides; the host
-    collects the PDOs and solves the scans. The exit status is 1 if a scan was torn, a frame was lost, or
-    errors exceed the reported uncertainty. The RMS error over the run may reach 1.15 times the reported RMS,
-    and the error of any coordinate 6 standard deviations.
+    Each patch is a CANopen node on a virtual bus inside this process. A spherical indenter presses and
+    slides; the host collects the PDOs and solves the scans. The exit status is 1 if a scan was torn, a frame
+    was lost, or errors exceed the reported uncertainty. The limit for the RMS error is 1.15 times the
+    reported RMS standard deviation. The limit for the error of a coordinate is 6 standard deviations.
     """
     import json
 

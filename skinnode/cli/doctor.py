@@ -1,4 +1,4 @@
-"""``skinnode doctor [HAND.toml]``: reports faults, each with its certainty and its remedy."""
+"""``skinnode doctor [HAND.toml]``: finds faults, and prints the certainty and the remedy of each fault."""
 
 from __future__ import annotations
 
@@ -36,10 +36,10 @@ def doctor(
 ) -> None:
     """Examine buses, nodes, configuration, wires, noise, baseline, timing and losses.
 
-    The doctor only listens and reads, so a running hand is not disturbed. The doctor judges the skin by the
-    scans that the nodes send; with --active, it starts a hand that is not running. Do not touch the skin
-    while the command runs. The exit status is 0 if no fault was found, 1 if any was found, 2 if the
-    examination could not run.
+    The command only receives frames and reads objects, so it does not disturb a running hand. To test the
+    skin, it needs the scans that the nodes send; with --active, it starts a hand that is not running. Do not
+    touch the skin while the command runs. The exit status is 0 if no fault was found, 1 if any was found, 2
+    if the command could not run.
     """
     from skinnode.cli._bus import find_buses
     from skinnode.cli._console import print_json, progress

@@ -23,22 +23,24 @@ _DEFAULT_SIZES = {
 def eds(
     upper_wires: Annotated[
         int | None,
-        typer.Option(min=1, max=254, help="Number of upper wires U, the rows of a frame; default 10."),
+        typer.Option(min=1, max=254, help="Number of upper wires, U; default 10."),
     ] = None,
     upper_electrodes: Annotated[
-        int | None, typer.Option(min=1, max=255, help="Number of electrodes N per upper wire; default 10.")
+        int | None, typer.Option(min=1, max=255, help="Number of electrodes per upper wire, N; default 10.")
     ] = None,
     lower_wires: Annotated[
         int | None,
-        typer.Option(min=1, max=254, help="Number of lower wires K, the columns of a frame; default 30."),
+        typer.Option(min=1, max=254, help="Number of lower wires, K; default 30."),
     ] = None,
     lower_electrodes: Annotated[
-        int | None, typer.Option(min=1, max=255, help="Number of electrodes M per lower wire; default 10.")
+        int | None, typer.Option(min=1, max=255, help="Number of electrodes per lower wire, M; default 10.")
     ] = None,
     layout: Annotated[
         str | None, typer.Option(help=f"Take the sizes from a layout: {LAYOUT_HELP}", metavar="LAYOUT")
     ] = None,
-    code_bits: Annotated[int, typer.Option(help="Width of a code: 16 or 24.", metavar="16|24")] = 16,
+    code_bits: Annotated[
+        int, typer.Option(help="Width of a resistance code in bits: 16 or 24.", metavar="16|24")
+    ] = 16,
     fd: Annotated[bool, typer.Option("--fd", help="Send PDOs in CAN FD frames.")] = False,
     dcf: Annotated[bool, typer.Option("--dcf", help="Print the DCF of one node; needs --node-id.")] = False,
     node_id: Annotated[

@@ -29,13 +29,13 @@ def check(
     hand: Annotated[Path, typer.Argument(help="The hand to check.", metavar="HAND.toml")],
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON instead of tables.")] = False,
 ) -> None:
-    """Validate a hand file and all files named in it, compute the hand's bus load, and list its limitations.
+    """Validate a hand file and the files named in it, compute the bus load, and list the hand's limitations.
 
-    For each bus, the command prints the planned load with every frame at its maximum length and with random
-    data. The command also prints the worst-case time from SYNC to the end of each patch's summary (absolute
-    and as a fraction of the SYNC period), and the longest wait of each frame in `others`. Notes list what the
-    hand cannot deliver, such as shear, or positions in the hand's coordinate frame. No bus is opened. The
-    exit status is 1 if the load of a bus exceeds its max_load, 2 if the file cannot be used.
+    For each bus, the command prints two planned loads: the worst case, in which every frame has its maximum
+    length, and the typical case, for random data. For each patch, it prints the worst-case time from SYNC to
+    the end of the summary. For each frame in `others`, it prints the longest wait for the bus. Notes list
+    results that the hand cannot provide, such as shear. No bus is opened. The exit status is 1 if the load of
+    a bus exceeds its max_load, 2 if the file cannot be used.
     """
     from skinnode.bus_load.plan import plan_of, require_room
     from skinnode.config import load_hand
@@ -215,9 +215,9 @@ def new(
         int, typer.Option(min=1, max=16, help="Number of buses that share the patches.", metavar="N")
     ] = 1,
 ) -> None:
-    """Print a commented hand file as a starting point, with a SYNC period that fits the bus load.
+    """Print a commented hand file as a starting point. Its SYNC period suits the bus load.
 
-    The patches are divided evenly among the buses, in order.
+    The patches are divided evenly among the buses, in the order of their node-IDs.
     """
     from skinnode.bus_load.plan import plan_of
     from skinnode.config import parse_hand

@@ -27,7 +27,7 @@ def host(
     seconds: Seconds = None,
     as_json: JsonLines = False,
 ) -> None:
-    """Bring a hand's patches up as CANopen manager, solve their scans and report every second.
+    """Bring up a hand's patches as CANopen manager, compute displacement fields and report every second.
 
     With --json, each patch has `contacts` (null before the first field): centroid, area, normal and
     shear force with standard deviations, in m, m² and N. Ctrl-C ends the command and leaves the nodes

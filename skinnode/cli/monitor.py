@@ -59,8 +59,9 @@ def monitor(
 ) -> None:
     """Show a hand on the terminal: depth and shear maps, touches, health, rates, load, events.
 
-    The command runs the hand as `skinnode host` does, but waits for missing patches. Keys: 1-9 select a
-    patch, z shows only that patch, t tares it, r records, space freezes the picture, ? shows help, q quits.
+    The command runs the hand as `skinnode host` does, but waits for missing patches. Keys 1-9 select a patch;
+    z shows only the selected patch, and t tares it. Key r records, space freezes the picture, ? shows help,
+    q quits.
     The screen requires the optional packages of the extra `tui`. The exit status is 0 if no fault occurred, 1
     if any fault occurred (faults are printed at the end), 2 if the monitor could not run.
     """
@@ -129,7 +130,7 @@ def _plan(hand: Path | None, interface: str | None, channel: str | None, simulat
         plan = load_hand(hand).on(interface, channel)
     else:
         plan = demo_hand(_SIMULATED, seed=1)
-        # only the posterior computes contact forces
+        # only the method "posterior" computes contact forces
         solver = plan.solver.model_copy(update={"method": "posterior"})
         plan = plan.model_copy(update={"name": "simulated hand", "solver": solver})
     if simulate:
@@ -143,7 +144,7 @@ def _plan(hand: Path | None, interface: str | None, channel: str | None, simulat
 def _running(
     stack: ExitStack, plan: HandConfig, stop: threading.Event, simulate: bool, quiet: bool
 ) -> Source:
-    """Return a monitor source that runs a host; ``stack`` closes the source.
+    """Return a monitor source that runs a host; closing ``stack`` also closes the source.
 
     Raises the same errors as :meth:`Host.from_config`.
     """
@@ -168,13 +169,13 @@ def _running(
             stack.enter_context(simulated(plan))
         tell(f"bringing up {counted(len(plan.patches), 'patch', 'patches')}")
         stack.enter_context(responsive_threads())
-        stack.enter_context(without_long_collections())  # collects garbage on entry: before the first SYNC
+        stack.enter_context(without_long_collections())  # collects garbage now, before the first SYNC
         host = stack.enter_context(Host.from_config(plan, cancelled=stop.is_set))
     return stack.enter_context(HostSource(host))
 
 
 def _recording(stack: ExitStack, path: Path, speed: float) -> Source:
-    """Return a monitor source that plays a recording; ``stack`` closes the source."""
+    """Return a monitor source that plays a recording; closing ``stack`` also closes the source."""
     from skinnode.monitor.source import ReplaySource
     from skinnode.record import replay
 

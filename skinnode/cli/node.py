@@ -51,7 +51,9 @@ def node(
     data_bitrate: Annotated[
         int, typer.Option(min=10_000, max=8_000_000, help="Data bit rate of CAN FD frames.", metavar="BPS")
     ] = 5_000_000,
-    code_bits: Annotated[int, typer.Option(help="Width of a code: 16 or 24.", metavar="16|24")] = 16,
+    code_bits: Annotated[
+        int, typer.Option(help="Width of a resistance code in bits: 16 or 24.", metavar="16|24")
+    ] = 16,
     serial: Annotated[
         int, typer.Option(min=0, max=0xFFFF_FFFF, help="Serial number (0x1018:4).", metavar="N")
     ] = 0,
@@ -134,7 +136,7 @@ def node(
 
 @contextmanager
 def _memory(store: Path | None) -> Iterator[FileMemory | None]:
-    """Yield the non-volatile memory in the file ``store``; the process holds a lock on the file."""
+    """Lock the file ``store``, and yield the non-volatile memory that it contains."""
     from skinnode.errors import ConfigError
     from skinnode.files.file_lock import FileInUse, NotARegularFile
     from skinnode.node.memory_file import FileMemory
@@ -174,7 +176,7 @@ class _Progress:
 
     elapsed_s: float
     node_id: int | None
-    """Node-ID of the node; None while the node has none."""
+    """Node-ID of the node; None until a node-ID is assigned."""
     state: str
     scans: int
     frames: int
@@ -227,7 +229,7 @@ def _faults(end: _Progress) -> list[str]:
 def _watch(
     runner: NodeRunner, port: CanPort, stop: threading.Event, seconds: float | None, as_json: bool
 ) -> None:
-    """Print a line every second until the command is stopped, the duration elapses or the node ends."""
+    """Print a line every second until the command is stopped, the duration has elapsed or the node ends."""
     start_s = time.monotonic()
     end_s = float("inf") if seconds is None else start_s + seconds
     before, due_s = replace(_progress(runner, port, 0.0), scans=0, frames=0), start_s + 1.0

@@ -226,7 +226,7 @@ def _write_dcf(
     for reading in made.as_bytes:
         where = f"0x{reading.index:04X}:{reading.subindex}"
         typer.echo(
-            f"note: CiA 306 cannot express {where}: its bytes are in a comment, which other tools skip"
+            f"note: CiA 306 cannot express {where}; the bytes are in a comment, which other tools skip"
         )
     for reading in refused:
         typer.echo(f"note: 0x{reading.index:04X}:{reading.subindex} {reading.refused}")

@@ -27,8 +27,8 @@ def record(
         typer.Option(
             "--output",
             "-o",
-            help="A folder, created if needed, in which the file is named after hand, date and time; "
-            "or a new file ending in .log or .blf. Existing files are never overwritten.",
+            help="A new file ending in .log or .blf; or a folder, created if needed, for a file named after "
+            "the hand, the date and the time. Existing files are never overwritten.",
             metavar="FOLDER|FILE",
         ),
     ],
@@ -54,7 +54,7 @@ def record(
     Play the recording with `skinnode replay`; can-utils and python-can can read it too. If the command is
     killed, at most the last second of the recording is lost. A recording made with --listen contains no
     baselines and can therefore be used only with CAN tools, not to compute fields. The exit status is 1 if
-    frames could not be written, or for any fault that `skinnode host` reports; 2 if the hand could not be
+    frames could not be written or a fault occurred that `skinnode host` reports, 2 if the hand could not be
     run.
     """
     from skinnode.config import load_hand
@@ -125,7 +125,10 @@ def _follow(
     as_json: bool,
     check: Callable[[], object] = lambda: None,
 ) -> None:
-    """Print a line every second until stopped or the duration elapses; propagate errors of ``check``."""
+    """Print a line every second until the command is stopped or the duration has elapsed.
+
+    Each time, ``check`` is called first; its errors are propagated.
+    """
     start_s = time.monotonic()
     end_s = float("inf") if seconds is None else start_s + seconds
     due_s = start_s + 1.0

@@ -17,10 +17,13 @@ def replay(
     recording: Annotated[
         Path,
         typer.Argument(
-            help="The .log or .blf file; its .jsonl must be in the same folder.", metavar="RECORDING"
+            help="The .log or .blf file of the recording; the .jsonl file must be in the same folder.",
+            metavar="RECORDING",
         ),
     ],
-    speed: Annotated[float, typer.Option(help="1: as recorded; 2: twice as fast.", metavar="X")] = 1.0,
+    speed: Annotated[
+        float, typer.Option(help="Playback speed: 1 is as recorded, 2 is twice as fast.", metavar="X")
+    ] = 1.0,
     fast: Annotated[bool, typer.Option("--fast", help="Play as fast as the scans can be solved.")] = False,
     as_json: Annotated[
         bool,
@@ -35,8 +38,8 @@ def replay(
     in m, m² and N.
 
     The exit status is 1 if the recording is damaged, was not ended properly, lacks frames or contains error
-    frames. It is also 1 if a scan was torn or missed, or if a chunk or summary was lost. The exit status is 2
-    if the recording cannot be read.
+    frames. The exit status is also 1 if a scan was torn or missed, or if a chunk or summary was lost. The
+    exit status is 2 if the recording cannot be read.
     """
     from skinnode.process.signals import stop_on_signal
     from skinnode.record import replay as play
@@ -45,7 +48,7 @@ def replay(
         run = play(recording, speed=None if fast else speed, cancelled=stop.is_set)
         deepest_m = {patch.name: 0.0 for patch in run.hand.patches}
         for field in run:
-            assert field.stamp is not None  # always true, because the host timestamps every field
+            assert field.stamp is not None  # the host timestamps every field
             if as_json:
                 print(json.dumps(field_table(field)), flush=not fast)
             depth_m = float(-field.displacement_m[..., 2].min())
@@ -80,7 +83,7 @@ def field_table(field: FieldFrame) -> dict[str, Any]:
         "method": field.method,
         "displacement_m": field.displacement_m.tolist(),
         "contacts": contact_tables(field),
-        # JSON has no infinity, which is the standard deviation of an unknown value
+        # an unknown value has an infinite standard deviation, which JSON cannot represent
         "displacement_std_m": [
             [[v if v < float("inf") else None for v in electrode] for electrode in wire]
             for wire in field.displacement_std_m.tolist()

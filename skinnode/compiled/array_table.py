@@ -1,8 +1,8 @@
 """Tables that pass many arrays and numbers to a kernel in one argument, with access by name.
 
-Numba checks and unpacks every argument of every call. For the fifty arrays of a patch, this overhead is 4 µs
-with warm caches and 40 µs with cold caches, about the time needed to solve four wires. An :class:`ArrayTable`
-is one array of addresses and shapes. A subclass declares the fields once, for Python and for kernels:
+Numba checks and unpacks every argument of every call. For the fifty arrays of a patch, this takes 4 µs with
+warm caches and 40 µs with cold caches. An :class:`ArrayTable` is one array of addresses and shapes. A
+subclass declares the fields once, for Python and for kernels:
 
     class Scan(ArrayTable):
         ohm: Annotated[NDArray[np.float64], "U K"]     # element type and axes
@@ -98,7 +98,7 @@ class _Field:
 
 @dataclass(frozen=True)
 class _Group:
-    """Fields of a NamedTuple, which kernels read as one tuple."""
+    """Table entry declared as a NamedTuple; kernels read its fields as one tuple."""
 
     name: str
     made_of: type
@@ -182,7 +182,7 @@ class ArrayTable:
     def __setattr__(self, name: str, value: object) -> None:
         if name in self._names and value is not getattr(self, name):  # allows ``table.x += 1``
             raise AttributeError(
-                f"{type(self).__name__}.{name}: kernels use its address; write to it in place"
+                f"{type(self).__name__}.{name}: cannot be replaced; write to the array in place"
             )
         super().__setattr__(name, value)
 
@@ -199,7 +199,7 @@ def _enter(table: str, field: _Field, value: Any, row: NDArray[np.int64], length
 
 
 class _ViewType(types.Type):  # type: ignore[misc]  # numba has no type hints
-    """Numba type of an :class:`ArrayTable`, represented by the address of its table."""
+    """Numba type of an :class:`ArrayTable` in a kernel; its value is the address of the table."""
 
     def __init__(self, made_of: type[ArrayTable]) -> None:
         self.made_of = made_of
@@ -216,11 +216,11 @@ class _ViewModel(models.PrimitiveModel):  # type: ignore[misc]
 
 
 def reader(made_of: type[_T]) -> Callable[[NDArray[np.int64]], _T]:
-    """Return a kernel function that converts a ``made_of`` table to an object with the declared fields.
+    """Return a function that gives kernels access to the fields of a table by name.
 
-    Only compiled code can call the function. Each use of a field name reads the table again, so read fields
-    before loops. In kernels, bool arrays have the element type uint8. The kernel raises TypeError if the
-    table has a different declaration.
+    Only compiled code can call the returned function. Each use of a field name reads the table again, so read
+    fields before loops. In kernels, bool arrays have the element type uint8. The kernel raises TypeError if
+    its table is not an instance of ``made_of``.
     """
     view, digest = _ViewType(made_of), made_of._digest
     message = f"table: got a table of another class, must be the table of a {made_of.__name__}"

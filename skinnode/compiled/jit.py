@@ -6,9 +6,9 @@ after a digest of every file that contains kernels: an edit to any of these file
 cache folder is created in the first writable location among ``$SKINNODE_CACHE_DIR``, the user's cache folder
 and the system's temporary folder. If no location is writable, kernels are not cached.
 
-``error_model="numpy"`` makes a division by zero yield inf (reported by a status) instead of raising an
-exception, and ``nogil`` lets a thread pool solve several patches at the same time. ``fastmath`` stays off
-because results must not depend on how a compiler reorders sums.
+With ``error_model="numpy"``, a division by zero yields inf instead of raising an exception. With ``nogil``, a
+thread pool can solve several patches at the same time. ``fastmath`` is off because results must not depend on
+how a compiler reorders sums.
 """
 
 from __future__ import annotations
@@ -107,8 +107,8 @@ def njit(function: _F) -> _F:
 def njit_brief(function: _F) -> _F:
     """Compile ``function`` as :func:`njit` does, but hold the interpreter lock while it runs.
 
-    Use this decorator for kernels that take about a microsecond. If such a short kernel released the lock,
-    reacquiring the lock from another thread could take longer than all other computations of a field.
+    Use this decorator for kernels that take about a microsecond. After releasing the lock, such a kernel
+    could wait for the lock much longer than it runs.
     """
     return _kept(function, nogil=False)
 

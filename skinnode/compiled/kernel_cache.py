@@ -1,13 +1,13 @@
 """File cache of compiled kernels that verifies each file before use.
 
 Numba's own file cache unpickles any file that it finds. A truncated file therefore causes an exception in the
-first call to a kernel on every run, and machine code with a flipped bit is executed. All signatures of a
-function share one index. Two processes that compile different signatures at the same time can therefore store
-the code of one signature under the name of the other.
+first call to a kernel on every run, and machine code with a flipped bit is executed. In numba's cache, all
+signatures of a function share one index file. Two processes that compile different signatures at the same
+time can therefore store the code of one signature under the name of the other.
 
 In this cache, each compiled signature has its own file, which contains a magic number, the SHA-256 of the
-payload, and the payload itself. The file name contains a digest of everything on which the code depends, so
-no index is needed. Files are written under a temporary name and renamed. If a file fails verification, it is
+payload, and the payload itself. The file name contains a digest of all inputs of the compilation, so no
+index is needed. Files are written under a temporary name and renamed. If a file fails verification, it is
 removed, the kernel is recompiled, and one line is logged. One line is also logged if a kernel cannot be
 cached. Cache errors never reach the caller.
 """
@@ -84,14 +84,16 @@ class KernelCache:
                 if kept_signature == signature
                 else None
             )
-        except Exception as error:  # the file is intact, but was written by another installation
+        except Exception as error:  # an intact file that another installation has written
             if _remove(path):
-                _report(self._folder, f"a file could not be loaded ({error!r:.200}); removed, recompiling")
+                _report(
+                    self._folder, f"a file could not be loaded ({error!r:.200}) and was removed; recompiling"
+                )
             return None
 
     def save_overload(self, signature: Any, compiled: Any) -> None:
         """Write ``compiled`` to the cache if possible."""
-        if compiled.lifted or compiled.library.has_dynamic_globals:  # numba's cache skips it too
+        if compiled.lifted or compiled.library.has_dynamic_globals:  # numba's cache excludes these too
             return
         path = self._path(signature, compiled.codegen)
         try:
@@ -148,9 +150,12 @@ def _heal(folder: Path) -> None:
         damaged = [file for file in files if _is_damaged(file)]
         removed = sum(map(_remove, damaged))
     if removed:
-        _report(folder, f"{removed} of {len(files)} files were damaged; removed, recompiling")
+        _report(folder, f"{removed} of {len(files)} files were damaged and have been removed; recompiling")
     elif damaged:
-        _report(folder, f"{len(damaged)} of {len(files)} files are damaged and cannot be removed; not used")
+        _report(
+            folder,
+            f"{len(damaged)} of {len(files)} files are damaged and cannot be removed; they are not used",
+        )
 
 
 def _is_damaged(file: Path) -> bool:
@@ -190,7 +195,7 @@ def _locked(folder: Path) -> Iterator[None]:
 
 
 def _report(folder: Path, what: str) -> None:
-    """Log ``what`` once per process and folder, so that a full disk produces a single line."""
+    """Log the message ``what`` once per process and folder, so that a full disk produces only one line."""
     kind = f"{folder} {what[:1].isdigit()}"
     if kind not in _reported:
         _reported.add(kind)

@@ -2,9 +2,9 @@
 
 LLVM prefers 256-bit vectors even if 512-bit vectors are twice as fast. LLVM vectorises only code whose rows
 provably do not overlap, and it may keep sums in memory instead of registers. ``load``, ``fma`` and ``store``
-compile to exactly these instructions, and each lane accumulates its own sum in the order written. The result
-is therefore the same for any number of threads and any split of the columns. On processors with narrower
-vectors, each operation is split.
+each compile to the vector instruction of the same name, and each lane accumulates its own sum in the order
+written. A kernel's results therefore do not depend on the number of threads or on how the columns are
+divided. On processors with narrower vectors, each operation is split.
 
 Vectors support +, − and *; a double in such an expression is broadcast to a vector.
 """

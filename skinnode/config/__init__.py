@@ -6,10 +6,9 @@
     models)
          -> HandConfig, or explain (one-line errors)
 
-:func:`load_hand` reads a file, :func:`parse_hand` validates a table in memory. Both raise
+:func:`load_hand` reads a file, and :func:`parse_hand` validates a table in memory. Both raise
 :class:`~skinnode.errors.ConfigError` with a one-line message: file, line and column, dotted key, value found
-and values allowed. Values must have exactly the required type, because TOML is typed: ``node_id = "3"`` is an
-error, not a 3.
+and values allowed. Because TOML is typed, values are not converted: ``node_id = "3"`` is an error.
 
 The suffix of a key is its unit; a key without a unit suffix contains a count, a ratio or a name.
 """

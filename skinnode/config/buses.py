@@ -11,9 +11,9 @@ from skinnode.config.table import Allowed, Name, NodeId, Table, one_of
 from skinnode.errors import ConfigError
 
 MAX_BUS_LOAD: Final = 0.70
-"""Default load limit of a bus, as a fraction. At higher bus loads, the response times of low-priority frames
-grow steeply (Davis, Burns, Bril, Lukkien: Controller Area Network (CAN) schedulability analysis, Real-Time
-Systems 35, 2007), and too little capacity remains to repeat frames after errors."""
+"""Default load limit of a bus, as a fraction. At higher loads, the response times of low-priority frames grow
+steeply, and too little capacity remains to repeat frames after errors. Source: Davis, Burns, Bril, Lukkien:
+Controller Area Network (CAN) schedulability analysis, Real-Time Systems 35, 2007."""
 
 Role = Literal["master", "guest"]
 GuestSends = Literal["nothing", "sdo"]
@@ -60,7 +60,7 @@ class BusConfig(Table):
     ] = 5_000_000
     """Bits per second in the data phase of CAN FD frames, from ESI to the CRC delimiter."""
     options: dict[str, bool | int | float | str] = Field(default={})
-    """Additional keyword arguments for the python-can interface."""
+    """Additional keyword arguments for the interface in python-can."""
     role: Annotated[Role, one_of(Role)] = "master"
     """Role of the host: ``master`` if it sends NMT and SYNC on the bus, ``guest`` if the robot's own master
     does."""
@@ -98,14 +98,11 @@ class SyncConfig(Table):
         Field(ge=0, le=240),
         Allowed("an integer from 2 to 240; or 0 if the host is a guest on all buses"),
     ] = 240
-    """Maximum value of the SYNC counter (0x1019), which starts at 1 and numbers the scans. 0: the SYNC of
-    another master has no counter, and each patch numbers its own scans."""
-    stagger_ms: Annotated[float, Field(ge=0, allow_inf_nan=False), Allowed("a number of at least 0 (ms)")] = (
-        0.0
-    )
+    """Maximum value of the SYNC counter (0x1019), which starts at 1 and numbers the scans. If the SYNC of
+    another master has no counter, the value is 0, and each patch numbers its own scans."""
+    stagger_ms: Annotated[float, Field(ge=0, allow_inf_nan=False), Allowed("a delay of at least 0 ms")] = 0.0
     """Delay from the SYNC on one bus to the SYNC on the next bus, milliseconds, if the host is the master. If
-    the delay is 0, the scans of all patches end together, so the last field is delayed until all others have
-    been solved."""
+    the delay is 0, the scans on all buses end at the same time and must wait for each other to be solved."""
 
     @property
     def stagger_s(self) -> float:
@@ -122,12 +119,12 @@ class BringUpConfig(Table):
     """Settings for bringing up patches, at start-up and later."""
 
     missing: Annotated[Missing, one_of(Missing)] = "refuse"
-    """Action if a patch does not answer at start-up: ``refuse`` does not start the hand; ``wait`` starts the
-    other patches and waits for the missing patch."""
+    """Action if a patch does not answer at start-up. With ``refuse``, the host does not start the hand. With
+    ``wait``, the host starts the other patches and waits for the missing patch."""
     heartbeat_ms: Annotated[int, Field(ge=20, le=10_000), Allowed("an integer from 20 to 10000")] = 250
-    """Heartbeat period of the nodes, milliseconds. The host sets the heartbeat period in the nodes. A guest
-    that sends nothing cannot set the period, and assumes that the nodes use it. At a period of 250 ms, a lost
-    node is detected within a second, and the heartbeats of four nodes use 0.1 % of the bandwidth."""
+    """Heartbeat period of the nodes, milliseconds. The host configures this period in the nodes. A guest that
+    sends nothing cannot configure it, and assumes that the nodes use this period. At a period of 250 ms, a
+    lost node is detected within a second, and the heartbeats of four nodes use 0.1 % of the bandwidth."""
 
     @property
     def heartbeat_s(self) -> float:

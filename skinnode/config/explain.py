@@ -36,7 +36,7 @@ def first_error(
     first = next((item for item in found if item["type"] == "extra_forbidden"), found[0])
     location, kind = first["loc"], first["type"]
     cause = first.get("ctx", {}).get("error")
-    if isinstance(cause, ConfigError):  # from a check in a model; the key is relative to the location
+    if isinstance(cause, ConfigError):  # raised by a model's validator, with a key relative to the model
         path = (*location, *key_path(cause.key))
         return ConfigError(dotted(path), cause.got, cause.allowed, where=where(path))
     keys, allowed = _place(location, table)

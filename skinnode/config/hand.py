@@ -30,8 +30,8 @@ class HandConfig(Table):
 
     A duplicate name, node-ID or serial number, an unknown bus, an impossible geometry or a conflict with the
     role of a bus causes a ConfigError. Pydantic wraps the ConfigError in a ValidationError;
-    :func:`parse_hand` unwraps the ConfigError. :func:`skinnode.bus_load.plan.check_plan` checks whether the
-    plan fits its buses.
+    :func:`parse_hand` unwraps the ConfigError. The bus load is checked separately, by
+    :func:`skinnode.bus_load.plan.check_plan`.
     """
 
     name: Name = "hand"
@@ -45,7 +45,7 @@ class HandConfig(Table):
     ]
     """Skin patches of the hand."""
     links: Annotated[tuple[LinkConfig, ...], Field(strict=False)] = ()
-    """Robot links on which patches are mounted, and the poses of these links in the hand's frame."""
+    """Robot links on which patches are mounted, with their poses in the hand's coordinate frame."""
     sync: SyncConfig = SyncConfig()
     bring_up: BringUpConfig = BringUpConfig()
     solver: SolverConfig = SolverConfig()
@@ -172,10 +172,10 @@ class HandConfig(Table):
             if bus.role == "master" or bus.guest_sends == "sdo":
                 continue
             if patch.baseline is None:
-                allowed = f"a file: on {bus.name} the host is a guest that sends nothing"
+                allowed = f"a file, because the host is a guest that sends nothing on {bus.name}"
                 raise ConfigError(f"patches[{i}].baseline", NOTHING, allowed)
             if patch.layout.coordinates == "node":
-                allowed = f"preset: on {bus.name} the host is a guest that sends nothing"
+                allowed = f"preset, because the host is a guest that sends nothing on {bus.name}"
                 raise ConfigError(f"patches[{i}].layout.coordinates", "node", allowed)
         guests = [bus.name for bus in self.buses if bus.role == "guest"]
         if guests and "period_ms" not in self.sync.model_fields_set:
@@ -222,7 +222,7 @@ def _parse(document: Document, folder: Path) -> HandConfig:
 
 
 def _check_geometry(key: str, patch: PatchConfig) -> None:
-    """Raise ConfigError if the geometry is impossible, or if there is not one gain per upper wire."""
+    """Raise ConfigError if the geometry is impossible, or if the number of gains is wrong."""
     try:
         layout = patch.layout.build()
     except ValueError as error:

@@ -1,4 +1,4 @@
-"""Poses in a hand file: of patches (``[patches.pose]``) and of the robot's links (``[[links]]``)."""
+"""Poses of patches (``[patches.pose]``) and of the robot's links (``[[links]]``) in a hand file."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _Part = Annotated[float, Field(ge=-1.001, le=1.001, allow_inf_nan=False), Allowe
 
 
 class PoseConfig(Table):
-    """Pose of a frame relative to its parent frame.
+    """Pose of a coordinate frame relative to its parent frame.
 
     The frame of a patch has x along the upper wires, y across them and z out of the skin.
     """
@@ -53,7 +53,7 @@ class PoseConfig(Table):
         return self
 
     def build(self) -> Pose:
-        """Return the pose as the model's type ``Pose``."""
+        """Return the pose as a :class:`~skinnode.model.pose.Pose`."""
         if self.rpy_rad is not None:
             return Pose.from_rpy(self.position_m, self.rpy_rad)
         return Pose(self.position_m, self.quaternion_xyzw or (0.0, 0.0, 0.0, 1.0))
@@ -65,7 +65,7 @@ class LinkConfig(Table):
     name: Name
     """Name of the link, used in the key ``link`` of each patch."""
     pose: PoseConfig = PoseConfig()
-    """Pose of the link's frame in the hand's frame, used until the program sets another pose
+    """Pose of the link's coordinate frame in the hand's frame, used until the program sets another pose
     (``HandFrame.at``)."""
 
     @field_validator("name")

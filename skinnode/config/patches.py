@@ -59,11 +59,11 @@ class LayoutConfig(Table):
     height_m: Length = 2e-3
     """Height of the upper electrodes above the lower electrodes, metres."""
     upper_wires: Count = 10
-    """Number of upper wires, U; each upper wire is one row of a frame."""
+    """Number of upper wires, U; each upper wire is one row of the resistance matrix."""
     upper_electrodes: Count = 10
     """Number of electrodes per upper wire, N."""
     lower_wires: Count | None = None
-    """Number of lower wires, K; each lower wire is one column of a frame. None: 3 N."""
+    """Number of lower wires, K; each lower wire is one column of the resistance matrix. None: 3 N."""
     lower_electrodes: Count | None = None
     """Number of electrodes per lower wire, M; None: U."""
     resistivity_ohm_per_m: _Resistivity = 1e7
@@ -110,14 +110,14 @@ class LayoutConfig(Table):
 def _preset(name: str, **sizes: float | int | None) -> PatchLayout:
     """Return a preset layout from a cache.
 
-    Layouts are immutable and can be shared. Most patches of a hand have the same layout, and each check of a
-    hand file requires the layouts.
+    Layouts are immutable and can be shared. Most patches of a hand have the same layout, and several checks
+    of a hand file build the layout of every patch.
     """
     return PatchLayout.preset(name, **sizes)  # type: ignore[arg-type]
 
 
 class CalibrationConfig(Table):
-    """Measured properties of a patch, except resistances at rest (``baseline``) and resistivity (layout)."""
+    """Measured properties of a patch, except those with their own keys: baseline and resistivity."""
 
     stiffness_n_per_m: Stiffness | None = None
     """Stiffness of the rubber under one electrode, N/m; overrides ``solver.stiffness_n_per_m``."""
@@ -132,11 +132,11 @@ class CalibrationConfig(Table):
     force_calibrated: bool = False
     """Whether ``young_pa`` has been calibrated on this patch, for instance by pressing it with typical
     objects while a load cell measures the force. If false, the standard deviations of normal forces are large
-    enough to cover rubber bonded to a rigid support, where the force can be fifty times as high. A modulus
-    from a data sheet is not a calibration."""
+    enough to cover rubber bonded to a rigid support, where the force can be fifty times as high as for thick
+    rubber. A modulus from a data sheet is not a calibration."""
     upper_gain: Annotated[tuple[_Gain, ...] | None, Field(strict=False), Allowed("a list of numbers")] = None
-    """Correction factors, one per upper wire, that restore the wire's resistances to their values at the time
-    of the baseline."""
+    """Correction factors, one per upper wire. Each factor multiplies the wire's measured resistances and
+    corrects drift since the baseline was measured."""
 
     @property
     def rubber(self) -> Rubber:
@@ -148,19 +148,19 @@ class TolerancesConfig(Table):
     """Manufacturing tolerances of a patch, which are included in the reported standard deviations.
 
     The text `"ordinary"` selects the defaults below; `"exact"` selects a patch without deviations from its
-    layout, such as a simulated patch. Only the posterior can include tolerances. If a patch has tolerances,
-    the method `auto` selects the posterior; the method `exact` ignores the tolerances in its standard
-    deviations.
+    layout, such as a simulated patch. Of the solver methods, only `posterior` includes tolerances in its
+    standard deviations; `exact` ignores tolerances. If a patch has tolerances, `auto` selects `posterior`.
     """
 
     placement: _Tolerance = ORDINARY.placement
-    """Standard deviation of the position of each upper and lower wire along each axis, in pitches."""
+    """Standard deviation of the position of each wire along each axis, as a multiple of the pitch."""
     thickness: _Tolerance = ORDINARY.thickness
-    """Standard deviation of the thickness between the electrodes, relative to the clearance."""
+    """Standard deviation of the rubber thickness between upper and lower electrodes, as a fraction of the
+    smallest distance between an upper and a lower electrode."""
     electrode_radius: _Tolerance = ORDINARY.electrode_radius
-    """Radius of the electrodes, in pitches. The forward model assumes point electrodes."""
+    """Radius of the electrodes, as a multiple of the pitch. The forward model assumes point electrodes."""
     gain: _Tolerance = ORDINARY.gain
-    """Standard deviation of the gain of the front end, as a fraction of the change in each resistance."""
+    """Relative standard deviation of the front end's gain for changes in resistance."""
 
     @model_validator(mode="before")
     @classmethod
@@ -194,8 +194,8 @@ class PatchConfig(Table):
     link: Name | None = None
     """Name of the robot link that carries the patch; None: the patch is fixed to the hand itself."""
     pose: PoseConfig = PoseConfig()
-    """Pose of the patch's frame in the frame of its link, or in the hand's frame if the patch has no link. A
-    link without a pose in ``[[links]]`` has the same frame as the hand."""
+    """Pose of the patch's coordinate frame in the frame of its link or, without a link, in the hand's frame.
+    A link without a pose in ``[[links]]`` has the same frame as the hand."""
     eds: Annotated[Path | None, Field(strict=False), Allowed("the path of an EDS file")] = None
     """Electronic data sheet (EDS) to check against the wire format of this patch; the path is relative to the
     hand file."""
@@ -205,8 +205,8 @@ class PatchConfig(Table):
     serial: Annotated[int | None, Field(ge=0, le=0xFFFF_FFFF), Allowed("an integer from 0 to 2^32 - 1")] = (
         None
     )
-    """Required serial number of the node (0x1018:4); None: any serial number is accepted. If no node answers
-    at the node-ID, the host finds the node by its serial number over LSS and assigns the node-ID."""
+    """Required serial number of the node (0x1018:4). None: the host accepts any serial number. If no node
+    answers at the node-ID, the host finds the node by its serial number over LSS and assigns the node-ID."""
     relative_noise: Ratio = 3e-6
     """Relative standard deviation of the analogue noise in a resistance measurement, excluding
     quantisation."""

@@ -18,35 +18,36 @@ class SolverConfig(Table):
     """Settings for computing displacements from resistances."""
 
     method: Annotated[Method, one_of(Method)] = "auto"
-    """Method: the ``exact`` inverse of each wire, the ``posterior`` of the whole patch, or ``auto``, which
-    selects one of these two according to layout and noise."""
+    """Solver method: ``exact`` inverts the model of each wire, ``posterior`` estimates the whole patch, and
+    ``auto`` selects one of these two according to the layout and the noise."""
     operator: Annotated[Operator, one_of(Operator)] = "dogleg"
-    """Operator (type of solver step) of the exact inverse."""
+    """Type of solver step that the method ``exact`` uses."""
     stiffness_n_per_m: Stiffness | None = None
-    """Stiffness of the rubber under one electrode, N/m; the exact inverse uses it to compute forces. The
+    """Stiffness of the rubber under one electrode, N/m; the method ``exact`` uses it to compute forces. The
     calibration of a patch can override this stiffness."""
     deadline_us: Annotated[
         int | None, Field(ge=100, le=10_000_000), Allowed("an integer from 100 to 10000000")
     ] = None
-    """Time limit per frame, microseconds, after which the solver returns its current estimate; None: no
-    limit."""
+    """Time limit for solving one scan, microseconds, after which the solver returns its current estimate;
+    None: no limit."""
     estimate_noise: bool = False
-    """Estimate the noise in the resistances from the stream of scans; requires the posterior."""
+    """Estimate the noise in the resistances from the stream of scans. Requires the method ``posterior``."""
     drift: Annotated[Drift, one_of(Drift)] = "none"
-    """Estimate a gain common to all resistances of the ``patch``, or of each upper ``wire``, together with
-    the displacement; requires the posterior."""
+    """Estimate drift of the resistances together with the displacement: as one gain for the whole ``patch``,
+    or one gain for each upper ``wire``. Requires the method ``posterior``."""
     normal_only: bool = False
     """Solve only for the height of the electrodes, without shear."""
     max_std_m: Annotated[
         float | None, Field(gt=0, le=1, allow_inf_nan=False), Allowed("a number above 0 and up to 1 (m)")
     ] = None
     """A field is precise only if no displacement has a standard deviation above this limit, metres. None: the
-    limit is derived from layout and noise."""
+    limit is derived from the layout and the noise."""
     max_force_std_n: Annotated[
         float | None, Field(gt=0, le=1e6, allow_inf_nan=False), Allowed("a number above 0 and up to 1e6 (N)")
     ] = None
     """A field is precise only if no contact's normal force has a standard deviation above this limit,
-    newtons. None: the limit is derived from layout and rubber, and applies only to calibrated forces."""
+    newtons. None: the limit is derived from the layout and the properties of the rubber, and applies only to
+    calibrated forces."""
     workers: Annotated[int | None, Field(ge=1, le=64), Allowed("an integer from 1 to 64")] = None
     """Number of threads that solve patches in parallel; None: one per core, at most one per patch."""
 
@@ -55,9 +56,9 @@ class StreamConfig(Table):
     """Settings for delivering scans and fields to programs."""
 
     partial: Annotated[Partial, one_of(Partial)] = "pass"
-    """Handling of incomplete scans, which lack chunks or the summary with the scan check. ``pass`` delivers
+    """Handling of incomplete scans: scans with missing chunks or a missing summary. ``pass`` delivers
     incomplete scans unchecked, together with a mask of the valid resistances; ``withhold`` does not deliver
     incomplete scans. Incomplete scans are counted in either case."""
     capacity_fields: Annotated[int, Field(ge=1, le=1_000_000), Allowed("an integer from 1 to 1000000")] = 64
     """Maximum number of fields in a subscriber's queue; if the queue is full, the oldest field is dropped.
-    The default, 64, holds more than one second of fields from four patches at 12.5 scans per second."""
+    At 12.5 scans per second, four patches fill the default queue of 64 fields in 1.3 s."""

@@ -19,7 +19,7 @@ _Cycle = Annotated[
 class SimulationConfig(Table):
     """Scene that ``vcan-sim`` simulates on each patch: an indenter repeatedly presses, slides and lifts off.
 
-    The host ignores it.
+    The host ignores this table.
     """
 
     seed: Annotated[int, Field(ge=0), Allowed("an integer of at least 0")] = 1
@@ -27,7 +27,8 @@ class SimulationConfig(Table):
     indenter_radius_m: Length = 0.04
     """Radius of the spherical indenter, metres."""
     depth: Ratio = 0.1
-    """Maximum indentation, as a fraction of the upper layer's height; 0: nothing touches the hand."""
+    """Maximum indentation, as a fraction of the height of the upper electrodes. 0: nothing touches the
+    hand."""
     shear_ratio: Annotated[float, Field(ge=0, le=2, allow_inf_nan=False), Allowed("a number from 0 to 2")] = (
         0.3
     )

@@ -35,8 +35,8 @@ _DEEPEST: Final = 32
 """Maximum number of parts in a key; a hand file needs six."""
 _PART: Final = r"(?:[\w-]++|\"[^\"\n]*+\"|'[^'\n]*+')[ \t]*+"
 _LONG_KEY: Final = re.compile(rf"(?<![\w\-\"'])(?:{_PART}\.[ \t]*+){{{4 * _DEEPEST}}}")
-"""Pattern that matches a key with far more than ``_DEEPEST`` parts. The pattern also matches long sequences
-of numbers joined by dots, which no hand file contains."""
+"""Pattern that matches a key with at least four times ``_DEEPEST`` parts. The pattern also matches any other
+equally long sequence of words joined by dots; hand files contain no such sequences."""
 _LEAST, _MOST = -(1 << 63), (1 << 63) - 1  # range of integers in TOML 1.0
 _INTEGERS: Final = "integers from -2^63 to 2^63 - 1"
 _TOO_LONG: Final = Shown("a longer integer")
@@ -69,8 +69,8 @@ def read_toml(path: Path, what: str) -> Document:
         what: Kind of file, for error messages.
 
     Raises:
-        ConfigError: The file cannot be read, is not TOML, is nested more deeply than any hand file, or
-            contains integers outside the range that TOML guarantees. The error message is one line.
+        ConfigError: The file cannot be read, is not TOML, is nested too deeply, or contains an integer
+            outside the range of TOML 1.0. The error message is one line.
     """
     try:
         text = read_input(what, path).decode()
@@ -78,7 +78,7 @@ def read_toml(path: Path, what: str) -> Document:
         raise ConfigError(
             f"byte {error.start}", error.object[error.start : error.end], "UTF-8", where=str(path)
         ) from None
-    if _LONG_KEY.search(text):  # tomllib would take minutes to parse so long a key
+    if _LONG_KEY.search(text):  # tomllib would take minutes to parse such a long key
         raise ConfigError(what, Shown("deeper nesting"), _TOO_DEEP, where=str(path))
     try:
         table = tomllib.loads(text)
@@ -86,7 +86,7 @@ def read_toml(path: Path, what: str) -> Document:
         raise _syntax_error(str(path), text, str(error)) from None
     except RecursionError:
         raise ConfigError(what, Shown("deeper nesting"), _TOO_DEEP, where=str(path)) from None
-    except ValueError:  # an integer has more decimal digits than Python accepts
+    except ValueError:  # the file contains an integer with more digits than Python accepts
         raise ConfigError(what, _TOO_LONG, _INTEGERS, where=str(path)) from None
     leaves = list(_leaves(table))
     if any(len(key) > _DEEPEST for key, _ in leaves):

@@ -6,7 +6,7 @@ client) and ``dut`` (the device under test) build on these two modules, and the 
 ``html_report`` write the results.
 
 The suite relies only on a node's EDS and on the frames that the node sends. The suite has its own tester,
-SDO client, EDS reader and constants: it could not detect an error in code that it shared with the node.
+SDO client, EDS reader and constants, because it could not detect errors in code shared with the node.
 """
 
 from skinnode.conformance.case import Case, NotApplicable, Result, Verdict

@@ -46,7 +46,7 @@ class Case:
     """Identifier of the case: its area and number, such as "SDO-07"."""
     title: str
     clause: str
-    """Clause that the case checks. It is a clause of CiA 301 v4.2.0 unless another document is named."""
+    """Clause that the case checks: a clause of CiA 301 v4.2.0 unless another document is named."""
     run: Callable[[Dut], None]
 
     @property
@@ -64,7 +64,7 @@ class Result:
     why: str = ""
     """Reason for the verdict; empty if the device passed without a warning.
 
-    States the expected and received data, the cause of the warning, or why the case does not apply.
+    This text gives the expected and received data, the cause of the warning, or why the case does not apply.
     """
     seconds: float = 0.0
     trace: tuple[TraceLine, ...] = field(default=(), repr=False)

@@ -215,7 +215,7 @@ NAME = "a string of 1 to 64 printable characters, not all blank"
         (
             ["sync", "stagger_ms"],
             -1,
-            "sync.stagger_ms: got -1, allowed: a number of at least 0 (ms)",
+            "sync.stagger_ms: got -1, allowed: a delay of at least 0 ms",
         ),
         (
             ["sync", "counter_overflow"],
@@ -252,7 +252,7 @@ NAME = "a string of 1 to 64 printable characters, not all blank"
             ["buses", 0, "role"],
             "guest",
             "patches[0].baseline: got nothing, "
-            "allowed: a file: on can0 the host is a guest that sends nothing",
+            "allowed: a file, because the host is a guest that sends nothing on can0",
         ),
         (
             ["buses", 0, "heartbeat_node_id"],

@@ -323,7 +323,7 @@ def test_a_patch_without_its_node_id_is_found_by_its_serial_number(
             {"role": "guest"},
             {},
             "patches[0].baseline: got nothing, "
-            "allowed: a file: on can0 the host is a guest that sends nothing",
+            "allowed: a file, because the host is a guest that sends nothing on can0",
         ),
         (
             {"role": "guest", "guest_sends": "sdo", "heartbeat_node_id": 3},

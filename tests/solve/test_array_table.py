@@ -132,7 +132,7 @@ def test_a_field_cannot_be_left_out() -> None:
 def test_a_field_cannot_be_replaced() -> None:
     """The kernel has the address of the old array."""
     table = Every(**values())
-    with pytest.raises(AttributeError, match="write to it in place"):
+    with pytest.raises(AttributeError, match="write to the array in place"):
         table.vector = np.zeros(3)
     table.vector += 1.0
     assert mark(table.table) == 4_000_000_002.0

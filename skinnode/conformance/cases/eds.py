@@ -18,7 +18,7 @@ _IDENTITY = ((1, "vendornumber"), (2, "productnumber"), (3, "revisionnumber"))
 
 @case(
     "EDS-01",
-    "The EDS contradicts neither itself nor CiA 301 nor the device's identity",
+    "The EDS is consistent with itself, with CiA 301 and with the device's identity",
     "CiA 306-1; 7.5.2.21",
 )
 def sheet(dut: Dut) -> None:

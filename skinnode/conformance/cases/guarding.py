@@ -51,7 +51,7 @@ def toggle(dut: Dut) -> None:
     for number in range(5):
         guarded(dut, 127, number % 2, f"answer {number + 1}")
     dut.reset(RESET_COMMUNICATION)
-    guarded(dut, 127, 0, "the first after a communication reset")
+    guarded(dut, 127, 0, "after a communication reset")
 
 
 @case("GUARD-04", "The device does not answer remote frames for other node-IDs", "7.2.8.3.2.1; 7.3.3")

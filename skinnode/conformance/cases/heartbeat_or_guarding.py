@@ -19,7 +19,7 @@ _CLAUSE = "7.2.8.2.2"
 def _both(dut: Dut, heartbeat_ms: int, guard_ms: int) -> None:
     """Set the heartbeat period and the guard time.
 
-    Raises NotApplicable if the device supports only one of the two.
+    Raises NotApplicable if the device supports only heartbeat or only guarding.
     """
     dut.need(HEARTBEAT)
     dut.need(GUARD_TIME)

@@ -51,7 +51,8 @@ def _none(expected: str, faults: list[str]) -> None:
 def _compare_defaults(dut: Dut, entries: Iterable[EdsEntry]) -> None:
     """Compare the device's default values with those in the EDS.
 
-    0x1010 and 0x1011 return capabilities instead of defaults, so a different value causes only a warning.
+    Reading 0x1010 or 0x1011 returns storage capabilities, so a value that differs from the EDS causes only a
+    warning.
     """
     faults: list[str] = []
     doubts: list[str] = []
@@ -132,7 +133,7 @@ def structure(dut: Dut) -> None:
 def limits(dut: Dut) -> None:
     found = False
     for entry in dut.eds.entries.values():
-        # Other rules apply to mapping counts (PDO-25), the error field (accepts only 0) and signatures.
+        # Different rules apply to mapping counts (see PDO-25), signatures, and the error field.
         if (entry.index in _PDOS and entry.subindex == 0) or entry.index in (*_COMMANDS, _ERROR_FIELD):
             continue
         for limit, beyond, codes in ((entry.high, 1, TOO_HIGH), (entry.low, -1, TOO_LOW)):

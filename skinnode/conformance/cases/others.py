@@ -26,7 +26,7 @@ RESTRICTED = (
 
 
 def _change(dut: Dut) -> tuple[dict[int, bytes], dict[int, bytes]]:
-    """Write non-default values to harmless objects; return their old and new values."""
+    """Write non-default values to 0x1015 and 0x1017; return the old and new values."""
     before, after = {}, {}
     for index, value in ((_EMCY_INHIBIT, 1000), (HEARTBEAT, 20_000)):
         entry = dut.eds.find(index)
@@ -93,7 +93,7 @@ def store_all_wrong(dut: Dut) -> None:
 
 @case(
     "OTHER-02",
-    "0x1010:01 stores parameters if the signature is 'save': values survive a node reset",
+    "0x1010:01 stores parameters if the signature is 'save', and the values survive a node reset",
     "7.5.2.13",
 )
 def store_all(dut: Dut) -> None:
@@ -107,35 +107,35 @@ def restore_all_wrong(dut: Dut) -> None:
 
 @case(
     "OTHER-04",
-    "0x1011:01 restores defaults if the signature is 'load': they apply after a node reset",
+    "0x1011:01 restores defaults at the next node reset if the signature is 'load'",
     "7.5.2.14",
 )
 def restore_all(dut: Dut) -> None:
     _restore(dut, 1)
 
 
-@case("OTHER-05", "0x1010:02 (communication) stores nothing if the signature is wrong", "7.5.2.13")
+@case("OTHER-05", "0x1010:02 stores no communication parameters if the signature is wrong", "7.5.2.13")
 def store_communication_wrong(dut: Dut) -> None:
     _wrong_signature(dut, STORE, 2)
 
 
 @case(
     "OTHER-06",
-    "0x1010:02 (communication) stores parameters if the signature is 'save': values survive a node reset",
+    "0x1010:02 stores communication parameters if the signature is 'save'; they survive a node reset",
     "7.5.2.13",
 )
 def store_communication(dut: Dut) -> None:
     _store(dut, 2)
 
 
-@case("OTHER-07", "0x1011:02 (communication) restores nothing if the signature is wrong", "7.5.2.14")
+@case("OTHER-07", "0x1011:02 restores no communication parameters if the signature is wrong", "7.5.2.14")
 def restore_communication_wrong(dut: Dut) -> None:
     _wrong_signature(dut, RESTORE, 2)
 
 
 @case(
     "OTHER-08",
-    "0x1011:02 (communication) restores defaults if the signature is 'load': they apply after a node reset",
+    "0x1011:02 restores communication defaults at the next node reset if the signature is 'load'",
     "7.5.2.14",
 )
 def restore_communication(dut: Dut) -> None:

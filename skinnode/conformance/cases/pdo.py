@@ -32,7 +32,7 @@ _EVENT_MS = 50
 _FIRST_S = 0.4
 """Maximum time (s) to wait after a SYNC for the first TPDO of a cycle.
 
-If the TPDO does not arrive, a later SYNC of the cycle may trigger it.
+If the TPDO does not arrive within this time, one of the next SYNCs may trigger it.
 """
 _SYNC_COUNTER = 0x1019
 _RESERVED_KINDS = range(241, 252)
@@ -136,7 +136,7 @@ def event_driven(dut: Dut) -> None:
         dut.operational()
         frames = [expect_pdo(dut, can_id, length, f"{pdo} when its event timer elapses") for _ in range(8)]
         gaps = gaps_ms(frames)
-        # A delayed frame shortens the next interval, so the mean interval hardly changes.
+        # A delayed frame shortens the next interval, so the mean is the better estimate of the inhibit time.
         if statistics.mean(gaps) < 40 * 0.95 or min(gaps) < 20:
             shown = ", ".join(f"{gap:.1f}" for gap in gaps)
             raise Failed(f"{pdo} at intervals of at least its inhibit time of 40 ms", f"gaps of {shown} ms")
@@ -254,13 +254,13 @@ def _for_start(dut: Dut, pdo: Pdo) -> int:
     return set_up(dut, pdo, PdoSetup(2, start=3))
 
 
-# --- STOPPED, and PRE-OPERATIONAL entered from OPERATIONAL: no trigger may cause a TPDO
+# --- no PDO is sent in STOPPED, or in PRE-OPERATIONAL after OPERATIONAL
 
 
 def _silent(command: int, kind: int, state: str, *, event_ms: int = 0, start: bool = False) -> Trial:
-    """Return a trial of a PDO that must not be sent in ``state``.
+    """Return a test which checks that no PDO is sent in ``state``.
 
-    The device enters ``state`` from OPERATIONAL, and the trial then triggers the PDO.
+    The test moves the device from OPERATIONAL to ``state``, and then triggers the PDO.
     """
 
     def trial(dut: Dut, pdo: Pdo) -> None:

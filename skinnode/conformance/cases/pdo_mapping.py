@@ -78,7 +78,7 @@ def _slots(dut: Dut, pdo: Pdo) -> int:
     return max(entry.subindex for entry in dut.eds.between(pdo.mapping, pdo.mapping))
 
 
-@case("PDO-21", "Default mappings contain mappable objects with their EDS lengths, and fit into a frame",
+@case("PDO-21", "Default mappings contain mappable objects with the lengths in the EDS, and fit into a frame",
       "7.5.2.36, 7.5.2.38")  # fmt: skip
 def default_mapping(dut: Dut) -> None:
     pdos = [*rpdos(dut), *tpdos(dut)]
@@ -99,14 +99,14 @@ def _check_mapped(dut: Dut, pdo: Pdo, subindex: int, word: int) -> None:
     where = f"0x{pdo.mapping:04X}:{subindex:02X}"
     if word < 0x0020_0000:  # a dummy entry names a data type instead of an object
         if pdo.transmits or word >> 16 not in dut.eds.dummies:
-            raise Failed(f"{where} to name an object or an allowed dummy", f"0x{word:08X}")
+            raise Failed(f"{where} to contain an object or an allowed dummy", f"0x{word:08X}")
         return
     entry = dut.eds.find(word >> 16, word >> 8 & 0xFF)
     # A mapped string may have any length.
     if entry is None or (entry.size and word & 0xFF != 8 * entry.size):
-        raise Failed(f"{where} to name an object in the EDS and its length", f"0x{word:08X}")
+        raise Failed(f"{where} to contain an object of the EDS with its length", f"0x{word:08X}")
     if not (entry.into_tpdo if pdo.transmits else entry.into_rpdo):
-        raise Failed(f"{where} to name an object that may be mapped into {pdo}", str(entry))
+        raise Failed(f"{where} to contain an object that may be mapped into {pdo}", str(entry))
 
 
 @case("PDO-22", "After remapping by the standard procedure, a PDO has the new mapping and the new length",

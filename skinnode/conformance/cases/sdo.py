@@ -168,7 +168,7 @@ def _unchanged(dut: Dut, entry: EdsEntry, before: bytes) -> None:
 
 
 def limited(entry: EdsEntry, limit: int | None, beyond: int) -> bytes | None:
-    """Return the value just beyond a limit; None without a limit or if the type cannot hold the value."""
+    """Return the value just beyond a limit; None if there is no limit or the type cannot hold the value."""
     if limit is None or not entry.writable or entry.data_type not in (*SIGNED, *UNSIGNED):
         return None
     try:
@@ -220,7 +220,7 @@ def default_sdo(dut: Dut) -> None:
 
 @case(
     "SDO-13",
-    "0x1000 can be read with the transfer type that the server selects; its length is as announced",
+    "0x1000 can be read with the transfer type that the server selects, and has the announced length",
     "7.2.4.3.5",
 )
 def read_short(dut: Dut) -> None:

@@ -170,4 +170,8 @@ def node_among(node: str, places: list[Place], key: str) -> tuple[Place, int]:
     if not found:
         raise ConfigError(key, node_id, f"a node-ID in the hand, or any node-ID with {buses}")
     which = " and ".join(f"{patch.name} on {place.bus.name}" for place, patch in found)
-    raise ConfigError(key, node_id, f"a patch name, or a node-ID with {buses}; node-ID {node_id} is {which}")
+    raise ConfigError(
+        key,
+        node_id,
+        f"a node-ID that is on one bus only; this node-ID is {which}; name the patch, or add {buses}",
+    )

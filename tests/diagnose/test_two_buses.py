@@ -53,8 +53,8 @@ def test_a_node_id_of_both_buses_is_asked_about(two_buses: Path, command: list[s
     done = run([*command, "--hand", two_buses])
     assert done.status == 2
     assert done.stderr == (
-        "error: NODE: got 5, allowed: a patch name, or a node-ID with --bus left or --bus right; "
-        "node-ID 5 is palm on left and thumb on right"
+        "error: NODE: got 5, allowed: a node-ID that is on one bus only; this node-ID is palm on left "
+        "and thumb on right; name the patch, or add --bus left or --bus right"
     )
 
 

@@ -1,7 +1,7 @@
-"""Faults of a CAN bus, and a rogue device that causes some of these faults by sending frames.
+"""Faults of a CAN bus, and a rogue device that sends frames to cause some of these faults.
 
-The rogue device has its own endpoint on the bus. Its frames take part in arbitration and are received by all
-nodes and hosts.
+The rogue device has its own endpoint on the bus. The rogue frames take part in arbitration and are received
+by all nodes and hosts.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from vcan_sim.timed_bus import CanFrame
 from vcan_sim.timed_bus.wire_frame import wire_frame
 
 FLOOD_COB_ID: Final = 0x001
-"""COB-ID of the frames that starve the bus. Only NMT commands have a higher priority."""
+"""COB-ID of the frames that starve the bus. Only NMT commands, with COB-ID 0x000, have a higher priority."""
 FLOOD_DATA: Final = bytes([0x55] * 8)
 _INTERMISSION_BITS: Final = 3
 _TICK_NS: Final = 1_000_000
@@ -41,7 +41,7 @@ _COUNTERS: Final = 240
 
 @dataclass(frozen=True, slots=True)
 class BusFaults:
-    """Faults of one bus. The default values mean no faults.
+    """Faults of one bus. By default, there are no faults.
 
     Raises:
         ConfigError: If a fraction is not between 0 and 1, or a rate is negative.
@@ -52,8 +52,8 @@ class BusFaults:
     bus_off: bool = False
     """Whether the nodes' CAN controller is bus-off, so that the nodes neither send nor receive frames."""
     starved: float = 0.0
-    """Bus load caused by a rogue device, as a fraction. Its frames have COB-ID 0x001, the highest priority
-    after NMT."""
+    """Bus load caused by a rogue device, as a fraction. The rogue device sends frames with COB-ID 0x001, the
+    highest priority after NMT."""
     rogue_nmt_per_s: float = 0.0
     """Rate of random NMT commands from a second master to one or all nodes, 1/s."""
     rogue_sync_per_s: float = 0.0
@@ -111,7 +111,7 @@ def check_bus(faults: BusFaults, bus: BusConfig) -> None:
 
 
 class BusAttacker:
-    """Rogue device on a bus. Its thread starts with the first fault that requires the device.
+    """Rogue device on a bus, with a thread that starts when a fault first requires this device.
 
     Args:
         bus: Configuration of the bus.
@@ -130,7 +130,7 @@ class BusAttacker:
         self._syncs = 0
 
     def set(self, faults: BusFaults) -> None:
-        """Replace the faults, and start the thread if it is needed for the first time."""
+        """Replace the faults, and start the thread with the first fault that requires the rogue device."""
         self._faults = faults
         self._changed.set()
         if faults.needs_attacker and self._thread.ident is None:

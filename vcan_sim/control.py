@@ -35,7 +35,7 @@ KEY: Final = "inject"
 
 
 class ControlError(SkinError):
-    """A simulator cannot be controlled, for example because it is not running."""
+    """A simulator cannot be controlled, for example because the simulator is not running."""
 
 
 class Controlled(Protocol):
@@ -73,7 +73,7 @@ def _listed(counts: dict[str, int]) -> str:
 
 
 def control_folder() -> Path:
-    """Return the folder for control sockets, and create it if necessary. Only this user can access it.
+    """Return the folder for control sockets, created if necessary; only this user can access it.
 
     Raises:
         ControlError: If the folder cannot be created, or other users can access it.

@@ -17,8 +17,8 @@ Ts = TypeVarTuple("Ts")
 def run(main: Coroutine[Any, Any, T]) -> T:
     """Run a coroutine like :func:`asyncio.run`, with the thread's clock: the system clock or a virtual clock.
 
-    In virtual time, the event loop waits only for timers and for callbacks from other threads. It polls
-    sockets and pipes in each iteration, but does not wait for them.
+    In virtual time, the event loop waits only for timers and for callbacks from other threads. Sockets and
+    pipes are polled in each iteration, but the event loop does not wait for them.
 
     Args:
         main: Coroutine to run.

@@ -42,7 +42,7 @@ class FaultSchedule:
         """Return the faults that are active at a scene time, in the order of the scene file.
 
         Args:
-            t_s: Scene time, s. No faults are active before time 0.
+            t_s: Scene time, s. No faults are active at negative scene times.
         """
         if t_s < -CLOSE_S:
             return ()
@@ -50,7 +50,7 @@ class FaultSchedule:
         return tuple(each for each in self.faults if each.from_s - CLOSE_S <= at_s < each.to_s - CLOSE_S)
 
     def next_change_s(self, t_s: float) -> float | None:
-        """Return the next scene time (s) at which any fault starts or ends; None if there is none.
+        """Return the next scene time (s) at which any fault starts or ends; None if there is no such time.
 
         Args:
             t_s: Current scene time, s.
@@ -63,7 +63,7 @@ class FaultSchedule:
         return (t_s - at_s) + min(later) if later else None
 
     def _within(self, t_s: float) -> float:
-        """Return the corresponding time in the first period of the scene, s."""
+        """Return the time (s) in the first period of the scene that corresponds to ``t_s``."""
         if self.repeat_s is None:
             return t_s
         at_s = math.fmod(max(t_s, 0.0), self.repeat_s)

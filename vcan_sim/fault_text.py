@@ -5,8 +5,8 @@
     text     [PLACE:]FAULT[,FAULT...]    PLACE is a patch or a bus; default: all patches or all buses
     FAULT    NAME | NAME=VALUE | none    none ends all faults of the patch or bus
 
-This form is used by the option ``--fault``, by the command ``vcan-sim inject``, and in ``[[faults]]`` tables
-of scene files.
+Faults have the same text form in the option ``--fault``, in the command ``vcan-sim inject`` and in the
+``[[faults]]`` tables of scene files.
 """
 
 from __future__ import annotations
@@ -21,7 +21,8 @@ from vcan_sim.bus_attacker import NO_BUS_FAULTS, BusFaults
 from vcan_sim.faults import NO_FAULTS, Faults
 
 NONE: Final = "none"
-"""Keyword that ends all faults of a patch or bus. As the value of a wire fault, it ends only this fault."""
+"""Keyword that ends all faults of a patch or bus. As the value of a wire fault, the keyword ends only this
+fault."""
 
 Value = int | float | bool | None
 AnyFaults = TypeVar("AnyFaults", Faults, BusFaults)

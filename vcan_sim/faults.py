@@ -1,6 +1,7 @@
 """Faults that can be injected into a simulated node, and counts of the injected faults.
 
-A chunk has at most one fault, so that these counts can be compared with a receiver's error counters.
+A chunk has at most one fault, so that the counts of injected faults can be compared with a receiver's
+counters.
 """
 
 from __future__ import annotations
@@ -60,7 +61,7 @@ _MOST: Final = {"drift_per_s": 1.0, "warmer_k": 100.0}
 
 @dataclass(frozen=True, slots=True)
 class Faults:
-    """Faults of one simulated node. The default values mean no faults.
+    """Faults of one simulated node. By default, there are no faults.
 
     Raises:
         ConfigError: If a value is out of range, or if the fractions of chunks or of scans add up to more than
@@ -87,13 +88,13 @@ class Faults:
     miscounted_by: int | None = None
     """Value added to the scan counter of a ``miscounted`` chunk, modulo 256; None for a random value."""
     corrupted: float = 0.0
-    """Fraction of the chunks in which one code is falsified. The length and the counters of these chunks are
-    correct."""
+    """Fraction of the chunks in which one code is falsified. The length and the counters of the falsified
+    chunks are correct."""
 
     # --- fractions of the scans
     torn: float = 0.0
-    """Fraction of the scans whose second half and summary are not sent. The next scan has the same scan
-    counter."""
+    """Fraction of the scans whose second half and summary are not sent. The scan after a torn scan has the
+    same scan counter."""
     summary_lost: float = 0.0
     reset: float = 0.0
     """Fraction of the scans during which the node is reset, as if by a watchdog, after half of the chunks."""
@@ -101,9 +102,9 @@ class Faults:
     """Fraction of the scans in which a chunk has the scan counter of the next scan. In the next scan, the
     chunk with the same index is lost."""
     understated: float = 0.0
-    """Fraction of the scans in which a chunk is lost and the summary conceals this loss. The falsified
-    summary has a valid check, a chunk count reduced by one, and the flag for scans with only the changed
-    chunks. If the node itself sends only changed chunks, the summary is not falsified."""
+    """Fraction of the scans in which a chunk is lost and the summary conceals this loss. In the falsified
+    summary, the number of chunks is reduced by one, the flag for changed chunks only is set, and the check,
+    if any, is valid. If the node itself sends only changed chunks, the summary is not falsified."""
     unchecked: float = 0.0
     """Fraction of the scans whose summary contains no check, as in protocol revision 1.0."""
     struck: int | None = None
@@ -143,7 +144,7 @@ class Faults:
     """Whether the converter is frozen: it repeats its last values and does not count conversions."""
     uncounted: bool = False
     """Whether the converter provides no count of its conversions. A host can then detect a stopped converter
-    only by its constant codes."""
+    only by constant codes."""
     unplugged: bool = False
     """Whether the node is disconnected from the bus and from its power supply. The node boots when the fault
     ends."""
@@ -161,16 +162,16 @@ class Faults:
     shorted_lower: int | None = None
     """Number of a lower wire that is shorted to all upper wires."""
     noisy_upper: int | None = None
-    """Number of an upper wire with a bad contact. Its resistances have additional noise of 0.3 %."""
+    """Number of an upper wire with a bad contact, so that its resistances have additional noise of 0.3 %."""
     noisy_lower: int | None = None
-    """Number of a lower wire with a bad contact. Its resistances have additional noise of 0.3 %."""
+    """Number of a lower wire with a bad contact, so that its resistances have additional noise of 0.3 %."""
     frozen_upper: int | None = None
     """Number of an upper wire whose resistances remain constant from the start of the fault."""
     frozen_lower: int | None = None
     """Number of a lower wire whose resistances remain constant from the start of the fault."""
     stuck_upper: int | None = None
     """Number of the upper wire at a stuck crossing, whose resistance remains constant from the start of the
-    fault. The lower wire is ``stuck_lower``."""
+    fault. The lower wire at the crossing is ``stuck_lower``."""
     stuck_lower: int | None = None
     """Number of the lower wire at the stuck crossing; see ``stuck_upper``."""
     crossed_upper: int | None = None
@@ -178,8 +179,8 @@ class Faults:
     crossed_lower: int | None = None
     """Number of a lower wire whose connection is exchanged with that of the next lower wire."""
     flipped: float = 0.0
-    """Fraction of the readings in which one bit of one code is flipped. The check of the scan covers the
-    wrong code."""
+    """Fraction of the readings in which one bit of one code is flipped. The check of the scan is computed
+    after the bit is flipped."""
     drift_per_s: float = 0.0
     """Relative drift of all resistances per second, from -1 to 1. The drift accumulates up to a factor of 10
     or 0.1, and is reset to zero when the fault ends."""
@@ -187,15 +188,16 @@ class Faults:
     """Sudden temperature change of the patch, K, from -100 to 100. All resistances change according to the
     temperature coefficient ``Imperfections.temperature_per_k`` of the patch."""
     error_passive: bool = False
-    """Whether the node's CAN controller is error-passive. The node reports this state as emergency 0x8120."""
+    """Whether the node's CAN controller is error-passive. The node reports the error-passive state as
+    emergency 0x8120."""
     duplicate_node_id: bool = False
     """Whether there is a second node with the same node-ID on the bus. The second node boots, responds to all
-    commands, and reports a skin at rest. It disappears when the fault ends."""
+    commands, and reports a skin at rest. The second node disappears when the fault ends."""
     restart_every_s: float = 0.0
     """Time between spontaneous resets of the node, s; 0 for no resets."""
     emcy_per_s: float = 0.0
-    """Rate of additional emergency messages, 1/s. When the fault ends, the node sends an *error reset*
-    message."""
+    """Rate of additional emergency messages, 1/s. When the emergency messages end, the node sends an *error
+    reset* message."""
     babble_per_s: float = 0.0
     """Rate of additional frames with the unused COB-ID 0x3F0, 1/s."""
 
@@ -312,6 +314,6 @@ def check_wires(faults: Faults, patch: str, shape: tuple[int, int]) -> None:
         ConfigError: If a wire number is too large for the patch.
     """
     for number, name in enumerate(OF_WIRES):
-        wires = shape[number % 2] - name.startswith("crossed")  # the last wire has no successor
+        wires = shape[number % 2] - name.startswith("crossed")  # the last wire has no next wire
         if (wire := getattr(faults, name)) is not None and wire >= wires:
             raise ConfigError(f"{patch}: {name}", wire, f"an integer from 0 to {wires - 1}")

@@ -1,8 +1,8 @@
 """Node with injected faults. Every frame between the node and its bus passes through this module.
 
 Faults of readings are implemented in :mod:`vcan_sim.faulty_converter`, and faults of scans in
-:mod:`vcan_sim.faulty_scans`. All faults except periodic events depend only on a seed and on the sequence of
-frames.
+:mod:`vcan_sim.faulty_scans`. Except for periodic events, the faults depend only on a seed and on the sequence
+of frames.
 """
 
 from __future__ import annotations
@@ -35,8 +35,8 @@ SIMULATED: Final = Pacing(slack_ns=THRIFTY.slack_ns, catch_up_ns=40_000_000)
 in one burst, so that it need not skip the next scan."""
 
 _STORM: Final = bytes.fromhex("0fff810000000000")
-"""Emergency message with error code 0xFF0F. In its error register, the generic bit and the
-manufacturer-specific bit are set."""
+"""Emergency message with error code 0xFF0F. The generic bit and the manufacturer-specific bit of the error
+register are set."""
 _MOST_AT_ONCE: Final = 32
 """Maximum number of overdue periodic events of one kind that are executed at once. Further overdue events are
 dropped."""
@@ -79,7 +79,7 @@ class FaultyNode(PatchNode):
         on_sent: Function called with the COB-ID of each frame after the frame has been sent or lost.
         serial: Serial number.
         profile: Protocol profile of the node.
-        faults: Initial faults. Their seed remains in use if the faults are replaced.
+        faults: Initial faults. The initial seed remains in use if the faults are replaced.
         temperature_per_k: Temperature coefficient of all resistances, 1/K.
     """
 
@@ -140,12 +140,12 @@ class FaultyNode(PatchNode):
 
     @property
     def injected(self) -> Injected:
-        """Counts of the injected faults, which continue to change."""
+        """Counts of the injected faults, updated while the node is running."""
         return self._injector.injected
 
     @property
     def tally(self) -> Tally:
-        """Counts of the node's frames by kind, which continue to change."""
+        """Counts of the node's frames by kind, updated while the node is running."""
         return self._injector.tally
 
     # --- input to the node: frames and time
@@ -352,7 +352,7 @@ class FaultyNode(PatchNode):
         return True
 
     def _from_twin(self, can_id: int, data: bytes) -> None:
-        """Put a frame from the second node on the bus, and pass its heartbeats to this node."""
+        """Put a frame from the second node on the bus; pass a heartbeat from the second node to this node."""
         kind = kind_of(can_id, data)
         self.tally.handed[kind] += 1
         try:

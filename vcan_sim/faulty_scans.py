@@ -1,4 +1,4 @@
-"""Faults of scans: applied to the chunks and summaries that a node sends."""
+"""Faults of the chunks and summaries that a node sends."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class FaultyScans:
         counter_overflow: Callable[[], int],
     ) -> None:
         self.reset_due = False
-        """Whether the node must be reset. Until the reset, its frames are not sent."""
+        """Whether the node must be reset. Until the reset, the frames of the node are not sent."""
         self._injector, self._profile = injector, profile
         self._put, self._counter_overflow = put, counter_overflow
         self._chunk_id, self._summary_id = od.chunk_cob_id(node_id), od.summary_cob_id(node_id)
@@ -57,7 +57,7 @@ class FaultyScans:
         self._half = max(1, profile.n_chunks // 2)
         self._fate = ""  # fault of the current scan, from OF_SCANS
         self._spoilt = False
-        self._counter_instead: int | None = None  # counter to send instead, after a torn scan
+        self._counter_instead: int | None = None  # counter to send after a torn scan, instead of ``_counter``
         self._index_of = chunk_indexer(profile)
         self._packed: list[bytes] = []  # chunks of the current scan, as packed by the node
         self._struck = -1  # index of the chunk to which the scan's fault applies
@@ -93,7 +93,7 @@ class FaultyScans:
         swapped, self._swapped = self._swapped, None
         try:
             self._suffer_chunk(fault, changed)
-        finally:  # send it even if the bus rejected the other frame
+        finally:  # send the swapped chunk even if the bus rejects this one
             self._release([] if swapped is None else [swapped])
 
     def send_summary(self, data: bytes) -> None:
@@ -249,7 +249,7 @@ class FaultyScans:
         return True
 
     def _release(self, chunks: Sequence[bytes]) -> None:
-        """Send all given chunks. Raises BusError at the end if the bus rejected any of these chunks."""
+        """Send all given chunks. Raises BusError after the last chunk if the bus has rejected any chunk."""
         failure: BusError | None = None
         for data in chunks:
             self._injector.tally.waiting[Kind.CHUNK] -= 1

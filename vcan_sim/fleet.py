@@ -30,12 +30,12 @@ from vcan_sim.tally import Tally
 
 PREPARED_S: Final = 120.0
 """Duration of the scene for which the contact mechanics are computed before the nodes start, s. The rest of
-the scene is computed when it is needed."""
+the scene is computed on first use."""
 
 
 @dataclass(frozen=True, slots=True)
 class NodeReport:
-    """State of one simulated node, and its counters since its start."""
+    """State of one simulated node, with counters since the start of the node."""
 
     patch: str
     node_id: int
@@ -68,8 +68,8 @@ class Fleet:
         unchecked: Names of patches with protocol revision 1.0, whose summaries contain no check.
         imperfections: Manufacturing errors, common to all patches or by patch name; default: the
             imperfections of the scene. The random errors differ from patch to patch.
-        scene: Scene that replaces the random strokes of ``[simulation]``. It starts on all patches at the
-            same time, when the first node has sent its first scan.
+        scene: Scene that replaces the random strokes of ``[simulation]``. The scene starts on all patches at
+            the same time, when the first node has sent its first scan.
 
     Raises:
         ConfigError: If a channel is given for a hand with several buses; if ``imperfections`` name an unknown
@@ -152,7 +152,7 @@ class Fleet:
         """Compute the beginning of the scene, open the buses and power the nodes on.
 
         Raises:
-            BusError: If any bus cannot be opened. The other buses are then closed.
+            BusError: If any bus cannot be opened. In this case, the other buses are closed again.
         """
         for scene in self._scenes.values():
             scene.prepare(PREPARED_S)
@@ -239,7 +239,7 @@ class Fleet:
         }
 
     def tally(self, patch: str) -> Tally:
-        """Return the counts of the frames of a patch's node by kind, which continue to change."""
+        """Return the frame counts of a patch's node by kind, updated while the node is running."""
         return self._stations[patch].tally()
 
     def passed(self, bus: str) -> Passed:

@@ -4,8 +4,8 @@ The solution of a wire is doubtful if the solver found no root, if an electrode 
 frames, or if the displacement is too rough to be caused by a press. On some layouts, a press can move a wire
 past a fold, where two roots of F = b merge. On such a layout, all solutions are doubtful, because the exact
 inverse cannot tell which of two nearby roots is right. The posterior estimates the positions from all wires
-of the patch. It confirms each doubtful root, replaces the root, or rejects the root. The thresholds are
-defined in :mod:`skinnode.solve.roots`.
+of the patch. Each doubtful root is then confirmed, replaced or rejected. The thresholds are defined in
+:mod:`skinnode.solve.roots`.
 """
 
 from __future__ import annotations
@@ -31,13 +31,14 @@ from skinnode.solve.wires.root_check import SOME_ROUGH, SOME_SUSPECT, RootCheck,
 PAUSE: Final = 16
 """Number of frames without a posterior solve after a posterior solve has missed its deadline.
 
-Without this pause, late solves would delay other patches on the same thread by 2 ms per frame.
+If the posterior missed its deadline in every frame, other patches on the same thread would be delayed by 2 ms
+per frame.
 """
 APART: Final = 3.0
-"""Weight of the distance between a root near a fold and the posterior estimate.
+"""Weight of the distance between a confirmed root near a fold and the posterior estimate.
 
-If the posterior confirms the root, the weighted distance is added in quadrature to the root's standard
-deviation, because the posterior cannot distinguish two very close roots.
+The weighted distance is added in quadrature to the standard deviation of the root, because the posterior
+cannot distinguish two very close roots.
 """
 NEAR_FOLD: Final = 2.0
 """Factor by which the standard deviation is enlarged if a posterior estimate replaces a root near a fold."""
@@ -67,7 +68,7 @@ class RootGate:
         self._pause = 0  # number of frames until the next posterior solve
         self.hurried = False
         """Whether there was too little time to check all doubtful roots in the last field."""
-        self._confirmed: Float | None = None  # last displacements confirmed despite their roughness
+        self._confirmed: Float | None = None  # displacements that the posterior last confirmed, m
         self._apart = np.zeros((len(problem.rest), 1, 1))  # additional standard deviation, m; see APART
         self._any_apart = False
         self._blind = roots.blind_wires(layout, options.normal_only)
@@ -131,7 +132,7 @@ class RootGate:
                 field, self.hurried = self._give_up(field, doubtful), True
             else:
                 if anew:
-                    self._posterior.reset()  # start at rest: if started at a wrong root, it would confirm it
+                    self._posterior.reset()  # start from the rest position, not from a possibly wrong root
                 its = self._exact.arrays
                 self._posterior.stop_at(until)
                 # Non-positive noise marks unusable resistances, so it is passed on unchanged.
@@ -149,7 +150,7 @@ class RootGate:
         return field
 
     def _doubtful(self) -> bool:
-        """Update ``_lost``, ``_unsure`` and ``_rough``; return whether any root is missing or doubtful."""
+        """Find doubtful roots; return whether any root is missing or doubtful."""
         found = check_roots(self._root_check.table)
         if found & SOME_ROUGH:
             if self._confirmed is not None:
@@ -158,7 +159,7 @@ class RootGate:
         return found & SOME_SUSPECT != 0 or bool(found & SOME_ROUGH and self._rough.any())
 
     def _keep_apart(self, field: FieldFrame, unasked: Mask) -> FieldFrame:
-        """Enlarge the standard deviations of held wires as when the posterior confirmed their roots."""
+        """Enlarge the standard deviations of held wires whose roots near folds were confirmed earlier."""
         if field.held is None:
             return field
         self._apart[unasked & ~field.held] = 0.0
@@ -247,14 +248,14 @@ class RootGate:
 
 
 def _mixed_share(estimate: FieldFrame, replaced: Mask) -> Float | None:
-    """Return the data share of each coordinate: the posterior's for ``replaced`` wires (U,), otherwise 1."""
+    """Return the data share: from the posterior ``estimate`` for ``replaced`` wires (U,), otherwise 1."""
     if estimate.data_share is None or not replaced.any():
         return None
     return np.where(replaced[:, None, None], estimate.data_share, 1.0)
 
 
 def _selected(status: tuple[Status, ...], changed: Mask, replaced: Mask) -> tuple[Status, ...]:
-    """Return ``status`` with ``replaced`` wires CONVERGED and no other ``changed`` wire CONVERGED."""
+    """Return ``status`` after replacing or rejecting the roots of the ``changed`` wires."""
     found = list(status)
     for u in np.flatnonzero(changed).tolist():
         if replaced[u]:

@@ -4,9 +4,9 @@ A zero residual does not identify the true position, because F = b has several r
 fold, where det J = 0. The roots on either side of a fold are called twins. A root is judged by the sign of
 det J, its distance from the rest position, its roughness, its likelihood relative to other roots of the same
 wire, and the posterior estimate of the whole patch. The roughness of a displacement u is √(uᵀ C⁻¹ u), with C
-from :mod:`skinnode.solve.smoothness`. The conditioning of a wire is the RMS of ∂x/∂(ln R) at rest. Several
-constants are in clearances; the clearance is the smallest distance at rest between an upper and a lower
-electrode. The energy of a displacement is −2 times the logarithm of its probability density.
+from :mod:`skinnode.solve.smoothness`. The conditioning of a wire is the RMS of ∂x/∂(ln R) at rest. The
+clearance between the layers is the smallest distance at rest between an upper and a lower electrode. The
+energy of a displacement is −2 log p, where p is the probability density of the displacement.
 
 =================  =====  ================================================  ================================
 constant           value  meaning                                           measured on
@@ -57,52 +57,53 @@ Mask = NDArray[np.bool_]
 # -- the layout ---------------------------------------------------------------------------------------------
 
 FOLDED: Final = 250.0
-"""RMS of ∂x/∂(ln R) at rest, in clearances, above which a press can move a wire past a fold. The RMS is 70 on
-the staggered layout with h = 0.5, where no folds were found. It is at least 1200 on staggered layouts with h
-of 1 or more and on all aligned and symmetric layouts, where the solver found the wrong root for one wire in
-30."""
+"""RMS of ∂x/∂(ln R) at rest, relative to the clearance between the layers, above which a press can move a
+wire past a fold. The RMS is 70 on the staggered layout with h = 0.5, where no folds were found. The RMS is at
+least 1200 on staggered layouts with h of 1 or more and on all aligned and symmetric layouts. On these
+layouts, the solver found a wrong root for one wire in 30."""
 BLIND: Final = 1e7
-"""RMS of ∂x/∂(ln R) at rest, in clearances, above which the resistances do not determine the positions. Only
-wires on a symmetry line of the layout and wires at least 1.5 pitches above aligned lower wires exceed this
-limit."""
+"""RMS of ∂x/∂(ln R) at rest, relative to the clearance between the layers, above which the resistances do not
+determine the electrode positions. The only such wires are wires on a symmetry line of the layout and wires at
+least 1.5 pitches above aligned lower wires."""
 NEARLY_BLIND: Final = 1e5
-"""RMS of ∂x/∂(ln R) at rest, in clearances, above which :data:`UNLIKELY_BLIND` replaces :data:`UNLIKELY`.
+"""RMS of ∂x/∂(ln R) at rest, relative to the clearance between the layers, above which the margin
+:data:`UNLIKELY_BLIND` replaces :data:`UNLIKELY`.
 
-Wires of aligned layouts with h ≥ 1 exceed this limit.
+The RMS is above this limit on aligned layouts with h ≥ 1.
 """
 NONLINEAR: Final = 0.003
-"""Standard deviation of the exact inverse, in clearances, above which every root must be checked like a root
-near a fold. With so much noise, a linear error estimate is not valid."""
+"""Standard deviation of the exact inverse, relative to the clearance between the layers, above which every
+root is checked. F is nonlinear on the scale of such errors, so a linear error estimate is not valid."""
 
 # -- one root -----------------------------------------------------------------------------------------------
 
 JUMP: Final = 0.2
-"""Movement of an electrode between two frames, in clearances, above which the new root must be checked.
+"""Movement of an electrode between two frames, relative to the clearance between the layers, above which the
+new root is checked.
 
-The smallest observed movement across a fold was 0.24.
+The smallest movement across a fold that has been observed was 0.24.
 """
 LARGE: Final = 0.03
-"""Displacement, in clearances, above which the roughness of a root is checked. The distance from the rest
-position to the nearest fold is larger."""
+"""Displacement, relative to the clearance between the layers, above which the roughness of a root is checked.
+All folds are farther than this from the rest position."""
 ROUGH_IN_STREAM: Final = 1.2
-"""Ratio of roughness to size above which a displacement in a live stream is checked with the posterior. The
-ratio was 0.5 to 1 for most presses, up to 1.7 for presses that moved a single electrode, and 1 to 2 for wrong
-roots."""
+"""Ratio of the roughness of a displacement to its size, above which a live stream checks the displacement
+with the posterior. The ratio was 0.5 to 1 for most presses, up to 1.7 for presses that moved a single
+electrode, and 1 to 2 for wrong roots."""
 ROUGH_AT_PATH_END: Final = 0.8
-"""Ratio of roughness to size above which the displacement at the end of a path is solved again from the
-guided start. The mean ratio was 0.67 for presses, and the ratio was 0.7 to 2 for wrong roots."""
+"""Ratio of the roughness of a displacement to its size, above which the end of a path is solved again from
+the guided start. The ratio was 0.67 on average for presses, and 0.7 to 2 for wrong roots."""
 SMOOTH_PATH: Final = 0.2
-"""Maximum error of a secant prediction on a smooth path, relative to the final displacement. The secant
-passes through the solutions of the previous two samples; for the first sample, the prediction is the rest
-position. Of 59 simulated paths that ended at a root other than the accepted root, 35 of the 37 correct paths
-stayed within 0.2, and the 22 wrong paths reached at least 0.24."""
+"""Maximum error of the positions predicted along a smooth path, relative to the final displacement. A
+position is predicted by extrapolation from the previous two samples. In simulations, the error was at most
+0.2 on all but two of 37 correct paths, and at least 0.24 on 22 wrong paths."""
 LONG_PATH: Final = 20
 """Minimum number of samples in a long path. Only the second half of a long path must be smooth, because a
 path that jumps to a wrong root early on may return to the correct root."""
 ROOT_RESIDUAL: Final = 1e-9
 """Maximum RMS of F/b − 1 at the end of a path that has reached a root.
 
-The solver's status may be other than CONVERGED there, because J can be nearly singular at a root.
+At such a root, J may be nearly singular, so that the solver does not report CONVERGED.
 """
 STILL_CONFIRMED: Final = 0.2
 """Maximum change of a confirmed displacement, relative to its size, for which the confirmation remains
@@ -111,14 +112,15 @@ valid."""
 # -- two roots of one wire ----------------------------------------------------------------------------------
 
 SAME_ROOT: Final = 1e-3
-"""Maximum distance between two solutions that count as the same root, relative to the displacement."""
+"""Maximum distance between two solutions that are considered to be the same root, relative to the
+displacement."""
 TWIN_REACH: Final = 2.0
 """Maximum distance between a root and its twin across a fold, relative to the wire's largest displacement.
-More distant twins need not be considered, because they are at least 1.3 times as rough as the root."""
+More distant twins are at least 1.3 times as rough as the root, so they are ignored."""
 TWIN_ROUGHNESS: Final = 1.05
 """Ratio of a twin's roughness to a root's roughness, below which the root is rejected as ambiguous. In 82
-simulated presses, the ratio was at most 1.044 for wrong roots. The limit also rejects 4 % of the correct
-roots."""
+simulated presses, the ratio was at most 1.044 for wrong roots. A ratio of 1.05 also rejects 4 % of the
+correct roots."""
 UNLIKELY: Final = 4.0
 """Minimum difference in energy (−2 log probability density) between an accepted root and any other root of
 the wire. In 3060 simulated pairs of roots, the energy of a wrong root was at most 2.6 below that of the
@@ -126,7 +128,7 @@ correct root."""
 UNLIKELY_BLIND: Final = 16.0
 """Minimum difference in energy (−2 log probability density) between two roots of a nearly blind wire.
 
-The margin is larger than :data:`UNLIKELY`, because the search may miss some roots of such a wire.
+For nearly blind wires, the search may miss roots, so the difference must be larger than :data:`UNLIKELY`.
 """
 
 # -- the posterior of the patch -----------------------------------------------------------------------------
@@ -134,26 +136,27 @@ The margin is larger than :data:`UNLIKELY`, because the search may miss some roo
 REFEREE_NOISE: Final = 1e-5
 """Minimum relative noise that the posterior assumes when it checks a root.
 
-With less noise, the posterior would have to reproduce the resistances exactly and might converge to the same
-wrong root.
+If the posterior assumed less noise, it might converge to the same wrong root as the exact inverse.
 """
 AGREE: Final = 6.0
 """Maximum distance between a root and the posterior estimate that confirms the root, in standard
 deviations."""
 NEAR: Final = 0.25
-"""Size of an electrode's first correction, in clearances, above which the posterior restarts by annealing."""
+"""First correction of an electrode position, relative to the clearance between the layers, above which the
+posterior is computed by annealing."""
 FAR: Final = 0.1
-"""Movement of an electrode, in clearances, after which the posterior estimate is compared with a new estimate
-annealed from the rest position. Without this comparison, slow presses could pass a fold unnoticed."""
+"""Movement of an electrode, relative to the clearance between the layers, after which the posterior estimate
+is compared with an estimate annealed from the rest position. Otherwise, a slow press could pass a fold
+unnoticed."""
 LIKELIER: Final = 4.0
 """Minimum decrease in energy (−2 log posterior density) for which a second annealed estimate replaces the
 first.
 
-If the decrease is smaller, both estimates belong to the same maximum of the posterior density.
+If the energy decreases by less, both estimates belong to the same maximum of the posterior density.
 """
 SUSPICIOUS: Final = 3.0
 """Estimate of a nuisance parameter, in prior standard deviations, above which the frame is also solved by
-annealing. Otherwise, a wrong drift estimate that mimics a displacement might persist throughout a stream."""
+annealing. A wrong drift estimate can mimic a displacement and would otherwise persist throughout a stream."""
 BELIEVABLE: Final = 5.0
 """Estimate of a nuisance parameter, in prior standard deviations, above which a frame is INCONSISTENT."""
 IMPOSSIBLE_CHANCE: Final = 1e-9
@@ -180,7 +183,7 @@ def nonlinear_in_noise(layout: PatchLayout, relative_noise: ArrayLike, normal_on
 
 
 def on_rest_branch(status: Index, branch: Index, rest_branch: Index, out_of_reach: Mask) -> Mask:
-    """Return a mask (U,) of the wires at a plausible root on the same branch as the rest position.
+    """Return a mask (U,) of the wires whose root is plausible and on the same branch as the rest position.
 
     Two positions are on the same branch if det J has the same sign at both positions. With more equations
     than unknowns, det J does not exist, and this condition is ignored. A root is plausible if no electrode

@@ -18,9 +18,9 @@ from skinnode.solve.wires.problem import PatchProblem
 
 CORRELATION_PITCHES: Final = 1.0
 """Correlation length ℓ, pitches. With ℓ = 1, the guided start found 3204 of 3209 roots in simulations of the
-staggered layout. It found fewer roots with ℓ = 0.7 and ℓ = 1.5."""
+staggered layout. With ℓ = 0.7 or ℓ = 1.5, the guided start found fewer roots."""
 ROUGH_SHARE: Final = 1e-3
-"""Relative increase in the diagonal of C. Without the increase, C may be numerically singular."""
+"""Relative increase in the diagonal of C, to prevent C from being numerically singular."""
 
 
 class Smoothness:
@@ -53,7 +53,7 @@ class Smoothness:
 
 @functools.lru_cache(maxsize=64)
 def _covariance(layout: PatchLayout, size: float) -> tuple[Float, Float]:
-    """Return C (U, n, n) for a standard deviation of ``size`` pitches, and its whitening matrix (U, N, N)."""
+    """Return C (U, n, n) for a standard deviation of ``size`` pitches, and C's whitening matrix (U, N, N)."""
     electrodes: Float = layout.upper_m / layout.pitch_m
     wires, most = electrodes.shape[:2]
     gaps = electrodes[:, :, None, :] - electrodes[:, None, :, :]

@@ -1,7 +1,7 @@
-"""Starting points for the solver if no earlier solution is close enough.
+"""Starting points for the solver, for samples or frames without an earlier solution nearby.
 
-- ``guided_start`` computes the maximum a posteriori estimate of a displacement with a smoothness prior. It
-  takes Gauss-Newton steps and reduces the assumed noise after each step (Tarantola 2005, section 3.4).
+- ``guided_start`` computes the maximum a posteriori estimate of a displacement with a smoothness prior. The
+  assumed noise is reduced after each Gauss-Newton step (Tarantola 2005, section 3.4).
 - ``near_twin`` estimates the position of a root's twin, the root on the other side of the nearest fold. Let σ
   be the smallest singular value of J, with left vector w and right vector v. To second order, the distance α
   between the roots along v satisfies σ α + ½ α² wᵀF″[v, v] = 0. The twin is therefore at α = −2σ / wᵀF″[v, v]
@@ -26,11 +26,11 @@ NOISE_LEVELS: Final[Float] = np.power(10.0, -0.5 * np.arange(2.0, 16.0))
 """Standard deviations of r assumed in the successive steps of the guided start: two per decade from 0.1 to
 3e-8.
 
-With one level per decade, the guided start failed on an additional 1 % of the wires in simulations.
+With only one noise level per decade, the guided start failed on an additional 1 % of the simulated wires.
 """
 POWER_STEPS: Final = 8
-"""Number of inverse iterations for the smallest singular value of J. The iteration converges quickly, because
-the second-smallest singular value is about three times as large."""
+"""Number of inverse iterations for the smallest singular value of J. Inverse iteration converges quickly,
+because the second-smallest singular value is about three times the smallest."""
 DIFFERENCE: Final = 1e-4
 """Half-width of the central difference of two Jacobians, pitches. Rounding errors are negligible, because the
 step is much larger than eps^(1/3) = 6e-6."""
@@ -46,8 +46,8 @@ def guided_start(problem: PatchProblem, wire: int, a: Float, covariance: Float) 
         covariance: (n, n) prior covariance of the wire's displacement, pitches².
 
     Returns:
-        (n,) position, pitches, and the number of evaluations of F and J. If the iteration fails, the position
-        is the rest position.
+        (n,) position, pitches, and the number of evaluations of F and J. If the iteration fails, the rest
+        position is returned.
     """
     n, equations = problem.rest.shape[1], a.size
     x = problem.rest[wire].copy()

@@ -38,9 +38,9 @@ from skinnode.solve.wires.problem import PatchProblem
 NO_CODE: Final = np.uint32(0xFFFF_FFFF)
 """Invalid code that marks a reading to be ignored; no converter sends this code."""
 EXACT_STD: Final = 0.0025
-"""Maximum standard deviation of an electrode position at rest, in clearances, for which ``auto`` selects the
-exact method. With 16-bit codes, the standard deviation is 0.0005 on the staggered layout with h = 0.5, and
-0.05 on the aligned layout."""
+"""Maximum standard deviation of an electrode position at rest, relative to the clearance between the layers,
+for which ``auto`` selects the exact method. With 16-bit codes, the standard deviation is 0.0005 on the
+staggered layout with h = 0.5, and 0.05 on the aligned layout."""
 
 
 class Tracker:
@@ -82,7 +82,7 @@ class Tracker:
         # estimate.
         self._posterior = Posterior(layout, dataclasses.replace(options.of_posterior(), follow_noise=False))
         self._noise = NoiseEstimate(layout.shape) if options.follow_noise else None
-        self._factor = 1.0  # noise factor that the method and the root check currently assume
+        self._factor = 1.0  # noise factor for which the method and the root check are configured
         self._exact = ExactTracker(
             layout,
             operator=options.operator,
@@ -108,8 +108,8 @@ class Tracker:
     def prepare(self) -> None:
         """Compute tables in advance, so that they do not delay the first frames of a touch by up to 0.1 s.
 
-        For the reference patch, this takes 0.25 s and 85 MB. Trackers of the same layout share the tables.
-        The host calls this method before it starts the nodes.
+        The tables for the reference patch require 0.25 s and 85 MB. Trackers of the same layout share the
+        tables. The host calls this method before it starts the nodes.
         """
         self._posterior.check.prepare()
 
@@ -226,7 +226,7 @@ class Tracker:
         return field if is_precise(field, self._limits) else amended(field, precise=False)
 
     def _follow_noise(self) -> None:
-        """Call :meth:`_adapt` if the noise estimate has changed."""
+        """Reconfigure the tracker if the noise estimate has changed."""
         if self._exact is not None and self._noise is not None and self._noise.factor != self._factor:
             self._adapt(self._noise)
 

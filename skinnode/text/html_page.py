@@ -1,4 +1,4 @@
-"""Template of the HTML pages that skinnode writes, and escaping of untrusted text."""
+"""HTML template of all pages that skinnode writes, and a function that escapes untrusted text."""
 
 from __future__ import annotations
 

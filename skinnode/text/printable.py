@@ -1,4 +1,4 @@
-r"""Makes untrusted text safe to print. This module alone defines which characters are printable.
+r"""Makes untrusted text safe to print. No other module defines which characters are printable.
 
 Text from a device, a file, a recording or the command line is untrusted. The rules are:
 
@@ -6,12 +6,13 @@ Text from a device, a file, a recording or the command line is untrusted. The ru
   ``od --json``, DCF files and comparisons use the original bytes.
 * A name in hand.toml that is not printable is rejected (``skinnode.config``).
 * The output of every command passes through :class:`PrintableStream`, or through the console of
-  ``skinnode.cli`` if it comes from rich. Both also escape file names and arguments that a command prints.
+  ``skinnode.cli`` if the output comes from rich. File names and arguments in the output are therefore
+  escaped, too.
 * In HTML pages, text is also HTML-escaped, so that untrusted text is never interpreted as markup.
 
 The method :meth:`str.isprintable` decides whether a character is printable. Control characters, surrogates
-and format characters, such as those that reverse the text direction, are not printable. They are replaced by
-Python escape sequences, such as ``\x1b`` and ``\u202e``.
+and format characters, such as those that reverse the text direction, are not printable. Non-printable
+characters are replaced by Python escape sequences, such as ``\x1b`` and ``\u202e``.
 """
 
 from __future__ import annotations
@@ -20,7 +21,8 @@ import re
 from typing import Any, Final, TextIO
 
 MOST: Final = 200
-"""Maximum number of characters of an untrusted text that are printed. No name is longer than this limit."""
+"""Maximum number of characters of an untrusted text that are printed. Names are always shorter than 200
+characters."""
 
 _SUSPECT: Final = re.compile(r"[^ -~]")
 _SUSPECT_IN_LINES: Final = re.compile(r"[^\n\t -~]")

@@ -1,6 +1,6 @@
 """Fault confinement states of a CAN controller (ISO 11898-1), as reported by SocketCAN error frames.
 
-The encoding of these frames is defined in <linux/can/error.h>.
+The encoding of SocketCAN error frames is defined in <linux/can/error.h>.
 """
 
 from __future__ import annotations

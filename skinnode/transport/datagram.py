@@ -1,8 +1,8 @@
 """Provide a UDP bus for load tests. Each UDP packet contains one frame in SocketCAN's memory layout.
 
-The UDP packets are received by the same reader as SocketCAN frames, so the tests also cover its system calls,
-timestamps and drop counter. UDP over the loopback device replaces the kernel's CAN driver and CAN protocol
-layer.
+The UDP packets are received by the same reader as SocketCAN frames, so the load tests also cover the system
+calls, timestamps and drop counter of this reader. UDP over the loopback device replaces the kernel's CAN
+driver and CAN protocol layer.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ def free_channel() -> str:
 
 
 class DatagramPort(CanPort):
-    """Receive-only port for a UDP bus. The ``channel`` in its configuration is the number of a UDP port."""
+    """Receive-only port for a UDP bus. The ``channel`` of a UDP bus is the number of a UDP port."""
 
     def _open(self) -> can.BusABC:
         try:

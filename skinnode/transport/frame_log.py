@@ -2,8 +2,8 @@
 
 If the process is killed, the file contains at least the frames written before the last
 :meth:`FrameLog.flush`. python-can's BLF writer buffers up to 128 kB of frames and completes the file header
-only when it stops. Flushing a BLF file therefore stops the writer, and the next frame is written by a new
-writer in append mode.
+only when the writer stops. Flushing a BLF file therefore stops the writer, and the next frame is written by a
+new writer in append mode.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ between two flushes, so that no frame is split between containers."""
 
 
 class LoggedFrame(NamedTuple):
-    """CAN frame in a log file. Its ``t_ns`` is a wall-clock time with a resolution of 1 µs."""
+    """CAN frame in a log file. The timestamp ``t_ns`` is a wall-clock time with a resolution of 1 µs."""
 
     frame: Frame
     channel: str
-    """Name of the channel. When read from a BLF file, which contains no names, the number of the channel,
-    counted from 0."""
+    """Name of the channel. A BLF file contains no channel names; when such a file is read, this is the number
+    of the channel, counted from 0."""
     sent: bool
     """Whether the recording program sent the frame."""
 
@@ -99,7 +99,7 @@ class FrameLog:
     def close(self) -> None:
         """Close the file.
 
-        Errors are ignored, because earlier calls have already reported any disk error.
+        Errors while closing are ignored, because earlier calls have already reported any disk error.
         """
         with contextlib.suppress(OSError):
             self.flush(to_disk=True)

@@ -1,9 +1,9 @@
 """Read frames from a candump log or a BLF file, even if the file is damaged.
 
 The reader skips damaged parts of a truncated or partly overwritten file and reads all other frames. Each
-damaged part is counted, and its line or offset is recorded (:class:`Damage`). Invalid file content never
-causes an exception. In a candump log, which has no checksums, a corrupted frame is not detected if it is
-still well-formed.
+damaged part is counted, and the line or offset of the part is recorded (:class:`Damage`). Invalid file
+content never causes an exception. In a candump log, which has no checksums, a corrupted frame cannot be
+detected if the frame is still well-formed.
 """
 
 from __future__ import annotations

@@ -56,11 +56,11 @@ _MULTICAST: Final = "udp_multicast"
 _VIRTUAL: Final = "virtual"
 
 _DELIVERY_S: Final = 0.05
-"""Maximum time that the kernel is assumed to take to deliver a frame, s. The longest time observed was 28
-ms."""
+"""Maximum time that the kernel is assumed to take to deliver a frame, s. The longest delivery time observed
+was 28 ms."""
 
-# Without this handler, python-can would print warnings to stderr in a program that does not configure
-# logging. The same errors are already reported by BusError.
+# Without a handler, python-can would print warnings to stderr in programs that do not configure logging. The
+# same errors are already reported by BusError.
 logging.getLogger("can").addHandler(logging.NullHandler())
 
 
@@ -79,7 +79,7 @@ def allowed_interfaces(config: BusConfig) -> str:
 class _Message(can.Message):
     """CAN message that is copied five times as fast as python-can's ``Message``.
 
-    python-can's virtual bus copies each message once per receiver.
+    Fast copying is important, because python-can's virtual bus copies each message once per receiver.
     """
 
     __slots__ = ()
@@ -369,7 +369,7 @@ class CanPort:
 
 
 def _tune_socket(fileno: int) -> None:
-    """Enlarge the receive buffer, and receive only frames sent to the socket's own multicast group."""
+    """Enlarge a socket's receive buffer, and restrict reception to the socket's own multicast group."""
     duplicate = socket.socket(fileno=os.dup(fileno))
     try:
         try:
@@ -391,8 +391,8 @@ def _tune_socket(fileno: int) -> None:
 def _discard_other_groups(sock: socket.socket) -> None:
     """Discard frames that arrived before the restriction to one multicast group took effect.
 
-    After any frame has been discarded, wait and repeat once, because the kernel may still be delivering
-    others.
+    If any frames are discarded, this is repeated after a pause, because the kernel may still be delivering
+    frames.
     """
     if _discard_waiting(sock):
         clock.sleep(_DELIVERY_S)
@@ -428,7 +428,7 @@ def _frame(message: can.Message) -> Frame:
 def _is_garbage(error: Exception) -> bool:
     """Return whether an error on a multicast bus was caused by a packet's content, not by the network.
 
-    Only network errors are caused by an OSError.
+    A network error is always caused by an OSError; an error due to a packet's content never is.
     """
     cause = error.__cause__
     return isinstance(error, can.CanOperationError) and cause is not None and not isinstance(cause, OSError)

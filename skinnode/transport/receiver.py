@@ -28,33 +28,33 @@ _POLL_S: Final = 0.02
 
 
 GATHER_NS: Final = 1_500_000
-"""Pause between two batches of frames, ns. Without this pause, the thread would wake up for every frame, up
-to 8,000 times per second. The pause has no effect on the timestamps of the frames."""
+"""Pause between two batches of frames, ns. Without a pause, the receiving thread would wake up for every
+frame, up to 8,000 times per second. The timestamps of the frames do not depend on the pause."""
 
 LONG_NS: Final = 5_000_000
 """Pause between two batches of frames if the arrival times of all expected frames are predicted, ns. An
 unexpected frame is received with a delay of up to 1.5 times this pause."""
 
 _BEFORE_NS: Final = 800_000
-"""Time before a predicted arrival at which earlier frames are fetched, ns. The predicted frame can then be
-fetched without delay."""
+"""Time before a predicted arrival at which all earlier frames are fetched, ns. The predicted frame can then
+be fetched without delay."""
 _SHORT_NS: Final = 300_000
-"""Minimum pause between two batches of frames, ns. It applies around the predicted arrival time of a
-frame."""
+"""Minimum pause between two batches of frames, ns. The minimum pause applies around the predicted arrival
+time of a frame."""
 _LATE_NS: Final = 600_000
-"""Time after a predicted arrival for which the minimum pause applies, ns."""
+"""Period after a predicted arrival during which the minimum pause applies, ns."""
 _GIVEN_UP_NS: Final = 200_000_000
 """Time after a predicted arrival at which a frame is considered lost, ns."""
 _ANSWER_NS: Final = 20_000_000
-"""Time after a request for which a response is expected, ns."""
+"""Period after a request during which a response is expected, ns."""
 _LAG_NS: Final = 50_000
-"""Time between the arrival of a frame and its availability in the socket, ns."""
+"""Time from the arrival of a frame until the frame can be read from the socket, ns."""
 
 
 class Intake:
     """Bounded queue of frames between a receiving thread and the reader thread.
 
-    If the queue is full, newly arrived frames are dropped, like in a full socket buffer, and counted in
+    If the queue is full, newly arrived frames are dropped, as in a full socket buffer, and counted in
     ``dropped``.
 
     Threads: only the reader may call :meth:`take` and :meth:`expect`. Only the receiving thread may call the
@@ -73,7 +73,7 @@ class Intake:
             raise ValueError(f"capacity: got {capacity}, must be at least 1")
         self.port = port
         self.seen_ns = 0
-        """Monotonic time up to which all frames that arrived have been queued or dropped, ns."""
+        """Monotonic time before which all received frames have been queued or dropped, ns."""
         self.due_ns = 0
         """Monotonic time of the next :meth:`fetch`, ns. Used only by the receiver."""
         self._capacity = capacity
@@ -150,7 +150,7 @@ class Intake:
         self.due_ns = min(awaited_ns, _together(now_ns, LONG_NS if known else GATHER_NS))
 
     def _next_awaited(self, now_ns: int) -> tuple[int, bool]:
-        """Return when to fetch the next predicted frame (ns), and whether all frames are predicted."""
+        """Return the time (ns) to fetch the next predicted frame, and whether all frames are predicted."""
         awaited_ns, all_known = now_ns + LONG_NS, bool(self._expected)
         for times in tuple(self._expected.values()):
             for t_ns in times:
@@ -205,7 +205,7 @@ class _Shared:
     """State of the receiving thread that several intakes share."""
 
     intakes: dict[Intake, None]
-    """Intakes in the order in which they were added, as keys."""
+    """Intakes as keys, in the order in which they were added."""
     poll: select.poll
 
 

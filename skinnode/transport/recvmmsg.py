@@ -1,7 +1,7 @@
 """Receive many socket messages with one call of recvmmsg(2), which Python's socket module lacks.
 
-The call does not release the global interpreter lock, because it never waits and takes only about 1 µs per
-message. Releasing the lock so often would delay other threads more.
+The call never waits and takes only about 1 µs per message, so it does not release the global interpreter lock
+(GIL). Releasing the GIL for each message would cause longer delays in other threads.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ class MessageBatch:
         self._got = 0
 
     def receive(self, sock: socket.socket, most: int) -> int:
-        """Receive up to ``most`` messages without waiting; they replace the previous messages.
+        """Receive up to ``most`` messages without waiting, and discard the previous messages.
 
         Returns:
             Number of messages received.

@@ -42,8 +42,8 @@ times."""
 _EXTENDED, _REMOTE, _ERROR = 1 << 31, 1 << 30, 1 << 29
 
 _OLDEST_NS: Final = 10_000_000_000
-"""Maximum age of a received frame, ns. A frame appears older if the wall clock was set after its arrival. Its
-timestamp is then replaced by the time of reading."""
+"""Maximum age of a received frame, ns. If the wall clock was set after a frame had arrived, the frame can
+appear older. The timestamp of such a frame is replaced by the time of reading."""
 
 _NEWEST_NS: Final = 100_000_000
 """Maximum time by which a frame's timestamp may be later than the start of reading its batch, ns."""
@@ -52,7 +52,7 @@ _IP_S: Final = 5.0
 """Maximum duration of an ``ip link`` command, s."""
 
 BATCH_FRAMES: Final = 256
-"""Maximum number of frames per system call. A fully loaded bus at 1 Mbit/s transmits this number in 30 ms."""
+"""Maximum number of frames per system call. A fully loaded bus at 1 Mbit/s transmits 256 frames in 30 ms."""
 
 
 class SocketReader:
@@ -181,9 +181,10 @@ def _ip_link(config: BusConfig, *arguments: str) -> None:
 class HardwareDelay:
     """Converts a CAN controller's hardware timestamps to the monotonic clock.
 
-    The result is accurate even if the kernel timestamps a frame late. A kernel timestamp is never early, so
-    each frame provides an upper bound on the difference between the two clocks. The difference is estimated
-    from the lowest bounds. The estimate rises no faster than two clocks can drift apart. Owned by one thread.
+    The converted timestamps are accurate even if the kernel timestamps a frame late. A kernel timestamp is
+    never early, so each frame provides an upper bound on the difference between the two clocks. The estimate
+    of this difference follows the lowest bounds, and rises no faster than two clocks can drift apart. Owned
+    by one thread.
     """
 
     DRIFT: Final = 200e-6  # maximum relative drift of two oscillators with a tolerance of 100 ppm each

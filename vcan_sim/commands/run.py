@@ -204,7 +204,7 @@ def _recorded(fleet: Fleet, scene: SceneConfig | None, folder: Path | None) -> I
 
 @contextmanager
 def _controlled(fleet: Fleet) -> Iterator[None]:
-    """Open the control socket for `vcan-sim inject`. If this fails, print a note and continue without it."""
+    """Open the control socket for `vcan-sim inject`; if this is impossible, print a note."""
     from vcan_sim.control import ControlError, ControlServer
 
     with ExitStack() as entered:

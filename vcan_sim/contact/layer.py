@@ -28,7 +28,8 @@ from scipy.special import j0, j1
 Float = NDArray[np.float64]
 
 DEEPEST: Final = 14.0
-"""Value of x = k h above which the layer is treated as a half-space. The relative error is below 2e-10."""
+"""Value of x = k h above which the layer is treated as a half-space. The relative error of this approximation
+is below 2e-10."""
 STEPS: Final = 32
 """Number of table points per layer thickness, in tables of displacement versus distance."""
 NODES: Final = 16
@@ -140,9 +141,9 @@ def cell_response(layer: Layer, offset_m: Float, size_m: float, reach_m: float) 
     """Return the surface displacement due to a uniform unit traction on a square cell at the origin.
 
     For a half-space, the displacement has a closed form (Love, Philosophical Transactions A 228, 377, 1929;
-    Johnson, eq. 3.25, for all directions). This form contains the integrals of 1/R, x²/R³, y²/R³, xy/R³, x/R²
-    and y/R² over a rectangle. The smooth difference between a layer and a half-space is integrated by
-    Gauss-Legendre quadrature.
+    Johnson, eq. 3.25, for all directions). The closed form contains the integrals of 1/R, x²/R³, y²/R³,
+    xy/R³, x/R² and y/R² over a rectangle. The smooth difference between a layer and a half-space is
+    integrated by Gauss-Legendre quadrature.
 
     Args:
         layer: Elastic layer.

@@ -27,8 +27,8 @@ STEPS: Final = 400
 TURNS: Final = 24
 """Maximum number of alternations between pressure and shear."""
 DAMPED: Final = 5
-"""Number of alternations after which the changes are halved. Without this damping, the iteration can
-oscillate if a thin layer has high friction."""
+"""Number of alternations after which the changes are halved. Without damping, the iteration can oscillate if
+the layer is thin and the friction is high."""
 
 
 class NoSolution(RuntimeError):

@@ -25,8 +25,8 @@ Mask = NDArray[np.bool_]
 
 # Columns of a wire's integer report
 STATUS, EVALUATIONS, STEPS, BRANCH, HELD, SPARE, TURN, REPORT = range(8)
-# Columns of a wire's floating-point report: RESIDUAL is the weighted RMS residual of the equations in use.
-# CHI2 is the χ² of the final residual, which has SPARE degrees of freedom.
+# Columns of a wire's floating-point report. RESIDUAL is the weighted RMS residual of the equations in use.
+# CHI2 is the χ² of the final residual, with SPARE degrees of freedom.
 RESIDUAL, OPTIMALITY, ERROR_ESTIMATE, CHI2, MEASURES = range(5)
 
 # Index of the front end's relative noise in a code map
@@ -38,7 +38,7 @@ SOLVE: Final = 1
 PREDICT: Final = 2
 """Solve the wire, starting at x + (∂x/∂a) (a − a of the last solve)."""
 HOLD: Final = 3
-"""Like PREDICT, but do not solve a wire whose residual at its present x is within noise."""
+"""Like PREDICT, but keep x unchanged if the residual at x does not exceed the noise."""
 
 # Optional tasks of a solve, combined with bitwise or
 COVARIANCE: Final = 1
@@ -46,7 +46,7 @@ COVARIANCE: Final = 1
 SKIP: Final = 2
 """Skip a wire whose first-order optimality ‖Jᵀr‖∞ is below tol_f (Xu et al. 2018, section 5.2)."""
 REUSE: Final = 4
-"""If a wire has moved only slightly, solve it with the J⁻¹ of an earlier solve."""
+"""If a wire has moved only slightly, reuse the J⁻¹ of an earlier solve."""
 
 
 class SolveOptions(ArrayTable):
@@ -109,7 +109,7 @@ class SolverArrays(ArrayTable):
     still_std: Annotated[Float, "U 3N"]
     """Standard deviations of the coordinates that are not unknowns."""
     turn: Annotated[Index, "1"]
-    """Frame number. With REUSE, this number determines which wires recompute their inverses."""
+    """Frame number. With REUSE, the frame number determines which wires recompute their inverses."""
     step_limit: float
     """Initial trust radius, pitches per coordinate."""
     point: Annotated[Float, "3E"]

@@ -3,9 +3,9 @@
 The unknowns are the coordinates of a wire's electrodes. Some electrodes may be fixed at rest, and x and y may
 be fixed (``normal_only``). A system with more equations than unknowns is called tall. The solution of a tall
 system minimises χ² = Σ (ρ_k/σ_k)², where ρ_k = a_k F_k − 1 is a relative residual and σ_k is its standard
-deviation. If the minimum exceeds the 1 − 1e-9 quantile, the frame is inconsistent with the model, and the
-wire is ILL_CONDITIONED. If it exceeds the 95 % quantile, the standard deviations are multiplied by √(χ²/dof)
-(Birge, Physical Review 40, 207, 1932). For square systems, the sign of det J is tested instead of χ².
+deviation. If χ² exceeds its 1 − 1e-9 quantile, the frame is inconsistent with the model, and the wire is
+ILL_CONDITIONED. If χ² exceeds its 95 % quantile, the standard deviations are multiplied by √(χ²/dof) (Birge,
+Physical Review 40, 207, 1932). For square systems, the sign of det J is tested instead of χ².
 """
 
 from __future__ import annotations
@@ -45,8 +45,8 @@ from skinnode.solve.wires.arrays import (
 from skinnode.solve.wires.hold import chi2_quantile_part
 
 DATA_ROUNDING: Final = 2.0
-"""Relative rounding error of a F, in eps. The error is the sum of four errors of eps/2, in R, in the gain, in
-their product and in F."""
+"""Relative rounding error of a F, in eps. The rounding errors of R, of the gain, of their product and of F
+are eps/2 each."""
 
 Z_95_ONE_SIDED: Final = 1.645
 """95 % quantile of the standard normal distribution."""

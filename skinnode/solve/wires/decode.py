@@ -50,7 +50,8 @@ def decode(frame: FrameArrays) -> int:
 def scale(frame: FrameArrays, sigma: float) -> float:
     """Compute the arrays ``a``, ``weight`` and ``used`` from ``ohm``, ``noise`` and ``valid``.
 
-    Returns the minimum relative standard deviation of the resistances, or ``sigma`` if none is known.
+    Returns the minimum relative standard deviation of the resistances, or ``sigma`` if no standard deviation
+    is known.
     """
     frame_ohm, gain, noise, valid = frame.ohm, frame.gain, frame.noise, frame.valid
     a, weight, used = frame.a, frame.weight, frame.used

@@ -1,4 +1,4 @@
-"""Compiled solver for a wire that moved only slightly, so that the J⁻¹ of an earlier solve can be used.
+"""Compiled solver for wires that moved only slightly, which reuses the J⁻¹ of an earlier solve.
 
 A simplified Newton step uses the inverse from an earlier position and does not evaluate J (Deuflhard, Newton
 methods for nonlinear problems, 2004, section 2.1). If successive steps shrink quickly, the inverse is still
@@ -17,7 +17,8 @@ from skinnode.model.layout import Float
 from skinnode.solve.linalg.vectors import largest
 
 FOLLOW_STEPS: Final = 4
-"""Maximum number of simplified Newton steps. A step takes a fifth of the time of computing a new inverse."""
+"""Maximum number of simplified Newton steps. A simplified Newton step takes a fifth of the time of computing
+a new inverse."""
 CONTRACTION: Final = 0.1
 """Maximum size of a simplified Newton step, relative to the previous step. After a larger step, the wire is
 solved with a new Jacobian."""
@@ -57,8 +58,8 @@ def follow(  # noqa: PLR0913 - arrays of one wire
 
     ``moved`` is the size of the predicted step, which has already been added to ``x``. Returns the number of
     evaluations of F (negative if no root was found), the number of steps taken, and the ratio of the first
-    step to the predicted step. If a root was found, it is at ``x`` + ``step``, and ``rho`` (K,) contains the
-    residual at ``x``. Otherwise, ``x`` is the last iterate.
+    step to the predicted step. If a root was found, the root is at ``x`` + ``step``, and ``rho`` (K,)
+    contains the residual at ``x``. If no root was found, ``x`` is the last iterate.
     """
     before, first = moved, math.inf
     for evaluations in range(1, FOLLOW_STEPS + 1):

@@ -1,18 +1,18 @@
-"""Compiled test whether a wire's resistances have changed by more than their noise.
+"""Compiled test for whether the resistances of a wire have changed by more than their noise.
 
 A wire whose resistances have not changed significantly is held: its last position x is kept, and the wire is
 not solved again. The test uses the residual ρ_k = a_k F_k(x) − 1, where F_k(x) is known from the last solve.
-A wire is held if the sum Σ (ρ_k/σ_k)² is below its 99 % quantile. Two errors contribute to ρ. The first is
-the noise of the new frame, with variance σ². The second is the error of x, due to the noise of the frame for
-which x was solved. This error has variance s² in the n directions of the range of J. With t = s²/σ², the mean
-of the sum is K + n t, and half of its variance is K + 2 n t + n t². The quantile is taken from a scaled
-distribution c χ²_ν with the same mean and variance (Satterthwaite 1946).
+A wire is held if the sum Σ (ρ_k/σ_k)² is below its 99 % quantile. Two errors contribute to ρ. The noise of
+the new frame has variance σ². The noise of the frame for which x was solved causes an error with variance s²
+in the n directions of the range of J. With t = s²/σ², the mean of the sum is K + n t, and half of its
+variance is K + 2 n t + n t². The quantile is taken from a scaled distribution c χ²_ν with the same mean and
+variance (Satterthwaite 1946).
 
 The test may miss a slow movement, so the variance of a held coordinate includes an estimate of the movement.
 The correction c = Σ_k (∂x_j/∂r_k) ρ_k of a coordinate is caused by the movement and by the noise of both
-frames. The variance is therefore at least c² minus the variance due to noise. In simulations of the staggered
-layout (h = 0.5, noise 1e-5), the 95 % intervals of held coordinates contained the true position in 98 % of
-the frames without movement, and in 96 to 97 % of the frames with slow movements.
+frames. The variance of the coordinate is therefore set to at least c² minus the variance due to noise. In
+simulations of the staggered layout (h = 0.5, noise 1e-5), the 95 % intervals of held coordinates contained
+the true position in 98 % of the frames without movement, and in 96 to 97 % of the frames with slow movements.
 """
 
 from __future__ import annotations
@@ -27,15 +27,16 @@ from skinnode.model.layout import Float
 Z_HOLD: Final = 2.326
 """99 % quantile of the standard normal distribution. A wire at rest fails the test in 1 % of the frames."""
 FRESHER: Final = 2.0
-"""Maximum ratio of noise variances for which a wire is held. The ratio compares the frame for which x was
-solved with the current frame."""
+"""Maximum ratio of the noise variance of the frame for which x was solved to that of the current frame. Above
+this ratio, a wire is not held."""
 
 
 def chi2_quantile(dof: float, z: float) -> float:
     """Return the χ² quantile that has the same probability as the normal quantile ``z``.
 
-    The approximation is that of Wilson & Hilferty (1931). At 99 %, its error is below 1 % for 3 or more
-    degrees of freedom. At very high probabilities, it never underestimates the quantile.
+    The quantile is approximated by the formula of Wilson & Hilferty (1931). At 99 %, the error of this
+    approximation is below 1 % for 3 or more degrees of freedom. At very high probabilities, the quantile is
+    never underestimated.
     """
     spread = 2.0 / (9.0 * dof)
     root = 1.0 - spread + z * math.sqrt(spread)

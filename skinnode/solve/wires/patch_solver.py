@@ -1,4 +1,4 @@
-"""Buffers of one patch, and the compiled function that computes all wires of a frame in one call.
+"""Buffers of one patch, and the compiled function that solves all wires of a frame in one call.
 
 The computations of a frame run in a single call, because passing arguments from Python to compiled code takes
 longer than most of the computations themselves.
@@ -42,8 +42,7 @@ SOLVE: Final = 8
 ACCEPT: Final = 16
 """Determine which wires have an acceptable root."""
 STORE: Final = 32
-"""Store the results. If ACCEPT runs in the same call, store them only if all wires have an acceptable
-root."""
+"""Store the results. In a call with ACCEPT, results are stored only if all wires have an acceptable root."""
 
 # Flags returned by a call, combined with bitwise or
 ALL_GOOD: Final = 1
@@ -123,7 +122,7 @@ class PatchSolver:
         self.turn = np.zeros(1, np.int64)
         """(1,) frame number, which SCALE increments.
 
-        With REUSE, this number determines which wires recompute their inverses.
+        With REUSE, the frame number determines which wires recompute their inverses.
         """
         self.still_std = np.full((upper, unknowns), np.inf)
         """(U, 3N) standard deviations of the coordinates that are not unknowns, pitches."""

@@ -50,7 +50,7 @@ class PatchProblem:
     def of(cls, layout: PatchLayout, baseline_ohm: ArrayLike | None = None) -> PatchProblem:
         """Convert a patch to solver units; ``baseline_ohm`` (U, K) was measured at rest, ohm.
 
-        Raises ValueError if any of these resistances is not positive.
+        Raises ValueError if any resistance in ``baseline_ohm`` is not positive.
         """
         pitch = layout.pitch_m
         rest, lower, potential, share, clearance = _at_rest(layout)
@@ -77,7 +77,7 @@ class PatchProblem:
 
         A displacement is implausible if an electrode moves farther than its clearance at rest. F does not
         change if an electrode is mirrored at the lower layer, or if two electrodes of a wire are exchanged.
-        The roots that result from these symmetries have implausible displacements.
+        Roots that result from these two symmetries have implausible displacements.
         """
         moved = (x - self.rest).reshape(self.layout.upper_m.shape)
         with np.errstate(over="ignore"):

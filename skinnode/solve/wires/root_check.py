@@ -1,4 +1,4 @@
-"""Compiled check that finds roots that may be wrong in a new displacement field."""
+"""Compiled check of a new displacement field, which finds roots that may be wrong."""
 
 from __future__ import annotations
 

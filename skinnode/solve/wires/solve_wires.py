@@ -1,4 +1,4 @@
-"""Compiled solver for all upper wires of a patch. It needs no GIL and allocates no memory.
+"""Compiled solver for all upper wires of a patch, without the GIL and without memory allocation.
 
 Three methods are tried for each wire until one of them succeeds: keep the last position (``hold``), take
 Newton steps with the inverse from an earlier solve (``follow``), or iterate with new Jacobians (``correct``).
@@ -24,8 +24,8 @@ from skinnode.solve.wires.follow import FRESH, follow, newton_step, standard_dev
 from skinnode.solve.wires.hold import within_noise
 
 REFRESH: Final = 8
-"""Maximum number of successive frames in which a wire is solved with the same inverse. The inverses of
-different wires are recomputed in different frames."""
+"""Maximum number of successive frames in which a wire is solved with the same inverse. Not all wires
+recompute their inverses in the same frame."""
 COVARIANCE_UNITS: Final = 3.0
 """Time to compute the covariance of a square system with 30 unknowns. The unit is the time of one evaluation
 of F and J plus one step."""
@@ -197,16 +197,16 @@ def solve_wires(  # noqa: PLR0913 - what changes from call to call
             solve.
         options: Operator, tasks and tolerances.
         todo: (U,) action for each wire: LEAVE, SOLVE, PREDICT or HOLD.
-        a: (U, K) resistances in solver units. If a value is out of range, it is set to 1, and its weight to
-            0.
+        a: (U, K) resistances in solver units. Values out of range are set to 1, and their weights to 0.
         weight: (U, K) weights of the equations; an equation with weight 0 is ignored.
         order: (U,) order in which the wires are solved.
         sigma: Standard deviation of a residual of weight 1; 0 if unknown.
         units: Time limit, in units of the time of one evaluation of F and J plus one step. The call returns
-            if the next wire might exceed this limit.
+            early if solving the next wire might exceed the time limit.
 
     Returns the estimated time spent, in the same unit as ``units``. A wire with fewer usable equations than
-    unknowns is not solved. Its status is NON_FINITE if a value was out of range, otherwise ILL_CONDITIONED.
+    unknowns is not solved. The status of such a wire is NON_FINITE if a value was out of range, otherwise
+    ILL_CONDITIONED.
     """
     spent, worst = 0.0, options.max_steps + 1 + COVARIANCE_UNITS
     for u in order:

@@ -1,7 +1,7 @@
 """Compiled computations before and after solving a frame.
 
-``start`` and ``choose`` run before the solve, ``accept_roots`` and ``store`` after it. The equivalent NumPy
-calls would take longer than solving a patch at rest.
+``start`` and ``choose`` run before the solve, ``accept_roots`` and ``store`` after it. NumPy calls for these
+computations would take longer than solving a patch at rest.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from skinnode.solve.wires import arrays as wires
 from skinnode.solve.wires.arrays import FrameArrays, SolverArrays
 
 STALE: Final = 2.0
-"""Factor of change in any weight of a tall system, above which the pseudoinverse J⁺ is recomputed."""
+"""If any weight of a tall system changes by more than this factor, the pseudoinverse J⁺ is recomputed."""
 DEADLINE: Final = int(Status.DEADLINE)
 
 
@@ -103,7 +103,7 @@ def store(solver: SolverArrays, frame: FrameArrays) -> bool:
     """Store each good solution as the last trusted solution, and the displacements of all wires.
 
     The standard deviations of all wires are stored as well. Returns whether any new trusted solution was
-    computed without one of its equations, whose ``a`` is then unknown.
+    computed without using all equations.
     """
     report, good = solver.report, frame.good
     solved_x, solved_a, solved_std = solver.x, solver.a_solved, solver.std

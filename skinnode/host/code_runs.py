@@ -45,8 +45,7 @@ LEAST_RUN: Final = 5
 a run of 1 if the codes of its neighbours have changed.
 """
 LEADS: Final = 3
-"""Number of crossings on a wire whose neighbours' codes must have changed before the wire is considered
-frozen.
+"""Minimum number of crossings on a frozen wire whose neighbours' codes have changed during the run.
 """
 
 _Int = NDArray[np.int64]

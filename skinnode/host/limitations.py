@@ -23,9 +23,8 @@ from skinnode.solve.tracker import choose_method
 from skinnode.solve.wires.problem import PatchProblem
 
 BY_PRIOR: Final = 0.3
-"""Standard deviation (fraction of the clearance) above which the resistances alone do not determine a
-displacement at rest. Few presses indent the layer by more than this fraction. Above the limit, neighbouring
-crossings and the elastic model mostly determine the displacement.
+"""Standard deviation (fraction of the clearance) above which resistances alone are considered insufficient to
+determine displacements. Few presses indent the layer by more than this fraction.
 """
 
 

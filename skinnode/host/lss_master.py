@@ -35,7 +35,7 @@ bus.
 
 STORE_ANSWER_S: Final = 2.0
 """Maximum time (s) to wait for the response to the store command. Before responding, the node writes to flash
-memory or syncs a file to disk. For comparison, CANopenNode's LSS master waits 1 s for every response.
+memory or syncs a file to disk. CANopenNode's LSS master waits 1 s for any response.
 """
 
 _SCAN_ANSWERS_S: Final = (0.03, 0.15)

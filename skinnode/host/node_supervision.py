@@ -26,7 +26,7 @@ heartbeat periods.
 
 _PROBE_NS: Final = 250_000_000
 """Interval (ns) between requests to an absent node. Without these requests, a node that sends no heartbeats
-would never be detected if its boot-up message was lost. The requests to four nodes take 0.1 % of a bus's
+would not be detected after its boot-up message was lost. The requests to four nodes take 0.1 % of a bus's
 capacity.
 """
 
@@ -56,7 +56,7 @@ class NodeSupervision:
         if node.upset or (count != node.defects and node.phase in (Phase.STARTING, Phase.RUNNING)):
             self._make_faulty(node, now_ns)
             return
-        # bring-up is already due, and must not be delayed by exceptions in frame handlers
+        # in the other phases, bring-up continues in spite of exceptions in frame handlers
         if count != node.defects:
             node.defects = count
             node.complaint = node.remote.monitor.defect = node.remote.defects.newest
@@ -87,7 +87,7 @@ class NodeSupervision:
             return
         if now_ns >= node.probe_ns:
             node.probe_ns = now_ns + _PROBE_NS
-            # the request is repeated later if the bus is unavailable or full
+            # a request that cannot be sent is repeated after `_PROBE_NS`
             with contextlib.suppress(BusError):
                 remote.probe()
         search_is_over = node.searching is None or node.searching.done()
@@ -150,7 +150,7 @@ class NodeSupervision:
         elif remote.monitor.said_since(NmtState.OPERATIONAL, node.since_ns):
             self._running(node, now_ns)
         elif remote.link.t_dispatched_ns > node.since_ns + START_DEADLINE_S * 1e9:
-            # the heartbeat was sent before the start command
+            # the state was reported before the start command, and no heartbeat has arrived since
             silent = remote.monitor.nmt_state == NmtState.OPERATIONAL
             self._fail(node, _not_started(remote, silent=silent), now_ns, refused=not silent)
         elif now_ns >= node.probe_ns:  # NMT commands are unconfirmed, so the start command may have been lost

@@ -69,7 +69,7 @@ class StreamStats:
 
 
 class StreamTap(Protocol):
-    """Recorder of the events other than received frames that affect which scans are solved.
+    """Recorder of the events, other than received frames, that affect which scans are solved.
 
     Mainline only.
     """

@@ -109,7 +109,7 @@ class Subscription:
                     except queue.Empty:
                         await arrived.wait()
         except TimeoutError:
-            if not limit.expired():  # not a timeout of this wait: the TimeoutError stopped the host
+            if not limit.expired():  # a TimeoutError stopped the host; the wait itself has not timed out
                 raise
             raise queue.Empty from None
         finally:

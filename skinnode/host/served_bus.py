@@ -62,7 +62,7 @@ class ServedBus:
 
 
 def serve_bus(hand: HandConfig, link: BusLink) -> ServedBus:
-    """Register the handlers for other masters, their SYNC, and LSS responses on a bus."""
+    """Register a bus's handlers for the frames of other masters and for LSS responses."""
     ticks = Ticks(hand.sync.counter_overflow)
     heard, lss = receive_bus(hand, link, ticks), LssMaster(link.send)
     link.handle(od.LSS_RESPONSE_COB_ID, lss.on_response)

@@ -21,7 +21,7 @@ _IDLE_S: Final = 0.1
 request."""
 
 _RETRY_S: Final = 0.02
-"""Pause after a bus error, in seconds, which is long enough to drain a full transmit queue."""
+"""Pause (s) after a bus error, long enough to drain a full transmit queue."""
 
 _CATCH_UP_FRAMES: Final = 4096
 """Maximum number of queued frames to process before a heartbeat is declared missed. A fully loaded 1 Mbit/s

@@ -112,8 +112,8 @@ class Storage:
     def report(self, t_ns: int) -> None:
         """Send emergency messages for the faults recorded since the last call.
 
-        If the fault affects the whole memory, its bit in the error register remains set, even across resets,
-        until the memory is reliable again.
+        A fault that affects the whole memory remains active, even across resets, until the memory is reliable
+        again.
         """
         for fault, detail in self._lasting.items():
             self._emcy.report(EmcyCode.DATA_SET, detail, t_ns, fault)

@@ -1,4 +1,4 @@
-"""Functions that read the time, wait, and start threads, based on either the system clock or a virtual clock.
+"""Functions that read the time, wait, and start threads on either the system clock or a virtual clock.
 
 Code that reads the time, waits or starts threads must call these functions. A new thread uses the clock of
 the thread that created it, and :func:`use` sets the clock of the current thread. Without a virtual clock,

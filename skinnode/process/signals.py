@@ -49,8 +49,7 @@ def stop_on_signal() -> Iterator[threading.Event]:
     was already ignored on entry, as under nohup.
 
     Raises:
-        ValueError: Called from a thread other than the main thread; only the main thread can set signal
-            handlers.
+        ValueError: The caller is not in the main thread; only the main thread can set signal handlers.
     """
     stop = SignalEvent()
 

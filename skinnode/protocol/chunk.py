@@ -160,7 +160,7 @@ def _places_of_codes(profile: PatchProfile) -> NDArray[np.intp]:
 
 @functools.lru_cache(maxsize=64)
 def chunk_of_code(profile: PatchProfile) -> NDArray[np.intp]:
-    """Return the chunk number of each code in a (U, K) array; chunks are numbered from 0 in sending order."""
+    """Return a (U, K) array of each code's chunk number; chunks are numbered from 0 in sending order."""
     lines, per_line = profile.lines, profile.n_codes // profile.lines
     within = np.arange(per_line) // profile.codes_per_chunk
     chunks = np.arange(lines)[:, None] * profile.chunks_per_line + within

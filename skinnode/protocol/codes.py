@@ -59,7 +59,7 @@ class CodeScale:
 
     @property
     def over_range(self) -> int:
-        """Reserved code for R/R0 outside ``lo`` to ``hi``, and for a measurement without a baseline."""
+        """Reserved code for R/R0 below ``lo`` or above ``hi``, and for a measurement without a baseline."""
         return self.steps + 1
 
     @property
@@ -132,7 +132,7 @@ def decode(codes: ArrayLike, baseline_ohm: ArrayLike, scale: CodeScale) -> tuple
 
     Returns:
         Resistances in ohm and a mask of the measurements, both with the same shape as ``codes``. The
-        resistance is NaN and the mask False for reserved codes, for :data:`MISSING`, and where R0 is not
+        resistance is NaN and the mask is False for reserved codes, for :data:`MISSING`, and where R0 is not
         positive and finite.
     """
     return Decoder(baseline_ohm, scale).decode(codes)

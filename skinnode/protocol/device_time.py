@@ -18,7 +18,7 @@ TIME_WRAP_US: Final = TIME_STEP_US << 16
 
 
 def restore_time_us(low_us: int, expected_us: int) -> int:
-    """Return the device time (µs) with the given low bits that is nearest to the expected time.
+    """Return the device time (µs) that has the given low bits and is nearest to the expected time.
 
     Args:
         low_us: device time from a checked summary, without its upper bits, µs.

@@ -1,4 +1,4 @@
-"""Decoding of partial scans, in which unsent chunks keep their last codes."""
+"""Decodes partial scans, in which unsent chunks keep their last codes."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from skinnode.protocol.profile import PatchProfile
 
 
 class HeldChunks:
-    """Store of the last known payload of each chunk of a patch.
+    """Stores the last known payload of each of a patch's chunks.
 
     Args:
         profile: sizes of the patch.
@@ -26,7 +26,7 @@ class HeldChunks:
         self.forget()
 
     def forget(self) -> None:
-        """Discard all payloads, because a missed scan may have changed the codes."""
+        """Discard all payloads, as required after a missed scan, which may have changed the codes."""
         self._payloads = [None] * self._profile.n_chunks
 
     def update(self, received: Sequence[bytes | None], *, carry: bool) -> None:

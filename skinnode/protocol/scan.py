@@ -96,8 +96,8 @@ class AssemblerStats:
     bad_length: int
     """* Frames with the wrong length for a chunk or a summary."""
     bad_index: int
-    """* Chunks with an index beyond the patch's last chunk, and summaries that state a number of chunks
-    larger than the patch has."""
+    """* Chunks with an index beyond the patch's last chunk, and summaries that announce more chunks than
+    the patch has."""
     bad_counter: int
     """* Frames whose scan counter is outside the range of the SYNC counter."""
     bad_form: int

@@ -103,7 +103,7 @@ def facts_of(table: Mapping[str, Any], patch: PatchConfig, bus: BusConfig) -> No
         bus: Configuration of the patch's bus.
 
     Raises:
-        KeyError, TypeError, OverflowError, ValueError: The table is malformed.
+        KeyError, TypeError, OverflowError, ValueError: The JSON object is malformed.
     """
     profile = PatchProfile.from_config(patch, bus)
     baseline = np.array(table["baseline_ohm"], dtype=np.float64)

@@ -45,7 +45,7 @@ class Tpdo:
     def __init__(self, number: int, records: PdoRecords) -> None:
         self.number, self._records = number, records
         self.ready_ns = 0
-        """End (ns) of the inhibit time, when the TPDO may be sent again."""
+        """Time (ns) at which the inhibit time ends and the TPDO may be sent again."""
         self.timer_ns = NO_DEADLINE_NS
         """Time (ns) at which the TPDO's event timer elapses."""
         self.waiting = False
@@ -72,7 +72,7 @@ class Tpdo:
         return min(self.timer_ns, self.ready_ns) if held else self.timer_ns
 
     def reload(self, t_ns: int) -> None:
-        """Apply the object dictionary's parameters for this TPDO, which were written at ``t_ns``."""
+        """Apply this TPDO's parameters, which were written to the object dictionary at ``t_ns``."""
         old, new = self.parameters, self._records.read()
         self.parameters = new
         if (old.enabled, old.kind, old.sync_start) != (new.enabled, new.kind, new.sync_start):
@@ -152,8 +152,8 @@ class TpdoEngine:
         self._claims: dict[int, Owner] = {}
         self._running = False
         self._timers = Timers()
-        # Numbers of the enabled TPDOs in ascending order, in three lists: TPDOs sent or sampled at SYNC,
-        # TPDOs sent on events, and TPDOs with an owner.
+        # Numbers of the enabled TPDOs in ascending order, in three lists: TPDOs that a SYNC sends or
+        # samples, TPDOs sent on events, and TPDOs with an owner.
         self._listening: list[int] = []
         self._eventful: list[int] = []
         self._owned: list[int] = []

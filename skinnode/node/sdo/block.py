@@ -25,8 +25,8 @@ SEGMENT_NS: Final = 500_000
 PDOs may cause a bus load of 70 %. A 1 Mbit/s bus then has a remaining capacity of at least 2200 frames/s.
 Block transfers use 2000 frames/s, so the transmit queue does not fill up.
 
-A block of 127 segments takes 64 ms, or 100 ms if the thread wakes up late. Clients wait longer than
-this for a frame; the canopen library, for example, waits 300 ms. Each time a segment cannot be sent, for
+A block of 127 segments takes 64 ms, or 100 ms if the thread wakes up late. Clients wait longer for a frame
+than one block takes; the canopen library, for example, waits 300 ms. Each time a segment cannot be sent, for
 example at a lower bit rate, the interval is doubled for the rest of the transfer.
 """
 SLOWEST_SEGMENT_NS: Final = 8 * SEGMENT_NS
@@ -42,7 +42,8 @@ TWICE_NS: Final = 3_000_000
 """Maximum interval (ns) between the two receptions of a duplicated frame: the duration of two maximum-length
 frames and an error frame at 125 kbit/s.
 
-A genuine second acknowledgement differs from the first, because the client has received more segments.
+An acknowledgement that is not a duplicate differs from the previous one, because the client has received more
+segments.
 """
 
 _LAST: Final = 0x80
@@ -91,7 +92,7 @@ class BlockUpload(Transfer):
         t_ns: time at which the initiate request was received, ns.
 
     Raises:
-        Refused: if the block size is not 1 to 127.
+        Refused: if the block size is not from 1 to 127.
     """
 
     def __init__(self, channel: Channel, target: Target, upload: Upload, t_ns: int) -> None:

@@ -6,9 +6,9 @@ readings of two wires changes the log evidence of a frame by −αᵀδ − ½ �
 readings z, α = P z, and δ is the change of z due to the exchange. The exchange fits no parameters to
 the frame, so an increase by a few nats is significant.
 
-In 108 healthy frames with six kinds of presses (staggered layout, h = 0.5, noise 1e-4), the log evidence
-changed by at most 2.8 nats. The median change was 125 nats with two upper wires crossed, and 43 nats with two
-lower wires crossed.
+In 108 healthy frames with six kinds of presses (staggered layout, h = 0.5, noise 1e-4), an exchange of two
+wires changed the log evidence by at most 2.8 nats. If two upper wires were actually crossed, the median
+change was 125 nats; for two lower wires, the median change was 43 nats.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class WirePair:
 
 
 def exchanged(z: Float, present: Mask, pair: WirePair) -> tuple[Float, Mask]:
-    """Return copies of the readings and their mask in which two wires are exchanged."""
+    """Return copies of the readings and of their mask, with two wires exchanged."""
     here, there = [pair.one, pair.other], [pair.other, pair.one]
     z, present = z.copy(), present.copy()
     for values in (z, present):

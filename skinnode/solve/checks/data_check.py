@@ -1,4 +1,4 @@
-"""Data check: find readings of a frame that contradict the others, solve without them, and assess trust.
+"""Finds the readings of a frame that contradict the others, solves without them, and assesses trust.
 
 Each frame is first solved with all readings except those with confirmed faults. The displacements are then
 converted to changes of the readings, linearised at rest. The model in
@@ -54,8 +54,8 @@ EXCUSED_FRAMES: Final = 8
 """Number of frames after an examination during which similar frames are not examined again; an examination
 takes 9 ms."""
 PATIENCE: Final = 4
-"""If the deadline leaves no time to examine suspicious frames, every n-th suspicious frame is examined
-anyway; this constant is n. A fault makes all subsequent frames suspicious; a press rarely does."""
+"""Interval, in suspicious frames, at which a frame is examined even if the deadline leaves no time. A fault
+makes all subsequent frames suspicious; a press rarely does."""
 EXAMINATION_S: Final = 3e-3
 """Expected duration of the first examination, s. Later examinations use measured durations."""
 CROSSED_FRAMES: Final = 5
@@ -161,7 +161,7 @@ class DataCheck:
     def check(
         self, solved: Solved, solve_without: Callable[[Mask], Solved], until: float = math.inf
     ) -> FieldFrame:
-        """Check the readings of a frame, and return its field with its faults and trust filled in.
+        """Check the readings of a frame, and return its field, including faults and trust.
 
         Args:
             solved: The frame, solved without the readings in :attr:`left_out`.

@@ -5,7 +5,7 @@ or loads that the prior does not expect, such as a contact much narrower than th
 in orthogonal matching pursuit, adds one load or one group of wrong readings at a time: the candidate with the
 largest gain in log evidence. Readings are reported as wrong only if the best explanation with faults exceeds
 the best explanation by loads alone by more than :data:`MARGIN` in log evidence. The same margin applies to
-crossed wires: after the two wires are exchanged, the readings are explained by loads alone.
+crossed wires. Their log evidence is that of loads alone after the two wires have been exchanged.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Confirmed faults of a stream of frames.
 
-The list decides which readings are left out of the next frames, and when they are used again.
+The list determines which readings are left out of the next frames, and when they are used again.
 """
 
 from __future__ import annotations

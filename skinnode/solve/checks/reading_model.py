@@ -36,8 +36,8 @@ MOST_USUAL: Final = 9
 :data:`USUAL`."""
 STORED: Final = 125_000_000
 """Maximum size of precomputed tables, in bytes. Computing the tables during the stream would delay the first
-touch by up to 0.1 s. The tables of the reference patch take 122 MB. For larger patches, the products with the
-loads are computed when they are needed."""
+frame with a touch by up to 0.1 s. The tables of the reference patch take 122 MB. For larger patches, the
+products with the loads are computed when they are needed."""
 OCTAVES: Final = (-7, 21)
 """Range of log2 κ, which covers noise from 1e-6 to 1e-2 and prior scales from 1e-4 to 1 pitch."""
 
@@ -178,7 +178,7 @@ def _model(layout: PatchLayout) -> ReadingModel:
 
 @njit
 def changes(jacobian_: Float, moved: Float, sigma: float, z: Float) -> None:
-    """Write J u / σ into ``z`` (U, K) for the displacements u, ``moved`` (U, 3N), in pitches."""
+    """Write J u / σ into ``z`` (U, K); the displacements u are ``moved`` (U, 3N), in pitches."""
     for u in range(z.shape[0]):
         multiply_vector(jacobian_[u], moved[u], z[u])
         for k in range(z.shape[1]):

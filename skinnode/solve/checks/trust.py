@@ -1,6 +1,6 @@
 """Decides whether a field is trusted and, if it is not, states the reason.
 
-A field is trusted if all upper wires in use converged, if sufficient readings and upper wires are in use, and
+A field is trusted if all upper wires in use converged, if enough readings and upper wires are in use, and
 if the readings do not contradict each other. The host additionally requires the patch to be alive.
 """
 
@@ -17,11 +17,11 @@ from skinnode.model.data_fault import DataFault
 from skinnode.model.status import Status
 
 OF_PATCH: Final = 0.75
-"""Minimum share of usable readings, and minimum share of trusted upper wires, for a field to be trusted. The
-field of the reference patch is still trusted if two upper wires and one lower wire are missing (share 0.77),
-but not if three upper wires are missing (0.7)."""
+"""Minimum fraction of usable readings, and minimum fraction of trusted upper wires, for a field to be
+trusted. The field of the reference patch is trusted if two upper wires and one lower wire are missing
+(fraction 0.77), but not if three upper wires are missing (0.7)."""
 OF_WIRE: Final = 0.8
-"""Minimum share of usable readings for an upper wire to be trusted."""
+"""Minimum fraction of a wire's readings that must be usable for the wire to be trusted."""
 CONTRADICTION: Final = (
     "the readings contradict each other, and no faulty wire or crossing explains the contradiction"
 )

@@ -42,7 +42,7 @@ from skinnode.solve.wires.problem import PatchProblem
 UNTOUCHED: Final = 4.0
 """Displacement, in standard deviations, up to which a patch is considered untouched.
 
-Noise alone exceeds this limit in 2 % of frames; those frames are searched for contacts.
+Noise alone exceeds this limit in 2 % of frames, which are then searched for contacts.
 """
 WILD: Final = 16.0
 """Maximum ratio of a wire's variances to the other wires' variances; a wire with a larger ratio is left
@@ -333,7 +333,8 @@ def _solve_loads(  # noqa: PLR0913, C901 - a kernel: field, matrices and outputs
             row, factor = whitening[i], moved[i]
             for j in range(z.size):
                 z[j] += factor * row[j]
-    for _ in range(SCALE_STEPS):  # MacKay's fixed point: Σ E[x]² = s² Σ (1 − posterior / prior variance)
+    # MacKay's fixed-point equation: Σ E[x]² = s² Σ (1 − posterior / prior variance)
+    for _ in range(SCALE_STEPS):
         power, count = 0.0, 0.0
         for j in range(z.size):
             variance = scale2 * gain[j] + level

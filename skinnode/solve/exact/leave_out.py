@@ -2,13 +2,13 @@
 
 If ``normal_only`` is set, the x and y coordinates of all electrodes are fixed at their rest values. If
 ``active_only`` is set, electrodes that no contact moves are fixed at rest. Initially, all electrodes of a
-wire are fixed. While χ² rejects the fit, the electrode that explains most of the residual becomes an unknown,
-together with its neighbours. If more than half of the electrodes have become unknowns, all electrodes become
-unknowns. As soon as the rest position explains a frame, all electrodes are fixed at rest again. The standard
-deviation of an omitted coordinate is the smallest movement that χ² would detect if no other electrode moved.
-To first order at rest, this movement is √(quantile − degrees of freedom) σ / ‖c‖. Here c is the component of
-the coordinate's column of J that is orthogonal to the columns of the unknowns and to the electrode's other
-columns.
+wire are fixed. While the χ² test rejects the fit, the electrode that explains most of the residual becomes an
+unknown, together with its neighbours. If more than half of the electrodes have become unknowns, all
+electrodes become unknowns. As soon as the rest position explains a frame, all electrodes are fixed at rest
+again. The standard deviation of an omitted coordinate is the smallest movement that the χ² test would detect
+if no other electrode moved. To first order at rest, this movement is √(quantile − degrees of freedom) σ /
+‖c‖. Here c is the component of the coordinate's column of J that is orthogonal to the columns of the unknowns
+and to the electrode's other columns.
 
 Each option rests on an assumption about the skin, and the standard deviations of the unknowns are valid only
 if the assumption holds. A χ² test reliably detects frames that violate the assumption of active_only. The

@@ -1,4 +1,4 @@
-"""Recovery of wires for which all solves in a frame failed to find an acceptable root.
+"""Recovers wires for which all solves in a frame failed to find an acceptable root.
 
 The recovery consists of three steps:
 

@@ -1,4 +1,4 @@
-"""Node with injected faults. Every frame between the node and its bus passes through this module.
+"""Simulated node with injected faults. All frames to and from the node pass through this module.
 
 Faults of readings are implemented in :mod:`vcan_sim.faulty_converter`, and faults of scans in
 :mod:`vcan_sim.faulty_scans`. Except for periodic events, the faults depend only on a seed and on the sequence

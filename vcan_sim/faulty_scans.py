@@ -234,7 +234,7 @@ class FaultyScans:
     def _send(self, can_id: int, data: bytes, *, spoilt: bool = False) -> bool:
         """Send a chunk or summary, then all late chunks of earlier scans.
 
-        Return whether the chunk or summary was sent.
+        Returns whether the chunk or summary was sent.
 
         After a ``spoilt`` frame, late chunks are not sent yet, because a receiver cannot tell from this frame
         that a new scan has begun.

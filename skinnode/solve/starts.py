@@ -32,8 +32,8 @@ POWER_STEPS: Final = 8
 """Number of inverse iterations for the smallest singular value of J. Inverse iteration converges quickly,
 because the second-smallest singular value is about three times the smallest."""
 DIFFERENCE: Final = 1e-4
-"""Half-width of the central difference of two Jacobians, pitches. Rounding errors are negligible, because the
-step is much larger than eps^(1/3) = 6e-6."""
+"""Step in either direction for the central difference of two Jacobians, pitches. Rounding errors are
+negligible with steps that are much larger than eps^(1/3) = 6e-6."""
 
 
 def guided_start(problem: PatchProblem, wire: int, a: Float, covariance: Float) -> tuple[Float, int]:

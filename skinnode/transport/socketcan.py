@@ -71,7 +71,7 @@ class SocketReader:
         """Number of frames dropped because the socket's receive buffer was full."""
         self._batch = MessageBatch(BATCH_FRAMES, FD_MTU, _ANCILLARY_BYTES)
         self.hardware_stamps = False
-        """Whether the newest frame had a hardware timestamp."""
+        """Whether the most recent frame had a hardware timestamp."""
         self._delay = HardwareDelay()
         sock.setsockopt(
             socket.SOL_SOCKET, _SO_TIMESTAMPNS, 0

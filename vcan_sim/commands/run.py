@@ -32,8 +32,8 @@ def run(  # noqa: PLR0913 - Typer derives a command's options from its arguments
     fault: Annotated[
         list[str] | None,
         typer.Option(
-            help="Faults of every node, such as lost=0.01,restart_every_s=5,frozen, or of one patch or bus, "
-            "such as palm:open_upper=3. Can be repeated.",
+            help="Faults of all nodes, such as lost=0.01,restart_every_s=5,frozen, or of one patch or bus, "
+            "such as palm:open_upper=3. This option can be repeated.",
             metavar="[PLACE:]FAULTS",
         ),
     ] = None,

@@ -132,7 +132,10 @@ class PointResponse:
         self._splines = tuple(CubicSpline(r, table) for table in tables)
 
     def __call__(self, distance_m: Float) -> tuple[Float, Float, Float, Float]:
-        """Return Z, A, B, K (m/N) of u_z = Z f_z; u_x = (A + B cos 2θ) f_x + B sin 2θ f_y + K cos θ f_z."""
+        """Return the coefficients Z, A, B and K (m/N) of the displacement due to a point force f.
+
+        The displacement is u_z = Z f_z and u_x = (A + B cos 2θ) f_x + B sin 2θ f_y + K cos θ f_z.
+        """
         found = [np.asarray(spline(distance_m)) for spline in self._splines]
         return found[0], found[1], found[2], found[3]
 

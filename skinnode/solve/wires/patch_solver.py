@@ -31,7 +31,7 @@ from skinnode.solve.wires.problem import PatchProblem
 from skinnode.solve.wires.solve_wires import solve_wires
 from skinnode.solve.wires.stages import accept_roots, choose, start, store
 
-# Stages of a call, in the order in which they run; combined with bitwise or
+# Stages of a call in the order in which they run, combined with bitwise or
 DECODE: Final = 1
 """Convert codes to resistances."""
 SCALE: Final = 2

@@ -1,9 +1,9 @@
-"""Prints all messages of the programs, one per line, so that an editor can read them together::
+"""Print all messages of the programs, one per line, so that an editor can review them together::
 
     python tools/messages.py [FOLDER...]
 
-A message is a string, such as an option's help text, that contains a space and is not a docstring.
-Placeholders in braces stand for the values inserted by an f-string.
+Every string that contains a space counts as a message, except docstrings. In the output of an f-string, the
+expressions in braces stand for the inserted values.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ FOLDERS = ("skinnode", "vcan_sim")
 
 
 class Message(NamedTuple):
-    """A string literal that may be shown to the user, and its location."""
+    """String literal that may be shown to the user, with its location."""
 
     place: str
     """File and line number."""
@@ -49,7 +49,7 @@ def _docstrings(tree: ast.AST) -> Iterator[ast.AST]:
 
 
 def _text(node: ast.AST) -> str | None:
-    """Return a string literal's text with placeholders; None if the node is not a string."""
+    """Return the text of a string literal or an f-string; None for any other node."""
     if isinstance(node, ast.Constant) and isinstance(node.value, str):
         return node.value
     if isinstance(node, ast.JoinedStr):

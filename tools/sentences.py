@@ -1,7 +1,7 @@
 """Select random sentences for an editor to grade: ``python -m tools.sentences --seed 1``.
 
-The sentences come from docstrings, comments, documentation pages, and messages (other strings of at least
-five words). Tests, the changelog, code blocks and tables are excluded.
+The sentences come from docstrings, comments, messages and documentation pages. A message is any other string
+of at least five words. Tests, the changelog, code blocks and tables are excluded.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ class Sentence(NamedTuple):
 
 
 def sentences() -> list[Sentence]:
-    """Return all sentences in the project, in the order of files."""
+    """Return all sentences in the project, file by file."""
     found: list[Sentence] = []
     for folder in ("skinnode", "vcan_sim", "tools"):
         for path in sorted((ROOT / folder).rglob("*.py")):

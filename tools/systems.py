@@ -1,11 +1,12 @@
 """Compare ``solve_system`` with SciPy on the Moré-Garbow-Hillstrom problems: ``python -m tools.systems``.
 
-All solvers use the same functions, a tolerance of 1e-12, and at most 2000 evaluations. All solvers start from
-the standard starting points multiplied by 1, 10 and 100. A square system with a root is solved if the final
-point is a root. Any other system is solved if the final point is a minimum of the residual norm. Whether a
-point is a root or a minimum is determined in 80-bit arithmetic, independently of the solver's reported
-status. A solver's claim is false if it reports success at a point that is neither a root nor a minimum, or a
-root of a square system at a point that is only a minimum.
+All solvers use the same functions, a tolerance of 1e-12, and at most 2000 evaluations. They start from the
+standard starting points multiplied by 1, 10 and 100. A square system that has a root is solved if the final
+point is a root. Any other system is solved if the final point is a minimum of the residual norm. The status
+that a solver reports is not used to decide this; roots and minima are verified in 80-bit arithmetic.
+
+A solver makes a false claim if it reports success at a point that is neither a root nor a minimum. It also
+makes a false claim if it reports a root of a square system at a point that is only a minimum.
 """
 
 from __future__ import annotations
@@ -31,8 +32,8 @@ MOST = 2000
 
 Function = Callable[[Any], Any]
 Solve = Callable[[Function, Function, Any], tuple[Any, bool, bool]]
-"""Solver function; returns the final point, whether a root or minimum is claimed, and whether a root is
-claimed."""
+"""Function that solves a system. It returns the final point, whether the solver claims a root or a minimum,
+and whether it claims a root."""
 
 
 def ours(operator: str) -> Solve:
@@ -75,14 +76,14 @@ SOLVERS: dict[str, Solve] = {
 
 
 def solved(problem: Problem, truth: Verdict) -> bool:
-    """Return whether a point classified as ``truth`` solves the problem."""
+    """Return whether a final point with the verdict ``truth`` solves the problem."""
     if truth.root or (problem.square and problem.least == 0):
         return truth.root
     return truth.minimum and (truth.isolated or truth.norm**2 <= problem.least * (1 + 5e-6))
 
 
 def outcomes(solve: Solve, square: bool) -> Iterator[dict[str, Any]]:
-    """Solve all square (or all tall) problems from every starting point; yield one outcome per attempt."""
+    """Solve all square or all tall problems from each of their starting points; yield the outcomes."""
     for problem in PROBLEMS:
         for factor in FACTORS if problem.square == square else ():
             calls = [0, 0]
@@ -107,7 +108,7 @@ def outcomes(solve: Solve, square: bool) -> Iterator[dict[str, Any]]:
 
 
 def measure(name: str) -> dict[str, Any]:
-    """Return one solver's row; the entry for tall problems is None if the solver does not support them."""
+    """Return a solver's row of the table; ``tall`` is None if the solver does not support tall systems."""
     kinds = {"square": True, "tall": False}
     found = {
         kind: None if "hybr" in name and not square else list(outcomes(SOLVERS[name], square))

@@ -1,4 +1,4 @@
-"""Renders docstring roles such as :class:`~skinnode.model.frames.FieldFrame` as code."""
+"""Show docstring roles such as :class:`~skinnode.model.frames.FieldFrame` as code in the documentation."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ _ROLE = re.compile(r":[a-z]+:`~?(?:[\w.]+\.)?([\w.]+)`")
 
 
 class Roles(griffe.Extension):
-    """Griffe extension that replaces the roles in docstrings during loading."""
+    """Griffe extension that replaces roles in docstrings when Griffe loads a module."""
 
     def on_object(self, *, obj: griffe.Object, **_: Any) -> None:
         if obj.docstring is not None:

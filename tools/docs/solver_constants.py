@@ -1,4 +1,4 @@
-"""Generates a table of the solver's tuning constants from the modules of ``skinnode.solve``."""
+"""Generate a table of the solver's tuning constants from the modules of ``skinnode.solve``."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ _NOT_TUNED: Final = {
     *("PREDICT", "HOLD", "COVARIANCE", "SKIP", "REUSE", "TASKS"),
     *("ROWS", "TILE", "REST", "TINY", "SQUARE_FLOOR", "A_MIN", "A_MAX", "NOISE_MAX"),
 }
-"""Names of constants that are omitted because they do not affect results: task flags, tile sizes, overflow
+"""Constants that the table omits because they do not affect results: task flags, tile sizes, overflow
 limits."""
 
 
 def constants() -> str:
-    """Return a table of all documented constants with numeric or accuracy values."""
+    """Return a table of all documented constants whose value is a number or an ``Accuracy``."""
     rows = [
         (md.code(f"{module.__name__.removeprefix('skinnode.solve.')}.{name}"), value, text)
         for module in _modules()

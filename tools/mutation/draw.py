@@ -1,12 +1,12 @@
 """Select random mutants of the source: ``python -m tools.mutation.draw`` writes ``mutants.json``.
 
 The mutation operators are those of cosmic-ray. First, places in the source are chosen with equal probability;
-then, one mutation is chosen for each place. If the choice were made directly among all mutations, a ``+``
-would be mutated eleven times as often as a ``not``, because it has eleven mutations.
+then, one mutation is chosen for each place. A direct choice among all mutations would select a ``+`` eleven
+times as often as a ``not``, because eleven different mutations apply to a ``+``.
 
-A mutant is identified by file, function, operator, and the text before and after the change. Line numbers are
-not used, so a list of mutants remains valid when code moves. The selection depends only on the seed and on
-digests of the places, so edits to other code do not affect whether a place is selected.
+A mutant is identified by its file, function and operator, and by the text before and after the change. Line
+numbers are not used, so a list of mutants remains valid when code moves. Places are ranked by a hash of the
+seed and of their source text. An edit therefore hardly changes which of the other places are selected.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ GROUPS: Final = {
     "solve": ("solve",),
     "host": ("host",),
 }
-"""Packages from which mutants are selected, by group."""
+"""Names of the groups of packages, and the packages in each group; mutants are selected for each group."""
 SEED: Final = 20260
 PER_PACKAGE: Final = 50
 
@@ -46,7 +46,7 @@ _DECORATORS_FOR_SPEED: Final = ("njit", "njit_part", "njit_body", "njit_brief", 
 
 @dataclass(frozen=True)
 class Mutant:
-    """A mutant of the source: a single change to a single file."""
+    """A single change to a single source file."""
 
     file: str
     """Path relative to the root of the repository."""
@@ -59,11 +59,11 @@ class Mutant:
     after: str
     """Lines added by the change."""
     nth: int
-    """Number of preceding mutants in the file with the same values of all other fields."""
+    """Index among the mutants of the file that are equal in all other fields, counted from 0."""
 
     @property
     def name(self) -> str:
-        """Name of the mutant: ten hexadecimal digits of a digest of all fields."""
+        """Name of the mutant: the first ten hexadecimal digits of a hash of all its fields."""
         return _digest(self.file, self.function, self.operator, self.before, self.after, self.nth)[:10]
 
     @property
@@ -85,7 +85,7 @@ class _Candidate:
 
 
 class _OnlyBehaviour(ast.NodeTransformer):
-    """Removes code that need not be tested: annotations, strings, and decorators that affect only speed."""
+    """Remove parts of the syntax tree that tests need not check: annotations, f-strings, speed decorators."""
 
     def visit_AnnAssign(self, node: ast.AnnAssign) -> Any:
         node.annotation = ast.Constant(0)
@@ -134,9 +134,11 @@ def _for_speed(decorator: ast.expr) -> bool:
 
 
 def _behaviour(source: str) -> str | None:
-    """Return a representation of ``source`` that reflects only its behaviour; None if it does not compile."""
+    """Return the syntax tree without parts that need no tests; None if ``source`` does not compile."""
     try:
-        with warnings.catch_warnings(action="ignore"):  # such as a warning about "is" with a literal
+        with warnings.catch_warnings(
+            action="ignore"
+        ):  # for example, a mutant that compares a literal with "is"
             compile(source, "mutant", "exec")
     except (SyntaxError, ValueError):
         return None
@@ -144,7 +146,7 @@ def _behaviour(source: str) -> str | None:
 
 
 def _functions(source: str) -> dict[int, str]:
-    """Return a mapping from each line to the qualified name of the innermost function or class around it."""
+    """Map each line number to the qualified name of the innermost function or class that contains it."""
     names: dict[int, str] = {}
 
     def walk(node: ast.AST, prefix: str) -> None:
@@ -193,7 +195,7 @@ def _changed_lines(source: str, other: str) -> tuple[str, str]:
 
 
 def _name(file: str, source: str, wanted: _Candidate) -> Mutant:
-    """Convert a candidate to a mutant; count preceding equal mutations to determine ``nth``."""
+    """Convert a candidate to a mutant; ``nth`` is the number of equal mutations before it in the file."""
     functions = _functions(source)
     function = functions.get(wanted.line, "<module>")
     before, after = _changed_lines(source, mutated(source, wanted.operator, wanted.occurrence))
@@ -221,7 +223,7 @@ def find(mutant: Mutant, source: str) -> str:
                 return other
             nth += 1
     raise LookupError(
-        f"{mutant.name}: {mutant.file}, {mutant.function}: no longer contains {mutant.before!r}"
+        f"{mutant.name}: {mutant.function} in {mutant.file} no longer contains {mutant.before!r}"
     )
 
 
@@ -279,7 +281,9 @@ def write(mutants: list[Mutant]) -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description="Select new mutants; keep the mutants of all other groups.")
+    parser = argparse.ArgumentParser(
+        description="Select new mutants for the given packages and keep all other mutants."
+    )
     parser.add_argument("--package", choices=GROUPS, action="append")
     packages = parser.parse_args().package or list(GROUPS)
     kept = [each for each in read() if each.group not in packages] if LIST.exists() else []

@@ -1,13 +1,14 @@
 """Run the tests on each selected mutant: ``python -m tools.mutation.run --package protocol``.
 
-Each mutant is applied to a private copy of the repository. The test stages listed in ``stages.toml`` are then
-run on the copy. The first failed test kills the mutant, as does a stage that exceeds its time limit. A
-failure of a real-time test is ignored unless the test also fails when run alone. Each verdict is written to
-``results.json`` immediately, and mutants with a verdict are skipped in later runs; ``--again`` repeats the
-survivors.
+Each mutant is applied to a private copy of the repository, and the test stages listed in ``stages.toml`` run
+on this copy. A mutant is killed if a test fails or if a stage exceeds its time limit. The failure of a
+real-time test is ignored unless the test also fails when it runs alone.
 
-A server process imports the libraries once and forks for each pytest run, because importing takes longer than
-most tests.
+Each verdict is written to ``results.json`` immediately. Later runs skip mutants that already have a verdict;
+``--again`` runs the surviving mutants again.
+
+Importing the libraries takes longer than most tests. This process therefore imports them once and forks a
+child for each pytest run.
 """
 
 from __future__ import annotations
@@ -50,8 +51,7 @@ _FILE_BYTES: Final = 1 << 30
 _TEST_S: Final = 120
 """Time limit for a single test, s."""
 _GRACE_S: Final = 60.0
-"""Constant part of a stage's time limit, s, which is added to six times the stage's duration without a
-mutant."""
+"""Constant part of a stage's time limit, s. The other part is six times the duration on unmutated code."""
 _PR_SET_CHILD_SUBREAPER: Final = 36
 _PASSED, _FAILED = 0, 1
 
@@ -68,7 +68,7 @@ class Outcome:
 
 
 class Tree:
-    """Private copy of the repository, with the kernels compiled from this copy."""
+    """Private copy of the repository, and a cache with the kernels compiled from it."""
 
     def __init__(self, folder: Path) -> None:
         self.source, self.cache, self.warm = folder / "tree", folder / "cache", folder / "warm"
@@ -102,10 +102,10 @@ class Tree:
             shutil.copy2(here, there)
 
     def put(self, mutant: Mutant) -> None:
-        """Apply a mutant to the copy, and remove only those compiled kernels that the mutant affects.
+        """Apply a mutant to the copy and remove the compiled kernels that the mutant affects.
 
-        numba itself recompiles the kernels of the mutated file. This method removes the kernels of all files
-        that import the mutated file.
+        numba detects the change of the mutated file and recompiles its kernels. It does not detect that
+        kernels in other files depend on the mutated file, so this method removes them.
         """
         path = self.source / mutant.file
         found = path.stat()
@@ -139,7 +139,7 @@ class Tree:
             ).stdout.strip()
 
     def _reached(self, file: str) -> set[str]:
-        """Return the names of kernel files that import ``file`` directly or indirectly."""
+        """Return the names of ``file`` and of all kernel modules that import it directly or indirectly."""
         package = ROOT / "skinnode"
         imports: dict[str, set[str]] = {}
         for path in (path for pattern in _KERNELS for path in package.glob(pattern)):
@@ -160,7 +160,7 @@ class Tree:
         os.utime(path, ns=times_ns)  # numba recompiles files whose modification time has changed
 
     def keep_kernels(self) -> None:
-        """Save the kernels compiled from the source without a mutant."""
+        """Save the kernels compiled from the unmutated source code."""
         shutil.rmtree(self.warm, ignore_errors=True)
         compiled = self.cache / "skinnode" / self._leaf()
         if compiled.exists():
@@ -187,7 +187,7 @@ class _Failures:
 
 
 def run_tests(tree: Tree, arguments: Sequence[str], limit_s: float) -> Outcome:
-    """Run pytest in a new process group; afterwards, kill all processes started by pytest."""
+    """Run pytest in a new process group, then kill all processes that pytest has started."""
     answer, begin_s = tree.log.with_name("answer"), time.monotonic()
     answer.unlink(missing_ok=True)
     child = os.fork()
@@ -235,7 +235,7 @@ def _be_pytest(tree: Tree, arguments: Sequence[str], answer: Path, limit_s: floa
         failures = _Failures()
         options = ["-q", "-n", "0", "--tb=short", "-p", "no:cacheprovider", "-o", f"timeout={_TEST_S}"]
         options += ["-W", "ignore::pytest.PytestAssertRewriteWarning"]
-        options += ["-W", "ignore::SyntaxWarning"]  # such as a warning about "is" with a literal
+        options += ["-W", "ignore::SyntaxWarning"]  # for example, a mutant that compares a literal with "is"
         status = int(pytest.main([*options, *arguments], plugins=[failures]))
         answer.write_text(json.dumps(failures.failed), "utf-8")
     except BaseException:
@@ -247,7 +247,7 @@ def _be_pytest(tree: Tree, arguments: Sequence[str], answer: Path, limit_s: floa
 
 
 def _end_children(group: int) -> None:
-    """Kill a process group, and all processes that left the group and were re-parented to this process."""
+    """Kill all processes in a group, then all other children, which may have left the group."""
     with contextlib.suppress(ProcessLookupError):
         os.killpg(group, signal.SIGKILL)
     for _ in range(100):
@@ -262,7 +262,7 @@ def _end_children(group: int) -> None:
 
 
 def _stages(mutant: Mutant, table: dict[str, Any]) -> list[list[str]]:
-    """Return the test files for a mutant, grouped by stage, without duplicates."""
+    """Return the test files for a mutant as one list per stage; each file occurs only once."""
     group = table[mutant.group]
     first = group.get("first", {}).get(Path(mutant.file).stem, [])
     stages, seen = [], set[str]()
@@ -282,7 +282,7 @@ def _expand(pattern: str) -> list[str]:
 
 
 class Session:
-    """Runs the tests on one tree; stores the results of the unmutated source as a reference."""
+    """Run tests on a tree. The results for the unmutated source code serve as a reference."""
 
     def __init__(self, tree: Tree, table: dict[str, Any], *, quick: bool) -> None:
         self._tree, self._table, self._quick = tree, table, quick
@@ -291,7 +291,7 @@ class Session:
         self._kept = tree.log.with_name("unmutated.json")
 
     def measure(self, mutants: Sequence[Mutant], *, trust: bool) -> None:
-        """Run the test files without a mutant, to measure durations and to exclude tests that fail."""
+        """Run the test files on unmutated code to measure their durations and to find failing tests."""
         if self._kept.exists() and trust:
             self._known = json.loads(self._kept.read_text("utf-8"))
         files = {path: None for each in mutants for stage in self._stages(each) for path in stage}
@@ -302,12 +302,14 @@ class Session:
         for path in missing:
             run = run_tests(self._tree, [path], 900.0)
             if run.status not in (_PASSED, _FAILED):
-                raise SystemExit(f"{path}: exit status {run.status} without a mutant; see {self._tree.log}")
+                raise SystemExit(
+                    f"{path}: exit status {run.status} on unmutated source code; see {self._tree.log}"
+                )
             failed = [
                 test for test in run.failed if run_tests(self._tree, [test], 900.0).status != _PASSED
             ]  # a test that passes alone probably failed because of CPU load
             for test in failed:
-                print(f"test excluded because it fails without a mutant: {test}", flush=True)
+                print(f"test excluded because it fails on unmutated source code: {test}", flush=True)
             self._known[path] = {"took_s": run.took_s, "failed": failed}
             self._kept.write_text(json.dumps(self._known, indent=1), "utf-8")
         if missing:
@@ -318,7 +320,7 @@ class Session:
         return stages[:1] if self._quick else stages
 
     def judge(self, mutant: Mutant) -> dict[str, Any]:
-        """Run the tests on a mutant; return the verdict and the reason for it."""
+        """Run the tests on a mutant; return the verdict, the reason and the duration."""
         begin_s = time.monotonic()
         try:
             self._tree.put(mutant)
@@ -336,7 +338,7 @@ class Session:
                 deselected = [word for test in left_out for word in ("--deselect", test)]
                 run = run_tests(self._tree, ["-x", *deselected, *files], limit_s)
                 if run.status is None:
-                    return "killed", f"time limit of {limit_s:.0f} s"
+                    return "killed", f"exceeded the time limit of {limit_s:.0f} s"
                 if run.status == _PASSED:
                     break
                 if run.status != _FAILED or not run.failed:
@@ -345,7 +347,7 @@ class Session:
                     return "killed", run.failed[0]
                 if run_tests(self._tree, [run.failed[0]], limit_s).status != _PASSED:
                     return "killed", run.failed[0]
-                print(f"{mutant.name}: failed only once: {run.failed[0]}", flush=True)
+                print(f"{mutant.name}: ignored a test that failed only once: {run.failed[0]}", flush=True)
                 left_out.append(run.failed[0])
         return ("open", "") if self._quick else ("survived", "")
 
@@ -365,7 +367,7 @@ def show(mutant: Mutant) -> str:
 
 
 def summary(mutants: Sequence[Mutant], results: dict[str, Any]) -> str:
-    """Return a line of text per group, followed by the survivors that are not known to be equivalent."""
+    """Return one line per group with the number of mutants by verdict, then the surviving mutants."""
     equivalent, lines = _equivalent(), []
     verdict = {each.name: results.get(each.name, {}).get("verdict", "not run") for each in mutants}
     verdict |= dict.fromkeys(equivalent, "equivalent")
@@ -382,7 +384,7 @@ def summary(mutants: Sequence[Mutant], results: dict[str, Any]) -> str:
 
 
 def _preload() -> None:
-    """Import slow-loading libraries, which are never mutated."""
+    """Import libraries that load slowly; they are never mutated."""
     import can  # noqa: F401
     import canopen  # noqa: F401
     import hypothesis  # noqa: F401
@@ -399,14 +401,14 @@ def main() -> None:
     parser.add_argument(
         "--only", action="append", metavar="NAME", help="run this mutant even if it already has a verdict"
     )
-    parser.add_argument("--again", action="store_true", help="run survivors again")
+    parser.add_argument("--again", action="store_true", help="run surviving mutants again")
     parser.add_argument(
-        "--trust", action="store_true", help="reuse earlier results of tests without a mutant"
+        "--trust", action="store_true", help="reuse earlier results of tests on unmutated source code"
     )
     parser.add_argument(
         "--quick",
         action="store_true",
-        help="run only the first stage; mutants that survive it remain undecided",
+        help="run only the first stage; give no verdict for mutants that survive it",
     )
     parser.add_argument("--show", action="store_true", help="print the verdicts without running tests")
     parser.add_argument(

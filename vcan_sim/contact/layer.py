@@ -134,7 +134,8 @@ class PointResponse:
     def __call__(self, distance_m: Float) -> tuple[Float, Float, Float, Float]:
         """Return the coefficients Z, A, B and K (m/N) of the displacement due to a point force f.
 
-        A normal force causes u_z = Z f_z. The force causes u_x = (A + B cos 2θ) f_x + B sin 2θ f_y + K cos θ f_z.
+        A normal force causes u_z = Z f_z. The tangential displacement along x is
+        u_x = (A + B cos 2θ) f_x + B sin 2θ f_y + K cos θ f_z.
         """
         found = [np.asarray(spline(distance_m)) for spline in self._splines]
         return found[0], found[1], found[2], found[3]

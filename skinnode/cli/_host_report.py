@@ -285,7 +285,7 @@ def _doubts(facts: Mapping[str, object]) -> str:
     """Return, as text, whether a trusted field is imprecise, and how many faults its readings have."""
     doubts, faults = "  imprecise" if facts["precise"] is False else "", facts["data_faults"]
     if isinstance(faults, list) and faults:
-        doubts += f"  {counted(len(faults), 'fault')} in the readings, excluded"
+        doubts += f"  {counted(len(faults), 'fault')} in the readings; the affected readings are excluded"
     return doubts
 
 

@@ -12,7 +12,9 @@ import typer
 
 from skinnode.errors import ConfigError
 
-app = typer.Typer(help="Measure solver, node and host on this machine.", no_args_is_help=True)
+app = typer.Typer(
+    help="Measure the performance of solver, node and host on this machine.", no_args_is_help=True
+)
 
 JsonFile = Annotated[
     Path | None, typer.Option("--json", metavar="FILE", help="Also write the results to FILE.")

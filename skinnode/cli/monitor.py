@@ -44,7 +44,7 @@ def monitor(
         ),
     ] = False,
     output: Annotated[
-        str,  # an empty string is not a folder name
+        str,  # Path would turn an empty string into the current folder
         typer.Option("--output", "-o", help="Folder for recordings made with the key r.", metavar="FOLDER"),
     ] = ".",
     seconds: Annotated[

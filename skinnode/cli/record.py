@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 def record(
     hand: Annotated[Path, typer.Argument(help="The hand to record.", metavar="HAND.toml")],
     output: Annotated[
-        str,  # an empty string is not a folder name
+        str,  # Path would turn an empty string into the current folder
         typer.Option(
             "--output",
             "-o",

@@ -93,7 +93,7 @@ def njit_part(function: _F) -> _F:
 def njit_body(function: _F) -> _F:
     """Inline ``function`` into the only kernel that calls it, before compilation.
 
-    Compiling and linking the two separately takes 50 % longer.
+    Compiling and linking ``function`` separately takes 50 % longer.
     """
     compiled: _F = numba.njit(inline="always", **_OPTIONS)(function)
     return compiled

@@ -55,7 +55,7 @@ def first_error(
 
 
 def short(value: object) -> object:
-    """Return ``value``; if its text exceeds 60 characters, return only the first 60, to fit on one line."""
+    """Return ``value``; if its text exceeds 60 characters, return the shortened text."""
     text = repr(value)
     return value if len(text) <= _LONGEST_SHOWN else Shown(text[: _LONGEST_SHOWN - 1] + "…")
 

@@ -36,7 +36,7 @@ class SolverConfig(Table):
     """Estimate drift of the resistances together with the displacement: as one gain for the whole ``patch``,
     or one gain for each upper ``wire``. Requires the method ``posterior``."""
     normal_only: bool = False
-    """Solve only for the height of the electrodes, without shear."""
+    """Solve only for the displacement of the electrodes in z, not for shear."""
     max_std_m: Annotated[
         float | None, Field(gt=0, le=1, allow_inf_nan=False), Allowed("a number above 0 and up to 1 (m)")
     ] = None

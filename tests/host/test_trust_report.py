@@ -81,7 +81,9 @@ def test_a_field_that_is_not_to_be_trusted_says_why() -> None:
 
 
 def test_a_trusted_field_without_some_readings() -> None:
-    assert line_of(a_field(faults=(FAULT,))).endswith("µm  1 fault in the readings, excluded")
+    assert line_of(a_field(faults=(FAULT,))).endswith(
+        "µm  1 fault in the readings; the affected readings are excluded"
+    )
     assert line_of(a_field(precise=False, faults=(FAULT, FAULT))).endswith(
-        "imprecise  2 faults in the readings, excluded"
+        "imprecise  2 faults in the readings; the affected readings are excluded"
     )

@@ -178,11 +178,11 @@ the mask of open wires has sub-index 2 i + 1, and the mask of shorted wires has 
 REJECTED_FRAMES: Final = 0x2040
 """Index of the counters of rejected frames; see :class:`skinnode.node.rejected.Rejected`."""
 CODES: Final = 0x2100
-"""Index of an array that contains the latest codes of upper wire 0, one code per sub-index. The array for
-upper wire r has index CODES + r."""
+"""Index of an array that contains the latest codes of upper wire 0, one code per sub-index. The codes of
+upper wire r are at index CODES + r."""
 BASELINE: Final = 0x2200
 """Index of an array that contains the R0 values of upper wire 0 in ohms (0 if unknown), one value per
-sub-index. The array for upper wire r has index BASELINE + r."""
+sub-index. The R0 values of upper wire r are at index BASELINE + r."""
 COORDINATES: Final = 0x2300
 """Index of the electrode coordinates, a DOMAIN; see
 :func:`skinnode.protocol.coordinates.pack_coordinates`."""

@@ -10,7 +10,7 @@ if TYPE_CHECKING:
 
 
 class Place(NamedTuple):
-    """A bus and its hand; the hand is None if no hand file is given."""
+    """A bus and the hand to which the bus belongs; the hand is None if no hand file is given."""
 
     bus: BusConfig
     hand: HandConfig | None

@@ -64,8 +64,8 @@ def faults_and_notes(running: Host) -> tuple[list[str], list[str]]:
     """Return the faults and the notes of the run, one line each.
 
     A node that skips scans because the computer running it is too slow sends EMCY 0x8110. If a node has sent
-    EMCY 0x8110, its missing and late frames are notes, not faults. An EMCY 0x8110 that is still active at the
-    end is also a note. Wrong frames remain faults.
+    EMCY 0x8110, its missing and late frames are reported as notes, not as faults. An EMCY 0x8110 that is
+    still active at the end is also reported as a note. Wrong frames remain faults.
     """
     _let_overruns_end(running)
     stats = running.stats()

@@ -211,7 +211,9 @@ def accuracy(
 def path(
     json: JsonFile = None,
     plot: PlotFile = None,
-    experiments: Annotated[int, typer.Option(min=1, help="Number of random presses per setting.")] = 10,
+    experiments: Annotated[
+        int, typer.Option(min=1, help="Number of random presses per layout and press depth.")
+    ] = 10,
 ) -> None:
     """Reproduce tables 2, 3 and 4 and figures 8 to 13 of the paper; print the paper's values alongside."""
     from skinnode.bench import path as bench

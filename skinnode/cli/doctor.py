@@ -37,9 +37,9 @@ def doctor(
     """Examine buses, nodes, configuration, wires, noise, baseline, timing and losses.
 
     The command only receives frames and reads objects, so it does not disturb a running hand. To test the
-    skin, it needs the scans that the nodes send; with --active, it starts a hand that is not running. Do not
-    touch the skin while the command runs. The exit status is 0 if no fault was found, 1 if any was found, 2
-    if the command could not run.
+    skin, the command needs the scans that the nodes send; with --active, it starts nodes that are not
+    running. Do not touch the skin while the command runs. The exit status is 0 if no fault was found, 1 if
+    any was found, 2 if the command could not run.
     """
     from skinnode.cli._bus import find_buses
     from skinnode.cli._console import print_json, progress

@@ -59,11 +59,11 @@ def monitor(
 ) -> None:
     """Show a hand on the terminal: depth and shear maps, touches, health, rates, load, events.
 
-    The command runs the hand as `skinnode host` does, but waits for missing patches. Keys 1-9 select a patch;
-    z shows only the selected patch, and t tares it. Key r records, space freezes the picture, ? shows help,
-    q quits.
-    The screen requires the optional packages of the extra `tui`. The exit status is 0 if no fault occurred, 1
-    if any fault occurred (faults are printed at the end), 2 if the monitor could not run.
+    The command runs the hand as `skinnode host` does, but waits for missing patches. Keys: 1-9 select a
+    patch, z shows only the selected patch, t tares the selected patch, r records, space freezes the picture,
+    ? shows help, q quits. The screen requires the optional packages of the extra `tui`. The exit status is 0
+    if no fault occurred, 1 if any fault occurred (faults are printed at the end), 2 if the monitor could not
+    run.
     """
     from skinnode.errors import NOTHING, ConfigError, Shown
 
@@ -195,7 +195,7 @@ def _show(source: Source, stop: threading.Event, seconds: float | None, output: 
     app.run(mouse=False)  # without mouse capture, text can be selected and copied
     if app.failure is not None:
         raise app.failure
-    if app.return_code:  # textual has reported an internal error of the screen
+    if app.return_code:  # the package textual has reported an internal error
         raise typer.Exit(2)
     if app.terminal_is_deaf:  # output would be invisible while the screen is shown
         raise typer.Exit(1 if app.faults.lines else 0)

@@ -41,7 +41,7 @@ from numba.extending import register_model as typed_register_model
 from numba.np import arrayobj as typed_arrayobj
 from numpy.typing import NDArray
 
-cgutils: Any = typed_cgutils  # numba's own type hints do not match this use
+cgutils: Any = typed_cgutils  # Any, because numba's type hints do not match the use here
 errors: Any = typed_errors
 imputils: Any = typed_imputils
 types: Any = typed_types

@@ -58,7 +58,7 @@ class KernelCache:
         file = inspect.getfile(function)
         self._folder = folder
         self._stem = f"{Path(file).stem}.{function.__qualname__}-{code.co_firstlineno}"
-        # without the path of the file, so that all installations of the same code share their kernels
+        # the path of the file is omitted, so that all installations of the same code share their kernels
         self._source = (sys.implementation.cache_tag, _file_digest(file), code.co_code.hex())
 
     @property

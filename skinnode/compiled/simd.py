@@ -4,7 +4,7 @@ LLVM prefers 256-bit vectors even if 512-bit vectors are twice as fast. LLVM vec
 provably do not overlap, and it may keep sums in memory instead of registers. ``load``, ``fma`` and ``store``
 each compile to the vector instruction of the same name, and each lane accumulates its own sum in the order
 written. A kernel's results therefore do not depend on the number of threads or on how the columns are
-divided. On processors with narrower vectors, each operation is split.
+divided. On processors with vectors narrower than LANES doubles, each operation is split.
 
 Vectors support +, − and *; a double in such an expression is broadcast to a vector.
 """
@@ -24,7 +24,7 @@ from numba.core.typing import templates as typed_templates
 
 from skinnode.compiled.jit import numba
 
-extending: Any = typed_extending  # numba's own type hints do not match this use
+extending: Any = typed_extending  # Any, because numba's type hints do not match the use here
 types: Any = typed_types
 templates: Any = typed_templates
 signature: Any = templates.signature

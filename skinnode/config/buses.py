@@ -102,7 +102,7 @@ class SyncConfig(Table):
     another master has no counter, the value is 0, and each patch numbers its own scans."""
     stagger_ms: Annotated[float, Field(ge=0, allow_inf_nan=False), Allowed("a delay of at least 0 ms")] = 0.0
     """Delay from the SYNC on one bus to the SYNC on the next bus, milliseconds, if the host is the master. If
-    the delay is 0, the scans on all buses end at the same time and must wait for each other to be solved."""
+    the delay is 0, the scans on all buses end at the same time, and some must wait to be solved."""
 
     @property
     def stagger_s(self) -> float:
@@ -123,7 +123,7 @@ class BringUpConfig(Table):
     ``wait``, the host starts the other patches and waits for the missing patch."""
     heartbeat_ms: Annotated[int, Field(ge=20, le=10_000), Allowed("an integer from 20 to 10000")] = 250
     """Heartbeat period of the nodes, milliseconds. The host configures this period in the nodes. A guest that
-    sends nothing cannot configure it, and assumes that the nodes use this period. At a period of 250 ms, a
+    sends nothing assumes that the nodes already use this period. At a period of 250 ms, a
     lost node is detected within a second, and the heartbeats of four nodes use 0.1 % of the bandwidth."""
 
     @property

@@ -184,7 +184,7 @@ class HandConfig(Table):
 
 
 def load_hand(path: Path | str) -> HandConfig:
-    """Read a hand file. Paths in the file are relative to its folder.
+    """Read a hand file. Paths in a hand file are relative to the folder that contains the file.
 
     Args:
         path: The file.

@@ -63,9 +63,10 @@ class LayoutConfig(Table):
     upper_electrodes: Count = 10
     """Number of electrodes per upper wire, N."""
     lower_wires: Count | None = None
-    """Number of lower wires, K; each lower wire is one column of the resistance matrix. None: 3 N."""
+    """Number of lower wires, K; each lower wire is one column of the resistance matrix. If
+    None, K is 3 N."""
     lower_electrodes: Count | None = None
-    """Number of electrodes per lower wire, M; None: U."""
+    """Number of electrodes per lower wire, M. If None, M equals U."""
     resistivity_ohm_per_m: _Resistivity = 1e7
     """Resistance of the rubber between two electrodes, divided by their distance, ohm per metre."""
     coordinates: Annotated[Coordinates, one_of(Coordinates)] = "preset"
@@ -192,7 +193,7 @@ class PatchConfig(Table):
     bus: Name = "can0"
     """Name of the bus to which the patch is connected."""
     link: Name | None = None
-    """Name of the robot link that carries the patch; None: the patch is fixed to the hand itself."""
+    """Name of the robot link that carries the patch. If None, the patch is fixed to the hand itself."""
     pose: PoseConfig = PoseConfig()
     """Pose of the patch's coordinate frame in the frame of its link or, without a link, in the hand's frame.
     A link without a pose in ``[[links]]`` has the same frame as the hand."""
@@ -205,7 +206,7 @@ class PatchConfig(Table):
     serial: Annotated[int | None, Field(ge=0, le=0xFFFF_FFFF), Allowed("an integer from 0 to 2^32 - 1")] = (
         None
     )
-    """Required serial number of the node (0x1018:4). None: the host accepts any serial number. If no node
+    """Required serial number of the node (0x1018:4). If None, the host accepts any serial number. If no node
     answers at the node-ID, the host finds the node by its serial number over LSS and assigns the node-ID."""
     relative_noise: Ratio = 3e-6
     """Relative standard deviation of the analogue noise in a resistance measurement, excluding
@@ -214,7 +215,7 @@ class PatchConfig(Table):
         Path | None, Field(strict=False), Allowed("the path of a file of resistances in ohm")
     ] = None
     """File with the resistances at rest, ohm: one line per upper wire, one number per lower wire.
-    None: the host reads the resistances at rest from the node."""
+    If None, the host reads the resistances at rest from the node."""
     calibration: CalibrationConfig = CalibrationConfig()
     tolerances: Annotated[TolerancesConfig, Field(json_schema_extra=_or_named), Allowed(_TOLERANCES)] = (
         TolerancesConfig()

@@ -28,8 +28,8 @@ class SolverConfig(Table):
     deadline_us: Annotated[
         int | None, Field(ge=100, le=10_000_000), Allowed("an integer from 100 to 10000000")
     ] = None
-    """Time limit for solving one scan, microseconds, after which the solver returns its current estimate;
-    None: no limit."""
+    """Time limit for solving one scan, microseconds; None means no limit. At the limit, the solver returns
+    its current estimate."""
     estimate_noise: bool = False
     """Estimate the noise in the resistances from the stream of scans. Requires the method ``posterior``."""
     drift: Annotated[Drift, one_of(Drift)] = "none"
@@ -40,16 +40,17 @@ class SolverConfig(Table):
     max_std_m: Annotated[
         float | None, Field(gt=0, le=1, allow_inf_nan=False), Allowed("a number above 0 and up to 1 (m)")
     ] = None
-    """A field is precise only if no displacement has a standard deviation above this limit, metres. None: the
-    limit is derived from the layout and the noise."""
+    """A field is precise only if no displacement has a standard deviation above this limit, metres. If
+    None, the limit is derived from the layout and the noise."""
     max_force_std_n: Annotated[
         float | None, Field(gt=0, le=1e6, allow_inf_nan=False), Allowed("a number above 0 and up to 1e6 (N)")
     ] = None
     """A field is precise only if no contact's normal force has a standard deviation above this limit,
-    newtons. None: the limit is derived from the layout and the properties of the rubber, and applies only to
-    calibrated forces."""
+    newtons. If None, the limit is derived from the layout and the properties of the rubber, and applies only
+    to calibrated forces."""
     workers: Annotated[int | None, Field(ge=1, le=64), Allowed("an integer from 1 to 64")] = None
-    """Number of threads that solve patches in parallel; None: one per core, at most one per patch."""
+    """Number of threads that solve patches in parallel. If None, the host uses one thread per core, but at
+    most one per patch."""
 
 
 class StreamConfig(Table):

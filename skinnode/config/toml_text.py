@@ -32,7 +32,7 @@ _VALUE: Final = re.compile(rf"{_STRING}|[^,\[\]{{}}#\n]+", re.DOTALL)
 _KEY: Final = re.compile(r'"(?:\\.|[^"\\\n])*"|\'[^\'\n]*\'|[A-Za-z0-9_-]+')
 _LONGEST_LINE: Final = 60
 _DEEPEST: Final = 32
-"""Maximum number of parts in a key; a hand file needs six."""
+"""Maximum number of parts in a key; keys in a hand file have at most six parts."""
 _PART: Final = r"(?:[\w-]++|\"[^\"\n]*+\"|'[^'\n]*+')[ \t]*+"
 _LONG_KEY: Final = re.compile(rf"(?<![\w\-\"'])(?:{_PART}\.[ \t]*+){{{4 * _DEEPEST}}}")
 """Pattern that matches a key with at least four times ``_DEEPEST`` parts. The pattern also matches any other

@@ -64,7 +64,7 @@ class Result:
     why: str = ""
     """Reason for the verdict; empty if the device passed without a warning.
 
-    This text gives the expected and received data, the cause of the warning, or why the case does not apply.
+    The reason gives the expected and received data, the cause of a warning, or why the case does not apply.
     """
     seconds: float = 0.0
     trace: tuple[TraceLine, ...] = field(default=(), repr=False)

@@ -73,7 +73,7 @@ def eds(
         {name: size for name, size in sizes.items() if size is not None}, layout, code_bits, fd
     )
     if dcf and node_id is None:
-        raise ConfigError("--node-id", None, "1 to 127, for --dcf")
+        raise ConfigError("--node-id", None, "a node-ID from 1 to 127 for the DCF")
     for option, value in (("--node-id", node_id), ("--bitrate", bitrate)):
         if value is not None and not dcf:
             raise ConfigError(

@@ -71,7 +71,7 @@ class BusConfig(Table):
     """Node-ID in the heartbeat that the host sends as master. The patches monitor the host's heartbeat and go
     pre-operational when it stops. If the node-ID is None, the host sends no heartbeat."""
     max_load: Annotated[
-        float, Field(gt=0, le=1, allow_inf_nan=False), Allowed("a number above 0 and up to 1")
+        float, Field(gt=0, le=1, allow_inf_nan=False), Allowed("a number greater than 0 and at most 1")
     ] = MAX_BUS_LOAD
     """Maximum planned bus load, as a fraction, assuming that every frame has its maximum length."""
     others: Annotated[tuple[OtherFrame, ...], Field(strict=False)] = ()

@@ -152,7 +152,9 @@ class HandConfig(Table):
         masters = [bus for bus in self.buses if bus.role == "master"]
         if (len(masters) - 1) * self.sync.stagger_ms >= self.sync.period_ms:
             most = self.sync.period_ms / (len(masters) - 1)
-            allowed = f"below {most:g}: the SYNC must be sent on all {len(masters)} buses within one period"
+            allowed = (
+                f"below {most:g}, because the SYNC must be sent on all {len(masters)} buses within one period"
+            )
             raise ConfigError("sync.stagger_ms", self.sync.stagger_ms, allowed)
         for i, bus in enumerate(self.buses):
             node_ids = [patch.node_id for patch in self.patches_on(bus.name)]

@@ -38,12 +38,16 @@ class SolverConfig(Table):
     normal_only: bool = False
     """Solve only for the displacement of the electrodes in z, not for shear."""
     max_std_m: Annotated[
-        float | None, Field(gt=0, le=1, allow_inf_nan=False), Allowed("a number above 0 and up to 1 (m)")
+        float | None,
+        Field(gt=0, le=1, allow_inf_nan=False),
+        Allowed("a number greater than 0 and at most 1 (m)"),
     ] = None
     """A field is precise only if no displacement has a standard deviation above this limit, metres. If
     None, the limit is derived from the layout and the noise."""
     max_force_std_n: Annotated[
-        float | None, Field(gt=0, le=1e6, allow_inf_nan=False), Allowed("a number above 0 and up to 1e6 (N)")
+        float | None,
+        Field(gt=0, le=1e6, allow_inf_nan=False),
+        Allowed("a number greater than 0 and at most 1e6 (N)"),
     ] = None
     """A field is precise only if no contact's normal force has a standard deviation above this limit,
     newtons. If None, the limit is derived from the layout and the properties of the rubber, and applies only

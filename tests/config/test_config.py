@@ -246,7 +246,11 @@ NAME = "a string of 1 to 64 printable characters, not all blank"
             [{"can_id": 0x800, "period_ms": 10}],
             "buses[0].others[0].can_id: got 2048, allowed: an integer from 0 to 0x7FF",
         ),
-        (["buses", 0, "max_load"], 1.5, "buses[0].max_load: got 1.5, allowed: a number above 0 and up to 1"),
+        (
+            ["buses", 0, "max_load"],
+            1.5,
+            "buses[0].max_load: got 1.5, allowed: a number greater than 0 and at most 1",
+        ),
         (["buses", 0, "role"], "slave", "buses[0].role: got 'slave', allowed: master or guest"),
         (
             ["buses", 0, "role"],

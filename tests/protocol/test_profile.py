@@ -353,7 +353,7 @@ def test_the_command_takes_the_sizes_of_a_layout(tmp_path: Path, monkeypatch: py
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
-        (["--dcf"], "--node-id: got nothing, allowed: 1 to 127, for --dcf"),
+        (["--dcf"], "--node-id: got nothing, allowed: a node-ID from 1 to 127 for the DCF"),
         (["--node-id=4"], "--node-id: got 4, allowed: only with --dcf"),
         (["--bitrate=500000"], "--bitrate: got 500000, allowed: only with --dcf"),
         (["--layout=aligned", "--lower-wires=4"], "--lower-wires: got 4, allowed: only without --layout"),

@@ -17,12 +17,12 @@ _MAPPINGS: Final = (*range(0x1600, 0x1800), *range(0x1A00, 0x1C00))
 _INVALID: Final = 1 << 31
 _LAST: Final = {_SYNC_COUNTER: 1, _PERIOD: 2, _SYNC: 3, _VERIFY: 4}
 """Objects to write after all others, in this order. The SYNC counter overflow value can be written only while
-the period is 0. The producer is started after both have been written. 0x1020 is written last, because a write
-to any other object clears it."""
+the SYNC period (0x1006) is 0. Writing 0x1005 starts the SYNC producer. 0x1020 is written last, because a
+write to any other object clears it."""
 
 
 def read_configuration(dut: Dut) -> dict[tuple[int, int], bytes]:
-    """Read all readable and writable objects, except commands and objects of variable length."""
+    """Read all readable and writable objects except 0x1003, 0x1010, 0x1011 and objects of variable length."""
     values: dict[tuple[int, int], bytes] = {}
     for entry in dut.eds.between(0x1000, 0x9FFF):
         if entry.index in _COMMANDS or not entry.size or not (entry.readable and entry.writable):
@@ -30,7 +30,7 @@ def read_configuration(dut: Dut) -> dict[tuple[int, int], bytes]:
         try:
             values[entry.index, entry.subindex] = dut.sdo.read(entry.index, entry.subindex)
         except Failed:
-            continue  # the OD cases report read failures
+            continue  # read failures are reported by the cases in area OD
     return values
 
 

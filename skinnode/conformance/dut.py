@@ -59,7 +59,7 @@ class Dut:
         self.bus.send(0x000, bytes((command, self.node_id)))
 
     def reset(self, command: int = RESET_NODE) -> None:
-        """Reset the node and await its boot-up message. Raises Failed unless it arrives."""
+        """Reset the node and await its boot-up message. Raises Failed if no such message arrives."""
         self.bus.clear()
         self.nmt(command)
         frame = self.bus.expect(
@@ -140,7 +140,7 @@ class Dut:
             raise Failed(f"{STATES[state]} {what}", STATES.get(got, f"state {got}"))
 
     def guard(self, what: str) -> int | None:
-        """Request the state with a remote frame and return the response byte; None without a response."""
+        """Request the state by remote frame; return the response byte, or None if there is no response."""
         self.bus.pending(self.error_control_id)
         self.bus.send(self.error_control_id, remote=True)
         frame = self.bus.take(self.error_control_id, 4 * QUIET_S)

@@ -176,7 +176,7 @@ def _hex(text: str) -> bytes | None:
 
 
 def parse_eds_file(path: Path, key: str = "EDS") -> tuple[Eds, EdsText]:
-    """Read an EDS or DCF in any encoding; the result's ``source`` names the encoding unless it is ASCII.
+    """Read an EDS or DCF in any encoding; a non-ASCII encoding is named in ``source`` of the result.
 
     Args:
         path: The file.
@@ -204,7 +204,7 @@ def parse_eds(text: str, source: str, codec: str = "utf-8") -> Eds:
     Args:
         text: Content of the file.
         source: Name of the file, for messages.
-        codec: Codec of non-ASCII names.
+        codec: Codec of the non-ASCII characters in the text.
 
     Raises:
         ProfileError: The text is not an EDS.
@@ -260,7 +260,7 @@ def _entries(
                 _object(entries, index, sections[title], found)
         except (ValueError, KeyError) as error:
             found.append(f"[{title}]: {error}")
-        if len(entries) > _MOST_ENTRIES:  # 60 characters can declare a compact array of 255 entries
+        if len(entries) > _MOST_ENTRIES:  # 60 characters can declare 255 entries (CompactSubObj)
             got = Shown(f"more than {_MOST_ENTRIES} values in the sections up to {title}")
             raise ProfileError("EDS", got, f"at most {_MOST_ENTRIES}", where=source)
     return entries, found
@@ -311,7 +311,7 @@ def _add(
 
 
 def _listed(sections: Mapping[str, Mapping[str, str]], described: set[int]) -> Iterator[str]:
-    """Yield a line for each object that is only listed or only described, and for each wrong count."""
+    """Yield a line for each object listed but not described, or vice versa, and for each wrong count."""
     listed: set[int] = set()
     for name in ("mandatoryobjects", "optionalobjects", "manufacturerobjects"):
         options = sections.get(name, {})

@@ -79,7 +79,7 @@ def mapped(dut: Dut, pdo: Pdo) -> list[int]:
 
 
 def payload_bytes(entries: list[int]) -> int:
-    """Return the length, in bytes, of a PDO with these mapping entries."""
+    """Return the length, in bytes, of a PDO with the given mapping entries."""
     return sum(entry & 0xFF for entry in entries) // 8
 
 

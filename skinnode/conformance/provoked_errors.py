@@ -1,4 +1,4 @@
-"""Provokes errors over the bus: a PDO that is too short, a missing heartbeat, missing guarding requests."""
+"""Provokes errors in the device under test by short PDOs, missing heartbeats or missing guarding requests."""
 
 from __future__ import annotations
 

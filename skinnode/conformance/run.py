@@ -1,4 +1,4 @@
-"""Runs each case after a reset and within a bounded time, and restores the node's configuration."""
+"""Runs each case after a reset, and finally restores the node's original configuration."""
 
 from __future__ import annotations
 

@@ -67,7 +67,7 @@ class Aborted(Failed):
 
 def name(code: int) -> str:
     """Return an abort code in hexadecimal, followed by its meaning."""
-    return f"0x{code:08X} ({MEANINGS.get(code, 'not a code of CiA 301')})"
+    return f"0x{code:08X} ({MEANINGS.get(code, 'not defined in CiA 301')})"
 
 
 def crc16(data: bytes) -> int:
@@ -109,7 +109,7 @@ class SdoClient:
         return self.answer(what)
 
     def served(self, request: bytes, what: str) -> bytes:
-        """Send a request as :meth:`ask` does and return the response. Raises Aborted if it is an abort."""
+        """Send a request as :meth:`ask` does and return the response. Raises Aborted if the node aborts."""
         return _not_aborted(self.ask(request, what), what)
 
     def _checked(self, frame: Frame | None, what: str) -> bytes:
@@ -173,7 +173,7 @@ class SdoClient:
             if answer[0] & 1:
                 return data
             toggle ^= 0x10
-        raise Failed(f"a last segment within {_MOST_BYTES} bytes, {what}", "none")
+        raise Failed(f"the last segment within {_MOST_BYTES} bytes, {what}", "none")
 
     def integer(self, index: int, subindex: int = 0) -> int:
         """Upload an unsigned number."""
@@ -197,7 +197,7 @@ class SdoClient:
         answer = self.served(start, what)
         if answer[0] & 0xF9 != 0xC0 or answer[1:4] != mux(index, subindex):
             raise Failed(
-                f"a response with C0, C2, C4 or C6 and the object to {what}", answer.hex(" ").upper()
+                f"a response to {what} with C0, C2, C4 or C6 and the object", answer.hex(" ").upper()
             )
         announced = int.from_bytes(answer[4:8], "little") if answer[0] & 2 else None
         checked = crc and bool(answer[0] & 4)
@@ -268,14 +268,14 @@ class SdoClient:
         answer = self.served(start, what)
         if answer[0] & 0xFB != 0xA0 or answer[1:4] != mux(index, subindex) or not 1 <= answer[4] <= 127:
             raise Failed(
-                f"a response with A0 or A4, the object and a block size to {what}", answer.hex(" ").upper()
+                f"a response to {what} with A0 or A4, the object and a block size", answer.hex(" ").upper()
             )
         parts = [data[at : at + _SEGMENT] for at in range(0, len(data), _SEGMENT)]
         if len(parts) > answer[4]:
             raise Failed(f"a block size of at least {len(parts)}, {what}", str(answer[4]))
         for number, part in enumerate(parts, 1):
             self.send(bytes((number | (0x80 if number == len(parts) else 0),)) + part)
-        answer = _not_aborted(self.answer(f"the blocks of a {what}"), what)
+        answer = _not_aborted(self.answer(f"the segments of a {what}"), what)
         if answer[:2] != bytes((0xA2, len(parts))):
             raise Failed(f"A2 {len(parts):02X} …, {what}", answer.hex(" ").upper())
         unused = _SEGMENT - len(parts[-1])
@@ -286,7 +286,7 @@ class SdoClient:
 
 
 def expedited(index: int, subindex: int, data: bytes) -> bytes:
-    """Return the request for an expedited download of one to four bytes that indicates its size."""
+    """Return the request for an expedited download of one to four bytes, with the data size indicated."""
     return bytes((0x23 | (4 - len(data)) << 2,)) + mux(index, subindex) + data.ljust(4, b"\0")
 
 

@@ -1,4 +1,4 @@
-"""Lists the conformance cases in their order, and selects cases by area or ID."""
+"""Lists the conformance cases in test plan order, and selects cases by area or ID."""
 
 from __future__ import annotations
 

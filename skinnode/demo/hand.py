@@ -9,8 +9,8 @@ from skinnode.config import HandConfig, parse_hand
 
 _NAMES: Final = ("palm", "thumb", "index", "middle", "ring", "little", "wrist", "back")
 _SYNC_MS_PER_PATCH: Final = 20
-"""SYNC period divided by the number of patches, ms. With 101 frames of up to 135 bits per scan, the bus load
-is 68 % at 1 Mbit/s."""
+"""SYNC period divided by the number of patches, ms. Each scan takes 101 frames of up to 135 bits, so the bus
+load is at most 68 % at 1 Mbit/s."""
 
 
 def demo_hand(patches: int, seed: int) -> HandConfig:

@@ -56,7 +56,7 @@ class PatchReport:
     latency_p99_ms: float
     score: Score
     distrust: str = ""
-    """Reason why the most recent untrusted field was not trusted; empty if all fields were trusted."""
+    """Why the newest untrusted field was not trusted; empty if all fields were trusted."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,11 +99,11 @@ class _Watch:
     deepest: tuple[float, Float, Float] | None = None
     newest: FieldFrame | None = None
     distrust: str = ""
-    """Reason why the most recent untrusted field was not trusted; empty if all fields were trusted."""
+    """Why the newest untrusted field was not trusted; empty if all fields were trusted."""
 
     def take(self, frame: FieldFrame, true_upper_m: Float, t_start_ns: int) -> None:
         stamp = frame.stamp
-        assert stamp is not None  # always true: the host stamps every field
+        assert stamp is not None  # always true: the host timestamps every field
         truth = true_upper_m - self.scorer.layout.upper_m
         error_m = self.scorer.add(frame, true_upper_m)
         depth_m = float(-truth[..., 2].min())
@@ -239,7 +239,7 @@ def play(hand: HandConfig, seconds: float, console: Console) -> Run:
                         _take(unscored.popleft(), watches, fleet, t_start_ns)
                     progress.update(host, elapsed_s, bits_before)
             bits, elapsed_s = _bits(host) - bits_before, (time.monotonic_ns() - t_start_ns) * 1e-9
-        while (frame := subscription.get(0.0)) is not None:  # fields solved while the host closed
+        while (frame := subscription.get(0.0)) is not None:  # fields solved while the host was closing
             unscored.append(frame)
         for frame in unscored:
             _take(frame, watches, fleet, t_start_ns)
@@ -277,7 +277,7 @@ def play(hand: HandConfig, seconds: float, console: Console) -> Run:
 
 
 def _take(frame: FieldFrame, watches: dict[str, _Watch], fleet: Fleet, t_start_ns: int) -> None:
-    assert frame.stamp is not None  # always true: the host stamps every field
+    assert frame.stamp is not None  # always true: the host timestamps every field
     if frame.stamp.device_time_us == 0:  # the time of a scan is unknown if its summary was lost
         return
     true_upper_m = fleet.truth_m(frame.stamp.patch, frame.stamp.device_time_us)
@@ -374,7 +374,7 @@ def print_report(console: Console, report: Report) -> None:
     if not report.faults:
         worst = max(row.score.worst_deviations for row in report.patches)
         console.print(
-            "no scan torn, no frame lost, errors consistent with those reported",
+            "no scan torn, no frame lost, errors consistent with the reported standard deviations",
             style="green",
             end=" ",
             soft_wrap=True,

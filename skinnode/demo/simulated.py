@@ -21,8 +21,8 @@ from skinnode.process.child_processes import starting_children
 def on_simulated_buses(hand: HandConfig) -> HandConfig:
     """Return a copy of the hand with virtual buses (UDP multicast) in place of the real buses.
 
-    The buses are replaced because simulated nodes must never send on a bus with real nodes. The copy states
-    exact tolerances, because simulated patches match their layouts exactly.
+    The buses are replaced because simulated nodes must never send on a bus with real nodes. The
+    copy's tolerances are "exact", because simulated patches match their layouts exactly.
     """
     exact = TolerancesConfig.model_validate("exact")
     patches = tuple(patch.model_copy(update={"tolerances": exact}) for patch in hand.patches)
@@ -72,7 +72,7 @@ def _run_nodes(hand: HandConfig, parent: Connection) -> None:
 
     from vcan_sim.fleet import Fleet
 
-    signal.signal(signal.SIGTERM, signal.SIG_IGN)  # also sent to this process; the parent ends it
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)  # the parent also receives SIGTERM and closes the pipe
     try:
         with Fleet(hand):
             parent.send("")

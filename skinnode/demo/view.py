@@ -20,7 +20,7 @@ from skinnode.monitor.field_map import MapStyle, Surface, mean_shear_m, paint_ma
 from skinnode.monitor.patch_panel import shear_text
 
 MAP_SIZE = 16
-"""Width of a square height map, characters; each character consists of two pixels, one above the other."""
+"""Width of a square height map, characters; each character shows two pixels, one above the other."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,7 +38,7 @@ class PatchView:
     rate_hz: float
     torn: int
     distrust: str = ""
-    """Reason why the newest field is not trusted; empty if it is trusted."""
+    """Why the newest field is not trusted; empty if it is trusted."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,7 +55,7 @@ class BusView:
 
 
 class HeightMap:
-    """Renders the depth of a patch like the monitor; the first upper wire is at the bottom."""
+    """Height map of a patch, drawn as in the monitor; the first upper wire is at the bottom."""
 
     def __init__(self, surface: Surface, full_scale_m: float) -> None:
         height = MAP_SIZE // 2

@@ -181,7 +181,7 @@ class BusConnection:
             if beat is not None:
                 return State(beat.state, "heartbeat")
             if heartbeat_s:
-                return State(None, f"no heartbeat, although its period is set to {heartbeat_s:g} s")
+                return State(None, f"no heartbeat, although the heartbeat period is set to {heartbeat_s:g} s")
         if not guarding:
             return State(None, "no heartbeat, and a master guards the node")
         for answer_s in GUARD_ANSWERS_S:

@@ -68,7 +68,7 @@ class BusListener:
         return dict(self._nodes)
 
     def node(self, node_id: int) -> NodeTraffic:
-        """Return the messages received from one node-ID, which may be none."""
+        """Return the messages received from one node-ID; empty if none were received."""
         return self._nodes.get(node_id) or NodeTraffic()
 
     def newest_beat(self, node_id: int, since_ns: int = 0) -> Beat | None:

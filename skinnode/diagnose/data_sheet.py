@@ -30,7 +30,7 @@ class DataSheet(NamedTuple):
 
 
 def read_profile(remote: RemoteOd) -> PatchProfile | None:
-    """Read the sizes of a patch; None if the device is not a patch.
+    """Read the numbers of wires and code bits of a patch; None if the device is not a patch.
 
     Raises NodeError if the device does not answer.
     """

@@ -40,7 +40,7 @@ class Dcf(NamedTuple):
 
     text: str
     values: int
-    """Number of the node's values in the file."""
+    """Number of node values written to the file."""
     as_bytes: tuple[Reading, ...]
     """Readings that CiA 306 notation cannot express; their bytes are written as comments."""
 

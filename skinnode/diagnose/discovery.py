@@ -21,7 +21,7 @@ from skinnode.text.printable import printable
 from skinnode.text.words import counted
 
 PACE_S: Final = 0.001
-"""Interval between requests, s. At 1 Mbit/s, the requests use a sixth of the bus and do not delay PDOs."""
+"""Interval between requests, s. At 1 Mbit/s, the requests use a sixth of the bus capacity."""
 
 ANSWER_S: Final = 0.12
 """Time (s) to wait for responses after the last request of a sweep."""
@@ -34,8 +34,8 @@ LISTEN_S: Final = 1.2
 """Minimum listening time, s. Stopped nodes are detected only by their heartbeats."""
 
 LSS_S: Final = 1.5
-"""Maximum time (s) to search for nodes without a node-ID. Nodes not found within this time are only
-reported as "more"."""
+"""Maximum time (s) to search for nodes without a node-ID. After this time, the search ends even
+if further nodes are known to exist."""
 
 OTHERS_S: Final = 1.0
 """Maximum wait for other SDO clients to finish, s."""
@@ -84,7 +84,7 @@ class FoundNode:
 
     @property
     def identity(self) -> list[str]:
-        """Texts for those of profile, vendor and product that the node reports."""
+        """Profile, vendor and product as text; values that the node does not report are omitted."""
         known = [self.profile] if self.profile else []
         for what, number in (("vendor", self.vendor_id), ("product", self.product_code)):
             if number is not None:

@@ -63,7 +63,7 @@ class ScanFacts:
     complete: NDArray[np.bool_]
     """(T,) whether each scan is complete."""
     step: float
-    """Width of one code relative to R0."""
+    """Size of one code step relative to R0."""
     stated_noise: float
     """Relative noise of the converter, from the hand file."""
     stats: AssemblerStats

@@ -96,7 +96,7 @@ def commission(
         if not agreed(before):
             return None
         fault = _configure(connection, wanted)
-    finally:  # a node without a node-ID boots when LSS releases it
+    finally:  # leaving LSS configuration mode lets a node without a node-ID boot
         connection.lss.release()
     faults = [fault] if fault else []
     booted = True

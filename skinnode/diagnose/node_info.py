@@ -225,7 +225,7 @@ def _sync(read: _Reader) -> str:
 def _storing(read: _Reader) -> str:
     able = read.number(od.STORE, 1) or 0
     if not able & 3:
-        return "not possible: nothing survives a power cycle"
+        return "not supported: settings are lost at power-off"
     how = "by itself" if able & 2 else "on command"
     date, time = read.number(od.VERIFY_CONFIGURATION, 1), read.number(od.VERIFY_CONFIGURATION, 2)
     if date is None:

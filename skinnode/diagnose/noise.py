@@ -34,14 +34,14 @@ _FLOOR: Final = 8
 %."""
 
 _MOVED: Final = 6.0
-"""Minimum motion of a touched crossing, in units of the stated noise."""
+"""Minimum standard deviation of a touched crossing's values, in units of the stated noise."""
 _EXPLAINED: Final = 2.0
-"""Minimum ratio of a touched crossing's motion to the part that other wires do not explain.
+"""Minimum ratio of a touched crossing's standard deviation to the part that other wires do not explain.
 
 Noise with 25 degrees of freedom exceeds this ratio once in a million crossings.
 """
 _TOUCHED: Final = 2
-"""Minimum number of crossings that move together on touched skin; a loose contact moves one crossing."""
+"""Minimum number of crossings that a touch affects at the same time; a loose contact affects one crossing."""
 _STEP: Final = 20.0
 """Minimum height of a jump, in units of the stated noise."""
 _STAYS: Final = 0.3
@@ -49,8 +49,8 @@ _STAYS: Final = 0.3
 _STILL: Final = 0.1
 """Maximum standard deviation of a crossing after its jump is removed, as a fraction of the jump."""
 _EVEN: Final = 0.2
-"""Maximum ratio of a crossing's own noise to the noise common to all crossings, if the supply is reported as
-noisy."""
+"""Ratio of a crossing's own noise to the noise common to all crossings; below this ratio, the supply is
+considered noisy."""
 
 Mask = NDArray[np.bool_]
 
@@ -62,11 +62,11 @@ class NoiseAnalysis:
     noise: Float
     """Noise relative to R0, including the residual effect of a touch; NaN if unknown."""
     stated: Float
-    """Noise expected from the converter and the code width, relative to R0."""
+    """Noise expected from the converter and from rounding to whole codes, relative to R0."""
     level: Float
     """Median R/R0."""
     touched: Mask
-    """Whether the crossing moved together with other crossings."""
+    """Whether the crossing's value varied together with those of other crossings."""
     steps: Mask
     """Whether the crossing was constant except for a single jump."""
     step_at: Counts
@@ -126,11 +126,11 @@ def _roughness(series: Float) -> Float:
 
 
 def _unexplained(moved: Float) -> Float:
-    """Return the (U, K) standard deviations of the motion that the other wires do not explain.
+    """Return the (U, K) standard deviations of the variation that the other wires do not explain.
 
-    For each upper wire, the leading half of the temporal components of all other upper wires is projected
-    out; for each lower wire, that of all other lower wires. At each crossing, the larger residual is used.
-    ``moved`` has mean 0.
+    From the signals of each upper wire, the leading half of the temporal components of all other upper wires
+    is removed. Lower wires are treated in the same way. Each crossing therefore has two residuals; the larger
+    standard deviation is returned. ``moved`` has mean 0.
     """
     count = len(moved)
     flat = moved.reshape(count, -1)
@@ -174,7 +174,7 @@ def _of_noise(shape: tuple[int, int], values: int) -> float:
 
 
 def _steps(safe: Float) -> tuple[Counts, Float, Mask]:
-    """Return scan and height of each crossing's largest jump, and whether the crossing is otherwise constant.
+    """Return the scan and height of each crossing's largest jump, and whether it is otherwise constant.
 
     A crossing is otherwise constant if its medians before and after the jump differ by the jump's height and
     the remaining variation is small.

@@ -160,7 +160,7 @@ def encode(entry: EdsEntry, text: str, node_id: int) -> bytes:
         if entry.data_type
         else f"the type of {entry} is specified only in the node's EDS (--eds FILE)"
     )
-    raise ConfigError("--write", text, f"--hex and bytes in hexadecimal: {where}")
+    raise ConfigError("--write", text, f"--hex and bytes in hexadecimal, because {where}")
 
 
 def read_entry(remote: RemoteOd, entry: EdsEntry) -> Reading:

@@ -56,7 +56,7 @@ _CONFIGURED_BY_OTHERS: Final = (
     "the patch scans on its own timer",
 )
 _UNEXPLAINED: Final = "^error register 0x|^last: none reported$"
-"""Pattern that matches the evidence of an error report without a cause."""
+"""Pattern for the evidence of a finding that reports an error without its cause."""
 _OVERRUN: Final = dict.fromkeys(_ERRORS, f"overrun|{_UNEXPLAINED}")
 _WIRE: Final = dict.fromkeys(_ERRORS, f"wire open or shorted|overrun|{_UNEXPLAINED}")
 _RESTARTED: Final = dict.fromkeys(_ERRORS, f"SYNC of unexpected length|heartbeat|overrun|{_UNEXPLAINED}")

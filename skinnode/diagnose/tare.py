@@ -66,7 +66,7 @@ class Tared:
 def refusal(patch: PatchConfig, bus: BusConfig) -> str:
     """Return why the hand file forbids taring this patch; empty if taring is allowed."""
     if patch.baseline is not None:
-        return f"its baseline is stored in {patch.baseline}, and a host would restore it from there"
+        return f"a host would overwrite the new baseline with {patch.baseline}"
     if bus.role == "guest" and bus.guest_sends == "nothing":
         return f"the hand file forbids sending on {bus.name} (role guest, guest_sends nothing)"
     return ""

@@ -30,7 +30,7 @@ def read_input(key: str, path: Path, most_bytes: int = MOST_BYTES) -> bytes:
         with open(descriptor, "rb") as file:
             if stat.S_ISDIR(os.fstat(descriptor).st_mode):
                 raise ConfigError(key, str(path), "a file that can be read (Is a directory)")
-            os.set_blocking(descriptor, True)  # only open() must not block: a pipe may have no writer
+            os.set_blocking(descriptor, True)  # O_NONBLOCK was needed only for open()
             data = file.read(most_bytes + 1)
     except OSError as error:
         raise ConfigError(key, str(path), f"a file that can be read ({error.strerror})") from None

@@ -31,7 +31,7 @@ def require_writable(option: str, file: Path) -> None:
 
 
 def write_text(option: str, file: Path, text: str) -> None:
-    """Encode ``text`` in UTF-8 and write it to ``file``, which ``option`` specifies.
+    """Encode ``text`` in UTF-8 and write it to ``file``; error messages name ``option``.
 
     Raises:
         ConfigError: The text could not be written completely; a regular file then keeps its old content.
@@ -40,7 +40,7 @@ def write_text(option: str, file: Path, text: str) -> None:
 
 
 def write_bytes(option: str, file: Path, data: bytes) -> None:
-    """Write ``data`` to ``file``, which ``option`` specifies.
+    """Write ``data`` to ``file``; error messages name ``option``.
 
     A regular file is replaced atomically after all data has been written, and keeps its permissions. Data for
     any other target, such as a pipe, is written directly to the target.

@@ -1,9 +1,8 @@
 """Predict when a patch's next scan will end, so that the receiver can let frames accumulate until then.
 
 On a fully loaded bus, a scan does not always end one period after the previous scan. If heartbeats delay the
-frames from several nodes, scans may end alternately at two phases of the scan period. In ``bench pipeline``,
-every fifth scan ended 12 ms later than the others; without heartbeats, all scans ended at the same phase. The
-prediction therefore covers every phase of the period at which a recent scan has ended.
+frames from several nodes, scans may end alternately at two phases of the scan period. The prediction
+therefore covers every phase of the period at which a recent scan has ended.
 """
 
 from __future__ import annotations

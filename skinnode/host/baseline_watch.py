@@ -79,7 +79,7 @@ class BaselineWatch:
         node.job = self._pool.submit(read)
 
     def _take_baseline(self, node: Supervised, job: Future[Joined | None], now_ns: int) -> None:
-        if job.exception() is None and job.result() is None:  # the finished job read only the error register
+        if job.exception() is None and job.result() is None:  # no baseline: the job read the error register
             return
         remote, stream = node.remote, node.remote.stream
         node.read_ns = now_ns + (LEAST_NS if stream.withholding else _DOUBT_NS)
@@ -98,12 +98,12 @@ class BaselineWatch:
         solver = read.solver
         if solver is not None:
             remote.link.call(lambda: stream.resume(solver, read.withholdings, anew=False), remote.defects)
-            node.announced = True  # even if the announcement was in a lost summary
+            node.announced = True  # the announcing summary may have been lost
             note_baseline(node)
 
 
 def note_baseline(node: Supervised) -> None:
-    """Record the baseline that the solver now uses, and increment the node's baseline count if it is new.
+    """Record the solver's current baseline; increment the node's baseline count if the baseline is new.
 
     A new baseline may also be found during bring-up, if an earlier read failed or the baseline changed while
     the node was absent.

@@ -103,7 +103,7 @@ class Callbacks:
         """Start a callback that passes a subscription's fields to ``function``.
 
         Raises:
-            TypeError: if ``function`` is not callable, or is async.
+            TypeError: ``function`` is not callable, or is async.
         """
         if not callable(function):
             raise TypeError(f"function: got {function!r}, must be a function that takes a field")

@@ -38,7 +38,10 @@ def test_the_demo_runs_and_writes_what_it_promises(tmp_path: Path) -> None:
     assert done.stderr == ""
     assert done.returncode == 0, done.stdout
     assert "\nerror in the deepest scan: " in done.stdout
-    assert "\nno scan torn, no frame lost, errors consistent with those reported" in done.stdout
+    assert (
+        "\nno scan torn, no frame lost, errors consistent with the reported standard deviations"
+        in done.stdout
+    )
     report = json.loads(figures.read_text())
     assert [patch["patch"] for patch in report["patches"]] == ["palm", "thumb"]
     assert report["faults"] == []

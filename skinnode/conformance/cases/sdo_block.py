@@ -42,7 +42,7 @@ def _write(dut: Dut, index: int, *, crc: bool) -> None:
     check(dut, index, 0, 2)
 
 
-@case("SDO-19", "0x1000 is read by block transfer without CRC", "7.2.4.3.12 to 15")
+@case("SDO-19", "0x1000 can be read by block transfer without CRC", "7.2.4.3.12 to 15")
 def block_read_short(dut: Dut) -> None:
     _read(dut, 0x1000, 0, dut.sdo.read(0x1000), crc=False)
 
@@ -58,7 +58,9 @@ def block_write_heartbeat(dut: Dut) -> None:
 
 
 @case(
-    "SDO-22", "A long object is read by block transfer, in sub-blocks of 127, 1 and 2 segments", "7.2.4.3.14"
+    "SDO-22",
+    "A long object can be read by block transfer in sub-blocks of 127, 1 or 2 segments",
+    "7.2.4.3.14",
 )
 def block_read_long(dut: Dut) -> None:
     entry, value = long_object(dut)
@@ -66,7 +68,7 @@ def block_read_long(dut: Dut) -> None:
         _read(dut, entry.index, entry.subindex, value, crc=False, size=size)
 
 
-@case("SDO-23", "A long object is read by block transfer with CRC", "7.2.4.3.12 to 16")
+@case("SDO-23", "A long object can be read by block transfer with CRC", "7.2.4.3.12 to 16")
 def block_read_crc(dut: Dut) -> None:
     entry, value = long_object(dut)
     _read(dut, entry.index, entry.subindex, value, crc=True)
@@ -79,7 +81,7 @@ def block_write_guard_time_crc(dut: Dut) -> None:
 
 @case(
     "SDO-25",
-    "0x1017 can be written by block transfer with CRC; a wrong CRC changes nothing",
+    "0x1017 can be written by block transfer with CRC; a write with a wrong CRC is refused",
     "7.2.4.3.8 to 11, 16",
 )
 def block_write_heartbeat_crc(dut: Dut) -> None:
@@ -149,7 +151,7 @@ def servers_after_reset(dut: Dut) -> None:
 
 @case(
     "SDO-30",
-    "SDO clients (0x1280 to 0x12FF) stored through 0x1010:01 survive a communication reset",
+    "SDO client parameters (0x1280 to 0x12FF) stored through 0x1010:01 survive a communication reset",
     "7.5.2.34, 7.5.2.13",
 )
 def clients_stored(dut: Dut) -> None:

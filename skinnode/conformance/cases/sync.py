@@ -18,7 +18,7 @@ _BUSY = (0x0800_0022,)
 
 
 def consume_only(dut: Dut) -> None:
-    """Stop the producer and set the period to 0, so that the counter overflow value can be written."""
+    """Stop the producer and set the SYNC period to 0, so that the counter overflow value can be written."""
     dut.need(COB_ID)
     dut.sdo.write_integer(COB_ID, 0, SYNC_ID, 4)
     if dut.eds.find(PERIOD) is not None:
@@ -56,7 +56,7 @@ def producer(dut: Dut) -> None:
     dut.bus.expect_silence(SYNC_ID, "SYNC after the producer was stopped", 3 * PERIOD_MS * 1e-3)
 
 
-@case("SYNC-03", "A TPDO of type 10 is sent three times during 30 SYNCs", "7.2.2.2, 7.5.2.37")
+@case("SYNC-03", "A TPDO of transmission type 10 is sent three times during 30 SYNCs", "7.2.2.2, 7.5.2.37")
 def count(dut: Dut) -> None:
     pdo = _synchronous(dut)
     for other in tpdos(dut):
@@ -136,12 +136,12 @@ def counter(dut: Dut) -> None:
     consume_only(dut)
     dut.sdo.write_integer(OVERFLOW, 0, 5, 1)
     produce(dut)
-    _counted(dut, [1, 2, 3, 4, 5, 1, 2, 3, 4, 5, 1], "in a cycle of 5")
+    _counted(dut, [1, 2, 3, 4, 5, 1, 2, 3, 4, 5, 1], "(overflow value 5)")
 
 
 @case(
     "SYNC-08",
-    "If stored through 0x1010:01, the producer starts after a node reset and counts from 1",
+    "With parameters stored through 0x1010:01, the producer starts after a node reset and counts from 1",
     "7.5.2.13, 7.5.2.22",
 )
 def counter_stored(dut: Dut) -> None:
@@ -155,7 +155,7 @@ def counter_stored(dut: Dut) -> None:
     _counted(dut, [1, 2, 3], "after a node reset")
 
 
-@case("SYNC-09", "The counter overflow value cannot be written while the period is not 0", "7.5.2.22")
+@case("SYNC-09", "The counter overflow value cannot be written while the SYNC period is not 0", "7.5.2.22")
 def overflow_in_use(dut: Dut) -> None:
     dut.need(OVERFLOW)
     dut.need(PERIOD)

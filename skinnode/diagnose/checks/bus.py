@@ -17,7 +17,7 @@ _SYNCS: Final = 10
 _ASTRAY: Final = 0.25
 """Maximum fraction of SYNC counters that are not the successor of the previous counter.
 
-Two SYNC producers cause a fraction of one half; lost SYNCs cause a much smaller fraction.
+With two SYNC producers, the fraction is about one half; with lost SYNCs, it is much smaller.
 """
 
 _BEATS: Final = 4
@@ -44,7 +44,7 @@ def check_bus(bus: BusFacts) -> Iterator[Finding]:
             f"the controller is {bus.link_state}",
             Sure.CERTAIN,
             "reported by the kernel (ip -details link show)",
-            "check bit rate, cable and the two 120 ohm terminations; then restart the interface",
+            "check the bit rate, the cable and the two 120 ohm terminations; then restart the interface",
         )
     if bus.link_bitrate_bps not in (None, bus.bitrate_bps):
         yield found(

@@ -60,7 +60,7 @@ def others(facts: BusFacts) -> list[str]:
 def not_judged(facts: BusFacts) -> list[str]:
     """Return one line for each check that could not be performed, with the reason."""
     if facts.failure:
-        return [f"{facts.name}: all checks except that of the interface"]
+        return [f"{facts.name}: all checks except the interface check"]
     lines = []
     for patch in facts.patches:
         scans = 0 if patch.scans is None else patch.scans.scans
@@ -72,13 +72,13 @@ def not_judged(facts: BusFacts) -> list[str]:
             )
         elif patch.scans is not None and skin.is_touched(patch.scans):
             lines.append(
-                f"{patch.name}: noise of individual crossings, and drift from the baseline: something "
+                f"{patch.name}: noise of individual crossings and drift from the baseline, because something "
                 "touched the skin; do not touch the skin during the next run"
             )
         elif patch.scans is not None and skin.may_be_frozen(patch.scans):
             lines.append(
                 f"{patch.name}: frozen or merely quiet: no code changed in {scans} scans, but the stated "
-                f"noise ({patch.scans.stated_noise:.0e}) is less than one code ({patch.scans.step:.0e}): "
-                "touch the patch during the next run; if this line appears again, the converter has stopped"
+                f"noise ({patch.scans.stated_noise:.0e}) is less than one code ({patch.scans.step:.0e}); "
+                "touch the patch during the next run: if this line appears again, the converter has stopped"
             )
     return lines

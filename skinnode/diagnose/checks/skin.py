@@ -49,8 +49,8 @@ def check_wires(bus: BusFacts) -> Iterator[Finding]:
         if own is not None:
             upper, lower = {*own.open_upper, *own.shorted_upper}, {*own.open_lower, *own.shorted_lower}
             for what, wires, advice in (
-                ("upper wires open", own.open_upper, "check connector and solder joints of these wires"),
-                ("lower wires open", own.open_lower, "check connector and solder joints of these wires"),
+                ("upper wires open", own.open_upper, "check the connector and solder joints of these wires"),
+                ("lower wires open", own.open_lower, "check the connector and solder joints of these wires"),
                 ("upper wires shorted", own.shorted_upper, "look for a short to a lower wire, or moisture"),
                 ("lower wires shorted", own.shorted_lower, "look for a short to an upper wire, or moisture"),
             ):
@@ -91,7 +91,7 @@ def _check_crossings(
                     f"{side} wires {what}: {_listed(tuple(int(i) for i in np.flatnonzero(wires)))}",
                     Sure.CERTAIN,
                     f"every crossing, {_in_all(scans)}",
-                    "check connector and solder joints of these wires" if what == "open" else advice,
+                    "check the connector and solder joints of these wires" if what == "open" else advice,
                 )
         always &= ~(always.all(axis=1, keepdims=True) | always.all(axis=0, keepdims=True))
         if always.any():
@@ -297,6 +297,6 @@ def _listed(wires: tuple[int, ...]) -> str:
 
 
 def _places(mask: Mask) -> str:
-    """Return the first crossings of a mask as text: upper/lower wire numbers."""
+    """Return up to six crossings of a mask as text (upper/lower wire numbers)."""
     places = [f"{row}/{column}" for row, column in np.argwhere(mask)[:6]]
     return ", ".join(places) + (" …" if mask.sum() > 6 else "")

@@ -87,12 +87,12 @@ def _check_sync(bus: BusFacts) -> Iterator[Finding]:
                 Sure.LIKELY,
                 f"99 % of the intervals are within {jitter_s * 1e3:.1f} ms of the "
                 f"{period_s * 1e3:.1f} ms period",
-                "reduce the load on the machine that sends SYNC; give the host a real-time priority",
+                "reduce the load on the machine that sends SYNC; give the host real-time priority",
             )
 
 
 def check_losses(bus: BusFacts) -> Iterator[Finding]:
-    """Check for lost frames, and locate the loss in this machine, on the bus or at the node."""
+    """Check whether frames were lost in this machine, on the bus or at a node."""
 
     def found(where: str, what: str, sure: Sure, evidence: str, advice: str) -> Finding:
         return Finding("losses", where, what, sure, evidence, advice)

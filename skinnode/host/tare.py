@@ -11,14 +11,14 @@ from skinnode.host.remote_node import RemoteNode
 from skinnode.process import clock
 
 TARE_DEADLINE_S: Final = 5.0
-"""Default time limit (s) for a tare, excluding the additional :data:`TARE_DEADLINE_SYNCS` periods. The node
-takes its 16 readings within milliseconds, and the host reads the baseline in 0.1 to 0.3 s. The supervisor may
-wait for 2 s after the previous read of the baseline.
+"""Default time limit (s) for a tare, excluding the additional :data:`TARE_DEADLINE_SYNCS` SYNC periods.
+
+A tare normally takes 0.1 to 0.3 s, but the host may wait up to 2 s between two reads of a baseline.
 """
 
 TARE_DEADLINE_SYNCS: Final = 3
-"""Number of SYNC periods added to a tare's time limit, because the next scan's summary announces the new
-baseline.
+"""Number of SYNC periods added to the time limit of a tare. The host learns of the new baseline only from the
+summary of the next scan.
 """
 
 _POLL_S: Final = 0.005

@@ -1,4 +1,4 @@
-"""Summarise a field's trust, precision, data share and faults for reports and JSON."""
+"""Summarise how reliable a displacement field is, for reports and JSON output."""
 
 from __future__ import annotations
 
@@ -13,10 +13,9 @@ from skinnode.text.json_values import plain
 
 
 def trust_table(field: FieldFrame | None) -> dict[str, Any]:
-    """Return a field's trust, precision, data share and faults; every value is None if there is no field.
+    """Return the trust, precision, data share and faults of a field; without a field, all values are None.
 
-    The entry ``deepest_data_share`` is the data share of the depth at the deepest electrode; 1 if no prior
-    was used.
+    The value of ``deepest_data_share`` is explained at :func:`deepest_data_share`.
     """
     if field is None:
         return dict.fromkeys(("trusted", "distrust", "precise", "deepest_data_share", "data_faults"))
@@ -33,14 +32,14 @@ def trust_table(field: FieldFrame | None) -> dict[str, Any]:
 
 
 def deepest_data_share(field: FieldFrame) -> float:
-    """Return the data share of the depth at the deepest electrode; 1 if no prior was used."""
+    """Return the share of the maximum depth that comes from data rather than the prior; 1 without a prior."""
     if field.data_share is None:
         return 1.0
     return float(field.data_share[..., 2].flat[int(np.argmin(field.displacement_m[..., 2]))])
 
 
 def fault_table(fault: DataFault) -> dict[str, Any]:
-    """Return a fault as a table for JSON; infinite deviations are replaced by None."""
+    """Return a data fault as a JSON-compatible dict, in which None replaces an infinite ``deviations``."""
     table: dict[str, Any] = plain(
         {
             "part": str(fault.part),

@@ -1,4 +1,4 @@
-"""Define the wire faults in a patch's health report, and detect open and shorted wires from codes."""
+"""Wire faults in the health report of a patch, and detection of open and shorted wires in a scan."""
 
 from __future__ import annotations
 

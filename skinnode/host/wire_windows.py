@@ -1,19 +1,18 @@
-"""Detect noisy and drifting wires in windows of successive scans, and measure the noise of the codes.
+"""Detect noisy and drifting wires from successive scans, and measure the noise of the resistance codes.
 
 Noise and drift are evaluated over windows of ``WINDOW`` scans. A wire is reported if the criterion for noise
 or drift is met in ``WINDOWS`` consecutive windows.
 
-The noise power of a wire is the mean square of its codes' second differences over time, which are not
-affected by steady movement. A wire is noisy if its noise power exceeds both the median over the wires on its
-side and the expected noise power by a factor of ``NOISY``.
+The noise power of a wire is estimated from the second differences of its codes over time, because a change
+at a constant rate has no second difference. A wire is noisy if its noise power exceeds both the median over
+the wires on its side and the expected noise power by a factor of ``NOISY``.
 
-A wire drifts if the resistances of all its crossings have changed by the same fraction of R0, while its
-neighbours have not changed in the same way. The change must exceed ``DRIFT``, both relative to the median
-wire and relative to rest. A touch, in contrast, changes the crossings of a wire unevenly, and the rubber
-spreads the change to the adjacent wires. In simulated touches (spheres of 2 mm to 0.3 m, indentations of 10
-to 60 %), a wire changed by more than ``DRIFT`` in 780,000 cases, none of which was mistaken for drift. The
-criterion for drift has a drawback: it misses adjacent wires that drift equally, and drift of a wire that is
-being touched.
+A wire drifts if the resistances of all its crossings have changed by the same fraction of R0, while the
+resistances of its neighbours have not. The change must exceed ``DRIFT``, compared with both the median wire
+and the baseline. A touch, in contrast, changes the crossings of a wire unevenly, and the rubber spreads the
+change to the adjacent wires. Touches changed a wire by more than ``DRIFT`` in 780,000 simulated cases, and
+none of these changes was mistaken for drift. The criterion does not detect adjacent wires that drift equally.
+It also does not detect the drift of a wire that is being touched.
 """
 
 from __future__ import annotations
@@ -38,8 +37,8 @@ NOISY: Final = 25.0
 5.
 """
 DRIFT: Final = 1e-3
-"""Minimum drift of a drifting wire, as a fraction of R0: a tenth of the change that a light touch causes in
-the touched crossings.
+"""Minimum drift of a drifting wire, as a fraction of R0. A light touch changes the resistance of a crossing
+by ten times this fraction.
 """
 UNEVEN: Final = 0.05
 """Maximum deviation of a drifting wire's crossings from their median, as a fraction of the drift."""
@@ -61,10 +60,10 @@ class WireWindows:
     def __init__(self, scale: CodeScale, relative_noise: float) -> None:
         self._scale, self._relative_noise = scale, relative_noise
         self.wires: tuple[WireFault, ...] = ()
-        """Faults of all wires currently found noisy or drifting."""
+        """Noisy and drifting wires, according to the latest windows."""
         self.windows = 0
         """Number of windows evaluated so far."""
-        self._odd: dict[WireFault, int] = {}  # fault -> number of consecutive windows
+        self._odd: dict[WireFault, int] = {}  # number of consecutive windows with each fault
         self._window: list[Codes] = []
         # crossings measured in every scan of the window; None: all crossings
         self._measured: NDArray[np.bool_] | None = None
@@ -107,8 +106,8 @@ class WireWindows:
             off = np.abs(ratio - (gain[:, None] if axis else gain))
             spread = _of_wires(off, axis, whole, np.max, np.nanmax)
             quiet = max(expected, _median_of_known(level))
-            # The wire must also have changed from rest: if a touch changes the median wire, the untouched
-            # wires deviate from the median without drifting.
+            # The deviation from the median is not enough: a touch may change the median wire, and the
+            # untouched wires then deviate from it without drifting.
             away = np.minimum(np.abs(gain - _median_of_known(gain)), np.abs(gain - 1.0))
             step = np.concatenate(([np.inf], np.abs(np.diff(gain)), [np.inf]))
             apart = np.fmin(step[:-1], step[1:])
@@ -122,11 +121,12 @@ class WireWindows:
 
 
 def _shown_noise(codes: NDArray[np.float64], power: NDArray[np.float64]) -> float:
-    """Return the noise (codes) that three quarters of the crossings exceed; 0 if not measurable.
+    """Return the lower quartile of the crossings' noise (codes); 0 if the noise is not measurable.
 
-    The noise of a crossing is measured only if its codes span at least three values without a lasting change.
-    With almost no noise, a crossing may still alternate between two codes if its value is at the edge of a
-    quantization step.
+    The noise of a crossing counts as 0 if its codes span fewer than three values, or if their mean changed
+    significantly from the first to the second half of the window. Two values are not sufficient, because a
+    crossing without noise may alternate between two codes if its resistance is at the edge of a quantization
+    step.
 
     Args:
         codes: (WINDOW, U, K) codes of a window.
@@ -140,7 +140,7 @@ def _shown_noise(codes: NDArray[np.float64], power: NDArray[np.float64]) -> floa
 
 
 def _median(values: NDArray[np.float64], axis: int) -> NDArray[np.float64]:
-    """Return the median of values that contain no NaN; for a patch, three times as fast as ``np.median``."""
+    """Return the median of values without NaN; three times as fast as ``np.median`` for small arrays."""
     ordered, count = np.sort(values, axis=axis), values.shape[axis]
     middle: NDArray[np.float64] = ordered.take([(count - 1) // 2, count // 2], axis=axis).sum(axis=axis)
     return 0.5 * middle
@@ -155,9 +155,10 @@ def _median_of_known(values: NDArray[np.float64]) -> float:
 def _of_wires(
     values: NDArray[np.float64], axis: int, whole: NDArray[np.bool_], plain: Any, without_nan: Any
 ) -> NDArray[np.float64]:
-    """Reduce the values of each wire's crossings to one number; ignore NaN unless all values are NaN.
+    """Reduce the values of each wire's crossings to one number; NaN if none of the crossings was measured.
 
-    NaN denotes a crossing that was not measured. The function is ten times as fast if no value is NaN.
+    NaN in ``values`` denotes a crossing that was not measured. The reduction by ``plain`` is used if there
+    is no NaN, because it is ten times as fast as ``without_nan``.
     """
     if not np.isnan(values).any():
         return np.asarray(plain(values, axis=axis))

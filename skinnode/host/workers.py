@@ -1,8 +1,8 @@
 """Run submitted jobs on a pool of worker threads, in order of submission.
 
-Submitting a job takes only half a microsecond of the mainline's time. Unlike ThreadPoolExecutor, the pool
-creates no result objects and uses no lock except that of its queue. If a job raises an exception, the
-exception is passed to an error handler submitted with the job, and the thread continues with the next job.
+Submitting a job takes half a microsecond: unlike ThreadPoolExecutor, the pool creates no result objects and
+uses no lock other than the lock of its queue. If a job raises an exception, the exception is passed to an
+error handler submitted with the job, and the thread continues with the next job.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ class Workers:
         keep_on(self._turn, self._defects, "taking a job")
 
     def _turn(self) -> bool:
-        """Wait for the next job and run it. Return False if the thread must end."""
+        """Wait for the next job and run it. Return False after :meth:`close`, to end the thread."""
         task = self._jobs.get()
         if task is None:
             return False

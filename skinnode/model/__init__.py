@@ -1,4 +1,4 @@
-"""Model of a patch, as values and pure functions.
+"""Physical and geometric model of a patch, consisting of immutable values and pure functions.
 
 ``layout`` and ``layout_file`` define the electrodes at rest, ``forward`` and ``kernels`` compute resistances
 from positions, and ``elastic`` computes displacements from loads. ``frames``, ``status`` and ``data_fault``

@@ -27,8 +27,8 @@ BLUR: Final = 0.1
 """Standard deviation of the Gaussian that blurs the rim of the load, relative to its radius. The blur limits
 the wave numbers that contribute."""
 _END: Final = 6.0
-"""Largest wave number in the integral, times the standard deviation of the blur; at this wave number, the
-blur has reduced the transform of the load to 1e-8."""
+"""Upper limit of the integral over the wave number, times the standard deviation of the blur. At this limit,
+the blur attenuates the Fourier transform of the load to 1e-8 of its value."""
 _NODES_PER_WAVE: Final = 8
 """Number of quadrature nodes per period of the Bessel functions at the largest distance."""
 
@@ -45,9 +45,9 @@ def bonded_layer_compliance(
         radius_m: Radius of the disc, m; the pressure is uniform except for the blurred rim (:data:`BLUR`).
 
     Returns:
-        Two displacements per unit force, m/N, each with the shape of ``distance_m``: along the force, and
-        along the surface away from a force that presses on the layer. For a force along +z, the outward
-        normal, reverse the sign of the second displacement.
+        Two displacements per unit force, m/N, each with the shape of ``distance_m``. The first is normal to
+        the surface, in the direction of the force. The second is tangential; it is positive away from the
+        load if the force presses on the layer, and positive towards the load if the force pulls.
 
     Raises:
         ValueError: If the thickness or the radius is not positive and finite.

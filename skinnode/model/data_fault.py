@@ -1,4 +1,4 @@
-"""Faults in the data of a patch: readings that failed a test and were left out of a field."""
+"""Faults in the data of a patch: readings that failed a test and were not used to compute a field."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class FaultKind(enum.StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class DataFault:
-    """Fault in the data: readings that failed a test and were left out of a field."""
+    """Readings of a patch that failed a test and were not used to compute a field."""
 
     part: FaultyPart
     kind: FaultKind
@@ -39,11 +39,11 @@ class DataFault:
     lower: int | None = None
     """Number of the lower wire; None if the fault affects all lower wires."""
     since: int = 0
-    """Scan in which the fault was first found: the host's scan number or, without a host, the number of
-    frames since the tracker was reset."""
+    """Number of the scan in which the fault was first found. A tracker that is used without a host counts the
+    scans since its last reset."""
     deviations: float = 0.0
-    """Significance of the fault, in standard deviations of a normal variable with the same tail probability;
-    inf if the fault is certain."""
+    """Significance of the fault, as the number of standard deviations of a normal variable with the same tail
+    probability; infinite for a fault that is certain."""
 
     @property
     def place(self) -> str:

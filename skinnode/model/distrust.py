@@ -1,4 +1,4 @@
-"""Text that states the reason why a field is not trusted."""
+"""Explain in words why a displacement field is not trusted."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from skinnode.model.status import Status
 
 
 def why_not(field: FieldFrame) -> str:
-    """Return the reason why a field is not trusted, as text; empty if the field is trusted.
+    """Return a text that explains why a field is not trusted; empty if the field is trusted.
 
-    For a field that has not been assessed, the text lists the statuses of wires that are not CONVERGED.
+    If the data of the field were not tested, the text counts the wires by status, except CONVERGED wires.
     """
     if field.trusted:
         return ""

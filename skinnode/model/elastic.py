@@ -1,8 +1,8 @@
 """Rubber as an elastic half-space: surface displacements caused by surface loads.
 
-The body fills z < 0, its surface is z = 0, and z points outwards, as everywhere in this project. A press is
-therefore a load with a negative z component. With the offset d = (x, y) from load to point, r = |d|, shear
-modulus G and Poisson's ratio ν, a point load f displaces the surface by (Boussinesq 1885, Cerruti 1882;
+The body fills z < 0, its surface is z = 0, and z points outwards. A body that presses on the surface
+therefore exerts a load with a negative z component. With the offset d = (x, y) from load to point, r = |d|,
+shear modulus G and Poisson's ratio ν, a point load f displaces the surface by (Boussinesq 1885, Cerruti 1882;
 Johnson, Contact Mechanics, 1985, eqs. 3.18 and 3.75 at z = 0, in our axes)
 
     ⎡ u_x ⎤      1   ⎡ (1−ν)/r + ν x²/r³    ν x y/r³              (½−ν) x/r² ⎤ ⎡ f_x ⎤
@@ -12,8 +12,8 @@ Johnson, Contact Mechanics, 1985, eqs. 3.18 and 3.75 at z = 0, in our axes)
 This module evaluates the matrix at a point (:func:`point_compliance`), and integrates it over a rectangle of
 uniform traction (:func:`rectangle_compliance`) or over the pressure under a sphere (:class:`HertzContact`).
 
-The model neglects the finite thickness of the rubber (a bonded layer is stiffer and its displacement decays
-faster than 1/r), large strain, and curvature of the skin.
+The model neglects large strain, the curvature of the skin and the finite thickness of the rubber. A bonded
+layer is stiffer than a half-space, and its displacement decays faster than 1/r.
 """
 
 from __future__ import annotations
@@ -120,12 +120,12 @@ def rectangle_compliance(rubber: Rubber, offset_m: ArrayLike, size_m: tuple[floa
 
 
 def _antiderivatives(x: Float, y: Float) -> Float:
-    """Return functions (5, P) with the mixed derivatives ∂²/∂x∂y x²/r³, y²/r³, xy/r³, x/r² and y/r²."""
+    """Return antiderivatives (5, P), in both x and y, of x²/r³, y²/r³, xy/r³, x/r² and y/r²."""
     r = np.hypot(x, y)
     ax, ay = np.abs(x), np.abs(y)
     with np.errstate(divide="ignore", invalid="ignore"):
-        # asinh(x/|y|) = ln(x + r) − ln|y|: the second term cancels in the sum over the corners, and asinh
-        # avoids the loss of digits in x + r
+        # asinh(x/|y|) replaces ln(x + r), which loses digits if x is negative. The two differ by ln|y|, which
+        # cancels in the sum over the corners.
         xx = np.where(ay > 0, y * np.arcsinh(x / ay), 0.0)
         yy = np.where(ax > 0, x * np.arcsinh(y / ax), 0.0)
         log_r = np.where(r > 0, np.log(r), 0.0)
@@ -138,7 +138,7 @@ def _antiderivatives(x: Float, y: Float) -> Float:
 def _compliance(  # noqa: PLR0913 - the six functions in the matrix
     rubber: Rubber, inverse: Float, xx: Float, yy: Float, xy: Float, x_r2: Float, y_r2: Float
 ) -> Float:
-    """Return the compliance (P, 3, 3) from 1/r, x²/r³, y²/r³, xy/r³, x/r², y/r² or their integrals."""
+    """Assemble the compliance matrices (P, 3, 3) from the six functions of x and y, or their integrals."""
     nu = rubber.poisson
     matrix = np.empty((*inverse.shape, 3, 3))
     matrix[..., 0, 0] = (1 - nu) * inverse + nu * xx
@@ -157,7 +157,7 @@ def _compliance(  # noqa: PLR0913 - the six functions in the matrix
 class HertzContact:
     """Hertzian contact between the rubber and a rigid sphere that presses on the rubber and slides over it.
 
-    The traction on the rubber is p (t_x, t_y, −1) with p = p₀ √(1 − r²/a²) inside the contact circle. The
+    Inside the contact circle, the pressure is p = p₀ √(1 − r²/a²) and the traction is (t_x p, t_y p, −p). The
     surface displacement has a closed form everywhere. Since p is radially symmetric, all integrals follow
     from two radial functions, Φ = ∫ p/|d| (Johnson eqs. 3.41a, 3.42a) and P, the load within r. The model
     assumes that shear does not change the pressure, which is exact for incompressible rubber and an
@@ -166,11 +166,11 @@ class HertzContact:
     Args:
         rubber: The material.
         radius_m: Radius of the sphere, metres.
-        indentation_m: Approach δ of the sphere, metres; 0 means no contact. Without shear, or if ν = 0.5, δ
-            equals the normal displacement at the centre of the contact.
+        indentation_m: Approach δ of the sphere, metres; 0 means no contact. The normal displacement at the
+            centre of the contact equals δ if there is no shear or if ν = 0.5.
         center_m: Centre (x, y) of the contact circle, metres.
-        traction_ratio: (t_x, t_y) ratio of the shear traction on the rubber to the pressure: a vector in the
-            sliding direction of the sphere whose length is the coefficient of friction.
+        traction_ratio: (t_x, t_y) ratio of the shear traction on the rubber to the pressure. The vector
+            points in the sliding direction of the sphere; its length is the coefficient of friction.
 
     Raises:
         ValueError: If a value is not finite, the radius is not positive, or the indentation is negative.
@@ -245,7 +245,7 @@ class HertzContact:
 
 
 def _hertz_integrals(offset: Float, a: float, peak: float) -> tuple[Float, Float, Float, Float]:
-    """Return Φ, Φ − S, (2S − Φ)/r² and P/r² at offsets (P, 2) from the centre of p = peak √(1 − r²/a²).
+    """Return Φ, Φ − S, (2S − Φ)/r² and P/r² at offsets (P, 2) from the centre of a Hertzian pressure p.
 
     χ = ∫ p |d| has the Laplacian Φ, so its gradient is d S with S = ∫₀ʳ Φ s ds / r², its second derivatives
     are S I + (Φ − 2S) d dᵀ/r², and ∫ p d dᵀ/|d|³ = Φ I − ∇∇χ. ∫ p d/|d|² is the field of a planar

@@ -1,4 +1,4 @@
-"""Input and output records of the host: resistances of a scan, and displacement fields."""
+"""Records of the resistances in a scan and of the displacement field computed from them."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ Z_95_TWO_SIDED: Final = 1.959964
 
 @dataclass(frozen=True, slots=True)
 class ScanStamp:
-    """Scan number and times of a scan; the clock is the host's monotonic clock unless stated otherwise."""
+    """Number and times of a scan. All times except ``device_time_us`` are on the host's monotonic clock."""
 
     patch: str
     """Name of the patch."""
@@ -27,19 +27,19 @@ class ScanStamp:
     counter: int
     """Scan number in the CAN frames, u8; equal to the SYNC counter if SYNC frames contain a counter."""
     device_time_us: int
-    """Time on the node's own clock at the SYNC of the scan, µs, 0 to 2³² − 1 with wrap-around; 0 if the
-    summary was lost. The resolution is 64 µs. The host derives the upper 10 bits; for the first scan, it uses
-    its own clock. The node's full 32-bit time with a resolution of 1 µs can be read from 0x2011:4; patches of
-    revision 1.0 send it with each scan."""
+    """Time of the scan's SYNC on the node's own clock, µs, modulo 2³²; 0 if the summary was lost.
+
+    The resolution is 64 µs. A summary contains only the lower 22 bits of the time, and the host adds the
+    upper 10 bits. Object 0x2011:4 of the node contains the time with a resolution of 1 µs."""
     t_sync_ns: int
     """Time at which the SYNC of this scan was sent or received; 0 if unknown."""
     t_receive_ns: int
     """Time at which the last frame of the scan was received."""
     t_solved_ns: int = 0
-    """Time at which the field was ready; 0 if it is not ready yet."""
+    """Time at which the displacement field was ready; 0 if it is not ready yet."""
 
     def solved_at(self, t_ns: int) -> ScanStamp:
-        """Return a copy of the stamp for a field that was ready at ``t_ns``."""
+        """Return a copy of the stamp for a displacement field that was ready at ``t_ns``."""
         return ScanStamp(
             self.patch, self.scan, self.counter, self.device_time_us, self.t_sync_ns, self.t_receive_ns, t_ns
         )
@@ -66,7 +66,7 @@ class SolveStats:
     jacobians: int
     """Number of evaluations of J, each of which also yields F."""
     steps: int
-    """Number of operator steps or, in a posterior solve, number of factorisations."""
+    """Number of solver iterations; in a posterior solve, number of matrix factorisations."""
     time_s: float
     """Elapsed time, s."""
 
@@ -84,11 +84,11 @@ class Contact:
     centroid_std_m: Float
     """(3,) standard deviation of the centre, metres."""
     area_m2: float
-    """Contact area, assuming a smooth body (Hertz), m²; the area of one cell if the contact is too small to
-    resolve."""
+    """Contact area of a smooth body (Hertz), m². A contact that is too small to resolve has the area of one
+    electrode cell."""
     area_std_m2: float
     normal_force_n: float
-    """Normal force, N; positive for a press."""
+    """Normal force, N; positive if the body presses on the skin."""
     normal_force_std_n: float
     shear_force_n: Float
     """(2,) shear force along and across the wires, N."""
@@ -96,10 +96,11 @@ class Contact:
     """(2,) standard deviation of the shear force, N."""
     force_calibrated: bool = False
     """Whether the forces are based on a calibration of this patch (``force_calibrated`` of Tracker or of
-    ``[patches.calibration]``). Without a calibration, the standard deviation of the normal force is a bound
-    on the model error: five standard deviations cover both the force computed for a half-space and the force
-    computed for a bonded layer as thick as the clearance. The standard deviation of the shear force includes
-    no such bound."""
+    ``[patches.calibration]``).
+
+    Without a calibration, the standard deviation of the normal force also covers the error of the half-space
+    model. The force computed for a bonded layer as thick as the clearance is within five standard deviations.
+    The standard deviation of the shear force does not cover this error."""
     axes: Float = field(default_factory=lambda: _FLAT)
     """(3, 3) unit vectors as rows, in the frame of the layout, at the centre of the contact: along the wire,
     across the wires and out of the skin. On a flat patch, these vectors are the x, y and z axes."""
@@ -114,55 +115,53 @@ class FieldFrame:
     displacement_std_m: Float
     """(U, N, 3) standard deviation due to noise in the resistances, metres; inf if the displacement is
     unknown. If a prior contributes to the displacement, the standard deviation is enlarged to cover rare
-    large errors of the prior, so an error above five standard deviations indicates a fault."""
+    large errors of the prior. An error above five standard deviations therefore indicates a fault."""
     status: tuple[Status, ...]
     """Status of each upper wire."""
     residual: Float
     """(U,) RMS of the relative residual F/b − 1 over the valid resistances of a wire."""
     stats: SolveStats
     force_n: Float | None = None
-    """(U, N, 3) loads on the skin, in newtons; None if ``contacts`` was switched off. The loads follow from
-    the displacement of an elastic half-space or, in an exact field with a given stiffness, from the paper's
-    law F = k Δs."""
+    """(U, N, 3) loads on the skin, in newtons; None if ``contacts`` was switched off. The loads are computed
+    with the model of an elastic half-space. If the method is ``exact`` and a stiffness k was specified, they
+    are computed as F = k Δs instead."""
     stamp: ScanStamp | None = None
-    """Scan from which the field was computed; None outside a host."""
+    """Number and times of the scan from which the field was computed; None without a host."""
     method: str = "exact"
-    """``exact`` if each wire was inverted; ``posterior`` if the patch was estimated as a whole."""
+    """``exact`` if each wire was solved separately; ``posterior`` if the patch was estimated as a whole."""
     by_prior: NDArray[np.bool_] | None = None
-    """(U,) mask of the wires whose own equations were not sufficient: in an exact field, the wires estimated
-    with the prior; in a posterior field, the wires without equations. Trust in these wires may be based on
-    the prior alone."""
+    """(U,) mask of the wires that were estimated with the prior because their own resistances were not
+    sufficient. With the method ``posterior``, these are the wires without any usable resistance. If such a
+    wire is trusted, the reason may be the prior alone."""
     contacts: tuple[Contact, ...] = ()
     """Contacts, strongest first; empty if nothing touches, if no wire could be solved, or if ``contacts`` was
-    switched off. The number of contacts also depends on the previous frame, so that noise does not split or
+    switched off. The number of contacts also depends on the previous scan, so that noise does not split or
     remove a contact."""
     gain: Float | None = None
-    """(U,) estimated gain error of each wire's resistances, as a fraction; None if no drift is estimated."""
+    """(U,) estimated relative gain error of each wire's resistances; None if gains are not estimated."""
     noise_factor: float = 1.0
-    """Ratio of the estimated noise to the configured noise; exactly 1 while the stream agrees with the
-    configured noise. If the resistances were computed from codes, the ratio refers to the noise at the input
-    of the converter."""
+    """Ratio of the estimated noise to the configured noise; exactly 1 while the two are consistent. If the
+    resistances were computed from codes, the ratio excludes quantization noise."""
     held: NDArray[np.bool_] | None = None
-    """(U,) mask of the wires that were not solved because their movement did not exceed the noise of the
-    frame."""
+    """(U,) mask of the wires that were not solved again, because their resistances changed by no more than
+    the noise."""
     core_std_m: Float | None = None
-    """(U, N, 3) standard deviation of typical errors, not enlarged for rare large errors of the prior,
-    metres; None if equal to ``displacement_std_m``."""
+    """(U, N, 3) standard deviation that is not enlarged to cover rare large errors of the prior, metres; None
+    if equal to ``displacement_std_m``."""
 
     distrust: str | None = None
-    """Reason why the field is not trusted, as text; empty if the field is trusted; None if not assessed."""
+    """Text that explains why the field is not trusted; empty if the field is trusted. None: not tested."""
     wires_trusted: NDArray[np.bool_] | None = None
-    """(U,) mask of the wires whose readings passed every test and are sufficiently complete; None if not
-    assessed."""
+    """(U,) mask of the wires with enough usable readings that passed every test; None if the readings were
+    not tested."""
     precise: bool = True
-    """Whether the standard deviations are within the limits that the user set (``max_std_m`` and
-    ``max_force_std_n`` of Tracker), or within their defaults."""
+    """Whether the standard deviations are within the limits ``max_std_m`` and ``max_force_std_n``."""
     data_share: Float | None = None
-    """(U, N, 3) share of each displacement that comes from the data of this frame rather than the prior: 1
-    minus the ratio of the posterior's variance to the prior's. None if all shares are 1, as in an exact
-    field."""
+    """(U, N, 3) fraction of each displacement that comes from the data of this scan rather than the prior;
+    None if all fractions are 1. The fraction is 1 minus the ratio of the posterior variance to the prior
+    variance."""
     faults: tuple[DataFault, ...] = ()
-    """Faults in the data: readings that failed a test and were left out of the field."""
+    """Readings that failed a test and were not used to compute the field."""
 
     @property
     def half_width_95_m(self) -> Float:
@@ -171,10 +170,10 @@ class FieldFrame:
 
     @property
     def trusted(self) -> bool:
-        """Whether all tests are passed, the data are sufficiently complete, and the patch is alive.
+        """Whether the data passed all tests, enough data arrived, and the patch's converter is running.
 
-        ``distrust`` contains the reason if the field is not trusted. A field that has not been assessed is
-        trusted if every wire converged.
+        If the field is not trusted, ``distrust`` contains the reason. If the data were not tested, the field
+        is trusted if every wire has the status CONVERGED.
         """
         if self.distrust is None:
             return all(status is Status.CONVERGED for status in self.status)
@@ -185,11 +184,11 @@ _Record = TypeVar("_Record", Contact, FieldFrame)
 
 
 def sealed(record: _Record, **changes: Any) -> _Record:
-    """Return a copy with ``changes`` and read-only arrays, which several receivers can share.
+    """Return a copy of a record with ``changes`` and read-only arrays, for use by several receivers.
 
-    The arrays are read-only views of the originals, which stay writable.
+    The arrays are read-only views. The original arrays stay writable.
     """
-    twin = object.__new__(type(record))  # avoids ``dataclasses.replace``, which takes five times as long
+    twin = object.__new__(type(record))  # five times as fast as ``dataclasses.replace``
     for name in _NAMES[type(record)]:
         value = changes[name] if name in changes else getattr(record, name)
         if isinstance(value, np.ndarray) and value.flags.writeable:
@@ -200,7 +199,7 @@ def sealed(record: _Record, **changes: Any) -> _Record:
 
 
 def amended(field: FieldFrame, **changes: Any) -> FieldFrame:
-    """Return a copy with ``changes``; equivalent to ``dataclasses.replace``, but five times as fast."""
+    """Return a copy of a field with ``changes``; five times as fast as ``dataclasses.replace``."""
     twin = object.__new__(FieldFrame)
     for name in _NAMES[FieldFrame]:
         object.__setattr__(twin, name, changes[name] if name in changes else getattr(field, name))

@@ -20,7 +20,7 @@ from skinnode.model.layout import Float
 from skinnode.model.pose import Pose
 
 HAND: Final = "hand"
-"""Name of the hand's own frame, and link name of the patches that are mounted on the hand itself."""
+"""Name of the hand's coordinate frame; also the link name of patches mounted on the hand itself."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,7 +35,7 @@ class Mount:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HandContact:
-    """Contact on a patch of a hand, in the frame of its link or of the hand."""
+    """Contact on a patch, expressed in the coordinate frame of the patch's link or of the hand."""
 
     patch: str
     """Name of the patch."""
@@ -51,7 +51,7 @@ class HandContact:
     """(3,) unit normal at the contact, pointing out of the skin. A pressing object exerts its normal force in
     the opposite direction."""
     normal_force_n: float
-    """Normal force, N; positive for a press."""
+    """Normal force, N; positive if the object presses on the skin."""
     normal_force_std_n: float
     force_n: Float
     """(3,) force of the object on the skin, the vector sum of normal force and shear, N."""
@@ -130,8 +130,8 @@ class HandContact:
 class Wrench:
     """Total force and torque that the contacts on a link, or on the hand, exert on the skin.
 
-    Forces too weak to be detected as contacts are not included, nor is the torque of each contact about its
-    own normal.
+    The wrench does not include forces that are too weak to be detected as contacts. It also does not include
+    the torque of each contact about its own normal.
     """
 
     frame: str
@@ -183,10 +183,10 @@ class Wrench:
 def wrench_of(contacts: Iterable[HandContact], frame: str, *, trusted: bool) -> Wrench:
     """Return the total wrench of contacts whose vectors are all in the same frame.
 
-    Errors on different patches are independent. On one patch, the errors of different contacts may be
-    correlated in any way: noise shifts load between neighbouring contacts, and an error in the layer's
-    stiffness scales all forces. The covariances of contacts on one patch are therefore combined into a bound
-    that is valid for any correlation.
+    Errors of contacts on different patches are assumed to be independent. Errors of contacts on the same
+    patch may be correlated: noise may shift load between neighbouring contacts, and an error in the layer's
+    stiffness scales all forces. As the correlation is unknown, the covariances of contacts on the same patch
+    are combined into a bound that is valid for any correlation.
 
     Args:
         contacts: The contacts, all in ``frame``.
@@ -200,8 +200,8 @@ def wrench_of(contacts: Iterable[HandContact], frame: str, *, trusted: bool) -> 
         force_n += contact.force_n
         torque_nm += np.cross(contact.position_m, contact.force_n)
     for group in of_patch.values():
-        # (Σ e)(Σ e)ᵀ ≤ Σ e eᵀ / w for weights with Σ w = 1; weights ∝ σ make the bound exact for fully
-        # correlated errors
+        # For weights w with Σ w = 1, (Σ e)(Σ e)ᵀ ≤ Σ e eᵀ / w. If w is proportional to the standard
+        # deviation, the bound is exact for fully correlated errors.
         stds = [math.sqrt(float(np.trace(contact.force_covariance_n2))) for contact in group]
         total = sum(stds)
         for contact, std in zip(group, stds, strict=True):

@@ -1,9 +1,9 @@
-"""Compiled forward model of one wire, with arrays in structure-of-arrays layout.
+"""Compiled forward model of one upper wire, for arrays in structure-of-arrays order.
 
-Lower electrodes are stored as (3, M, K) and the Jacobian as its transpose (3N, K). Vectors of neighbouring
-lower wires k are therefore contiguous in memory, and their sums stay in registers. Most of the time is spent
-on distances. A square root and a division per pair would saturate one slow execution unit of the processor,
-so 1/√ is computed by multiplications instead. Lengths may be in any unit; F has the inverse unit.
+Lower electrodes are stored as (3, M, K), and the Jacobian is stored transposed (3N, K). Values of
+neighbouring lower wires are therefore contiguous in memory, and sums stay in registers. Most of the time is
+spent on the inverse distances of electrode pairs. These are computed by multiplications alone, because
+processors execute square roots and divisions slowly. Lengths may be in any unit; F has the inverse unit.
 """
 
 from __future__ import annotations
@@ -35,10 +35,11 @@ relative_residual_part = njit_body(relative_residual)
 
 @njit_part
 def _inverse_root(square: Lanes) -> Lanes:
-    """Return 1 / √``square`` to within 1.5 ulp from 1e-307 to 1e307; NaN for subnormal numbers and inf.
+    """Return 1 / √``square`` with an error below 1.5 ulp; NaN for subnormal numbers and inf.
 
-    With e = 1 − square y², the result is y (1 + e/2 + 3/8 e² + 5/16 e³ + 35/128 e⁴ …). Two iterations of this
-    series without the e⁴ term reduce e from 0.07 to 1e-5 and then below the last bit.
+    With e = 1 − square y², the result is y (1 + e/2 + 3/8 e² + 5/16 e³ + 35/128 e⁴ …). The series
+    is evaluated twice without the e⁴ term. The first evaluation reduces e from 0.07 to 1e-5, and the second
+    reduces e to rounding errors.
     """
     y = rough_inverse_root(square)
     for _ in range(2):
@@ -97,7 +98,7 @@ def potential_jacobian(x: Float, lower: Float, f: Float, jt: Float) -> None:
 
 @njit
 def surface_laplacian(x: Float, lower: Float, normal: Float, out: Float, slope_t: Float) -> None:
-    """Write the Laplacian of F within the surface, −∂²F/∂n², of one wire into ``out`` (K,).
+    """Write the surface Laplacian of F, which equals −∂²F/∂n², into ``out`` (K,) for one wire.
 
     ``normal`` (3N,) contains the unit normal at each electrode; ``x`` and ``lower`` are as in
     :func:`potential`. ``slope_t`` (3N, K) receives the transposed derivative of the Laplacian with respect to

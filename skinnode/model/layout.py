@@ -1,4 +1,4 @@
-"""Geometry of a patch: the positions of its electrodes at rest, which also determine all matrix sizes.
+"""Geometry of a patch: the positions of its electrodes at rest.
 
 The x axis is along an upper wire, y across the upper wires and z out of the skin; the lower layer is at
 z = 0.
@@ -25,8 +25,8 @@ MOST_ELECTRODES: Final = 1024
 takes 75 MB, and the posterior stores several of these matrices."""
 
 MOST_PAIRS: Final = 1 << 22
-"""Maximum number of pairs that consist of an upper and a lower electrode. Storing the distances of all pairs
-takes 100 MB, and each evaluation of all wires computes every distance."""
+"""Maximum number of electrode pairs, each with one upper and one lower electrode. Storing the distances of
+all pairs takes 100 MB."""
 
 _HASH_RESOLUTION_M: Final = 1e-9
 """Resolution of coordinates in the hash, m; differences below a nanometre are ignored."""
@@ -37,7 +37,7 @@ def require_array(name: str, value: ArrayLike, shape: tuple[int | str, ...], *, 
 
     Args:
         name: Name of the argument, for error messages.
-        value: The value; not copied if it is already such an array.
+        value: The value; not copied if it is already a C-ordered float64 array.
         shape: Required shape; a letter stands for any length of at least 1.
         finite: Whether every number must be finite.
 
@@ -45,7 +45,7 @@ def require_array(name: str, value: ArrayLike, shape: tuple[int | str, ...], *, 
         ValueError: If the value cannot be converted. The error message contains the argument's name, its
             value and the requirement.
     """
-    if (  # fast path for the arrays that a host passes with every frame
+    if (  # fast path for the arrays that a host passes with every scan
         type(value) is np.ndarray
         and value.dtype == np.float64
         and value.shape == shape
@@ -55,7 +55,7 @@ def require_array(name: str, value: ArrayLike, shape: tuple[int | str, ...], *, 
         return value
     try:
         kind = np.asarray(value).dtype.kind
-        if kind not in "biufO":  # a cast would discard the imaginary part, or convert dates to numbers
+        if kind not in "biufO":  # a cast would discard imaginary parts, and convert dates to numbers
             raise TypeError(f"of {np.asarray(value).dtype}")
         array = np.ascontiguousarray(value, dtype=np.float64)
     except (TypeError, ValueError) as error:
@@ -94,7 +94,8 @@ class PatchLayout:
     Args:
         upper_m: (U, N, 3) electrodes of the U upper wires, metres; they move with the surface.
         lower_m: (K, M, 3) electrodes of the K lower wires, metres; they do not move.
-        resistivity_ohm_per_m: Resistance of the rubber per metre between two electrodes, the paper's g.
+        resistivity_ohm_per_m: Resistance of the rubber between two electrodes, per metre of their distance;
+            called g in Xu et al. 2018.
         name: Name of the layout; need not be the name of a preset.
 
     Raises:
@@ -150,12 +151,12 @@ class PatchLayout:
         """Return a flat layout by name.
 
         - ``aligned``: The lower wires run straight along y and are evenly spaced in x. Their electrodes are
-          offset from the upper wires by a quarter pitch, as in a literal reading of the paper's figure.
+          offset from the upper wires by a quarter pitch, as the figure in Xu et al. 2018 suggests.
         - ``symmetric``: The layout is the same as ``aligned``, except that there is no offset. The
           Jacobian is close to singular.
         - ``staggered``: The lower layer is half a pitch wider than the patch, its electrodes are 1.2 pitches
-          apart, and lower wire k is shifted in y by 0.43 (k mod 3 − 1) pitches. In measurements, this layout
-          was up to a thousand times better conditioned than the others.
+          apart, and lower wire k is shifted in y by 0.43 (k mod 3 − 1) pitches. The condition
+          number of the Jacobian is up to a thousand times lower than for the other presets.
 
         Args:
             name: ``aligned``, ``symmetric`` or ``staggered``.
@@ -205,7 +206,7 @@ class PatchLayout:
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Shape of a frame, (U, K)."""
+        """Shape (U, K) of the resistances of one scan."""
         return self.upper_m.shape[0], self.lower_m.shape[0]
 
     @property
@@ -218,8 +219,8 @@ class PatchLayout:
     def pitch_m(self) -> float:
         """Length scale of the patch, metres.
 
-        The length scale is the median distance between neighbouring electrodes on an upper wire or, if a wire
-        has a single electrode, the median distance from an upper electrode to the nearest lower electrode.
+        This is the median distance between neighbouring electrodes on an upper wire. If each upper wire has
+        only one electrode, it is the median distance from an upper electrode to the nearest lower electrode.
         """
         steps = np.linalg.norm(np.diff(self.upper_m, axis=1), axis=2)
         if steps.size:
@@ -234,7 +235,7 @@ class PatchLayout:
 
     @functools.cached_property
     def layout_hash(self) -> int:
-        """CRC-32 of the sizes and of all coordinates in nm; hosts compare it with object 0x2000 of nodes."""
+        """CRC-32 of the sizes and all coordinates in nm; a host compares it with object 0x2000 of a node."""
         sizes = np.array([*self.upper_m.shape, *self.lower_m.shape], dtype="<i8")
         parts = [np.rint(a / _HASH_RESOLUTION_M).astype("<i8") for a in (self.upper_m, self.lower_m)]
         return zlib.crc32(b"".join(a.tobytes() for a in (sizes, *parts)))

@@ -21,8 +21,7 @@ _MOST_NPZ_BYTES: Final = 16 << 20
 _MOST_VALUES: Final = {"upper_m": 3 * MOST_ELECTRODES, "lower_m": 3 * MOST_PAIRS, "resistivity_ohm_per_m": 1}
 """Maximum number of values in each array of a layout file."""
 _MOST_ITEM_BYTES: Final = 32
-"""Maximum size of one value, in bytes: the size of a complex long double, which is rejected later because of
-its type."""
+"""Maximum size of one array element, in bytes; the largest numeric type of NumPy has this size."""
 _LONGEST_KEY: Final = 40
 _MOST_HEADER_BYTES: Final = 10_240
 """Maximum size of an array's header, in bytes; NumPy reads headers of up to 10,000 characters."""
@@ -53,11 +52,12 @@ def read_npz(path: Path) -> PatchLayout:
 
 
 def _require_sizes(data: io.BytesIO, path: Path) -> None:
-    """Check the headers of an NPZ file before unpacking: a few megabytes can unpack to gigabytes.
+    """Check the array sizes in an NPZ file before unpacking, because a small file can unpack to gigabytes.
 
     Raises:
-        ConfigError: If a member is unknown, duplicate or too large, or is neither stored nor deflated.
-            zipfile and NumPy raise their own errors if the file is not an NPZ file.
+        ConfigError: If an array is unknown, duplicate or too large, or if its compression method is not
+            supported.
+        Exception: An error from zipfile or NumPy, if the file is not an NPZ file.
     """
     with zipfile.ZipFile(data) as members:
         seen: set[str] = set()

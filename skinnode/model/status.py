@@ -7,7 +7,7 @@ from collections.abc import Iterable
 
 
 class Status(enum.IntEnum):
-    """Outcome of a solve. If the status is not CONVERGED, the result is the best iterate found."""
+    """Outcome of a solve. If a solve does not converge, its result is the best iterate found."""
 
     CONVERGED = 0
     """The result is a root that passed all checks."""
@@ -22,11 +22,11 @@ class Status(enum.IntEnum):
     ILL_CONDITIONED = 5
     """The Jacobian is singular, resistances are missing, or the root may be wrong."""
     NON_FINITE = 6
-    """A value overflowed, or resistances were unusable."""
+    """A value overflowed, or resistances were not usable."""
     INVALID_START = 7
     """F or J is not finite at the starting point; `solve_system` returns the starting point unchanged."""
     INCONSISTENT = 8
-    """No deformation explains the resistances: χ² is far above what their noise allows."""
+    """No deformation explains the resistances: their χ² is far larger than noise can explain."""
 
 
 _BY_NUMBER = tuple(Status)

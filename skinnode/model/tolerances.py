@@ -1,4 +1,4 @@
-"""Manufacturing tolerances of a patch: allowed differences between its geometry and its layout."""
+"""Manufacturing tolerances of a patch, as differences between the real patch and its layout."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class Tolerances:
     placement: float = 0.0
     """Position of each upper and lower wire along each axis, in pitches."""
     thickness: float = 0.0
-    """Thickness of the layer between the electrodes, as a fraction of the clearance."""
+    """Rubber thickness between upper and lower electrodes, as a fraction of their smallest distance."""
     electrode_radius: float = 0.0
     """Radius of the electrodes, in pitches; the forward model treats electrodes as points."""
     gain: float = 0.0
@@ -37,6 +37,6 @@ class Tolerances:
 
 
 EXACT: Final = Tolerances()
-"""Tolerances of a patch that matches its layout exactly, such as a simulated patch."""
+"""Zero tolerances, for a patch that matches its layout exactly, such as a simulated patch."""
 ORDINARY: Final = Tolerances(placement=0.02, thickness=0.05, electrode_radius=0.05, gain=0.02)
-"""Tolerances that a good workshop achieves."""
+"""Typical tolerances of carefully manufactured patches."""

@@ -54,9 +54,8 @@ class CanopenDevice:
         send: called with the COB-ID and payload of each frame that the node sends, in order.
         serial: serial number (0x1018:4), u32.
         memory: memory for the values that survive a power cycle; None for a device without a memory.
-        kind: sizes and layout of the patch. The content of the memory must have been saved with the same
-            value; see
-            :class:`~skinnode.node.memory.Kept`.
+        kind: text that identifies the sizes and layout of the patch. The content of the memory is used only
+            if it was saved with the same text.
         set_bit_rate: changes the bit rate (bit/s) for LSS; None if the node cannot change it.
 
     Raises:
@@ -195,7 +194,7 @@ class CanopenDevice:
 
     @property
     def silent_from_ns(self) -> int:
-        """Time (ns) from which :meth:`on_timer` reports the silence of the master or a monitored node.
+        """Time (ns) from which :meth:`on_timer` reports that the master or a monitored node has gone silent.
 
         The caller must first pass all frames received before that time to :meth:`on_frame`.
         """
@@ -243,7 +242,7 @@ class CanopenDevice:
                 self._nmt.obey(command, t_ns)
 
     def _reset(self, objects: tuple[int, int], t_ns: int) -> None:
-        """Reset objects and services, then boot; without a node-ID, wait until LSS assigns one."""
+        """Reset objects and services, then boot. A node without a node-ID waits until LSS assigns one."""
         self._enter(NmtState.INITIALISING, t_ns)
         self._lss.reset_communication()
         self.node_id = self._lss.node_id
@@ -367,8 +366,8 @@ class CanopenDevice:
         handlers: dict[int, Handler] = self._error_control.handlers()
         if self._time.cob_id is not None:
             handlers[self._time.cob_id] = self._on_time
-        # The handlers of SYNC, SDO, NMT and LSS are registered last, so that configured COB-IDs cannot
-        # replace them.
+        # SYNC, SDO, NMT and LSS are registered last, so that other services with the same COB-ID cannot
+        # replace their handlers.
         handlers[self._sync.cob_id] = self._on_sync
         handlers[od.sdo_request_cob_id(self.node_id)] = self._on_sdo
         handlers[od.NMT_COB_ID] = self._on_nmt

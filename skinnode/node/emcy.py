@@ -26,7 +26,7 @@ _RESERVED_BIT: Final = 1 << 30
 
 
 class EmcyProducer:
-    """Producer of emergency messages, which are sent whenever an error occurs or ends.
+    """Producer of emergency messages, which report the beginning and the end of each error.
 
     Args:
         store: object dictionary.
@@ -68,7 +68,7 @@ class EmcyProducer:
         self._send_end(code, t_ns)
 
     def report(self, code: EmcyCode, detail: bytes, t_ns: int, who: int = 0) -> None:
-        """Report an error that lasts until :meth:`clear`, unless it is already active with the same detail.
+        """Report an error that lasts until :meth:`clear`, unless it was already reported with this detail.
 
         Args:
             code: error code.
@@ -92,7 +92,7 @@ class EmcyProducer:
             self._send_end(code, t_ns)
 
     def allow(self, allowed: bool, t_ns: int) -> None:
-        """Allow or withhold messages, depending on the node's NMT state."""
+        """Set whether messages may be sent, which depends on the NMT state of the node."""
         self._allowed = allowed
         self._try(t_ns)
 
@@ -100,7 +100,7 @@ class EmcyProducer:
         """Send the messages allowed at ``t_ns``. A message refused by the bus stays in the queue."""
         cob_id = self._store.integer(od.COB_ID_EMCY) & COB_ID_MASK
         while self._waiting and self._allowed and t_ns >= self._free_ns:
-            if self._lost:  # the loss is reported first, because the dropped messages were the oldest
+            if self._lost:  # report this first: the dropped messages were the oldest
                 self._send(cob_id, self._loss())
                 self._lost = 0
             else:
@@ -145,10 +145,10 @@ class EmcyProducer:
             self.on_timer(t_ns)
 
     def _loss(self) -> bytes:
-        """Return the emergency message that reports dropped emergency messages.
+        """Return an emergency message that reports how many emergency messages were dropped.
 
-        Detail bytes 0 and 1, which otherwise contain a number of skipped scans, are 0. Detail bytes 2 and 3
-        contain the number of dropped messages.
+        Detail bytes 2 and 3 contain the number of dropped messages. Detail bytes 0 and 1 are 0; in overrun
+        messages (0x8110) about scans, they contain the number of skipped scans.
         """
         detail = struct.pack("<HH", 0, min(self._lost, 0xFFFF))
         self._remember(EmcyCode.CAN_OVERRUN, detail)
@@ -188,7 +188,7 @@ class EmcyProducer:
         check_cob_id(value, self._store.integer(od.COB_ID_EMCY))
 
     def _on_cob_id(self) -> None:
-        if not self._exists:  # messages queued so far must not be sent when EMCY is enabled again
+        if not self._exists:  # discard queued messages, so that they are not sent when EMCY is enabled again
             self._waiting.clear()
             self._lost = 0
 

@@ -24,11 +24,11 @@ from skinnode.node.services import NodeServices
 Handler = Callable[[bytes, int], None]
 
 _RIVAL_BEATS: Final = 3
-"""Silence, in heartbeat periods of this node, that ends a node-ID conflict with another node. Both nodes
-usually have the same heartbeat period, and the margin allows for a lost heartbeat."""
+"""Number of heartbeat periods without a frame from a node with the same node-ID after which the conflict is
+considered resolved. The number allows for a lost heartbeat of the other node."""
 _RIVAL_NS: Final = 750_000_000
-"""Silence (ns) that ends a node-ID conflict with another node if this node sends no heartbeats: three default
-heartbeat periods.
+"""Time (ns) without a frame from a node with the same node-ID after which the conflict is considered
+resolved, if this node sends no heartbeats. The value is three default heartbeat periods.
 """
 
 
@@ -47,7 +47,7 @@ class ErrorControl:
         listen: Callable[[], None],
         failed: Callable[[int], None],
     ) -> None:
-        self._cob_id = 0  # set when the node receives its node-ID
+        self._cob_id = 0  # heartbeat COB-ID; 0 until the node has a node-ID
         store, emcy, now = services.store, services.emcy, services.now
         self._store, self._emcy, self._now = store, emcy, now
         self._rejected, self._send = services.rejected, services.send
@@ -124,9 +124,8 @@ class ErrorControl:
     def _on_own(self, _: bytes, t_ns: int) -> None:
         """Report once that another node has this node-ID.
 
-        The error ends after three heartbeat periods without frames from the other node.
-
-        Each frame from the other node is counted. Only an operator can resolve the node-ID conflict.
+        The error ends after three heartbeat periods without frames from the other node. Every frame from the
+        other node increments a counter of rejected frames.
         """
         self._rival_until_ns = t_ns + (_RIVAL_BEATS * self._producer.period_ns or _RIVAL_NS)
         self._rejected.count(Rejected.OWN_ERROR_CONTROL)

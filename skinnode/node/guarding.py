@@ -29,10 +29,7 @@ class Guarding:
         """Time (ns) at which the node life time expires."""
 
     def reset(self) -> None:
-        """Reset the toggle bit and end guarding.
-
-        In CiA 301, only *reset communication* resets the toggle bit.
-        """
+        """Reset the toggle bit and end guarding, as CiA 301 requires for *reset communication*."""
         self._toggle = 0
         self._guarded = False
         self.deadline_ns = NO_DEADLINE_NS
@@ -66,7 +63,7 @@ class Guarding:
         self._emcy.clear(EmcyCode.HEARTBEAT, t_ns)
 
     def on_timer(self, t_ns: int) -> None:
-        """Report a life guarding event if the node life time has expired, once until the next request."""
+        """Report a life guarding event if the node life time has expired and was not yet reported."""
         if t_ns >= self.deadline_ns:
             self._guarded = False
             self.deadline_ns = NO_DEADLINE_NS

@@ -15,12 +15,12 @@ from skinnode.node.emcy import EmcyProducer
 from skinnode.node.object_dictionary import ObjectStore
 
 _BOOTED: Final = 1
-"""Second detail byte of an emergency message that reports the restart, not the silence, of a monitored
-node."""
+"""Second detail byte of an emergency message about a monitored node that has restarted; the byte is 0 if the
+node has gone silent."""
 
 
 class HeartbeatProducer:
-    """Schedule of a node's heartbeats; a heartbeat that is late by a period or more shifts the schedule."""
+    """Schedule of a node's heartbeats. The schedule restarts if a heartbeat is late by a period or more."""
 
     def __init__(self) -> None:
         self.period_ns = 0

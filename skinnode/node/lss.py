@@ -91,7 +91,7 @@ class LssSlave:
 
     @property
     def may_boot(self) -> bool:
-        """Whether the node must boot: it has received a node-ID and left the configuration state."""
+        """Whether the node can boot, because it has received a node-ID and left the configuration state."""
         return (
             not self.configured and self.pending_node_id != NOT_CONFIGURED and self.state is LssState.WAITING
         )
@@ -101,11 +101,7 @@ class LssSlave:
 
         A pending node-ID that was not stored is lost. The caller must then call :meth:`reset_communication`.
 
-        Two open-source CiA 305 stacks treat the persistent and the pending node-ID in the same way. In the
-        NMT sub-state *reset application*, the stack c-open copies the persistent node-ID to the pending
-        node-ID. In *reset communication*, it copies the pending node-ID to the active node-ID (src/co_nmt.c).
-        The stack CANopenNode initialises the pending node-ID from non-volatile memory after *reset node*, and
-        does not change it at *reset communication* (305/CO_LSSslave.h).
+        The CANopen stacks c-open (src/co_nmt.c) and CANopenNode (305/CO_LSSslave.h) do the same.
         """
         self.pending_node_id = self._persistent_node_id
 
@@ -123,8 +119,8 @@ class LssSlave:
         intended for other slaves.
 
         After *activate bit timing*, the node stops sending immediately and changes its bit rate after a
-        delay. After a second delay, when all other nodes have changed their bit rates, the node may send
-        again.
+        delay. The node may send again after a second delay, which gives all other nodes time to change their
+        bit rates.
 
         Args:
             data: payload of the frame.
@@ -226,7 +222,7 @@ class LssSlave:
 
 
 class BitRateChange:
-    """Bit rate change requested by *activate bit timing*, with one delay before and one after the change.
+    """Bit rate change after the LSS request *activate bit timing*, with a delay before and after the change.
 
     Args:
         set_bit_rate: changes the bit rate (bit/s); None if the node cannot change it.
@@ -237,7 +233,7 @@ class BitRateChange:
         self._bit_rate_bps: int | None = None
         self._change_ns = self._over_ns = NO_DEADLINE_NS
         self.deadline_ns = NO_DEADLINE_NS
-        """Time (ns) at which :meth:`silent` must be called next."""
+        """Time (ns) at which the caller must call :meth:`silent` to continue the bit rate change."""
 
     def begin(self, bit_rate_bps: int | None, delay_ms: int, t_ns: int) -> None:
         """Start a bit rate change.

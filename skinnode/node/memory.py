@@ -17,7 +17,7 @@ from skinnode.errors import SkinError
 
 @dataclass(frozen=True, slots=True)
 class Parameters:
-    """Saved parameters of one group (CiA 301 v4.2, 7.5.2.13): only values other than the defaults."""
+    """Saved values of a parameter group (CiA 301 v4.2, 7.5.2.13). Default values are not saved."""
 
     node_id: int = 0
     """Node-ID of the node when the parameters were saved; some saved COB-IDs include this node-ID."""
@@ -30,7 +30,7 @@ class Kept:
     """Content of a memory: all values that survive a power cycle."""
 
     patch: str = ""
-    """Sizes and layout of the patch that saved this content. A different patch must not use the content."""
+    """Text that identifies the sizes and layout of the patch. Other patches must not use this content."""
     node_id: int | None = None
     """Node-ID stored by LSS: 1 to 127, or 255 for no node-ID; None if LSS has not stored a configuration."""
     bit_rate_bps: int | None = None

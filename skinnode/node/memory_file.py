@@ -21,8 +21,7 @@ from skinnode.node.memory import Fault, Kept, MemoryFault, Parameters
 
 _FORMAT: Final = "skinnode node memory 1"
 _MOST_BYTES: Final = 1 << 24
-"""Maximum accepted size of a memory file, in bytes. The file of a node with 512 PDOs and the largest baseline
-is less than a tenth of this size."""
+"""Maximum accepted size of a memory file, in bytes; over ten times the size of the largest valid file."""
 
 
 class FileMemory:
@@ -30,16 +29,15 @@ class FileMemory:
 
     Saving takes a few milliseconds and blocks all nodes that run on the same thread.
 
-    A ``FileMemory`` has exclusive access to its file from :meth:`claim` or the first :meth:`save` until
+    :meth:`claim` or the first :meth:`save` locks the file for exclusive access. The file stays locked until
     :meth:`close`, the end of a ``with`` block or the deletion of the object. The lock is a kernel lock on a
-    separate file in the same folder, so the lock is released when the process ends, even if the process is
-    killed.
+    separate file in the same folder. The kernel therefore releases the lock even if the process is killed.
 
-    Saving writes a temporary file, flushes this file to the storage medium and renames it to the memory file.
-    After a power failure or the death of the process, the memory file therefore has either its old or its new
-    content. Only the owner can read the file (mode 0600). If the path is a symbolic link, access is refused.
-    A file that is damaged or belongs to another patch is preserved: before saving, the file is renamed by
-    appending ``.unused-`` and a digest of its content.
+    Saving writes a temporary file, flushes it to the storage medium and renames it to the memory file. If the
+    power fails or the process is killed, the memory file therefore has either its old or its new content.
+    Only the owner can read the file (mode 0600). A path that is a symbolic link is rejected. Before a file
+    that is damaged or belongs to another patch is replaced, it is renamed by appending ``.unused-`` and a
+    digest of its content.
 
     Args:
         path: path of the file; its folder must exist.

@@ -1,12 +1,12 @@
 """Object dictionary of a running node: declarations and current values of the objects.
 
 The declarations are in :mod:`skinnode.protocol.objects`; the EDS files are generated from the same
-declarations. Each value is stored as the little-endian bytes sent on the bus. An SDO response therefore
-contains a slice of these bytes, and a PDO payload is a concatenation of values. Services can register
-functions for an object: :meth:`ObjectStore.bind` registers a function that computes the value,
-:meth:`ObjectStore.guard` a check before each write, and :meth:`ObjectStore.watch` a callback after each
-write. The value of a DOMAIN can be stored outside the object dictionary (:meth:`ObjectStore.bind_domain`). A
-refused write does not change the object.
+declarations. Each value is stored as the little-endian bytes that SDO and PDO frames contain.
+
+Services can register functions for an object. :meth:`ObjectStore.bind` registers a function that computes the
+value, :meth:`ObjectStore.guard` registers a check before each write, and :meth:`ObjectStore.watch` registers
+a callback after each write. With :meth:`ObjectStore.bind_domain`, the value of a DOMAIN is stored outside the
+object dictionary. A refused write does not change the object.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ MAX_BYTES: Final = 1 << 16
 Reader = Callable[[int], bytes]
 """Callback that computes and returns the value of a sub-index as bytes, or raises Refused."""
 Guard = Callable[[int, int], None]
-"""Callback that checks a new value and raises Refused to reject the value. Arguments: the sub-index and the
-value (for REAL32, its bit pattern)."""
+"""Callback that checks a new value and raises Refused to reject the value. Its arguments are the sub-index
+and the value; a REAL32 value is passed as its bit pattern."""
 Watcher = Callable[[int], None]
 """Callback invoked after a client's write; the argument is the sub-index."""
 ChangeWatcher = Callable[[int, int], None]
@@ -221,7 +221,7 @@ class ObjectStore:
         return self._values[index, subindex] if reader is None else reader(subindex)
 
     def written(self, index: int, subindex: int) -> bytes:
-        """Return the bytes last written by a client, even if the object is computed on reading."""
+        """Return the bytes last written by a client, even if a read would return a computed value."""
         return self._values[index, subindex]
 
     def integer(self, index: int, subindex: int = 0) -> int:

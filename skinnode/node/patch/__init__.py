@@ -1,9 +1,8 @@
 """Patch application of a CANopen device.
 
-::
-
-    source -> acquisition (resistances to codes) -> application (a scan at SYNC, by timer or on command)
-        -> chunk_selection (which chunks to send) -> scan_stream (chunks and summary, one after the other)
+The module ``application`` takes a scan at each SYNC, by timer or on command. ``acquisition`` reads the
+resistances from the source and encodes them as codes, ``chunk_selection`` selects the chunks to send, and
+``scan_stream`` sends the chunks and the summary.
 
 The module ``patch_node`` combines the device and the application. The module ``objects`` connects the
 application to the object dictionary. The modules ``wire_faults``, ``source_monitor`` and ``self_test`` detect

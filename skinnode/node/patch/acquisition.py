@@ -1,4 +1,4 @@
-"""Acquisition of a patch's codes by sampling the analogue port, and taring of the baseline."""
+"""Read the resistances of a patch from its analogue port, encode them as codes, and measure the baseline."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from skinnode.protocol.profile import PatchProfile
 from skinnode.protocol.summary import PHASES
 
 TARE_READS: Final = 16
-"""Number of readings averaged to measure a baseline. Averaging reduces the baseline's noise to a quarter of
-one reading's noise, which increases the noise of R/R0 by 3 %."""
+"""Number of readings averaged to measure a baseline. The baseline then has a quarter of the noise of a single
+reading, so the noise of R/R0 is only 3 % higher than the noise of R."""
 
 
 class Acquisition:
-    """Acquisition of codes from a source, which also stores the baseline and the last scan's codes.
+    """Acquisition of codes from a source. Stores the baseline and the codes of the last scan.
 
     Args:
         profile: sizes of the patch.

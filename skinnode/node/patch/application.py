@@ -1,4 +1,4 @@
-"""Patch application, which takes scans (at SYNC, by timer or on command), tares, and performs self-tests.
+"""Patch application, which takes scans, measures the baseline and performs self-tests.
 
 The module :mod:`skinnode.node.patch.objects` connects the manufacturer objects (0x2000 to 0x2301) to the
 application. The CANopen communication services are in :mod:`skinnode.node.device`.
@@ -75,8 +75,8 @@ class PatchApplication:
         self.overruns = 0
         """Number of scans skipped because one scan was still being sent and another was waiting."""
         self.slow_overruns = 0
-        """Number of scans skipped because of a slow computer or bus. Scans skipped because of a short scan
-        period are excluded."""
+        """Number of scans skipped because the computer or the bus is too slow, rather than because the scan
+        period is too short."""
         self._scan_ns = NO_DEADLINE_NS  # time of the next scan triggered by the node's timer
         describe(services.store, layout, acquisition.scale, serial)
         self._connect()
@@ -133,7 +133,7 @@ class PatchApplication:
             t_ns: time at which the SYNC was received, ns.
         """
         scans = not self._period_ns
-        if not scans or self.stream.full:  # if the new scan is not skipped, its summary is sent at this SYNC
+        if not scans or self.stream.full:  # otherwise, this SYNC starts a new scan
             self.stream.on_sync(turns, t_ns)
         if scans:
             self._scan(self._following() if counter is None else counter, turns, t_ns)
@@ -202,7 +202,7 @@ class PatchApplication:
             self._end_overrun(t_ns)
 
     def _end_overrun(self, t_ns: int) -> None:
-        """Report the end of an overrun, because a new scan can be queued again or scanning has stopped."""
+        """Report the end of an overrun: a new scan can be queued again, or scanning has stopped."""
         self._late = False
         self._emcy.clear(EmcyCode.CAN_OVERRUN, t_ns)
 
@@ -259,7 +259,7 @@ class PatchApplication:
             case od.SELF_TEST if value not in (0, od.SELF_TEST_SIGNATURE):
                 raise Refused(AbortCode.CANNOT_STORE)
             case od.SINGLE_SCAN if value:
-                # If SYNC counters serve as scan counters, a single scan would have the same scan counter as
+                # If scans are numbered by the SYNC counter, a scan on command would have the same number as
                 # the scan at the next SYNC.
                 numbered_by_sync = not self._period_ns and self._store.integer(od.SYNC_COUNTER_OVERFLOW)
                 if numbered_by_sync or not self._operational:

@@ -1,20 +1,20 @@
-"""Scan stream, which sends each scan's chunks, spaced by the inhibit time, followed by the summary.
+"""Send the chunks of each scan at intervals of at least the inhibit time, followed by the summary.
 
-Chunks are sent in a TPDO whose first mapped object is 0x2010. This TPDO must be event-driven, or must have
-been due at the SYNC that started the scan. After the chunks, the summary is sent in all TPDOs whose first
-mapped object is 0x2011. An event-driven summary TPDO is sent immediately after the chunks. A synchronous
-summary TPDO that was due at the SYNC that started the scan is also sent immediately. Otherwise, it waits for
-a later SYNC at which it is due. Event-driven TPDOs for other objects are sent after the chunks, too.
+Chunks are sent in a TPDO whose first mapped object is 0x2010. This TPDO must be event-driven, or it must be
+due at the SYNC that starts the scan. After the chunks, the summary is sent in all TPDOs whose first mapped
+object is 0x2011. A summary TPDO is sent immediately if it is event-driven, or if it was due at the SYNC that
+started the scan. Any other summary TPDO is sent at the next SYNC at which it is due. Event-driven TPDOs with
+other objects are also sent after the chunks.
 
 **Pacing.** The standard defines the inhibit time as a minimum interval between frames. On a general-purpose
-operating system, however, threads wake up late, so a scan could take longer than the SYNC period if the
-minimum interval were strict. The stream therefore makes up for delays of up to ``catch_up_ns``, if necessary
-by sending several frames at once. The mean frame rate never exceeds the rate that the inhibit time allows
-(generic cell rate algorithm, ITU-T I.371). If ``catch_up_ns`` is 0, the minimum interval is strict.
+operating system, however, threads wake up late. A scan could then take longer than the SYNC period if the
+minimum interval were strict. The stream therefore compensates for delays of up to ``catch_up_ns``, if
+necessary by sending several frames at once. The mean frame rate never exceeds the rate that the inhibit time
+allows (generic cell rate algorithm, ITU-T I.371). If ``catch_up_ns`` is 0, the minimum interval is strict.
 
-The node receives the time of a SYNC from its caller, but cannot measure the duration of the subsequent
-sampling. The stream therefore requests a timer event immediately after a scan's first chunk. The interval to
-the second chunk is then measured from the time of this timer event.
+The node receives the time of a SYNC from its caller, but cannot measure how long it then takes to read the
+resistances. The stream therefore requests a timer event immediately after a scan's first chunk. The interval
+to the second chunk is then measured from the time of this timer event.
 
 **Synchronous window (0x1007).** Chunks and summaries in synchronous TPDOs that are still unsent when the
 window closes are discarded. The window does not apply to event-driven TPDOs.
@@ -38,8 +38,8 @@ from skinnode.node.pdo.tpdo import Tpdo, TpdoEngine
 from skinnode.protocol.summary import SummaryFlag, pack_checked_summary, pack_summary, pack_summary_record
 
 _HELD_UP: Final = 0.1
-"""Maximum fraction of the sending time lost to delays before a skipped scan is attributed to a slow computer
-or bus. Normal thread jitter causes smaller losses."""
+"""A skipped scan is attributed to a slow computer or bus if delays make up more than this fraction of the
+sending time. Normal thread jitter causes shorter delays."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,7 +55,7 @@ class OutgoingScan:
     device_time_us: int
     """Time of the scan on the node's clock in µs, modulo 2³²."""
     check_of_codes: int | None = None
-    """CRC over the codes at a receiver after this scan; None for a summary without a scan check."""
+    """CRC over the codes that a receiver has after this scan; None if the summary contains no CRC."""
     turns: frozenset[int] = frozenset()
     """Numbers of the synchronous TPDOs that were due at the SYNC that started the scan."""
 
@@ -67,7 +67,7 @@ class ScanStream:
         store: object dictionary.
         tpdos: the TPDOs of the node.
         chunk: content of the chunk record (0x2010) before the first chunk is sent.
-        catch_up_ns: maximum delay (ns) that the stream makes up for by sending later chunks sooner.
+        catch_up_ns: maximum delay (ns) for which the stream compensates by sending the next chunks earlier.
     """
 
     def __init__(self, store: ObjectStore, tpdos: TpdoEngine, chunk: bytes, catch_up_ns: int) -> None:
@@ -77,11 +77,11 @@ class ScanStream:
         self._next_scan: OutgoingScan | None = None
         self._carrier: Tpdo | None = None  # TPDO for the current scan's chunks
         self._unsent: deque[bytes] = deque()
-        self._verbatim = False  # whether the carrier maps the whole chunk record
+        self._verbatim = False  # whether this TPDO contains the whole chunk record
         self._chunks_sent = 0
-        self._busy_ns = 0  # time at which the current uninterrupted series of scans began
+        self._busy_ns = 0  # time since which the stream has been sending without a pause
         self._just_begun = False
-        self._paced_ns = 0  # sum of inhibit times in the current series of scans
+        self._paced_ns = 0  # sum of the inhibit times since then
         self.chunk = chunk
         """Content of the chunk record (0x2010): the last chunk sent."""
         self.summary = bytes(12)
@@ -97,10 +97,9 @@ class ScanStream:
         return self._next_scan is not None
 
     def is_held_up(self, t_ns: int) -> bool:
-        """Return whether sending the current scans takes longer than the inhibit time requires.
+        """Return whether the stream is sending the current scans more slowly than the inhibit time permits.
 
-        A result of True means that the thread receives too little processor time or that the bus refuses
-        frames.
+        If so, the thread receives too little processor time, or the bus refuses frames.
         """
         busy_ns = t_ns - self._busy_ns
         lost_ns = busy_ns - self._paced_ns
@@ -116,7 +115,7 @@ class ScanStream:
     # --- methods called by the TPDO engine
 
     def sends(self, tpdo: Tpdo) -> bool:
-        """Return whether a TPDO is carrying the chunks of the current scan."""
+        """Return whether a TPDO is used to send the chunks of the current scan."""
         return tpdo is self._carrier
 
     def on_reload(self, tpdo: Tpdo) -> None:
@@ -206,7 +205,7 @@ class ScanStream:
             carrier.ready_ns = max(carrier.ready_ns, earliest_ns) + inhibit_ns
             self._paced_ns += inhibit_ns
             tpdos.emit(carrier, self.chunk if self._verbatim else tpdos.payload(carrier))
-            self._chunks_sent += 1  # counted after sending, because the bus may refuse the chunk
+            self._chunks_sent += 1  # not before sending, because the bus may refuse the chunk
         return not unsent
 
     def _end(self, scan: OutgoingScan, t_ns: int) -> None:

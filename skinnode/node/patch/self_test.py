@@ -18,18 +18,18 @@ from skinnode.protocol.codes import CodeScale, encode
 from skinnode.protocol.self_test import SelfTest, SelfTestFault
 
 READINGS: Final = 16
-"""Number of readings in a self-test, which equals the number for a tare.
+"""Number of readings in a self-test, as in a tare.
 
-16 readings determine the standard deviation of one crossing's resistance to within 18 % (1/√30). Over a patch
-with 300 crossings, the uncertainty is 1 %.
+With this number, the noise of one crossing is measured with a relative standard error of 18 % (1/√30). For a
+patch with 300 crossings, the standard error of the RMS noise is 1 %.
 """
 
 NOISE_LIMIT: Final = 1e-3
-"""Maximum relative noise of a reading for the self-test to pass: a hundred times the noise for which the
-solver's accuracy is specified."""
+"""Maximum relative noise of a reading for which the self-test passes. The accuracy of the solver is specified
+for a hundredth of this noise."""
 
 
-@np.errstate(over="ignore", invalid="ignore")  # no converter returns values large enough to overflow
+@np.errstate(over="ignore", invalid="ignore")  # only unrealistically large resistances overflow
 def self_test(read: Callable[[], Float], baseline_ohm: Float, scale: CodeScale) -> SelfTest:
     """Perform a self-test of a patch.
 

@@ -16,8 +16,8 @@ class ResistanceSource(Protocol):
     by the converter, an integer of any size. The node reads ``conversions`` after :meth:`read`. Each summary
     indicates whether the number has changed, so the host detects a stopped converter immediately. If the
     attribute ``conversions`` is missing or None, the host must detect a stopped converter from the codes. The
-    conversions must be counted in the converter itself, not in :meth:`read`. A source may supply
-    ``conversions`` only if its converter completes at least one conversion per scan.
+    conversions must be counted in the converter itself, not in :meth:`read`. A source may have this attribute
+    only if its converter completes at least one conversion of all crossings per scan.
     """
 
     def read(self, t_ns: int) -> Float:
@@ -57,7 +57,7 @@ class SourceFault(IntEnum):
 
 
 class SourceFailed(Exception):
-    """Error raised and handled inside a node if reading the source fails."""
+    """Error raised if a source cannot be read."""
 
     def __init__(self, fault: SourceFault, message: str) -> None:
         self.fault = fault

@@ -28,13 +28,15 @@ class SourceMonitor:
         """One-line description of the source's last failure; empty before the first failure."""
 
     def reset(self, t_ns: int) -> None:
-        """Report a persisting failure again after a reset."""
+        """Report the failure again after a reset if the source is still failing."""
         if self._fault is not None:
             self._report(self._fault, t_ns)
 
     @contextlib.contextmanager
     def watch(self, t_ns: int) -> Iterator[None]:
-        """Report and re-raise a source failure in the ``with`` block; report the end of an earlier failure.
+        """Monitor the source while it is read in the ``with`` block.
+
+        A failure is reported and raised again. If an earlier failure has ended, its end is reported.
 
         Args:
             t_ns: current time, ns.
@@ -44,7 +46,7 @@ class SourceMonitor:
         except SourceFailed as failure:
             self.failures += 1
             self.error = str(failure)
-            if failure.fault is not self._fault:  # a lasting failure is reported once, not at every scan
+            if failure.fault is not self._fault:  # report a continuing failure only once
                 self._report(failure.fault, t_ns)
             self._on_failure()
             raise

@@ -1,4 +1,4 @@
-"""Detection of open and shorted wires from a scan's codes, and reporting of wire faults by EMCY 0x5000."""
+"""Detect open and shorted wires in the codes of a scan, and report them in EMCY messages (0x5000)."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ class WireFaultReporter:
         self._reported = WireFaults.none(profile)
 
     def reset(self) -> None:
-        """Forget the reported faults, because the node was reset."""
+        """Clear the list of reported faults after a reset, so that persisting faults are reported again."""
         self._reported = WireFaults.none(self._profile)
 
     def report(self, faults: WireFaults, t_ns: int) -> None:

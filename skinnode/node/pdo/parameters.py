@@ -1,6 +1,6 @@
-"""PDO parameters: their permitted values and their meaning (CiA 301 v4.2, 7.5.2.33 to 7.5.2.38).
+"""Communication and mapping parameters of PDOs (CiA 301 v4.2, 7.5.2.33 to 7.5.2.38).
 
-For errors without an abort code in the standard, a node sends the same abort code as CANopenNode.
+If the standard defines no abort code for an error, a node sends the same abort code as the stack CANopenNode.
 """
 
 from __future__ import annotations
@@ -79,7 +79,7 @@ class Mapped:
 
 @dataclass(frozen=True, slots=True)
 class PdoParameters:
-    """Parameters of a PDO from its communication and mapping records. Times are in ns; 0 disables a time."""
+    """Communication and mapping parameters of a PDO. Times are in ns; 0 means that a time is not used."""
 
     enabled: bool
     """Whether the PDO is enabled and has at least one mapped object."""
@@ -138,7 +138,7 @@ class PdoRecords:
         store.guard(mapping, self._guard_mapping)
 
     def _word(self, subindex: int) -> int:
-        """Return the communication parameter at a sub-index; 0 if this PDO lacks the parameter."""
+        """Return the communication parameter at a sub-index; 0 if the PDO does not have this parameter."""
         has = self._store.has(self._parameter, subindex)
         return self._store.integer(self._parameter, subindex) if has else 0
 

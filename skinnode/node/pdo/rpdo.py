@@ -3,9 +3,9 @@
 A synchronous RPDO (types 0 to 240) is applied at the SYNC after its reception, if it was received within the
 synchronous window (0x1007). Of several RPDOs with the same number received between two SYNCs, only the last
 is applied. An RPDO of type 254 or 255 is applied immediately. Excess bytes of an RPDO are ignored; an RPDO
-that is too short is not applied. An emergency message reports a length error once, until an RPDO with the
-correct length arrives. In OPERATIONAL, an event timer monitors the reception of an RPDO after it has been
-received for the first time.
+that is too short is not applied. A length error is reported by an emergency message, and is not reported
+again until an RPDO with the correct length has arrived. After an RPDO has been received for the first time in
+OPERATIONAL, its event timer monitors its reception.
 """
 
 from __future__ import annotations
@@ -156,7 +156,7 @@ class RpdoEngine:
         wrong = None
         if len(data) < parameters.size:
             wrong = EmcyCode.PDO_NOT_PROCESSED
-        elif len(data) > fd_length(parameters.size):  # CAN FD pads lengths above 8 bytes
+        elif len(data) > fd_length(parameters.size):  # CAN FD payloads may be padded
             wrong = EmcyCode.PDO_LENGTH_EXCEEDED
         self._set_wrong(rpdo, wrong, data, t_ns)
         if wrong is EmcyCode.PDO_NOT_PROCESSED:
@@ -171,7 +171,7 @@ class RpdoEngine:
             self._pending[rpdo.number] = data
 
     def _execute(self, rpdo: _Rpdo, data: bytes) -> None:
-        """Write the mapped objects. A refused value is ignored, because a PDO has no response."""
+        """Write the mapped objects. Ignore values that an object refuses, because a PDO has no response."""
         for index, subindex, start, end in rpdo.fields:
             with contextlib.suppress(Refused):
                 self._store.write(index, subindex, data[start:end])

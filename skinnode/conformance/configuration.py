@@ -37,10 +37,8 @@ def read_configuration(dut: Dut) -> dict[tuple[int, int], bytes]:
 def write_back(dut: Dut, before: Values) -> list[str]:
     """Restore a node's original configuration after a case that stored or restored parameters.
 
-    The node must have been reset after that case.
-
-    Restores the defaults, writes the values of ``before`` that differ from the defaults, and stores the
-    result.
+    Restores the defaults, writes the values of ``before`` that differ from the defaults, and stores all
+    parameters. The caller must have reset the node beforehand.
 
     Args:
         dut: The device.

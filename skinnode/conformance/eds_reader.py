@@ -1,7 +1,7 @@
 """Reads the electronic data sheet (CiA 306) of a device under test.
 
 The reader uses only :mod:`configparser`, so that its result depends neither on the EDS writer of this project
-nor on the canopen library. Case EDS-01 reports the contradictions within the file; a file
+nor on the canopen library. Case EDS-01 reports contradictions within the file. A file
 that cannot be parsed raises ProfileError.
 """
 

@@ -20,7 +20,7 @@ from skinnode.protocol.profile import BusType, PatchProfile
 from skinnode.transport import CanPort
 
 SILENT_CASES: Final = 3
-"""Number of consecutive cases without any response before the remaining cases are skipped."""
+"""Number of consecutive cases without a response after which the remaining cases are skipped."""
 
 
 @dataclass(frozen=True, slots=True)

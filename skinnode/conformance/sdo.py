@@ -219,7 +219,7 @@ class SdoClient:
         return data
 
     def _read_sub_block(self, size: int, what: str) -> tuple[bytes, int, bool]:
-        """Read a sub-block; return its bytes, its number of segments, and whether it is the last."""
+        """Read a sub-block; return its data, its number of segments, and whether it ends the transfer."""
         data = b""
         for number in range(1, size + 1):
             segment = _not_aborted(self.answer(f"segment {number}, {what}"), what)
@@ -262,7 +262,7 @@ class SdoClient:
     def write_block(
         self, index: int, subindex: int, data: bytes, *, crc: bool = False, wrong_crc: bool = False
     ) -> None:
-        """Download at most one sub-block by block transfer; if ``wrong_crc`` is true, the CRC is wrong."""
+        """Download at most one sub-block by block transfer, optionally with a wrong CRC."""
         what = f"block write to 0x{index:04X}:{subindex:02X}"
         start = bytes((0xC2 | crc << 2,)) + mux(index, subindex) + struct.pack("<I", len(data))
         answer = self.served(start, what)

@@ -16,7 +16,7 @@ from skinnode.transport import CanPort, Frame
 ANSWER_S: Final = 1.0
 """Maximum wait for a response, s.
 
-The limit is far longer than a device needs, so that a busy machine does not cause failures.
+Devices respond much faster; the limit is generous so that a busy machine does not cause failures.
 """
 
 QUIET_S: Final = 0.06

@@ -35,8 +35,7 @@ BITRATE_BPS: Final = 1_000_000
 _REDRAW_S: Final = 0.2
 _LINE_S: Final = 1.0
 _LULL_S: Final = 0.004
-"""Waiting time for a new field, s; after this time, all scans of the current SYNC are assumed to be
-solved."""
+"""Maximum wait for a new field, s; if none arrives, the scans of the current SYNC are considered solved."""
 
 
 @dataclass(frozen=True, slots=True)

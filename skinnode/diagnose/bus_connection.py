@@ -155,10 +155,9 @@ class BusConnection:
             return None
 
     def guarded(self, node_id: int) -> bool:
-        """Return whether a master guards the node.
+        """Return whether the node has life guarding enabled, which a remote frame would start.
 
-        A remote frame from this program would start life guarding in a guarded node. When the program then
-        stops sending, the node would report the loss of its master.
+        After this program stops sending remote frames, such a node would report the loss of its master.
         """
         remote = self.od(node_id)
         try:
@@ -183,7 +182,7 @@ class BusConnection:
             if heartbeat_s:
                 return State(None, f"no heartbeat, although the heartbeat period is set to {heartbeat_s:g} s")
         if not guarding:
-            return State(None, "no heartbeat, and a master guards the node")
+            return State(None, "no heartbeat; no remote frame was sent, because it might start life guarding")
         for answer_s in GUARD_ANSWERS_S:
             asked_ns = time.monotonic_ns()
             self.link.ask_remote(od.heartbeat_cob_id(node_id))

@@ -42,8 +42,8 @@ DEFAULT_NOISE: Final = 3e-6
 """Relative noise assumed for the converter if there is no hand file."""
 
 _PAUSES_S: Final = (0.0, 0.1, 0.3, 0.6)
-"""Pauses (s) before successive attempts to read a node. A host that reads a baseline occupies the node for
-0.1 to 0.3 s."""
+"""Pauses (s) before successive attempts to read a node. While a host reads the baseline, the SDO server is
+busy for 0.1 to 0.3 s."""
 
 _FIRST_SYNC_S: Final = 0.5
 _KNOWN_TO_ALL: Final = frozenset(

@@ -145,7 +145,7 @@ def discover(connection: BusConnection, progress: Callable[[str], None] = lambda
 def _let_others_finish(connection: BusConnection) -> None:
     """Wait until other clients' SDO transfers have ended, because a new request would abort them.
 
-    A host makes SDO transfers during bring-up, but normally not afterwards.
+    A host performs SDO transfers during bring-up, but normally not afterwards.
     """
     end_s = time.monotonic() + OTHERS_S
     while time.monotonic() < end_s:

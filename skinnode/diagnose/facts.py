@@ -57,7 +57,7 @@ class ScanFacts:
     t_s: Float
     """(T,) time from the end of the first scan to the end of each scan, s."""
     latency_s: Float
-    """(T,) time from SYNC to the last frame, s; NaN if no SYNC was received."""
+    """(T,) time from SYNC to the last frame of the scan, s; NaN if no SYNC was received."""
     device_us: Counts
     """(T,) clock of the node, µs; -1 if the summary was lost."""
     complete: NDArray[np.bool_]
@@ -120,7 +120,7 @@ class BusFacts:
     """Listening time, s."""
     frames: int = 0
     load: float = 0.0
-    """Bus load as a fraction, in the busiest second of the capture; without scans, in the last second."""
+    """Bus load (fraction) in the busiest second of the capture, or in the last second if no scan arrived."""
     error_frames: int = 0
     dropped: int = 0
     outages: int = 0
@@ -137,8 +137,8 @@ class BusFacts:
     """Counters of the SYNCs received; 0 for a SYNC without a counter."""
     sync_ours: bool = False
     own_period_s: float = 0.0
-    """Period of the SYNC that the doctor sends, s; 0 if another node sends SYNC. The period
-    exceeds ``period_s`` if a node that no host has configured needs more time for a scan."""
+    """Period of the SYNC that the doctor sends, s; 0 if another node sends SYNC. It is
+    longer than ``period_s`` if an unconfigured node needs more time for a scan."""
     active: bool = False
     """Whether the doctor was allowed to start nodes that were not running."""
     role: str = "master"

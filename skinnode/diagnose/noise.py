@@ -2,12 +2,13 @@
 
 The functions are pure and compute two estimates of the noise. Second differences of successive scans
 (variance 6 σ²) are insensitive to slow touches. The part of a crossing's signal that the other wires do not
-explain is insensitive to quick touches. A touch affects the crossings of many wires by combinations of a few
-functions of time, whereas the noise of each crossing is independent. Both estimates are upper bounds on the
-noise, so the smaller of the two is used. A quick, deep and small touch affects both estimates. A touch
-hardly affects the smallest singular values of a wire. On touched skin, a wire's smallest singular values are
-therefore compared with those of its neighbours. The patch as a whole is assessed by its own smallest
-singular values.
+explain is insensitive to quick touches: a touch changes the values of many crossings by linear combinations
+of a few functions of time, whereas the noise is independent at each crossing. Both estimates are upper bounds
+on the noise, so the smaller of the two is used.
+
+A quick, deep and small touch affects both estimates, but hardly affects the smallest singular values of a
+wire's signals. On touched skin, these singular values are therefore compared with those of the neighbouring
+wires. The patch as a whole is assessed by its own smallest singular values.
 """
 
 from __future__ import annotations
@@ -38,7 +39,7 @@ _MOVED: Final = 6.0
 _EXPLAINED: Final = 2.0
 """Minimum ratio of a touched crossing's standard deviation to the part that other wires do not explain.
 
-Noise with 25 degrees of freedom exceeds this ratio once in a million crossings.
+For pure noise with 25 degrees of freedom, the probability of exceeding this ratio is 1e-6.
 """
 _TOUCHED: Final = 2
 """Minimum number of crossings that a touch affects at the same time; a loose contact affects one crossing."""

@@ -1,6 +1,6 @@
 """Defines the names and types of CiA 301 v4.2 objects (7.5.2), used to describe a device without an EDS.
 
-Sub-index 0 of an array or record is the number of entries, which is read from the device.
+Sub-index 0 of an array or record contains its number of entries, which is read from the device.
 """
 
 from __future__ import annotations

@@ -13,7 +13,7 @@ from .conftest import bench_on, patch_on
 
 NOT_APPLICABLE = {
     "SDO-04": "no object with access wo",
-    "SDO-29": "no SDO server beyond the default one",
+    "SDO-29": "no additional SDO server",
     "SDO-30": "no SDO client",
     "OD-04": "no object with access wo",
     "OD-05": "no object has the optional sub-index 0xFF",

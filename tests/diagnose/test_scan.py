@@ -105,7 +105,7 @@ def test_a_node_that_a_master_guards_is_not_asked_by_remote_frame(
         while (frame := listener.recv(0.0)) is not None:
             remotes += [frame.can_id] if frame.remote else []
     assert node.state == "unknown"
-    assert "a master guards" in node.state_known_by
+    assert "might start life guarding" in node.state_known_by
     assert remotes == []
 
 

@@ -121,7 +121,9 @@ def wrong_sequence(dut: Dut) -> None:
     dut.sdo.aborts(b"\xa2\x80\x14", 0x1000, 0, codes, "an acknowledgement of segment 128")
 
 
-@case("SDO-28", "SDO servers in the EDS (0x1201 to 0x127F) can be read, and no others exist", "7.5.2.33")
+@case(
+    "SDO-28", "SDO server objects in the EDS (0x1201 to 0x127F) can be read, and no others exist", "7.5.2.33"
+)
 def further_servers(dut: Dut) -> None:
     for index in range(0x1201, 0x1280):
         if dut.eds.has(index):
@@ -135,7 +137,7 @@ def further_servers(dut: Dut) -> None:
 def servers_after_reset(dut: Dut) -> None:
     servers = dut.eds.indices(0x1201, 0x127F)
     if not servers:
-        raise NotApplicable("the EDS has no SDO server beyond the default one (0x1201 to 0x127F)")
+        raise NotApplicable("the EDS has no additional SDO server (0x1201 to 0x127F)")
     before = {(index, sub): dut.sdo.read(index, sub) for index in servers for sub in (1, 2)}
     for index in servers:
         for subindex in (1, 2):

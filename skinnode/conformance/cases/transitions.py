@@ -42,7 +42,7 @@ def _application_object(dut: Dut) -> tuple[EdsEntry, bytes] | None:
 
 @case(
     "TRANS-01",
-    "Reset node and reset communication work in every state; the latter keeps application parameters",
+    "NMT resets work in every state; a communication reset keeps application parameters",
     "7.3.2.2.1",
 )
 def resets(dut: Dut) -> None:
@@ -92,7 +92,7 @@ def _transition(dut: Dut, command: int, *others: int) -> None:
 
 @case(
     "TRANS-02",
-    "Enter pre-operational, addressed to the node or to all nodes, works in OPERATIONAL and STOPPED",
+    "NMT enter pre-operational, to the node or to all nodes, works in OPERATIONAL and STOPPED",
     "7.2.8.2.1, 7.3.2.2",
 )
 def enter_pre_operational(dut: Dut) -> None:
@@ -101,7 +101,7 @@ def enter_pre_operational(dut: Dut) -> None:
 
 @case(
     "TRANS-03",
-    "Start, addressed to the node or to all nodes, works in PRE-OPERATIONAL and STOPPED",
+    "NMT start, to the node or to all nodes, works in PRE-OPERATIONAL and STOPPED",
     "7.2.8.2.1, 7.3.2.2",
 )
 def start(dut: Dut) -> None:
@@ -110,7 +110,7 @@ def start(dut: Dut) -> None:
 
 @case(
     "TRANS-04",
-    "Stop, addressed to the node or to all nodes, works in PRE-OPERATIONAL and OPERATIONAL",
+    "NMT stop, to the node or to all nodes, works in PRE-OPERATIONAL and OPERATIONAL",
     "7.2.8.2.1, 7.3.2.2",
 )
 def stop(dut: Dut) -> None:

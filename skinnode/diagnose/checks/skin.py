@@ -19,13 +19,13 @@ from skinnode.text.words import counted
 NOISY: Final = 5.0
 """Minimum ratio of a noisy crossing's noise to the stated noise.
 
-In 20 scans, noise at the stated level practically never reaches this ratio.
+Over 20 scans, a crossing with the stated noise practically never reaches this ratio.
 """
 
 _DRIFT: Final = 0.003
 """Minimum deviation |R/R0 − 1| at rest that justifies a tare.
 
-The limit is 100 times the noise of a good converter and 1 % of the effect of a press.
+A good converter's noise is a hundredth of this value; a press changes R/R0 a hundred times as much.
 """
 
 _MANY: Final = 0.8

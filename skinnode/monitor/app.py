@@ -28,7 +28,7 @@ from skinnode.monitor.widgets import Canvas, Dialog
 PERIOD_S: Final = 0.1
 """Minimum interval between screen updates, s."""
 SHARE: Final = 0.2
-"""Maximum fraction of one processor's time spent on drawing.
+"""Maximum fraction of the time of one processor core that is spent on drawing.
 
 If drawing is slow, the screen is updated less often.
 """
@@ -96,7 +96,7 @@ class MonitorApp(App[None]):
         super().__init__(driver_class=PatientDriver, ansi_color=colours != "rgb")
         self.faults = FaultBook(live=source.live)
         self.failure: SkinError | None = None
-        """Error that ended the source."""
+        """Error that caused the monitor to end; None if no error has occurred."""
         self._source, self._folder, self._over, self._seconds = source, folder, over, seconds
         self._theme = theme_for(colours)
         self.canvas = Canvas()
@@ -128,7 +128,7 @@ class MonitorApp(App[None]):
         self._turn()
 
     def on_unmount(self) -> None:
-        """Stop capturing log messages for the event log."""
+        """Remove the logging handler, so that log messages are no longer added to the event log."""
         logging.getLogger().removeHandler(self._records)
 
     @property
@@ -169,7 +169,7 @@ class MonitorApp(App[None]):
         self.faults.update(view, time.monotonic_ns(), ending=ending)
         for event in self._source.events():
             begins = event.what == "operational" and time.monotonic() - self._begun_s < _BEGIN_S
-            if not begins:  # at start-up, all patches report that they are operational
+            if not begins:  # omit the events of the start-up
                 self._lines.append(log_line(event, self._wall_minus_mono_ns))
         self._settle_tares()
         if not self._paused:
@@ -308,7 +308,7 @@ class MonitorApp(App[None]):
 
 
 class _Records(logging.Handler):
-    """Logging handler that adds warnings to the event log; printing them would corrupt the picture."""
+    """Logging handler that adds warnings to the event log. Printed warnings would corrupt the screen."""
 
     def __init__(self, lines: deque[LogLine]) -> None:
         super().__init__(logging.WARNING)

@@ -25,17 +25,17 @@ from skinnode.model.frames import FieldFrame
 from skinnode.model.layout import Float
 
 Colours = Literal["rgb", "ansi", "none"]
-"""Colours of the terminal: 256 or more, the 16 ANSI colours, or none (NO_COLOR)."""
+"""Colours of the terminal: at least 256 colours, the 16 ANSI colours, or none (NO_COLOR)."""
 
 Line = list[Segment]
 """Styled text of a screen line or of a part of a line."""
 
-# Five points of matplotlib's colour map "magma" (CC0), whose perceived brightness increases uniformly.
+# Five points of matplotlib's colour map "magma" (CC0). Its perceived brightness increases uniformly.
 _MAGMA: Final = np.array([(0, 0, 4), (81, 18, 124), (183, 55, 121), (252, 137, 97), (252, 253, 191)], float)
 LEVELS: Final = 24
-"""Number of shades. More shades would be indistinguishable and take longer to draw and to transmit."""
+"""Number of shades. Additional shades would be indistinguishable, but take longer to draw and transmit."""
 _UNKNOWN: Final = -1
-"""Shade level of skin without a measurement."""
+"""Shade level of pixels whose depth is unknown."""
 _SIGNS: Final = "·:-=+*#%@"
 """Characters that represent depth, from untouched to deepest; denser characters represent deeper skin."""
 _ANSI: Final = ("black", "blue", "magenta", "red", "yellow", "bright_white")
@@ -50,9 +50,9 @@ _STEPS_M: Final = tuple(
     step * 10.0**power for power in (-5, -4, -3, -2) for step in (1.0, 1.5, 2.0, 3.0, 5.0, 7.0)
 )
 _LEAST_M: Final = 5e-5
-"""Minimum depth drawn at full brightness, m; the limit prevents noise from looking like a touch."""
+"""Minimum depth drawn at full brightness, m. Without this limit, noise would look like a touch."""
 _MEMORY_NS: Final = 6_000_000_000
-"""Time for which a past press still determines the brightness scale, ns."""
+"""Time for which the brightness scale still depends on a press that has ended, ns."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -65,13 +65,13 @@ class Surface:
     """(2, U, N) shear: components along and across the upper wires."""
     shear_std_m: Float
     unknown: NDArray[np.bool_]
-    """Electrodes without a measurement."""
+    """(U, N) mask of the electrodes whose displacement is unknown."""
     aspect: float
     """Ratio of the patch's width to its height."""
 
     @property
     def deepest_m(self) -> float:
-        """Depth of the deepest electrode with a measurement, m."""
+        """Maximum known depth, m."""
         return float(np.max(self.depth_m, initial=0.0, where=~self.unknown))
 
 
@@ -150,7 +150,7 @@ class Scale:
         self.full_m = _LEAST_M
 
     def update(self, t_ns: int, deepest_m: float) -> None:
-        """Update the brightness scale with the depth of the deepest press at ``t_ns``, in m."""
+        """Update the brightness scale with ``deepest_m``, the maximum depth at ``t_ns``, in m."""
         while self._peaks and (self._peaks[0][0] < t_ns - _MEMORY_NS or self._peaks[0][0] > t_ns):
             self._peaks.popleft()
         while self._peaks and self._peaks[-1][1] <= deepest_m:
@@ -170,7 +170,7 @@ class MapStyle:
 
     @property
     def full_shear_m(self) -> float:
-        """Shear drawn at full brightness, m: less than ``full_m``, because shear is smaller than depth."""
+        """Shear drawn at full brightness, m. The factor accounts for shear being smaller than depth."""
         return 0.25 * self.full_m
 
 
@@ -193,7 +193,7 @@ def paint_map(
 
 
 def _arrows_on(surface: Surface, style: MapStyle, width: int, height: int) -> dict[tuple[int, int], str]:
-    """Return arrows keyed by column and line, spaced closely enough to show several arrows per press."""
+    """Return the arrows to draw, as a mapping from (column, line) to a character."""
     down = 1 if height < 7 else 2 if height < 18 else 3
     across = 2 * down
     rows, columns = (
@@ -212,7 +212,7 @@ def _arrows_on(surface: Surface, style: MapStyle, width: int, height: int) -> di
 
 
 def paint_shear(surface: Surface, style: MapStyle, width: int, height: int) -> list[Line]:
-    """Draw shear as arrows; the stronger the shear, the brighter the arrow.
+    """Draw shear as arrows. Arrows for stronger shear are brighter.
 
     Each electrode has an arrow if the map is large enough; on larger maps, arrows are also drawn between
     electrodes.
@@ -256,7 +256,7 @@ def _depth_line(above: Sequence[int], below: Sequence[int], arrows: dict[int, st
 
 
 def _grouped(cells: Sequence[tuple[str, Style]]) -> Line:
-    """Merge neighbouring cells of the same style, because drawing time grows with the number of segments."""
+    """Merge neighbouring cells of the same style, because fewer segments take less time to draw."""
     return [
         Segment("".join(sign for sign, _ in run), style)
         for style, run in itertools.groupby(cells, key=lambda cell: cell[1])

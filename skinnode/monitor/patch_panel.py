@@ -17,7 +17,7 @@ from skinnode.monitor.theme import Paint, Theme, beside, centred, pad, spread
 from skinnode.monitor.view_model import PatchView
 
 GONE: Final = ("lost", "never seen", "stale", "refused", "restarting", "booting", "starting")
-"""Conditions of a patch whose newest field is out of date."""
+"""Conditions in which the last displacement field of a patch is out of date."""
 _AROUND: Final = 3
 """Number of lines in a tile, excluding its map."""
 _LEAST_OUTLINED: Final = (8, 5)
@@ -33,7 +33,7 @@ def tiles(patches: Sequence[PatchView], paint: Paint, width: int, height: int) -
     aspect = max((patch.surface.aspect for patch in patches if patch.surface is not None), default=1.0)
 
     def high_of(columns: int) -> int:
-        """Return the height of a map, in lines, for a given number of columns of tiles."""
+        """Return the height of each map, in lines, if the tiles are arranged in ``columns`` columns."""
         box = width // columns - 1, height // -(-count // columns) - _AROUND
         across, down, frame = _fit(*box, aspect) if min(box) > 0 else (0, 0, 0)
         return down + frame if across else 0
@@ -64,9 +64,9 @@ def _tile(number: int, patch: PatchView, paint: Paint, width: int, height: int) 
 def _map(patch: PatchView, paint: Paint, width: int, height: int, *, arrows: bool) -> list[Line]:
     """Draw the depth map of a patch, centred in its box.
 
-    An outline marks the edge of the map, because untouched skin is as dark as the screen. If a patch stops
-    sending data, its last map is drawn without colours, and the patch's condition is written over the map, so
-    that the map is not mistaken for live data.
+    An outline marks the edge of the map, because untouched skin is as dark as the screen. If a patch has
+    stopped sending data, its last map is drawn without colours. The condition of the patch is then written
+    over the map, so that the map is not mistaken for live data.
     """
     theme = paint.theme
     if patch.surface is None:
@@ -127,7 +127,7 @@ def _figures(patch: PatchView, theme: Theme, width: int) -> Line:
 
 
 def _health(patch: PatchView, theme: Theme, width: int) -> Line:
-    """Draw a patch's condition, and its first fault or, if the patch has no fault, its field rate."""
+    """Draw a line with the patch's most important fault or, if it has no fault, with its field rate."""
     style = theme.of(patch.level)
     if patch.words:
         return pad([Segment(f" {patch.condition}: {patch.words[0]}", style)], width, theme)

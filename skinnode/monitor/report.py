@@ -28,9 +28,9 @@ class FaultBook:
     """Faults of a monitoring session, each listed once, in order of first occurrence.
 
     Args:
-        live: Whether the source is a running hand, whose patches must be operational soon after the start. A
-            recording begins before the bring-up, so a patch that is never operational is recorded as a fault
-            only at the end of the recording.
+        live: Whether the source is a running hand. Its patches must be operational soon after the start. A
+            recording begins before the patches are started. A patch in a recording is therefore reported
+            only at the end, if it was never operational.
     """
 
     def __init__(self, *, live: bool) -> None:
@@ -50,8 +50,8 @@ class FaultBook:
         Args:
             view: Current view of the hand.
             real_ns: Monotonic time of the monitor, ns.
-            ending: Whether the session is ending; a patch that is not yet operational is then recorded as a
-                fault.
+            ending: Whether the session is ending. If so, a patch that has not become operational is recorded
+                as a fault.
         """
         if self._begun_ns is None:
             self._begun_ns = real_ns
@@ -75,7 +75,7 @@ class FaultBook:
 
 
 def _lasting(health: PatchHealth) -> list[tuple[str, str]]:
-    """Return a patch's faults, other than its condition, as pairs of an identifying key and a text."""
+    """Return the wire faults, duplicate node-ID and last EMCY of a patch as pairs of a key and a text."""
     wires = [f"{fault.side} wire {fault.number} {fault.state}" for fault in health.wires]
     found = [(text, text) for text in wires]
     if health.duplicate_id:
@@ -95,7 +95,7 @@ def watch(
         source: Host or recording.
         stop: Event that ends the iteration.
         seconds: Maximum duration; None for no limit.
-        faults: Fault book in which the session's faults are recorded.
+        faults: Object to which the faults of the session are added.
 
     Raises:
         SkinError: The source failed.

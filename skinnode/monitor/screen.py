@@ -77,7 +77,7 @@ def _header(view: View, ui: UiState, theme: Theme, width: int) -> Line:
 
 
 def _losses(view: View, bus: BusView) -> str:
-    """Describe the first kind of frame loss found on a bus; return an empty text if no frame was lost."""
+    """Return a text about lost chunks, summaries or scans on a bus; empty if nothing was lost."""
     counts = [patch.stream.assembler for patch in view.patches if patch.bus == bus.name]
     for name, one, several in (
         ("chunks_lost", "chunk lost", "chunks lost"),

@@ -27,7 +27,7 @@ from skinnode.record import Recorder, Replay
 
 _CAPACITY: Final = 1
 _EVENTS: Final = 500
-"""Maximum number of events kept until the next screen update."""
+"""Maximum number of events that are queued between two screen updates."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,8 +35,7 @@ class Snapshot:
     """State of a hand at one instant, as mappings from patch names or bus names."""
 
     t_ns: int
-    """Time on the host's monotonic clock, ns; for a recording, the clock of the host that made the
-    recording."""
+    """Time on the host's monotonic clock, ns. In a recording, this is the clock of the recorded host."""
     health: Mapping[str, PatchHealth]
     bus_health: Mapping[str, BusHealth]
     buses: Mapping[str, BusStats]
@@ -66,7 +65,7 @@ class Source(Protocol):
     """Whether patches can be tared and recorded."""
 
     def snapshot(self) -> Snapshot:
-        """Return the current state of the hand. Raises the SkinError that ended the source."""
+        """Return the current state of the hand. Raises SkinError if the source has failed."""
 
     def events(self) -> list[HealthEvent]:
         """Return the events since the last call."""
@@ -105,7 +104,7 @@ class HostSource:
         self.hand, self.title = host.hand, host.hand.name
         self._host = host
         self._events = host.events(capacity=_EVENTS)
-        self._fields = host.fields(capacity=_CAPACITY)  # reports a failure of the host
+        self._fields = host.fields(capacity=_CAPACITY)  # also receives the error if the host fails
         self._recorder: Recorder | None = None
         self._untap: Callable[[], None] | None = None
 
@@ -262,7 +261,7 @@ class ReplaySource:
                 pass
             for flaw in self._run.flaws:
                 self._all_events.publish(HealthEvent(self._run.clock(), self.title, "recording", flaw))
-        except Exception as error:  # report every exception to the user, not only SkinError
+        except Exception as error:  # also report unexpected exceptions to the user
             self._failure = error if isinstance(error, SkinError) else SkinError(f"replay: {error!r}")
 
     def _health(self) -> dict[str, PatchHealth]:
@@ -291,7 +290,7 @@ class ReplaySource:
 
 
 def drain(subscription: EventSubscription) -> list[HealthEvent]:
-    """Return all queued events; the entry None marks the end of the queue."""
+    """Return all queued events, without waiting for more."""
     found: list[HealthEvent] = []
     while (event := subscription.get(0.0)) is not None:
         found.append(event)

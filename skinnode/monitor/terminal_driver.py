@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 _STDOUT: Final = 1
 
 _MAX_QUEUED: Final = 30
-"""Maximum number of writes queued for the terminal; a few pictures fit into the queue."""
+"""Maximum number of writes queued for the terminal, sufficient for a few screen updates."""
 
 _END_S: Final = 1.0
 """Maximum time to wait at exit for the terminal to accept queued output, s."""
@@ -25,8 +25,8 @@ _END_S: Final = 1.0
 class _Writer(threading.Thread):
     """Writes text to a file descriptor on a daemon thread.
 
-    The thread does not write through ``sys.stdout``, because a stalled write would hold a lock for which the
-    interpreter waits at exit.
+    The thread does not use ``sys.stdout``, because a write that blocks would hold the lock of ``sys.stdout``,
+    and the interpreter would wait for this lock at exit.
     """
 
     def __init__(self, descriptor: int, gone: threading.Event) -> None:
@@ -62,7 +62,7 @@ class PatientDriver(LinuxDriver):
         self._gone = threading.Event()
         self._writer: _Writer | None = None
         self.torn = False
-        """Whether output was discarded because the queue was full, so that the screen must be redrawn."""
+        """Whether output was discarded because the queue was full. If so, the screen must be redrawn."""
 
     def start_application_mode(self) -> None:
         """Start the writer thread, then enter application mode."""
@@ -80,7 +80,7 @@ class PatientDriver(LinuxDriver):
 
     @property
     def busy(self) -> bool:
-        """Whether output is still queued, so that a new picture would have to wait."""
+        """Whether the terminal has not yet accepted all queued output."""
         return self._writer is not None and self._writer.queue.qsize() > 0
 
     @property
@@ -90,11 +90,11 @@ class PatientDriver(LinuxDriver):
 
     @property
     def deaf(self) -> bool:
-        """Whether the terminal has stalled, so that a write would block, or no longer exists."""
+        """Whether the terminal no longer exists, or has not accepted all output after :meth:`close`."""
         return self.gone or (self._writer is not None and self._writer.is_alive())
 
     def run_input_thread(self) -> None:
-        """Read keys until the application ends; treat an input error as a closed terminal."""
+        """Read keys until the application ends. An input error means that the terminal was closed."""
         try:
             super().run_input_thread()
         except OSError:

@@ -31,7 +31,7 @@ class Theme:
     bad: Style
     chosen: Style
     alarm: Style
-    """Style that marks a recording, a pause or a lost patch."""
+    """Style of labels that show a recording, a pause or a lost patch."""
     gauge: Style
 
     def of(self, level: Level) -> Style:

@@ -11,11 +11,11 @@ from skinnode.model.frames import FieldFrame
 from skinnode.model.layout import Float
 
 TOUCH: Final = 0.35
-"""Depth, as a fraction of the maximum depth, above which skin is assigned to a touch. Under
-Hertzian pressure, the rim of a contact is half as deep as its centre."""
+"""Minimum depth of the electrodes in a touch, as a fraction of the maximum depth. In a Hertzian contact, the
+depth at the rim is half the depth at the centre."""
 SURE: Final = 6.0
-"""Minimum depth of a touch, as a multiple of its standard deviation; noise on 100 electrodes exceeds this
-limit once in 10 million fields."""
+"""Minimum depth of the electrodes in a touch, as a multiple of the standard deviation of the depth. On 100
+electrodes, noise exceeds this limit once in 10 million fields."""
 LEAST_TOUCH_M: Final = 1e-5
 
 
@@ -40,9 +40,9 @@ class Touch:
 def touches_of(field: FieldFrame, rest_m: Float) -> tuple[Touch, ...]:
     """Return the contacts on a patch, strongest first.
 
-    If the exact inverse computed the field and the field contains no contacts (for example, an old
-    recording), each connected region of pressed skin is returned as a contact. The forces of a region are
-    known only if a stiffness was specified.
+    A field computed by the exact inverse may contain no contacts, for example in an old recording. Each
+    connected region of pressed skin is then returned as a contact. The forces on a region are known only if a
+    stiffness was specified.
 
     Args:
         field: Newest field of the patch.

@@ -27,7 +27,7 @@ from skinnode.monitor.source import Snapshot
 from skinnode.monitor.touches import Touch, touches_of
 
 Level = Literal["good", "note", "bad"]
-"""Severity: no fault, a condition to check, or a fault."""
+"""Severity of a condition: ``good`` for no fault, ``note`` for a condition to check, ``bad`` for a fault."""
 HISTORY_NS: Final = 2_000_000_000
 """Period over which rates and latencies are computed, ns."""
 
@@ -48,7 +48,7 @@ class PatchView:
     rate_hz: float
     """Fields per second."""
     latency_s: float | None
-    """Median time from the arrival of a scan's last frame to the scan's field, over recent fields, s."""
+    """Median time from the arrival of a scan's last CAN frame until its field was ready, s."""
     latency_max_s: float | None
     scan: int | None
     trusted: bool
@@ -56,7 +56,7 @@ class PatchView:
     """Reason why the newest field is not trusted; empty if the field is trusted or does not exist."""
     precise: bool
     data_share: float | None
-    """Data share of the deepest electrode's depth; None if there is no field."""
+    """Fraction of the maximum depth that comes from data rather than the prior; None without a field."""
     data_faults: tuple[DataFault, ...]
     """Faulty readings that were excluded when the newest field was computed."""
     method: str
@@ -79,7 +79,7 @@ class BusView:
     level: Level
     words: tuple[str, ...]
     load: float
-    """Fraction of the last second during which frames occupied the bus."""
+    """Bus load over the last second, as a fraction of the bus capacity."""
     frames_hz: float
     lost: int
     """Number of frames dropped by the kernel or the host."""
@@ -93,7 +93,7 @@ class View:
     patches: tuple[PatchView, ...]
     buses: tuple[BusView, ...]
     scans_hz: float
-    """Fields per second from the patch with the highest rate; equals the SYNC rate if no scan is lost."""
+    """Fields per second of the patch with the highest rate; equal to the SYNC rate if no scan is lost."""
     fields_hz: float
     """Fields per second, summed over all patches."""
     latency_s: float | None
@@ -130,7 +130,7 @@ class History:
         """Add the newest snapshot and return its view."""
         kept = self._kept
         if kept and kept[-1].t_ns > snapshot.t_ns:
-            kept.clear()  # the clock of a recording may jump back
+            kept.clear()  # in a recording, the clock may be set back
         elif kept and kept[-1].t_ns == snapshot.t_ns:
             kept.pop()
         kept.append(snapshot)
@@ -231,7 +231,7 @@ def upper_m(layout: LayoutConfig) -> Float:
 def judge_patch(
     health: PatchHealth, stream: StreamStats, before: StreamStats
 ) -> tuple[str, Level, tuple[str, ...]]:
-    """Return the condition of a patch, its severity and all other faults."""
+    """Return the condition of a patch, the severity of its faults, and descriptions of its other faults."""
     condition = health.condition
     if condition is Condition.STALE and not stream.solved and not stream.withheld:
         return "starting", "note", ()
@@ -240,7 +240,7 @@ def judge_patch(
     missed = stream.assembler.scans_missed - before.assembler.scans_missed
     lossy = [f"{count} {what} lost" for count, what in ((losses, "chunks"), (missed, "scans")) if count > 0]
     if condition is not Condition.OPERATIONAL:
-        lossy = []  # omit lost frames: a missing patch loses every frame
+        lossy = []  # a patch that is not operational loses all frames
     level: Level = "good"
     if lossy or words:
         level = "note"

@@ -1,10 +1,10 @@
 """CANopen device: the CiA 301 communication services and an application that uses them.
 
 The device is synchronous and deterministic: it has no thread and reads no clock. The caller passes received
-frames and the current time to the device, and calls the device again at the time that the device requests. On
-a bus, the caller is :class:`~skinnode.node.runner.NodeRunner`; tests call the device directly. No received
-frame causes an exception in the device itself, but exceptions from the application and from ``send``
-propagate to the caller.
+frames to :meth:`CanopenDevice.on_frame` with their times of reception, and calls
+:meth:`CanopenDevice.on_timer` at the time that :meth:`CanopenDevice.next_deadline_ns` returns. On a bus, the
+caller is :class:`~skinnode.node.runner.NodeRunner`. No received frame causes an exception in the device
+itself, but exceptions from the application and from ``send`` propagate to the caller.
 """
 
 from __future__ import annotations

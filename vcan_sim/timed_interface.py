@@ -16,6 +16,7 @@ from typing import Any, Final, cast
 import can
 
 from skinnode.process import clock as process_clock
+from skinnode.transport import Frame
 from vcan_sim.timed_bus import BitRates, CanFrame, Delivered, Event, StationOptions, TimedBus
 from vcan_sim.virtual_time import Mailbox, VirtualClock
 
@@ -40,9 +41,9 @@ class Inbox:
         self._clock, self._queue = clock, Mailbox(clock)
         self._quiet_until_ns, self._due = 0, False
 
-    def put(self, message: can.Message) -> None:
+    def put(self, delivered: Delivered) -> None:
         """Append a frame. The virtual clock calls this method while no thread runs."""
-        self._queue.store(message)
+        self._queue.store(delivered)
         if self._due:
             return
         if self._clock.now_ns >= self._quiet_until_ns:
@@ -51,9 +52,19 @@ class Inbox:
             self._due = True
             self._clock.call_at(self._quiet_until_ns, self._wake)
 
-    def get(self, timeout_s: float | None) -> can.Message:
+    def get(self, timeout_s: float | None) -> Delivered:
         """Return the next frame. Raises :class:`queue.Empty` if no frame arrives within the time-out."""
-        return cast(can.Message, self._queue.get(timeout=timeout_s))
+        return cast(Delivered, self._queue.get(timeout=timeout_s))
+
+    def get_all(self, timeout_s: float, most: int) -> list[Delivered]:
+        """Return up to ``most`` waiting frames; if there are none, wait for the first until the time-out."""
+        try:
+            frames = [self.get(timeout_s)]
+        except queue.Empty:
+            return []
+        waiting = self._queue.queue
+        frames += [waiting.popleft() for _ in range(min(len(waiting), most - 1))]
+        return frames
 
     def _wake(self) -> None:
         self._due, self._quiet_until_ns = False, self._clock.now_ns + COALESCED_NS
@@ -83,8 +94,8 @@ class Segment:
         self._leaving: set[int] = set()
         self._connected: set[int] = set()
         self._due_ns: int | None = None
-        self.cpu_ns: Counter[str] = Counter()
-        """CPU time (ns) spent on simulating the bus, by thread name."""
+        self.cpu_ns: Counter[str] | None = None
+        """CPU time (ns) spent on simulating the bus, by thread name; None (default): not measured."""
 
     def join(self) -> int:
         """Connect a new station and return its number."""
@@ -118,33 +129,23 @@ class Segment:
             self.clock.call_at(due_ns, self._advance)
 
     def _advance(self) -> None:
-        start_ns = time.thread_time_ns()
-        self._deliver()
-        self.cpu_ns[threading.current_thread().name] += time.thread_time_ns() - start_ns
+        if self.cpu_ns is None:
+            self._deliver()
+        else:
+            start_ns = time.thread_time_ns()
+            self._deliver()
+            self.cpu_ns[threading.current_thread().name] += time.thread_time_ns() - start_ns
 
     def _deliver(self) -> None:
         self._due_ns = None
-        wall_to_monotonic_ns = self.clock.time_ns() - self.clock.now_ns
         for event in self.bus.advance(self.clock.now_ns):
             if isinstance(event, Delivered):
-                frame = event.frame
                 for station in event.receivers:
-                    self._inboxes[station].put(
-                        can.Message(
-                            timestamp=(event.time_ns + wall_to_monotonic_ns) * 1e-9,
-                            arbitration_id=frame.can_id,
-                            is_extended_id=frame.extended,
-                            is_remote_frame=frame.remote,
-                            is_fd=frame.fd,
-                            bitrate_switch=frame.brs,
-                            dlc=frame.dlc if frame.remote else None,
-                            data=frame.data,
-                            channel=self.channel,
-                        )
-                    )
+                    self._inboxes[station].put(event)
             for listener in self.listeners:
                 listener(event)
-        self._disconnect()
+        if self._leaving:
+            self._disconnect()
         self._plan()
 
     def _disconnect(self) -> None:
@@ -211,8 +212,7 @@ class TimedInterface(can.BusABC):
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
         """Queue a frame for transmission; the frame is sent when it wins arbitration."""
-        if self._is_shutdown:
-            raise can.CanOperationError(f"{self.channel_info} is closed")
+        self._check_open()
         if msg.is_error_frame:
             raise can.CanOperationError(
                 f"{self.channel_info}: got an error frame, must be a data or remote frame"
@@ -234,15 +234,49 @@ class TimedInterface(can.BusABC):
         """Return the next received frame, or None if no frame arrives within ``timeout`` seconds."""
         end_ns = None if timeout is None else self._clock.monotonic_ns() + round(timeout * 1e9)
         while True:
-            if self._is_shutdown:
-                raise can.CanOperationError(f"{self.channel_info} is closed")
+            self._check_open()
             left_s = None if end_ns is None else max(0.0, (end_ns - self._clock.monotonic_ns()) * 1e-9)
             try:
-                message = self._inbox.get(left_s)
+                message = self._message(self._inbox.get(left_s))
             except queue.Empty:
                 return None
             if self._matches_filters(message):
                 return message
+
+    def _message(self, delivered: Delivered) -> can.Message:
+        frame = delivered.frame
+        wall_to_monotonic_ns = self._clock.time_ns() - self._clock.now_ns
+        return can.Message(
+            timestamp=(delivered.time_ns + wall_to_monotonic_ns) * 1e-9,
+            arbitration_id=frame.can_id,
+            is_extended_id=frame.extended,
+            is_remote_frame=frame.remote,
+            is_fd=frame.fd,
+            bitrate_switch=frame.brs,
+            dlc=frame.dlc if frame.remote else None,
+            data=frame.data,
+            channel=self._segment.channel,
+        )
+
+    # --- methods that CanPort uses in place of send and recv
+
+    def send_frame(self, can_id: int, data: bytes, *, remote: bool, fd: bool) -> None:
+        """Queue a frame for transmission; the arguments are those of :class:`FrameInterface`."""
+        self._check_open()
+        self._segment.send(self._station, CanFrame(can_id, data, False, remote, 0, fd, fd))
+
+    def read_frames(self, timeout_s: float, most: int) -> list[Frame]:
+        """Return up to ``most`` received frames; the filters of python-can do not apply."""
+        self._check_open()
+        return [
+            Frame(sent.can_id, sent.data, event.time_ns, sent.remote, False, sent.extended, sent.fd)
+            for event in self._inbox.get_all(timeout_s, most)
+            for sent in (event.frame,)
+        ]
+
+    def _check_open(self) -> None:
+        if self._is_shutdown:
+            raise can.CanOperationError(f"{self.channel_info} is closed")
 
     def shutdown(self) -> None:
         """Close the endpoint and leave the bus."""

@@ -85,12 +85,15 @@ def measure(patches: int, touched: int, scans: int) -> Row:
         segments = [segment(bus.channel, clock, rates) for bus in hand.buses]
         with Fleet(hand, scene=scene_of(touched)) as fleet, Host.from_config(hand) as host:
             clock.sleep(_SETTLED_S)
-            solved, before = _solved(host), _cpu_ns(segments)
-            start = time.perf_counter()
+            solved, start = _solved(host), time.perf_counter()
             clock.sleep(scans * PERIOD_MS * 1e-3)
             real_s = time.perf_counter() - start
-            spent = _cpu_ns(segments) - before
             fields = _solved(host) - solved
+            for each in segments:  # measuring the CPU time slows the bus, so this is done in a second run
+                each.cpu_ns = Counter()
+            before = _cpu_ns(segments)
+            clock.sleep(scans * PERIOD_MS * 1e-3)
+            spent = _cpu_ns(segments) - before
             assert not fleet.failed
     each = 1e-6 / (patches * scans)
     return {
@@ -172,7 +175,7 @@ def _cpu_ns(segments: Sequence[Segment]) -> Counter[str]:
     """Return the total CPU time of the nodes, the buses and the host so far, ns."""
     by_bus: Counter[str] = Counter()
     for each in segments:
-        by_bus.update(each.cpu_ns)
+        by_bus.update(each.cpu_ns or {})
     spent: Counter[str] = Counter(bus=by_bus.total())
     for thread in threading.enumerate():
         if thread is threading.main_thread() or thread.ident is None:

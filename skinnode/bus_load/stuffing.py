@@ -115,6 +115,48 @@ def fd_bits(ids: NDArray[np.uint32], lengths: _Bytes, payload: _Bytes, nominal: 
     _fd(ids, lengths, payload, _arrays()[1], nominal, fast)
 
 
+def classic_frame_bits(head: int, data: bytes) -> int:
+    """Count the bits of one classic frame with an 11-bit identifier.
+
+    Args:
+        head: the bits from the start of frame to the data length code, as a number of 19 bits.
+        data: data bytes, at most 8.
+
+    Returns:
+        Number of bits, including stuff bits and inter-frame space.
+    """
+    # Numba would compile the kernel twice for numbers below and above 2⁶³, hence two halves.
+    word = int.from_bytes(data, "big")
+    return int(_classic_one(head, len(data), word >> 32, word & 0xFFFF_FFFF, *_arrays()))
+
+
+@njit_brief
+def _classic_one(  # noqa: PLR0913 - arrays of a compiled kernel
+    head: int, length: int, high: int, low: int, crc_of: Any, run_of: Any
+) -> int:
+    crc: Any = np.int64(crc_of[head >> 16])
+    crc = (crc << 8 & 0x7FFF) ^ np.int64(crc_of[crc >> 7 ^ (head >> 8 & 0xFF)])
+    crc = (crc << 8 & 0x7FFF) ^ np.int64(crc_of[crc >> 7 ^ (head & 0xFF)])
+    # as in _classic: bytes of the stuffed region are assembled from two adjacent payload bytes
+    stream = (ALTERNATING & 0x3F) << 18 | head >> 1
+    stuff: Any = 0
+    run: Any = 0
+    before: Any = head
+    for shift in (16, 8, 0):
+        entry = np.int64(run_of[run << 8 | (stream >> shift & 0xFF)])
+        stuff, run = stuff + (entry & 0xFF), entry >> 8
+    for k in range(length - 1, -1, -1):
+        byte = (high >> 8 * (k - 4) if k >= 4 else low >> 8 * k) & 0xFF
+        crc = (crc << 8 & 0x7FFF) ^ np.int64(crc_of[crc >> 7 ^ byte])
+        entry = np.int64(run_of[run << 8 | (before & 1) << 7 | byte >> 1])
+        stuff, run, before = stuff + (entry & 0xFF), entry >> 8, byte
+    last = (before & 1) << 15 | crc
+    for shift in (8, 0):
+        entry = np.int64(run_of[run << 8 | (last >> shift & 0xFF)])
+        stuff, run = stuff + (entry & 0xFF), entry >> 8
+    return int(HEAD_BITS + 8 * length + CRC_BITS + TAIL_BITS + stuff)
+
+
 @njit_brief
 def _classic(  # noqa: PLR0913 - arrays of a compiled kernel
     ids: Any, lengths: Any, payload: Any, stride: int, crc_of: Any, run_of: Any, bits: Any

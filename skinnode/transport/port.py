@@ -25,6 +25,7 @@ from skinnode.errors import BusError
 from skinnode.process import clock
 from skinnode.text.words import counted
 from skinnode.transport.frame import Frame
+from skinnode.transport.frame_interface import FrameInterface
 from skinnode.transport.socketcan import BATCH_FRAMES, SocketReader, set_link_bitrate
 
 if TYPE_CHECKING:
@@ -161,6 +162,7 @@ class CanPort:
         self._dropped_before = 0  # number of frames dropped by earlier readers
         self._away = False
         self._bus = self._open()
+        self._direct = _direct(self._bus)
         self._reader = self._open_reader()
         # The sender of a multicast frame also receives the frame. To recognise its own frames, this port
         # sends a unique tag in the channel field, which python-can transmits but does not use.
@@ -178,10 +180,15 @@ class CanPort:
     @property
     def reads_batches(self) -> bool:
         """Whether :meth:`recv_batch` may return more than one frame."""
+        return self._reader is not None or self._direct is not None
+
+    @property
+    def pollable(self) -> bool:
+        """Whether :meth:`fileno` returns a file descriptor that can be polled for frames."""
         return self._reader is not None
 
     def fileno(self) -> int:
-        """Return the socket's file descriptor, or -1 if the port cannot read batches of frames."""
+        """Return the socket's file descriptor; -1 if the port is not pollable or is closed."""
         return -1 if self._reader is None else self._reader.fileno()
 
     @property
@@ -237,18 +244,12 @@ class CanPort:
             if len(data) > self._longest:
                 raise ValueError(f"data: got {counted(len(data), 'byte')}, must be at most {self._longest}")
             data = data.ljust(fd_length(len(data)), b"\0")
-        message = _Message(
-            arbitration_id=can_id,
-            is_extended_id=False,
-            is_remote_frame=remote,
-            is_fd=fd,
-            bitrate_switch=fd,
-            channel=self._tag,
-            data=data,
-        )
         undelivered = 0
         try:
-            self._bus.send(message, self._send_timeout_s)
+            if self._direct is not None:
+                self._direct.send_frame(can_id, data, remote=remote, fd=fd)
+            else:
+                self._bus.send(self._message(can_id, data, remote, fd), self._send_timeout_s)
         except (can.CanError, OSError, ValueError) as error:
             if self._closed or self._away or self.config.interface != _VIRTUAL:
                 with self._counting:
@@ -260,6 +261,17 @@ class CanPort:
         with self._counting:
             self._sent += 1
             self._undelivered += undelivered
+
+    def _message(self, can_id: int, data: bytes, remote: bool, fd: bool) -> can.Message:
+        return _Message(
+            arbitration_id=can_id,
+            is_extended_id=False,
+            is_remote_frame=remote,
+            is_fd=fd,
+            bitrate_switch=fd,
+            channel=self._tag,
+            data=data,
+        )
 
     def recv(self, timeout_s: float) -> Frame | None:
         """Return the next frame, or None if no frame arrives within ``timeout_s``.
@@ -275,16 +287,20 @@ class CanPort:
 
         Args:
             timeout_s: Maximum time to wait for a frame, s.
-            most: Maximum number of frames. Interfaces other than socketcan return one frame at a time.
+            most: Maximum number of frames. Only socketcan and timed return more than one frame at a time.
 
         Raises:
             BusError: if the interface fails or is closed.
         """
-        if self._reader is None:
+        if self._reader is None and self._direct is None:
             return self._recv_message(timeout_s)
         try:
-            frames = self._reader.read(timeout_s, most)
-        except (OSError, ValueError) as error:  # ValueError: the socket was closed
+            if self._direct is not None:
+                frames = self._direct.read_frames(timeout_s, most)
+            else:
+                assert self._reader is not None
+                frames = self._reader.read(timeout_s, most)
+        except (can.CanError, OSError, ValueError) as error:  # ValueError: the socket was closed
             self._errors += 1
             raise BusError(f"{self._where}: cannot receive ({_why(error)})") from error
         self._received += len(frames)
@@ -326,6 +342,7 @@ class CanPort:
             self._bus.shutdown()
         self._link_gone = None
         self._bus = self._open()
+        self._direct = _direct(self._bus)
         self._reader = self._open_reader()
         self._away = False
 
@@ -366,6 +383,10 @@ class CanPort:
 
     def __repr__(self) -> str:
         return f"<CanPort {self._where}>"
+
+
+def _direct(bus: can.BusABC) -> FrameInterface | None:
+    return bus if isinstance(bus, FrameInterface) else None
 
 
 def _tune_socket(fileno: int) -> None:

@@ -212,9 +212,8 @@ class _Shared:
 class Receiver:
     """Receives frames from the ports of several intakes until :meth:`close` is called.
 
-    Threads: all ports that can read batches of frames share one receiving thread. Each other port has its own
-    thread, because receiving with python-can may block. If a port fails, reception from the other ports
-    continues.
+    Threads: all ports that can be polled share one receiving thread. Each other port has its own thread, because
+    receiving with python-can may block. If a port fails, reception from the other ports continues.
 
     Args:
         intakes: Queues to fill.
@@ -231,7 +230,7 @@ class Receiver:
         self._stop = clock.event()
         self._shared: threading.Thread | None = None
         self._alone: dict[Intake, threading.Thread] = {}
-        if any(intake.port.reads_batches for intake in intakes):
+        if any(intake.port.pollable for intake in intakes):
             self._shared = clock.thread(target=self._receive_batches, name="receive")
             self._shared.start()
         for intake in intakes:
@@ -247,7 +246,7 @@ class Receiver:
 
     def resume(self, intake: Intake) -> None:
         """Resume reception on a port that has failed and been reopened. Any thread may call this method."""
-        if intake.port.reads_batches:
+        if intake.port.pollable:
             intake.resume()
             self._joining.append(intake)
             return
@@ -325,6 +324,10 @@ class Receiver:
                 # Fetch twice: frames may have arrived while this thread was suspended.
                 if intake.fetch(_POLL_S) or intake.fetch(0.0):
                     self._notify()
+                    if intake.port.reads_batches:
+                        now_ns = clock.monotonic_ns()
+                        intake.gather(now_ns)
+                        clock.sleep(max(0, intake.due_ns - now_ns) * 1e-9)
             except Exception as error:
                 self._on_defect(error)
                 clock.sleep(_POLL_S)

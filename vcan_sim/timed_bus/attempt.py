@@ -18,7 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Final
+from typing import Final, NamedTuple
 
 from vcan_sim.timed_bus.bit_rates import BitRates
 from vcan_sim.timed_bus.disturbances import Hit
@@ -61,8 +61,7 @@ class BitError:
     """Stations that detect the error in bit ``bit``."""
 
 
-@dataclass(frozen=True, slots=True)
-class Course:
+class Course(NamedTuple):
     """Course of a transmission attempt. Times are in ticks from the start of frame."""
 
     senders: tuple[int, ...]

@@ -62,4 +62,4 @@ class BitRates:
 
     def ceil_ns(self, ticks: int) -> int:
         """Convert ticks to ns, rounded up, so that no event is reported before it happens."""
-        return -(-ticks // self.ticks_per_ns)
+        return ticks if self.ticks_per_ns == 1 else -(-ticks // self.ticks_per_ns)

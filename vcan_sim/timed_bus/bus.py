@@ -12,7 +12,6 @@ time.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from types import MappingProxyType
 
 from skinnode.errors import ConfigError
@@ -66,6 +65,7 @@ class TimedBus:
         disturbances: Sequence[Disturbance] = (),
     ) -> None:
         self._rates = rates or BitRates()
+        self._bit = self._rates.nominal_ticks
         self._stations = [Station(index, options) for index, options in enumerate(stations)]
         self._disturbances = Disturbances()
         self._now = 0
@@ -335,7 +335,10 @@ class TimedBus:
         if self._flight is not None:
             self._next = self._flight.next
             return
-        due = None if self._start is None else self._start + self._rates.nominal_ticks
+        due = None if self._start is None else self._start + self._bit
+        if not self._recovering:
+            self._next = due
+            return
         for station in self._recovering:
             at = self._recovery_end(station)
             # A start of frame before this time interrupts the recessive run.
@@ -363,13 +366,16 @@ class TimedBus:
         self._plan()
 
     def _choose_start(self, now: int) -> None:
-        earliest = min((station.ready for station in self._pending.values()), default=None)
-        self._start = None if earliest is None else max(now, self._free, earliest)
+        if self._pending:
+            earliest = min([station.ready for station in self._pending.values()])
+            self._start = max(now, self._free, earliest)
+        else:
+            self._start = None
 
     # --- arbitration
 
     def _arbitrate(self, now: int) -> None:
-        start = now - self._rates.nominal_ticks
+        start = now - self._bit
         self._start = None
         contenders = [station for station in self._pending.values() if station.ready <= start]
         if not contenders:  # all frames have been removed from the queues since the start of frame
@@ -383,10 +389,10 @@ class TimedBus:
             winners = [station for station, key in zip(contenders, heads, strict=True) if key == lowest]
         for station in self._recovering:
             station.runs_seen += self._runs(station, start)
-        self._flight = self._take_off(start, winners)
-        self._recessive_from = start + self._flight.course.recessive
+        self._flight = flight = self._take_off(start, winners)
+        self._recessive_from = start + flight.course.recessive
         ceil_ns = self._rates.ceil_ns
-        self._occupancy.add(ceil_ns(start), ceil_ns(start + self._flight.course.free))
+        self._occupancy.add(ceil_ns(start), ceil_ns(start + flight.course.free))
 
     def _take_off(self, start: int, winners: list[Station]) -> Flight:
         waiting = {}
@@ -409,7 +415,7 @@ class TimedBus:
                 for station in winners
             ]
             course = disturbed(sending, self._participants(receivers), hit, self._rates)
-        return Flight(start, course, waiting, receivers)
+        return Flight(start, course, waiting, senders, receivers)
 
     def _attempt(self, frame: CanFrame, esi: bool, start: int) -> Attempt:
         def n_bits() -> int:
@@ -503,7 +509,7 @@ class TimedBus:
     def _still_receiving(self, flight: Flight) -> tuple[int, ...]:
         """Return the stations that have received an attempt without error since its start of frame."""
         receivers, side_errors = flight.receivers, flight.course.side_errors
-        if not side_errors and self._receivers.get(tuple(flight.waiting)) is receivers:
+        if not side_errors and self._receivers.get(flight.senders) is receivers:
             return receivers
         lost = {station for error in side_errors for station in error.detected_by}
         return tuple(index for index in receivers if self._stations[index].on_bus and index not in lost)
@@ -536,8 +542,8 @@ class TimedBus:
         if course.error is not None:
             return
         if leaving.index in course.senders and len(course.senders) > 1:  # other stations send the same bits
-            flight.course = replace(
-                course, senders=tuple(each for each in course.senders if each != leaving.index)
+            flight.course = course._replace(
+                senders=tuple(each for each in course.senders if each != leaving.index)
             )
             self._return(leaving)
             return

@@ -81,15 +81,22 @@ class Station:
 class Flight:
     """Transmission attempt in progress."""
 
-    __slots__ = ("course", "receivers", "side", "start", "waiting")
+    __slots__ = ("course", "receivers", "senders", "side", "start", "waiting")
 
     def __init__(
-        self, start: int, course: Course, waiting: dict[int, Waiting], receivers: tuple[int, ...]
+        self,
+        start: int,
+        course: Course,
+        waiting: dict[int, Waiting],
+        senders: tuple[int, ...],
+        receivers: tuple[int, ...],
     ) -> None:
         self.start = start
         self.course = course
         self.waiting = waiting
         """Frames being sent in the attempt, by station."""
+        self.senders = senders
+        """Stations that were sending at the start of frame."""
         self.receivers = receivers
         """Stations that were on the bus at the start of frame and only receive."""
         self.side = 0
@@ -98,5 +105,8 @@ class Flight:
     @property
     def next(self) -> int:
         """Time of the attempt's next event, ticks."""
-        side = self.course.side_errors
-        return self.start + (side[self.side].ticks if self.side < len(side) else self.course.end)
+        course = self.course
+        if not course.side_errors:
+            return self.start + course.end
+        side = course.side_errors
+        return self.start + (side[self.side].ticks if self.side < len(side) else course.end)

@@ -113,6 +113,8 @@ class FaultyBus:
 
     def injected(self) -> InjectedOnBus:
         """Return the counts of the faults that have been injected into the bus."""
+        if self._segment is not None:
+            self._segment.catch_up()
         return replace(self._counts)
 
     def _apply(self) -> None:
@@ -127,11 +129,11 @@ class FaultyBus:
         if self._segment is None or share == (0.0 if self._rule is None else self._rule.share):
             return
         if self._rule is not None:
-            self._segment.bus.undisturb(self._rule)
+            self._segment.undisturb(self._rule)
             self._rule = None
         if share:
             self._rule = RandomShare(share, self._faults.seed)
-            self._segment.bus.disturb(self._rule)
+            self._segment.disturb(self._rule)
 
     def _on_event(self, event: Event) -> None:
         if isinstance(event, ErrorFrame) and event.destroyed and event.cause is Cause.DISTURBED:

@@ -17,7 +17,15 @@ import can
 
 from skinnode.process import clock as process_clock
 from skinnode.transport import Frame
-from vcan_sim.timed_bus import BitRates, CanFrame, Delivered, Event, StationOptions, TimedBus
+from vcan_sim.timed_bus import (
+    BitRates,
+    CanFrame,
+    Delivered,
+    Disturbance,
+    Event,
+    StationOptions,
+    TimedBus,
+)
 from vcan_sim.virtual_time import Mailbox, VirtualClock
 
 COALESCED_NS: Final = 1_000_000
@@ -40,6 +48,11 @@ class Inbox:
     def __init__(self, clock: VirtualClock) -> None:
         self._clock, self._queue = clock, Mailbox(clock)
         self._quiet_until_ns, self._due = 0, False
+
+    @property
+    def quiet_until_ns(self) -> int:
+        """Time (ns) before which a further frame does not wake the reader."""
+        return self._quiet_until_ns
 
     def put(self, delivered: Delivered) -> None:
         """Append a frame. The virtual clock calls this method while no thread runs."""
@@ -118,15 +131,44 @@ class Segment:
         self.bus.send(self.clock.now_ns, station, frame)
         self._plan()
 
+    def disturb(self, rule: Disturbance) -> None:
+        """Add a rule that injects errors from now on."""
+        self.catch_up()
+        self.bus.disturb(rule)
+
+    def undisturb(self, rule: Disturbance) -> None:
+        """Remove a rule that :meth:`disturb` added."""
+        self.catch_up()
+        self.bus.undisturb(rule)
+
+    def catch_up(self) -> None:
+        """Deliver all frames and call all listeners up to the present.
+
+        The segment simulates the bus only when a frame has to wake a reader, at most
+        :data:`COALESCED_NS` late; the time stamps are exact.
+        """
+        self._deliver()
+
     def inbox(self, station: int) -> Inbox:
         """Return a station's queue of received frames."""
         return self._inboxes[station]
 
     def _plan(self) -> None:
         due_ns = self.bus.next_event_ns
-        if due_ns is not None and (self._due_ns is None or due_ns < self._due_ns):
+        if due_ns is None:
+            return
+        due_ns = max(due_ns, self._quiet_until_ns())
+        if self._due_ns is None or due_ns < self._due_ns:
             self._due_ns = due_ns
             self.clock.call_at(due_ns, self._advance)
+
+    def _quiet_until_ns(self) -> int:
+        """Return the time before which no frame of the stations that want to send can wake a reader."""
+        sender = self.bus.only_sender
+        inboxes = self._inboxes
+        return min(
+            [inboxes[station].quiet_until_ns for station in self._connected if station != sender], default=0
+        )
 
     def _advance(self) -> None:
         if self.cpu_ns is None:

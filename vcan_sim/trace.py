@@ -28,17 +28,19 @@ class Trace:
     """
 
     def __init__(self, of: Segment) -> None:
-        self._channel = of.channel
+        self._of, self._channel = of, of.channel
         self._wall_ns = of.clock.time_ns() - of.clock.now_ns
         self._lines: list[str] = []
         of.listeners.append(self._on_event)
 
     def __len__(self) -> int:
         """Return the number of recorded frames."""
+        self._of.catch_up()
         return len(self._lines)
 
     def text(self) -> str:
         """Return the trace with one line per frame, such as ``(1600000000.000310) can0 080#01``."""
+        self._of.catch_up()
         return "".join(self._lines)
 
     def _on_event(self, event: Event) -> None:

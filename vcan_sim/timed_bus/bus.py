@@ -266,6 +266,14 @@ class TimedBus:
         return len(sender.queue) + (sender.sending is not None)
 
     @property
+    def only_sender(self) -> int | None:
+        """Index of the only station that is sending or wants to send; None for no station or several."""
+        senders = set(self._pending)
+        if self._flight is not None:
+            senders.update(self._flight.senders)
+        return senders.pop() if len(senders) == 1 else None
+
+    @property
     def frames(self) -> Mapping[tuple[int, bool], int]:
         """Number of delivered frames by identifier and whether the identifier is extended."""
         return MappingProxyType(self._frames)

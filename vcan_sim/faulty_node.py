@@ -97,6 +97,7 @@ class FaultyNode(PatchNode):
         temperature_per_k: float = EXACT.temperature_per_k,
     ) -> None:
         self._injector = Injector(faults, node_id)
+        self._periods_ns = _periods_ns(faults)
         self._emit, self._on_sent = emit, on_sent
         self._chunk_id, self._summary_id = od.chunk_cob_id(node_id), od.summary_cob_id(node_id)
         self._faulty_scans = FaultyScans(
@@ -137,6 +138,7 @@ class FaultyNode(PatchNode):
     @faults.setter
     def faults(self, faults: Faults) -> None:
         self._injector.faults = faults
+        self._periods_ns = _periods_ns(faults)
 
     @property
     def injected(self) -> Injected:
@@ -203,8 +205,10 @@ class FaultyNode(PatchNode):
         faults = self.faults
         if faults.unplugged != self._unplugged or faults.duplicate_node_id != (self._twin is not None):
             return 0
-        of_twin = None if self._twin is None else self._twin.next_deadline_ns()
         own = None if self._unplugged else self._own_deadline_ns(faults)
+        if self._twin is None:
+            return own
+        of_twin = self._twin.next_deadline_ns()
         return min((each for each in (own, of_twin) if each is not None), default=None)
 
     def _own_deadline_ns(self, faults: Faults) -> int | None:
@@ -212,7 +216,9 @@ class FaultyNode(PatchNode):
         if faults.error_passive != self._passive:
             return 0
         own = super().next_deadline_ns()
-        due = [self._due_ns[name] for name, period_ns in _periods_ns(faults).items() if period_ns]
+        if not (self._periods_ns or self._stormed):
+            return own
+        due = [self._due_ns[name] for name in self._periods_ns]
         if self._stormed and not faults.emcy_per_s:
             due.append(0)
         if not due or self.nmt_state is NmtState.INITIALISING:
@@ -264,10 +270,11 @@ class FaultyNode(PatchNode):
     # --- periodic events
 
     def _do_due_events(self, t_ns: int) -> None:
-        for name, period_ns in _periods_ns(self.faults).items():
-            if not period_ns:
+        periods_ns = self._periods_ns
+        for name in self._due_ns:
+            if name not in periods_ns:
                 self._due_ns[name] = 0
-                continue
+        for name, period_ns in periods_ns.items():
             if not self._due_ns[name]:  # the first period begins when the fault starts
                 self._due_ns[name] = t_ns + period_ns
             for _ in range(_MOST_AT_ONCE):
@@ -373,7 +380,9 @@ class FaultyNode(PatchNode):
 
 
 def _periods_ns(faults: Faults) -> dict[str, int]:
-    """Return the period (ns) of each kind of periodic event; 0 if there are no such events."""
+    """Return the period (ns) of each active kind of periodic event."""
     rates = {"emcy": faults.emcy_per_s, "babble": faults.babble_per_s}
-    periods = {name: round(1e9 / rate) if rate else 0 for name, rate in rates.items()}
-    return {"restart": round(faults.restart_every_s * 1e9), **periods}
+    periods = {name: round(1e9 / rate) for name, rate in rates.items() if rate}
+    if faults.restart_every_s:
+        periods = {"restart": round(faults.restart_every_s * 1e9), **periods}
+    return periods

@@ -10,7 +10,7 @@ from skinnode.errors import BusError
 from skinnode.protocol.chunk import chunk_indexer, unpack_scan_with_check
 from skinnode.protocol.profile import PatchProfile
 from skinnode.protocol.summary import SummaryFlag, pack_checked_summary, pack_summary, unpack_summary
-from vcan_sim.faults import OF_CHUNKS, OF_SCANS
+from vcan_sim.faults import NO_FAULTS, OF_CHUNKS, OF_SCANS
 from vcan_sim.injector import Injector
 from vcan_sim.tally import Kind
 
@@ -57,6 +57,7 @@ class FaultyScans:
         self._half = max(1, profile.n_chunks // 2)
         self._fate = ""  # fault of the current scan, from OF_SCANS
         self._spoilt = False
+        self._intact = False  # whether no fault of the scan itself or of an earlier scan affects this scan
         self._counter_instead: int | None = None  # counter to send after a torn scan, instead of ``_counter``
         self._index_of = chunk_indexer(profile)
         self._packed: list[bytes] = []  # chunks of the current scan, as packed by the node
@@ -82,6 +83,9 @@ class FaultyScans:
         if counter != self._counter:
             self._begin_scan(counter)
         self._chunks += 1
+        if self._intact and self._injector.faults is NO_FAULTS:  # the usual case, three times as fast
+            self._send(self._chunk_id, data)
+            return
         changed = self._suffer_scan(data)
         if changed is None:
             self._injector.tally.lost[Kind.CHUNK] += 1
@@ -128,6 +132,12 @@ class FaultyScans:
         if self._fate == "torn":
             self._injector.injected.torn += 1
         self._packed, self._struck = [], -1
+        self._intact = (
+            self._fate == ""
+            and self._counter_instead is None
+            and self._lost_next < 0
+            and self._swapped is None
+        )
         if self._fate in ("displaced", "understated"):
             struck = self._injector.faults.struck
             chunks = self._profile.n_chunks

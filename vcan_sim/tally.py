@@ -44,9 +44,12 @@ _BY_FUNCTION: Final = {
     od.command_cob_id(0): Kind.COMMAND,
     od.sdo_request_cob_id(0): Kind.SDO_REQUEST,
     od.sdo_response_cob_id(0): Kind.SDO_RESPONSE,
+    od.heartbeat_cob_id(0): Kind.HEARTBEAT,
 }
 _FUNCTION_CODE: Final = 0x780
-_HEARTBEAT: Final = od.heartbeat_cob_id(0)
+_KIND_OF_ID: Final = [
+    _SINGLE.get(can_id) or _BY_FUNCTION.get(can_id & _FUNCTION_CODE, Kind.OTHER) for can_id in range(0x800)
+]
 
 
 def kind_of(can_id: int, data: bytes, remote: bool = False) -> Kind:
@@ -56,12 +59,8 @@ def kind_of(can_id: int, data: bytes, remote: bool = False) -> Kind:
     """
     if remote:
         return Kind.REMOTE
-    if (single := _SINGLE.get(can_id)) is not None:
-        return single
-    function = can_id & _FUNCTION_CODE
-    if function == _HEARTBEAT:
-        return Kind.BOOT_UP if data.startswith(_BOOT_UP_DATA) else Kind.HEARTBEAT
-    return _BY_FUNCTION.get(function, Kind.OTHER)
+    kind = _KIND_OF_ID[can_id]
+    return Kind.BOOT_UP if kind is Kind.HEARTBEAT and data.startswith(_BOOT_UP_DATA) else kind
 
 
 class Tally:

@@ -129,7 +129,8 @@ class Segment:
     def send(self, station: int, frame: CanFrame) -> None:
         """Queue a frame of a station for transmission."""
         self.bus.send(self.clock.now_ns, station, frame)
-        self._plan()
+        if self._due_ns is None or self.bus.waiting(station) == 1:  # otherwise, earlier frames are planned
+            self._plan()
 
     def disturb(self, rule: Disturbance) -> None:
         """Add a rule that injects errors from now on."""

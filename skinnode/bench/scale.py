@@ -89,8 +89,8 @@ def measure(patches: int, touched: int, scans: int) -> Row:
             clock.sleep(scans * PERIOD_MS * 1e-3)
             real_s = time.perf_counter() - start
             fields = _solved(host) - solved
-            for each in segments:  # measuring the CPU time slows the bus, so this is done in a second run
-                each.cpu_ns = Counter()
+            for bus in segments:  # measuring the CPU time slows the bus, so this is done in a second run
+                bus.cpu_ns = Counter()
             before = _cpu_ns(segments)
             clock.sleep(scans * PERIOD_MS * 1e-3)
             spent = _cpu_ns(segments) - before

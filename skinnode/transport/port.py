@@ -14,6 +14,7 @@ import errno
 import logging
 import os
 import socket
+import threading
 import uuid
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Final, Self
@@ -157,7 +158,7 @@ class CanPort:
         self._longest = 64 if config.fd else 8
         self._closed = False
         self._link_gone: Exception | None = None
-        self._counting = clock.lock()  # protects the counters when several threads call send()
+        self._counting = threading.Lock()  # protects the counters when several threads call send()
         self._sent = self._received = self._errors = self._undelivered = self._malformed = 0
         self._dropped_before = 0  # number of frames dropped by earlier readers
         self._away = False

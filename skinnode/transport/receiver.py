@@ -212,8 +212,8 @@ class _Shared:
 class Receiver:
     """Receives frames from the ports of several intakes until :meth:`close` is called.
 
-    Threads: all ports that can be polled share one receiving thread. Each other port has its own thread, because
-    receiving with python-can may block. If a port fails, reception from the other ports continues.
+    Threads: all ports that can be polled share one receiving thread. Each other port has its own thread,
+    because receiving with python-can may block. If a port fails, reception from the other ports continues.
 
     Args:
         intakes: Queues to fill.

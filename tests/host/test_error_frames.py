@@ -11,6 +11,7 @@ from skinnode.host import Host
 from skinnode.host.accounting import discrepancies, losses_of_bus
 from skinnode.host.dispatcher import Dispatcher
 from skinnode.transport import Frame
+from vcan_sim.faults import Faults
 from vcan_sim.fleet import Fleet
 
 from .conftest import eventually
@@ -44,6 +45,7 @@ def test_an_error_frame_is_a_fault_of_the_bus(hand: HandConfig, fleet: Fleet) ->
     bus = hand.buses[0]
     with Host.from_config(hand) as host, can.Bus(interface="virtual", channel=bus.channel) as driver:
         assert "can0: 1 error frame" not in faults_and_notes(host)[0]
+        fleet.inject(Faults(unplugged=True))  # a host without processor time would drop the newest frames
         driver.send(can.Message(arbitration_id=0x04, data=bytes(8), is_error_frame=True))
         assert eventually(lambda: host.bus_health("can0").error_frames == 1), host.stats()
         assert "can0: 1 error frame" in faults_and_notes(host)[0]

@@ -203,14 +203,14 @@ def test_node_that_restarts_by_itself(hand: HandConfig, rack: Rack, caplog: pyte
 def test_bus_that_fails_is_opened_again_and_the_stream_goes_on(
     hand: HandConfig, fleet: Fleet, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    def broken(timeout: float | None) -> None:
+    def broken(*_: object) -> None:
         raise can.CanOperationError("Network is down")
 
     with caplog.at_level(logging.WARNING), Host.from_config(hand) as host:
         fields = host.fields(timeout_s=10)
         take(fields, 4)
         bus = host._buses["can0"].link._port._bus  # where a driver would fail
-        monkeypatch.setattr(bus, "recv", broken)
+        monkeypatch.setattr(bus, "read_frames", broken)
         assert eventually(lambda: host.stats().buses["can0"].outages == 1)
         assert eventually(lambda: host._buses["can0"].link.failure is None)
         take(fields, 10)

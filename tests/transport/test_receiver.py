@@ -27,7 +27,7 @@ def _no_thread_is_left() -> Iterator[None]:
 class Script:
     """A port that plays frames and then an error, or silence."""
 
-    reads_batches = False
+    reads_batches = pollable = False
 
     def __init__(self, count: int, error: Exception | None = None) -> None:
         self.config = BusConfig(name="script")

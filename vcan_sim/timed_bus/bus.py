@@ -320,8 +320,63 @@ class TimedBus:
             now_ns = self._rates.ceil_ns(self._now)
             raise ValueError(f"time_ns: got {time_ns}, must be at least {now_ns}, the time of the last call")
         while self._next is not None and self._next <= ticks:
-            self._step(self._next)
+            if not self._deliver_burst(ticks):
+                self._step(self._next)
         self._now = ticks
+
+    def _deliver_burst(self, until: int) -> bool:
+        """Deliver the frame being sent and its sender's further frames, if no other station can interfere.
+
+        The result is the same as that of :meth:`_step`, at a third of the cost.
+
+        Args:
+            until: time up to which to deliver frames, ticks.
+
+        Returns:
+            Whether the conditions were met.
+        """
+        flight, pending = self._flight, self._pending
+        if flight is None or self._recovering or self._disturbances or not self._counts_are_zero:
+            return False
+        course, senders, receivers = flight.course, flight.senders, flight.receivers
+        if (
+            course.error is not None
+            or course.side_errors
+            or len(course.senders) != 1
+            or senders != course.senders
+        ):
+            return False
+        sender = self._stations[senders[0]]
+        if self._receivers.get(senders) is not receivers or (pending and [*pending] != [sender.index]):
+            return False
+        waiting, start = flight.waiting[sender.index], flight.start
+        free, end = start + course.free, start + course.end
+        ceil_ns, bit, queue = self._rates.ceil_ns, self._bit, sender.queue
+        self._flight = self._start = self._next = None
+        while end <= until:
+            frame = waiting.frame
+            self._events.append(
+                Delivered(ceil_ns(end), sender.index, frame, receivers, waiting.queued_ns, ceil_ns(start))
+            )
+            identifier = (frame.can_id, frame.extended)
+            self._frames[identifier] = self._frames.get(identifier, 0) + 1
+            sender.sending, self._free = None, free
+            if not pending:
+                return True
+            start = max(free, sender.ready)
+            if start + bit > until:
+                self._start, self._next = start, start + bit
+                return True
+            sender.sending = waiting = queue.pop()
+            if not len(queue):
+                pending.clear()
+            course = undisturbed(senders, waiting.frame, False, self._rates)
+            free, end = start + course.free, start + course.end
+            self._recessive_from = start + course.recessive
+            self._occupancy.add(ceil_ns(start), ceil_ns(free))
+        self._flight = Flight(start, course, {sender.index: waiting}, senders, receivers)
+        self._next = end
+        return True
 
     def _step(self, now: int) -> None:
         flight = self._flight

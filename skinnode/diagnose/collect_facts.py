@@ -1,7 +1,7 @@
 """Collects the facts about one bus.
 
-Facts are collected by listening and by reading objects. Unless ``active`` is set, nothing is changed on the
-bus, so a running hand is not disturbed.
+Facts are collected by listening and by reading objects. Unless ``active`` is set, no node is started
+and no SYNC is sent, so a running hand is not disturbed.
 """
 
 from __future__ import annotations

@@ -70,7 +70,7 @@ class FoundNode:
     boot_ups: int
     """Boot-up messages received during the search."""
     duplicate: str
-    """Evidence that two nodes have this node-ID; otherwise empty."""
+    """Evidence that two nodes have this node-ID; empty if there is none."""
     wrong_answer: str = ""
     """Newest invalid SDO response as hexadecimal text, if there was no valid response."""
 

@@ -31,7 +31,7 @@ A good converter's noise is a hundredth of this value; a press changes R/R0 a hu
 _MANY: Final = 0.8
 _FEW: Final = 0.1
 _SHARE: Final = 0.7
-"""Minimum fraction of a noisy wire's crossings that are noisy; others may be quiet by chance."""
+"""Minimum fraction of noisy crossings on a noisy wire; its other crossings may be quiet by chance."""
 
 
 def _judged(bus: BusFacts) -> Iterator[tuple[PatchFacts, ScanFacts, NoiseAnalysis]]:
@@ -79,7 +79,7 @@ def _check_crossings(
         (
             "out of range",
             scans.n_over,
-            "if the baseline is missing or old, tare at rest; a press may also exceed the range",
+            "if the baseline is missing or old, tare the untouched skin; a press may also exceed the range",
         ),
     ):
         always, sometimes = rest & (counts >= whole), rest & (counts > 0) & (counts < whole)

@@ -76,7 +76,7 @@ def _check_sync(bus: BusFacts) -> Iterator[Finding]:
                 "SYNCs are missing",
                 Sure.CERTAIN,
                 f"{missing} of {len(intervals) + missing}",
-                "check the load on the machine that sends SYNC, and the bus",
+                "check the bus, and the load on the machine that sends SYNC",
             )
         regular = intervals[intervals < 1.5 * period_s]
         jitter_s = float(np.percentile(np.abs(regular - period_s), 99)) if len(regular) else 0.0

@@ -1,8 +1,7 @@
-"""State of the faults injected into a fleet, with a log of its changes.
+"""Current faults of a simulated hand's patches and buses, and a log of all fault changes.
 
-Three sources change faults: :meth:`vcan_sim.fleet.Fleet.inject`, texts (``vcan-sim inject``) and a scene's
-schedule. Each change is checked before it takes effect, and each call applies either all of its changes or
-none.
+Faults are changed by :meth:`vcan_sim.fleet.Fleet.inject`, by the command ``vcan-sim inject`` and by a scene's
+fault schedule. A set of changes is checked first. If one change is invalid, none of them takes effect.
 """
 
 from __future__ import annotations
@@ -38,11 +37,11 @@ class FaultEvent:
     """Name of the faulty patch or bus."""
     fault: str
     value: Value
-    """Value of the fault that starts or ends."""
+    """Value of the fault, for example 0.1 for ``lost=0.1``."""
     on: bool
     """True if the fault starts, False if it ends."""
     refused: str = ""
-    """Reason why a scheduled change did not take effect; empty if the change took effect."""
+    """Reason why a scheduled change did not take effect; empty if it took effect."""
 
     def __str__(self) -> str:
         what = f"{self.place}:{name_and_value(self.fault, self.value)} {'on' if self.on else 'off'}"
@@ -51,9 +50,9 @@ class FaultEvent:
 
 @dataclass(frozen=True, slots=True)
 class Places:
-    """Patches and buses of a fleet, with functions that check and set their faults.
+    """Names of a fleet's patches and buses, and functions that check and set their faults.
 
-    The ``check`` functions raise ConfigError if the patch or bus cannot have the faults.
+    The ``check`` functions raise ConfigError if the patch or bus cannot have the given faults.
     """
 
     patches: Sequence[str]
@@ -94,30 +93,30 @@ class FleetFaults:
         return self._of_buses[name]
 
     def texts(self) -> list[str]:
-        """Return the current faults as one text per faulty patch or bus, such as ``palm:lost=0.1``."""
+        """Return the current faults as one string per faulty patch or bus, such as ``palm:lost=0.1``."""
         found = [(name, text_of(faults)) for name, faults in (self._of_patches | self._of_buses).items()]
         return [f"{place}:{text}" for place, text in found if text != NONE]
 
     @property
     def log(self) -> tuple[FaultEvent, ...]:
-        """All starts and ends of faults so far, oldest first."""
+        """Starts and ends of all faults since the log was last cleared, oldest first."""
         return tuple(self._log)
 
     def forget_log(self) -> None:
-        """Clear the log, which grows with each change."""
+        """Clear the log of fault changes, which otherwise grows without limit."""
         self._log.clear()
 
     # --- changes
 
     def inject(self, *texts: str, key: str = "--fault") -> None:
-        """Change the faults named in the given texts; all other faults remain unchanged.
+        """Change the faults named in the given strings; all other faults remain unchanged.
 
         Args:
-            *texts: Texts such as ``palm:unplugged`` or ``palm:none``; see :mod:`vcan_sim.fault_text`.
+            *texts: Strings such as ``palm:unplugged`` or ``palm:none``; see :mod:`vcan_sim.fault_text`.
             key: Name of the command-line option, for error messages.
 
         Raises:
-            ConfigError: If a text is invalid. After this error, all faults are unchanged.
+            ConfigError: If a string is invalid. In this case, no fault is changed.
         """
         places = self._places
         self._change(parse_changes(texts, places.patches, places.buses, key))
@@ -129,8 +128,8 @@ class FleetFaults:
             faults: New faults by patch.
 
         Raises:
-            ConfigError: If a patch is not in the hand or cannot have the faults. In this case no fault
-                changes.
+            ConfigError: If a patch is not in the hand or cannot have the faults. In this case, no fault
+                is changed.
         """
         for name in faults:
             if name not in self._places.patches:
@@ -146,8 +145,8 @@ class FleetFaults:
             faults: New faults.
 
         Raises:
-            ConfigError: If the bus is not in the hand or cannot have the faults. In this case no fault
-                changes.
+            ConfigError: If the bus is not in the hand or cannot have the faults. In this case, no fault
+                is changed.
         """
         if name not in self._places.buses:
             raise ConfigError("bus", name, f"a bus of the hand: {', '.join(self._places.buses)}")
@@ -155,13 +154,13 @@ class FleetFaults:
             self._replace({}, {name: faults})
 
     def follow(self, ended: Iterable[TimedFault], started: Iterable[TimedFault]) -> None:
-        """End and start scheduled faults.
+        """Apply the changes that are due in a fault schedule.
 
-        A scheduled change that contradicts other faults is refused and logged.
+        A change that contradicts other faults is refused, and the refusal is logged.
 
         Args:
-            ended: Scheduled faults that end; other faults of the same patch or bus do not change.
-            started: Scheduled faults that start.
+            ended: Scheduled faults to end.
+            started: Scheduled faults to start.
         """
         by_place: dict[tuple[str, bool], dict[str, Value]] = {}
         for each in ended:
@@ -194,7 +193,7 @@ class FleetFaults:
             self._replace(patches, buses)
 
     def _replace(self, patches: Mapping[str, Faults], buses: Mapping[str, BusFaults]) -> None:
-        """Check all new faults, then apply and log them. The caller must hold the lock."""
+        """Check all new faults, then apply and log them. The caller must hold ``_lock``."""
         for name, faults in patches.items():
             self._places.check_patch(name, faults)
         for name, of_bus in buses.items():

@@ -1,4 +1,4 @@
-"""Fault injector of one node: current faults, random generator and counts."""
+"""Random injection of faults into one simulated node."""
 
 from __future__ import annotations
 
@@ -9,13 +9,14 @@ from vcan_sim.tally import Tally
 
 
 class Injector:
-    """Fault injector that draws and counts a node's faults, determined by a seed and the order of calls.
+    """Fault injector of one node, which decides at random when a fault occurs and counts the occurrences.
 
-    :attr:`faults` can be replaced at any time from any thread.
+    The random sequence is reproducible: it depends only on the seed, the node-ID and the order of calls. Any
+    thread may replace :attr:`faults` at any time.
 
     Args:
-        faults: Initial faults; their seed remains in use when the faults are replaced.
-        node_id: Node-ID, which makes nodes with the same seed draw different faults.
+        faults: Initial faults and random seed. The seed does not change when the faults are replaced.
+        node_id: Node-ID. Nodes with the same seed but different node-IDs have different random sequences.
     """
 
     def __init__(self, faults: Faults, node_id: int) -> None:
@@ -28,7 +29,7 @@ class Injector:
         return share > 0.0 and bool(self.random.random() < share)
 
     def draw_one(self, names: tuple[str, ...]) -> str:
-        """Draw at most one fault, each with the probability given by its fraction; return its name, or ""."""
+        """Return the name of at most one fault, drawn with the probabilities in :attr:`faults`, or ""."""
         faults = self.faults
         if faults is NO_FAULTS:
             return ""
@@ -40,12 +41,12 @@ class Injector:
         return ""
 
     def loses(self, fault: str | None) -> bool:
-        """Draw whether a fault drops a frame; if so, count the frame."""
+        """Decide at random whether a fault drops a frame; if so, count the frame."""
         if fault is None or not self.draw(getattr(self.faults, fault)):
             return False
         self.count(fault)
         return True
 
     def count(self, fault: str) -> None:
-        """Count one injection of a fault."""
+        """Count one occurrence of a fault."""
         setattr(self.injected, fault, getattr(self.injected, fault) + 1)

@@ -8,9 +8,9 @@
         field = host.fields(timeout_s=5).get()
         assert skin_truth(field).wrench[2] < 0
 
-The option ``--skin-bus`` selects the bus of all tests; by default, tests run in virtual time on a bus with
-exact times. If a test fails, the plugin saves the test's bus trace, scene, ground truth and a plot in a
-folder that the test report names.
+The option ``--skin-bus`` selects the kind of CAN bus for all tests. By default, tests run in virtual time on
+a simulated bus. If a test fails, the plugin saves the bus trace, the scene, the ground truth and a plot. The
+test report names the folder with these files.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import pytest
 
-if TYPE_CHECKING:  # numba and NumPy are imported only on demand
+if TYPE_CHECKING:  # at run time, a test imports numba and NumPy only if it needs them
     from skinnode.config import HandConfig
     from skinnode.host import Host
     from skinnode.model.frames import FieldFrame
@@ -40,10 +40,11 @@ BUSES: Final = {
     "udp_multicast": ("udp_multicast", ""),
     "vcan0": ("socketcan", "vcan{}"),
 }
-"""Interface and channel for each choice of ``--skin-bus``. The bus number replaces the braces; a unique
-channel name replaces an empty channel."""
+"""python-can interface and channel for each choice of ``--skin-bus``. The braces stand for the number of the
+bus in the hand. If the channel is empty, each test chooses a random channel."""
 TRUTH_READINGS: Final = 200
-"""Number of each patch's newest readings whose ground truth is saved if a test fails."""
+"""Maximum number of readings per patch for which the ground truth is saved when a test fails. The newest
+readings are saved."""
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -53,13 +54,13 @@ def pytest_addoption(parser: pytest.Parser) -> None:
         "--skin-bus",
         choices=tuple(BUSES),
         default="timed",
-        help="bus of simulated hands: timed (virtual time, the default), virtual, udp_multicast or vcan0",
+        help="CAN bus of the simulated hand: timed (virtual time, default), virtual, udp_multicast or vcan0",
     )
     group.addoption(
         "--skin-kept",
         metavar="DIR",
         default="skin-kept",
-        help="folder for the trace, scene, truth and plot of tests that fail (default: skin-kept)",
+        help="folder for the trace, scene, ground truth and plot of failed tests (default: skin-kept)",
     )
 
 
@@ -82,11 +83,11 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
 
 
 class SkinTest:
-    """Simulated hand of one test, with its host and traces.
+    """Simulated hand, host and bus traces of one test.
 
     Args:
         bus: Value of the option ``--skin-bus``.
-        open_until_end: Stack of context managers, closed at the end of the test.
+        open_until_end: Stack of context managers that is closed at the end of the test.
     """
 
     def __init__(self, bus: str, open_until_end: ExitStack) -> None:
@@ -114,13 +115,13 @@ class SkinTest:
         return self.fleet
 
     def started(self, needs: str) -> Fleet:
-        """Return the running hand, which the fixture ``needs`` requires."""
+        """Return the running hand; ``needs`` is the name of the fixture that requires it."""
         if self.fleet is None:
-            raise RuntimeError(f"{needs}: there is no hand yet, call skin_hand first")
+            raise RuntimeError(f"{needs}: there is no hand yet; call skin_hand first")
         return self.fleet
 
     def bring_up(self, options: dict[str, Any]) -> Host:
-        """Start a host that brings the hand up; the host is closed at the end of the test."""
+        """Start a host for the hand; the host is closed at the end of the test."""
         from skinnode.host import Host
 
         return self._open.enter_context(Host.from_config(self.started("skin_host").hand, **options))
@@ -134,7 +135,7 @@ class SkinTest:
         return self._open.enter_context(open_can_bus(config))
 
     def keep(self, folder: Path) -> list[str]:
-        """Save the trace, ground truth, scene and plot of the test, and return the names of the files."""
+        """Save the test's bus trace, ground truth, scene and plot, and return the file names."""
         folder.mkdir(parents=True, exist_ok=True)
         kept = ["trace.log"]
         (folder / "trace.log").write_text("".join(trace() for trace in self._traces), encoding="utf-8")
@@ -175,13 +176,13 @@ class SkinTest:
         return hand.model_copy(update={"buses": tuple(buses)})
 
     def _own(self, name: str) -> str:
-        """Return a channel that no other test uses."""
+        """Return a random channel, so that simultaneous tests do not share a bus."""
         if self.bus == "udp_multicast":
             return f"239.75.{random.randrange(256)}.{random.randrange(1, 255)}"
         return f"{name}-{uuid.uuid4().hex[:8]}"
 
     def _trace(self, bus: Any) -> Callable[[], str]:
-        """Record the frames of a bus, and return a function that returns the trace as text."""
+        """Start to record the frames of a bus; the returned function gives the trace as text."""
         from skinnode.process import clock
         from vcan_sim.trace import Listener, Trace
 
@@ -198,13 +199,13 @@ class SkinTest:
 
 
 class SkinFaults:
-    """Fixture object that injects faults into the nodes and buses of a test's simulated hand."""
+    """Injector of faults into the nodes and buses of a test's simulated hand."""
 
     def __init__(self, test: SkinTest) -> None:
         self._test = test
 
     def inject(self, place: str | None = None, **faults: Any) -> None:
-        """Replace the faults of one patch, of one bus, or of all patches.
+        """Replace the faults of one patch, one bus or all patches.
 
         Args:
             place: Name of the patch or bus; None for all patches.
@@ -232,7 +233,7 @@ class SkinFaults:
             fleet.inject(Faults(**faults), place)
 
     def clear(self, place: str | None = None) -> None:
-        """End the faults of one patch, of one bus, or of all patches."""
+        """End the faults of one patch, one bus or all patches."""
         self.inject(place)
 
     def injected(self, patch: str) -> Injected:
@@ -253,7 +254,7 @@ _TEST: Final = pytest.StashKey[SkinTest]()
 
 @pytest.fixture
 def skin_clock(request: pytest.FixtureRequest) -> Iterator[Any]:
-    """Clock of the test: module ``skinnode.process.clock``, in virtual time with ``--skin-bus timed``."""
+    """Module ``skinnode.process.clock``. With ``--skin-bus timed``, the test runs in virtual time."""
     from skinnode.process import clock
     from vcan_sim.virtual_time import VirtualClock
 
@@ -277,7 +278,8 @@ def skin_hand(_skin_test: SkinTest) -> Callable[..., Fleet]:
     """Function that powers on a simulated hand: ``skin_hand(hand, scene=None, **options) -> Fleet``.
 
     ``hand`` and ``scene`` are files or configurations; the options are passed to
-    :class:`vcan_sim.fleet.Fleet`. The bus selected by ``--skin-bus`` replaces the buses of the hand file.
+    :class:`vcan_sim.fleet.Fleet`. The option ``--skin-bus`` overrides the interface and channel
+    of every bus in the hand file.
     """
 
     def start(
@@ -290,15 +292,18 @@ def skin_hand(_skin_test: SkinTest) -> Callable[..., Fleet]:
 
 @pytest.fixture
 def skin_host(_skin_test: SkinTest) -> Callable[..., Host]:
-    """Function that brings up the hand: ``skin_host(**options) -> Host``; options as for ``from_config``."""
+    """Function that starts a host for the simulated hand: ``skin_host(**options) -> Host``.
+
+    The options are passed to :meth:`skinnode.host.Host.from_config`.
+    """
     return lambda **options: _skin_test.bring_up(options)
 
 
 @pytest.fixture
 def skin_can(_skin_test: SkinTest) -> Callable[..., Any]:
-    """Function that opens a python-can bus for a user's own master: ``skin_can(bus=None) -> can.BusABC``.
+    """Function that opens a python-can endpoint on a bus of the hand: ``skin_can(bus=None) -> can.BusABC``.
 
-    ``bus`` is the name of one of the hand's buses; the default is the first bus. The endpoint is closed at
+    ``bus`` is the name of the bus; the default is the first bus. The endpoint is closed at
     the end of the test.
     """
     return _skin_test.connect
@@ -306,7 +311,10 @@ def skin_can(_skin_test: SkinTest) -> Callable[..., Any]:
 
 @pytest.fixture
 def skin_truth(_skin_test: SkinTest) -> Callable[[FieldFrame], PatchTruth]:
-    """Function that returns the ground truth of a field's scan; the hand needs a scene."""
+    """Function that returns the ground truth for a field from the host.
+
+    The ground truth is available only if the hand was started with a scene.
+    """
 
     def truth(field: FieldFrame) -> PatchTruth:
         if field.stamp is None:
@@ -327,7 +335,7 @@ def skin_faults(_skin_test: SkinTest) -> SkinFaults:
 def pytest_runtest_makereport(
     item: pytest.Item, call: pytest.CallInfo[None]
 ) -> Generator[None, pytest.TestReport, pytest.TestReport]:
-    """Save the data of a simulated hand if its test fails, and list the files in the test report."""
+    """If a test with a simulated hand fails, save the hand's data and list the files in the test report."""
     report = yield
     test = item.stash.get(_TEST, None)
     if test is not None and report.when == "call" and report.failed:
@@ -337,5 +345,5 @@ def pytest_runtest_makereport(
             kept = ", ".join(test.keep(folder))
             report.sections.append(("simulated hand", f"kept in {folder}: {kept}"))
         except Exception as error:
-            report.sections.append(("simulated hand", f"nothing kept in {folder}: {error}"))
+            report.sections.append(("simulated hand", f"could not save the data in {folder}: {error}"))
     return report

@@ -1,4 +1,4 @@
-"""Recording of a simulated run: bus trace, ground truth, faults and scene, as files in a new folder.
+"""Record a simulated run in a new folder: bus trace, ground truth, faults and scene.
 
 ===============  =======================================================================================
 file             content
@@ -37,14 +37,14 @@ SCENE: Final = "scene.json"
 
 
 def channel_of(bus: str) -> str:
-    """Return the channel name of a bus in traces: the bus name with underscores in place of blanks."""
+    """Return a bus name with underscores instead of spaces, for the channel column of a trace."""
     return re.sub(r"\s", "_", bus)
 
 
 class Recording:
     """Recording of a fleet during a ``with`` block, which must enclose the ``with`` block of the fleet.
 
-    Call :meth:`poll` at least once a minute, because a patch stores only its newest readings.
+    Call :meth:`poll` at least once a minute, because each patch stores only a limited number of readings.
 
     Args:
         folder: New folder for the files.
@@ -93,7 +93,7 @@ class Recording:
         np.savez_compressed(self._folder / TRUTH, **arrays)
 
     def poll(self) -> None:
-        """Record the ground truth of all new scans and all fault changes since the last call."""
+        """Record the ground truth of all scans since the last call, and all fault changes since then."""
         if self._failure is not None:
             raise self._failure
         wall_ns = clock.time_ns() - clock.monotonic_ns()

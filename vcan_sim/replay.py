@@ -1,4 +1,4 @@
-"""Replay of a recorded bus trace on buses, with the original timing."""
+"""Replay a recorded CAN trace with the original timing."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ FROM_NODES: Final = frozenset(
 )
 """Kinds of frames that nodes send. A host sends frames of all other kinds, and may also send heartbeats."""
 _DRAINED_EVERY: Final = 64
-"""Number of frames to send between two clearings of the buses' receive queues."""
+"""Number of sent frames after which the receive queues of all endpoints are emptied."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,8 +37,7 @@ class Replayed:
 
     sent: int
     left_out: int
-    """Number of frames not sent, because they were excluded or because the endpoint does not support them
-    (extended and error frames)."""
+    """Number of frames left out: excluded frames, extended frames and error frames."""
     refused: int
     """Number of frames that the bus refused."""
     seconds: float
@@ -61,7 +60,7 @@ def trace_of(recording: Path) -> Path:
 
 
 def channels_in(trace: Path) -> list[str]:
-    """Return the channel names in a trace, in the order of their first frames.
+    """Return the channel names in a trace, in order of first appearance.
 
     Args:
         trace: Trace file.
@@ -71,7 +70,9 @@ def channels_in(trace: Path) -> list[str]:
     """
     found = list(dict.fromkeys(logged.channel for logged in FrameLogReader(trace)))
     if not found:
-        raise ConfigError("RECORDING", str(trace), "a trace with at least one frame, as from candump -L")
+        raise ConfigError(
+            "RECORDING", str(trace), "a trace in the format of candump -L with at least one frame"
+        )
     return found
 
 
@@ -85,9 +86,10 @@ def replay(
     """Send recorded frames with their original timing.
 
     Args:
-        frames: Frames with their times. A frame earlier than its predecessor is sent immediately.
+        frames: Recorded frames. If a frame has an earlier time than the preceding frame, it is sent
+            immediately.
         ports: Open endpoint for each channel; frames of channels without an endpoint are not sent.
-        wait: Function that waits for a given number of seconds, and returns True if the replay must end.
+        wait: Function that waits for a given number of seconds. It returns True to end the replay.
         from_nodes: Whether to send only the frames that nodes send.
 
     Returns:
@@ -118,7 +120,7 @@ def replay(
 
 
 def _drain(port: CanPort) -> None:
-    """Discard all received frames, because the receive queue would otherwise fill up."""
+    """Discard all received frames, so that the receive queue does not fill up."""
     try:
         while port.recv(0.0) is not None:
             pass

@@ -1,12 +1,13 @@
-"""Scene of random strokes: a sphere repeatedly presses, slides and lifts, and deforms the skin.
+"""Scene in which a sphere repeatedly presses into the skin, slides in a random direction and lifts off.
 
 The displacement of the electrodes is the closed-form solution for a sliding Hertz contact on a half-space
-(:class:`skinnode.model.elastic.HertzContact`), so the ground truth has no grid and does not depend on a
-solver's discretisation. A scene is a pure function of scene time: it can be evaluated at any times in any
-order, and the same seed produces the same scene.
+(:class:`skinnode.model.elastic.HertzContact`), so the ground truth contains no
+discretisation error. A scene is a pure function of scene time and the seed: its state can be computed for any
+time, in any order.
 
-The onset of sliding is simplified: while the sphere accelerates, the ratio of shear to pressure grows from
-zero to the coefficient of friction. A real contact slips from its rim inwards (Cattaneo, Mindlin).
+The onset of sliding is simplified: while the sphere accelerates, the ratio of shear stress to pressure rises
+from zero to the coefficient of friction everywhere in the contact. In a real contact, slip starts at the rim
+and spreads inwards (Cattaneo, Mindlin).
 """
 
 from __future__ import annotations
@@ -24,11 +25,11 @@ from skinnode.model.layout import Float, PatchLayout
 from vcan_sim.smooth import GLIDE_RAMP, ease, glide
 
 LEAD_S: Final = 0.8
-"""Rest time (s) before the first press, for measuring the baseline and opening a viewer."""
+"""Minimum time (s) before the first press, so that the baseline can be measured on the untouched skin."""
 
 PRESS, SLIDE, LIFT = 0.36, 0.40, 0.14
-"""Durations of press, slide and lift as fractions of a cycle; in the remaining time the skin is at rest. In a
-4 s cycle, a press takes 1.4 s."""
+"""Durations of press, slide and lift as fractions of a cycle. For the rest of the cycle, the skin is
+untouched."""
 
 _GOLDEN: Final = 0.5 * (math.sqrt(5.0) - 1.0)
 
@@ -37,7 +38,7 @@ _GOLDEN: Final = 0.5 * (math.sqrt(5.0) - 1.0)
 class Stroke:
     """Stroke of a sphere: press, slide and lift.
 
-    ``heading`` is a unit vector; all times are in seconds after first contact.
+    ``heading`` is the unit vector of the sliding direction.
     """
 
     radius_m: float
@@ -76,7 +77,8 @@ class Scene:
         layout: Layout of the patch at rest. The upper electrodes are on the surface of the rubber; a curved
             skin is treated as its projection onto the x-y plane.
         simulation: Seed, sphere radius, depth, friction, speed and timing of the strokes.
-        number: Number of the patch in the hand. Each patch has its own strokes and phase.
+        number: Number of the patch in the hand. Patches differ in their random strokes and in the time of the
+            first touch.
         rubber: Material of the skin. Its Young's modulus affects the force but not the displacement.
     """
 
@@ -87,7 +89,7 @@ class Scene:
 
     @property
     def lead_s(self) -> float:
-        """Scene time (s) of the first touch; patches differ by up to a quarter of a cycle."""
+        """Scene time (s) of the first touch, which differs between patches by up to a quarter of a cycle."""
         return LEAD_S + 0.25 * self.simulation.cycle_s * math.fmod(self.number * _GOLDEN, 1.0)
 
     def stroke(self, index: int) -> Stroke:
@@ -125,7 +127,10 @@ class Scene:
         return () if contact is None else (contact,)
 
     def upper_m(self, t_s: float) -> Float:
-        """Return the upper electrodes (U, N, 3), in m, at a scene time; at rest: ``layout.upper_m``."""
+        """Return the positions (U, N, 3) of the upper electrodes in m at scene time ``t_s``.
+
+        At rest, the method returns ``layout.upper_m`` itself.
+        """
         contacts = self.contacts(t_s)
         if not contacts:
             return self.layout.upper_m
@@ -138,10 +143,10 @@ class Scene:
 
     @functools.cached_property
     def _field_m(self) -> tuple[Float, Float]:
-        """Corners of the rectangle to which the centre of the sphere is confined.
+        """Lower and upper corner of the rectangle in which the centre of the sphere moves.
 
-        The rectangle is one pitch inside the outermost electrodes, or shrinks to their midpoint if the patch
-        is too small.
+        The rectangle is one pitch smaller on each side than the area of the electrodes. If the patch is too
+        small, the rectangle shrinks to the middle of the patch.
         """
         low, high = self._surface_m.min(axis=0), self._surface_m.max(axis=0)
         inset = np.minimum(self.layout.pitch_m, 0.5 * (high - low))

@@ -1,29 +1,31 @@
-"""Smooth motion profiles that rise from 0 to 1."""
+"""Smooth motion profiles from 0 to 1."""
 
 from __future__ import annotations
 
 from typing import Final
 
 GLIDE_RAMP: Final = 0.2
-"""Duration of a glide's acceleration phase, and also of its deceleration phase, as a fraction of the
-glide."""
+"""Durations of the acceleration and deceleration phases of :func:`glide`, as fractions of the total
+duration."""
 
 
 def ease(share: float) -> float:
-    """Rise from 0 to 1 with zero speed and acceleration at both ends: minimum jerk (Flash and Hogan 1985).
+    """Return the value of a minimum-jerk profile from 0 to 1 (Flash and Hogan 1985).
+
+    Speed and acceleration are zero at both ends.
 
     Args:
-        share: Elapsed fraction of the duration; the result is 0 below 0 and 1 above 1.
+        share: Elapsed fraction of the duration. Values below 0 count as 0, and values above 1 as 1.
     """
     s = min(max(share, 0.0), 1.0)
     return s * s * s * (10.0 + s * (6.0 * s - 15.0))
 
 
 def glide(share: float) -> float:
-    """Rise from 0 to 1 at constant speed, with smooth ramps of length ``GLIDE_RAMP`` at both ends.
+    """Return the value of a profile from 0 to 1 at constant speed, with smooth acceleration and deceleration.
 
     Args:
-        share: Elapsed fraction of the duration; the result is 0 below 0 and 1 above 1.
+        share: Elapsed fraction of the duration. Values below 0 count as 0, and values above 1 as 1.
     """
     s = min(max(share, 0.0), 1.0)
     if s > 0.5:

@@ -1,4 +1,4 @@
-"""Functions for waiting in tests, with the clock of the test: a virtual clock or the system clock."""
+"""Functions for waiting in tests, in virtual time or real time."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ def eventually(
     """Wait until a condition is true.
 
     Args:
-        condition: Function without arguments whose result is interpreted as true or false.
+        condition: Function without arguments. Its result is interpreted as true or false.
         within_s: Maximum wait, s.
         every_s: Time between two calls of ``condition``, s.
         what: Description of the condition, for the error message.
@@ -26,13 +26,13 @@ def eventually(
     while not condition():
         if clock.monotonic() >= end_s:
             name = what or getattr(condition, "__qualname__", repr(condition))
-            raise AssertionError(f"not within {within_s:g} s: {name}")
+            raise AssertionError(f"condition not true within {within_s:g} s: {name}")
         clock.sleep(every_s)
 
 
 @contextmanager
 def within(seconds: float) -> Iterator[None]:
-    """Check that a ``with`` block ends within a maximum duration, without interrupting the block.
+    """Check that a ``with`` block takes no longer than a maximum duration; the block is not interrupted.
 
     Args:
         seconds: Maximum duration, s.

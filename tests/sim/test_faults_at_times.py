@@ -301,7 +301,7 @@ def table(**changes: Any) -> str:
         (table(fault="lost_chunk=0.1"), "3:1", ["faults[0].fault", "'lost_chunk'", "lost"]),
         (table(fault="lost=1.5"), "3:1", ["lost", "1.5", "a fraction from 0 to 1"]),
         (table(fault="lost"), "3:1", ["lost", "a number"]),
-        (table(fault=""), "3:1", ["faults[0].fault", "the text of a fault"]),
+        (table(fault=""), "3:1", ["faults[0].fault", "a fault, such as"]),
         (table(fault="seed=3"), "3:1", ["'seed'", "the seed is not a fault"]),
         (table(fault="stuck_upper=1"), "3:1", ["stuck_upper", "which name a crossing"]),
         (table(where="can0"), "3:1", ["'lost'", "bus_off"]),

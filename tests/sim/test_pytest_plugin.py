@@ -126,7 +126,7 @@ def test_bad_use_is_one_line(tmp_path: Path) -> None:
     assert done.returncode == 4
     assert "--skin-bus" in done.stderr
     (tmp_path / "test_more.py").write_text("def test_no_hand(skin_host):\n    skin_host()\n")
-    assert "skin_host: there is no hand yet, call skin_hand first" in run(tmp_path, "test_more.py").stdout
+    assert "skin_host: there is no hand yet; call skin_hand first" in run(tmp_path, "test_more.py").stdout
 
 
 def test_a_fault_that_is_unknown_or_of_no_patch_is_one_line(tmp_path: Path) -> None:

@@ -434,7 +434,7 @@ SLIDE = '[[touches.motions]]\nkind = "slide"\nby_m = [0.001, 0.0]\nfrom_s = 1.3\
             + TOUCH
             + TOUCH.replace("ball", "two").replace("[0.018", "[0.021"),
             "19:1",
-            ["touches[1].at_m", "mm away from that of touches[0]"],
+            ["touches[1].at_m", "mm from the contact of touches[0]"],
         ),
         (BODY + TOUCH + "times = 2\n", "5:1", ["touches[0].every_s", "nothing"]),
         ("repeat_s = 1.5\n" + BODY + TOUCH, "11:1", ["touches[0].to_s", "repeat_s"]),

@@ -1,4 +1,4 @@
-"""Scenes as data: rigid bodies that press, slide, roll, shear, turn, tap and walk on a hand's patches.
+"""Scenes defined in files: rigid bodies press on a hand's patches, and slide, roll or turn while in contact.
 
 ::
 
@@ -8,9 +8,9 @@
         -> response (displacement of the electrodes) -> patch (state at any time) -> truth
     faults (checks with the hand) -> vcan_sim.fault_schedule
 
-The contact mechanics comes from :mod:`vcan_sim.contact`, which shares no code with the solvers. A scene is a
-function of scene time. Each touch starts and ends with an undeformed skin and is computed at fixed time steps
-in order. The state at a given time therefore does not depend on the order in which times are requested.
+The contact mechanics are computed in :mod:`vcan_sim.contact`, which shares no code with the solvers. The skin
+is undeformed before and after each touch. Each touch is computed at fixed time steps, always from its start.
+The state at a given time therefore does not depend on which times are requested, or in which order.
 """
 
 from vcan_sim.scenes.bind import bind_scene, load_scene

@@ -1,4 +1,4 @@
-"""Bind a scene to a hand: check every touch on its patch, and return one :class:`PatchScene` per patch."""
+"""Apply a scene to a hand: check the touches on each patch, and create one :class:`PatchScene` per patch."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from vcan_sim.scenes.touch_checks import check_apart, check_on_patch, error_at, 
 
 
 def load_scene(path: Path | str, hand: HandConfig) -> SceneConfig:
-    """Read a scene file and check its touches on the patches of a hand.
+    """Read a scene file, and check that a given hand can play the scene.
 
     Args:
         path: Scene file.
@@ -26,7 +26,7 @@ def load_scene(path: Path | str, hand: HandConfig) -> SceneConfig:
 
     Raises:
         ConfigError: If the file cannot be read, is not a scene, or contains a touch or fault that is
-            impossible in the hand. The message is one line with file, line and column.
+            impossible for the hand. The message states the file, line and column of the error.
     """
     scene = read_scene(path)
     bind_scene(scene, hand)
@@ -35,10 +35,10 @@ def load_scene(path: Path | str, hand: HandConfig) -> SceneConfig:
 
 
 def bind_scene(scene: SceneConfig, hand: HandConfig) -> dict[str, PatchScene]:
-    """Return the scenes of all patches of a hand by patch name, including untouched patches.
+    """Return a mapping from patch name to scene, for all patches of a hand including untouched patches.
 
     Args:
-        scene: Scene to bind.
+        scene: Scene of the hand.
         hand: Hand whose patches the scene touches.
 
     Raises:
@@ -55,12 +55,14 @@ def bind_scene(scene: SceneConfig, hand: HandConfig) -> dict[str, PatchScene]:
 
 
 def layer_of(skin: SkinConfig, patch: PatchConfig, layout: PatchLayout) -> Layer:
-    """Return the elastic layer of a patch, with the scene file's values, or else the hand file's values.
+    """Return the elastic layer of a patch.
+
+    Values in the scene file override those in the hand file.
 
     Args:
         skin: The scene file's ``[skin]`` table.
         patch: The patch in the hand file.
-        layout: Layout of the patch; its height is the default thickness.
+        layout: Layout of the patch. The default thickness is the height of the upper electrodes.
     """
     calibration = patch.calibration
     return Layer(

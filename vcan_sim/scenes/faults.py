@@ -1,4 +1,4 @@
-"""Convert a scene's ``[[faults]]`` tables into a fault schedule, and check the faults for a hand."""
+"""Convert a scene's ``[[faults]]`` tables to a fault schedule, and check that they are possible."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from vcan_sim.faults import NO_FAULTS, OF_WIRES, check_wires
 from vcan_sim.scenes.tables import FaultConfig, SceneConfig
 
 _WIRE: Final = re.compile(r"(?P<patch>.+) (?P<side>upper|lower) (?P<number>\d{1,4})")
-"""Pattern of a wire in the key ``where``, such as ``palm upper 3``."""
+"""Pattern for the name of a wire in the key ``where``, such as ``palm upper 3``."""
 
 
 def schedule_of(scene: SceneConfig, hand: HandConfig) -> FaultSchedule:
@@ -28,8 +28,8 @@ def schedule_of(scene: SceneConfig, hand: HandConfig) -> FaultSchedule:
 
     Raises:
         ConfigError: If a fault names a patch, a wire or a bus that the hand does not have, is unknown or out
-            of range, or contradicts another fault at some time. The message is one line with file, line and
-            column.
+            of range, or contradicts a simultaneous fault. The message states the file, line and column of
+            the error.
     """
     found = []
     for i, fault in enumerate(scene.faults):
@@ -59,7 +59,7 @@ def _timed(number: int, fault: FaultConfig, hand: HandConfig, repeat_s: float | 
 
 
 def _place_and_text(fault: FaultConfig, hand: HandConfig) -> tuple[str, bool, str]:
-    """Return the name of the faulty patch or bus, whether it is a bus, and the fault in text form."""
+    """Return the name of the faulty patch or bus, whether it is a bus, and the fault as a string."""
     patches, buses = [patch.name for patch in hand.patches], [bus.name for bus in hand.buses]
     if fault.where in patches:
         return fault.where, False, fault.fault
@@ -72,12 +72,12 @@ def _place_and_text(fault: FaultConfig, hand: HandConfig) -> tuple[str, bool, st
     name = f"{fault.fault}_{wire['side']}"
     if name not in OF_WIRES or fault.fault == "stuck":
         kinds = dict.fromkeys(each.partition("_")[0] for each in OF_WIRES if not each.startswith("stuck"))
-        raise ConfigError("fault", fault.fault, f"the fault of a wire: {', '.join(kinds)}")
+        raise ConfigError("fault", fault.fault, f"a fault that a wire can have: {', '.join(kinds)}")
     return wire["patch"], False, f"{name}={wire['number']}"
 
 
 def _check_alone(scene: SceneConfig, late: TimedFault, earlier: list[TimedFault]) -> None:
-    """Raise ConfigError if an earlier ``[[faults]]`` table sets the same fault at the same place and time."""
+    """Raise ConfigError if an earlier ``[[faults]]`` table sets the same fault at an overlapping time."""
     for early in earlier:
         same = early.place == late.place and early.on_bus == late.on_bus and early.values.keys() & late.values
         if same and early.from_s < late.to_s and late.from_s < early.to_s:
@@ -105,7 +105,7 @@ def _check_together(
 
 
 def _with_place(scene: SceneConfig, number: int, error: ConfigError) -> ConfigError:
-    """Return a fault's error with the fault's position in the scene file added."""
+    """Return a copy of an error that also states where the fault is defined in the scene file."""
     key = f"faults[{number}].{'where' if error.key == 'where' else 'fault'}"
     shown = error.key.removeprefix("fault").strip()
     allowed = f"{shown}: {error.allowed}" if shown and error.key != "where" else error.allowed

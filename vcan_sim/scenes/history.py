@@ -1,8 +1,8 @@
-"""History of one touch: the contact at fixed time steps, each computed from the preceding step.
+"""Computation of one touch at fixed time steps, each from the preceding step.
 
-Friction depends on the past, so the time steps are computed in order and stored. The window of cells follows
-the body in steps of whole cells on a lattice fixed to the patch; tractions remain at their points on the
-skin.
+Friction depends on the past, so the time steps are computed in order and stored. The cells lie on a lattice
+that is fixed to the patch. The window of cells follows the body by whole cells, so the tractions need no
+interpolation.
 """
 
 from __future__ import annotations
@@ -23,10 +23,9 @@ from vcan_sim.scenes.tables import TouchConfig
 from vcan_sim.scenes.window import CLOSE, Window, centred_m, overlap_m, solve_depth
 
 _LEAST: Final = 1e-5
-"""Threshold below which the body is considered lifted, as a fraction of the touch's maximum depth or
-force."""
+"""Depth or force below which the body does not touch the skin, relative to the maximum of the touch."""
 _LOOSER: Final = (1.0, 10.0, 100.0)
-"""Factors for the contact solver's tolerance, tried in this order until the solver converges."""
+"""Factors by which the contact solver's tolerance is multiplied, tried in order until it converges."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,7 +52,7 @@ class Step:
 
 
 class History:
-    """Time steps of one touch, computed in order on first use. Safe to use from several threads.
+    """Time steps of one touch, computed in order when first needed. Several threads may share an instance.
 
     Args:
         touch: Touch to compute.
@@ -61,7 +60,7 @@ class History:
         friction: Coefficient of friction.
         window: Cells under the body.
         step_s: Time step, s.
-        electrodes: Electrodes at which the displacement of the surface is computed.
+        electrodes: Electrodes whose displacement is computed.
     """
 
     def __init__(  # noqa: PLR0913 - all inputs of a touch
@@ -127,7 +126,7 @@ class History:
         return self._summary(depth)
 
     def _solve(self, pose: Pose, offset_m: Float, slide_m: Float, start: Contact) -> tuple[float, Contact]:
-        """Return the depth (m) and the contact after a move to a pose; ``start`` is the initial guess."""
+        """Return depth (m) and contact at a new pose, with ``start`` as the solver's initial guess."""
         grid = self.window.grid
 
         def at(depth_m: float) -> Contact:
@@ -152,7 +151,7 @@ class History:
         return depth, newest
 
     def _follow(self, pose: Pose) -> None:
-        """Move the window by whole cells to the body's pose; tractions remain at their points on the skin."""
+        """Shift the window by whole cells to the position of the body, without moving the tractions."""
         grid = self.window.grid
         way = (np.asarray(pose.place_m) - np.asarray(self.touch.at_m)) / grid.size_m
         first = (round(float(way[0])), round(float(way[1])))
@@ -191,13 +190,13 @@ class History:
 def _advance(  # noqa: PLR0913 - all inputs of a time step
     grid: Grid, last: Contact, start: Contact, overlap_m: Float, slide_m: Float, friction: float
 ) -> Contact:
-    """Return the contact after a move; if the solver does not converge, try looser tolerances.
+    """Return the contact after the body has moved.
 
-    If no tolerance in ``_LOOSER`` leads to convergence, compute the time step without friction. The
-    frictionless state is still an equilibrium of the elastic layer.
+    If the solver does not converge, it is restarted with a larger tolerance. If it does not converge with any
+    factor in ``_LOOSER``, the time step is computed without friction.
 
     Raises:
-        NoSolution: If the frictionless solution does not converge either.
+        NoSolution: If the solver does not converge without friction either.
     """
     for looser in _LOOSER:
         try:
@@ -208,7 +207,7 @@ def _advance(  # noqa: PLR0913 - all inputs of a time step
 
 
 def _shifted(traction_pa: Float, shift: tuple[int, int]) -> Float:
-    """Return the tractions (3, X, Y) in a window shifted by whole cells, without those outside it."""
+    """Return the tractions (3, X, Y) in a window shifted by whole cells; new cells have zero traction."""
     moved = np.zeros_like(traction_pa)
     size = traction_pa.shape[1:]
     if abs(shift[0]) >= size[0] or abs(shift[1]) >= size[1]:

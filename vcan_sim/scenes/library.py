@@ -1,4 +1,4 @@
-"""Scenes that are shipped with the simulator, by name."""
+"""Named scenes that are shipped with the simulator."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ _FOLDER: Final = Path(__file__).with_name("shipped")
 
 
 def shipped_scenes() -> dict[str, Path]:
-    """Return the files of the scenes shipped with the simulator, by scene name."""
+    """Return a mapping from the names of the shipped scenes to their files."""
     return {path.stem: path for path in sorted(_FOLDER.glob("*.toml"))}
 
 
 def scene_file(scene: Path) -> Path:
-    """Return the scene file for a path or for the name of a shipped scene.
+    """Return the path of a scene file, given the path or the name of a shipped scene.
 
     Args:
         scene: Path of a scene file, or name of a scene shipped with the simulator.

@@ -63,14 +63,14 @@ def pose_at(touch: TouchConfig, t_s: float) -> Pose:
 
 
 def highest_level(touch: TouchConfig) -> float:
-    """Return the maximum normal force (N) of a force-controlled touch, else the maximum depth (m)."""
+    """Return the maximum normal force (N) of a force-controlled touch, or the maximum depth (m) otherwise."""
     levels = [touch.force_n if touch.by_force else touch.depth_m]
     levels += [motion.force_n if touch.by_force else motion.depth_m for motion in touch.motions]
     return max(level for level in levels if level is not None)
 
 
 def yaws_rad(touch: TouchConfig) -> tuple[float, ...]:
-    """Return yaw angles (rad) that cover a touch's rotation in steps of at most 0.25 rad."""
+    """Return yaw angles (rad) that cover the rotation during a touch in steps of at most 0.25 rad."""
     turned = sum(abs(motion.by_rad or 0.0) for motion in touch.motions)
     if not turned:
         return (touch.yaw_rad,)
@@ -78,7 +78,7 @@ def yaws_rad(touch: TouchConfig) -> tuple[float, ...]:
 
 
 def _way_m(motion: MotionConfig, share: float, t_s: float) -> tuple[float, float]:
-    """Return a body's displacement (x, y) in metres along the skin since a motion began."""
+    """Return a body's displacement (x, y) along the skin in metres since the motion began."""
     if motion.kind == "walk":
         return _walked_m(motion, t_s)
     way_x, way_y = motion.by_m or (0.0, 0.0)
@@ -88,7 +88,10 @@ def _way_m(motion: MotionConfig, share: float, t_s: float) -> tuple[float, float
 
 
 def _walked_m(motion: MotionConfig, t_s: float) -> tuple[float, float]:
-    """Return the displacement (x, y) of a random walk in metres, with minimum jerk between its targets."""
+    """Return the displacement (x, y) of a random walk in metres.
+
+    The motion between consecutive targets follows a minimum-jerk profile.
+    """
     targets = _targets_m(motion)
     elapsed = min(max(t_s, motion.from_s), motion.to_s) - motion.from_s
     step_s = (motion.to_s - motion.from_s) / (len(targets) - 1)
@@ -100,7 +103,10 @@ def _walked_m(motion: MotionConfig, t_s: float) -> tuple[float, float]:
 
 @functools.lru_cache(maxsize=256)
 def _targets_m(motion: MotionConfig) -> tuple[tuple[float, float], ...]:
-    """Return a random walk's targets in metres, uniform in a disc of radius ``reach_m`` about the start."""
+    """Return the targets (x, y) of a random walk in metres, uniformly distributed in a disc.
+
+    The disc has the radius ``reach_m`` and is centred on the start of the walk.
+    """
     count = max(1, round((motion.to_s - motion.from_s) / (motion.every_s or _EVERY_S)))
     random = np.random.default_rng(1 if motion.seed is None else motion.seed)
     r = (motion.reach_m or 0.0) * np.sqrt(random.uniform(0.0, 1.0, count))

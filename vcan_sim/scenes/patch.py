@@ -1,11 +1,10 @@
 """Scene of one patch: state of the skin at any time, interpolated between the time steps of the touches.
 
 The state at a given time is the mean of the four nearest time steps, weighted by the uniform cubic B-spline
-(de Boor, A Practical Guide to Splines, 1978, chapter IX). The weights are positive and sum to 1, so
-properties shared by all time steps also apply to the mean: pressure is not negative, shear is at most
-friction times pressure, the force is the integral of the tractions, and the displacement is the layer's
-response to the tractions. All these quantities are twice continuously differentiable in time. A motion
-shorter than four time steps is smoothed.
+(de Boor, A Practical Guide to Splines, 1978, chapter IX). The weights are positive and sum to 1. The mean is
+therefore physically consistent like each time step: its pressure is not negative, its shear traction does not
+exceed the friction limit, and its displacement is the layer's response to its tractions. All quantities are
+twice continuously differentiable in time. Motions shorter than four time steps are smoothed.
 """
 
 from __future__ import annotations
@@ -36,7 +35,7 @@ class PatchScene:
         number: Number of the patch in the hand.
         step_s: Time step of the contact mechanics, s.
         repeat_s: Period of the scene, s; None if the scene plays once.
-        histories: Computed touches of the patch.
+        histories: Touches of the patch.
     """
 
     layout: PatchLayout
@@ -52,7 +51,9 @@ class PatchScene:
         return max((history.touch.to_s for history in self.histories), default=0.0)
 
     def upper_m(self, t_s: float) -> Float:
-        """Return the upper electrodes' positions (U, N, 3), metres; at rest: ``layout.upper_m`` itself.
+        """Return the positions (U, N, 3) of the upper electrodes in metres.
+
+        At rest, the method returns ``layout.upper_m`` itself.
 
         Args:
             t_s: Scene time, s.
@@ -81,17 +82,19 @@ class PatchScene:
         return PatchTruth(t_s, moved.reshape(self.layout.upper_m.shape), tuple(contacts), wrench)
 
     def prepare(self, until_s: float = math.inf) -> None:
-        """Compute the time steps of all touches in advance instead of on first use.
+        """Compute the time steps of all touches in advance.
+
+        Without this call, each time step is computed when it is first needed.
 
         Args:
-            until_s: Scene time up to which time steps are computed, s.
+            until_s: Scene time up to which the touches are computed, s.
         """
         for history in self.histories:
             if history.touch.from_s < until_s:
                 history.step(min(history.last, math.ceil(min(until_s / self.step_s, history.last))))
 
     def _touching(self, t_s: float) -> Iterator[tuple[History, Weighted]]:
-        """Yield each touch that contributes to the state at ``t_s``, and its weighted time steps."""
+        """Yield each touch with contact near ``t_s``, and its time steps with their weights."""
         t_s = t_s if self.repeat_s is None or t_s < 0.0 else math.fmod(t_s, self.repeat_s)
         low = math.floor(t_s / self.step_s)
         weights = _spline(t_s / self.step_s - low)
@@ -105,7 +108,7 @@ class PatchScene:
 
 
 def _spline(share: float) -> tuple[float, float, float, float]:
-    """Return the cubic B-spline weights of four time steps, for a time between the second and the third."""
+    """Return the cubic B-spline weights of four time steps, at a time between the second and third step."""
     s, rest = share, 1.0 - share
     cube, other = s * s * s / 6.0, rest * rest * rest / 6.0
     second = 2.0 / 3.0 - s * s * (1.0 - 0.5 * s)
@@ -113,7 +116,7 @@ def _spline(share: float) -> tuple[float, float, float, float]:
 
 
 def _contact(history: History, steps: Weighted) -> BodyContact:
-    """Return the weighted mean of a touch's time steps, on the smallest window that covers them all."""
+    """Return the weighted mean of several time steps of a touch, in a window that covers all their cells."""
     firsts = np.array([step.first for _, step in steps])
     low = firsts.min(axis=0)
     size = (firsts - low).max(axis=0) + np.array(steps[0][1].traction_pa.shape[1:])

@@ -1,4 +1,7 @@
-"""Preview plot of a scene (needs matplotlib): force of each body over time, and pressure at maximum depth."""
+"""Plot a preview of a scene: force of each body over time, and pressure at maximum depth.
+
+This module requires matplotlib.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +22,7 @@ _COLOURS: Final = ("tab:blue", "tab:orange", "tab:green", "tab:red", "tab:purple
 
 
 def write_plot(scene: SceneConfig, hand: HandConfig, file: Path) -> None:
-    """Plot a scene to an image file, with one column per patch that a body touches.
+    """Plot a scene to an image file, with one column per touched patch.
 
     Args:
         scene: Scene to plot.

@@ -15,20 +15,21 @@ from vcan_sim.contact.solve import Contact
 from vcan_sim.scenes.shapes import Float
 
 BEYOND: Final = 20.0
-"""Distance from a point force, in layer thicknesses; at larger distances the displacement is below
-``FAR``."""
+"""Distance from a point force, in layer thicknesses, beyond which the displacement is negligible (below
+``FAR``)."""
 CLUSTER_CELLS: Final = 6.0
-"""Distance from the window, in cells; for farther electrodes, 2 × 2 cells act as one point force."""
+"""Distance from the window, in cells. For electrodes beyond this distance, the tractions of 2 × 2 cells are
+combined into one point force."""
 FAR: Final = 1e-5
-"""Threshold for the displacement due to a point force, relative to its maximum; smaller values count as zero.
-The displacement of an elastic layer decays exponentially with the distance from the force."""
+"""Threshold below which the displacement due to a point force is set to zero, relative to its maximum. The
+displacement of an elastic layer decays exponentially with the distance from the force."""
 POINTS: Final = 4096
 """Number of points in the table of displacement versus distance from a point force."""
 
 
 @dataclass(frozen=True, eq=False)
 class Electrodes:
-    """Electrodes on the skin's surface, with methods that compute their displacement.
+    """Electrodes on the skin's surface, and the displacement that a contact causes at them.
 
     Use :meth:`of` to create an instance.
 
@@ -63,7 +64,7 @@ class Electrodes:
     def displacement_m(self, grid: Grid, origin_m: Float, contact: Contact) -> Float:
         """Return the displacement of the electrodes due to a contact.
 
-        For electrodes inside the window, the displacement of the cells is interpolated by cubics. All other
+        Inside the window, the displacement of the cells is interpolated by cubic polynomials. All other
         electrodes are at least two cells away from any loaded cell, so each cell's traction acts as a point
         force at the cell's centre. For electrodes farther than ``CLUSTER_CELLS`` from the window, the forces
         of each group of 2 × 2 cells act at the centre of the group.
@@ -95,7 +96,7 @@ class Electrodes:
         return moved
 
     def _under_forces(self, places_m: Float, at_m: Float, force_n: Float) -> Float:
-        """Return the displacement (P, 3) of places (P, 2) due to point forces (3, F) at ``at_m`` (F, 2)."""
+        """Return the displacement (P, 3) at positions (P, 2) due to point forces (3, F)."""
         x = places_m[:, None, 0] - at_m[:, 0]
         y = places_m[:, None, 1] - at_m[:, 1]
         r = np.sqrt(x * x + y * y)
@@ -115,7 +116,7 @@ class Electrodes:
 
 @functools.lru_cache(maxsize=64)
 def _radial(layer: Layer, reach_m: float) -> tuple[Float, float]:
-    """Return the table of displacement versus distance from a point force, and the table's step in metres.
+    """Return a table of displacement versus distance from a point force, and the distance step in metres.
 
     For a half-space, the table contains the solution of Boussinesq and Cerruti (Johnson, Contact Mechanics,
     1985, sections 3.2 and 3.6). For a layer, :class:`vcan_sim.contact.layer.PointResponse` adds the
@@ -145,7 +146,7 @@ def _clustered(force_n: Float) -> Float:
 
 
 def _cubic(field: Float, index: Float) -> Float:
-    """Interpolate a vector field (3, X, Y) at fractional indices (P, 2), with cubics through 4 × 4 cells."""
+    """Interpolate a vector field (3, X, Y) at fractional indices (P, 2) by cubic polynomials in x and y."""
     low = np.clip(np.floor(index).astype(np.intp) - 1, 0, np.array(field.shape[1:]) - 4)
     weights = _lagrange(index - low)
     found = np.zeros((len(index), 3))

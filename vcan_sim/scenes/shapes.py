@@ -19,7 +19,7 @@ Height = Callable[[Float], Float]
 
 @dataclass(frozen=True, slots=True)
 class Shape:
-    """Shape of a rigid body, as a height above its lowest point.
+    """Shape of a rigid body, given by the height of its surface above its lowest point.
 
     Attributes:
         height: Function from positions (…, 2) in the body frame, metres, to heights (…,), metres.
@@ -32,10 +32,10 @@ class Shape:
     key: tuple[object, ...]
 
     def over(self, places_m: Float, yaw_rad: float) -> Float:
-        """Return the height of a rotated body's surface at positions in the axes of the patch.
+        """Return the height of the rotated body's surface at given positions.
 
         Args:
-            places_m: (…, 2) positions relative to the body's lowest point, metres.
+            places_m: (…, 2) positions relative to the body's lowest point, in the axes of the patch, metres.
             yaw_rad: Rotation of the body about z, rad.
 
         Returns:
@@ -97,7 +97,7 @@ def box_edge(length_m: float, slope_rad: float, edge_radius_m: float) -> Shape:
         slope_rad: Angle between each flank and the skin, rad.
         edge_radius_m: Rounding radius of the edge, metres.
     """
-    tangent_m = edge_radius_m * math.sin(slope_rad)  # distance of the rounding's end from the edge
+    tangent_m = edge_radius_m * math.sin(slope_rad)  # half width of the rounding
     tangent_height_m = edge_radius_m * (1.0 - math.cos(slope_rad))
 
     def height(places_m: Float) -> Float:
@@ -126,5 +126,5 @@ def ridge(radius_m: float, length_m: float) -> Shape:
 
 
 def _rounded(distance_m: Float, radius_m: float) -> Float:
-    """Return a circle's height at a given horizontal distance from the circle's lowest point."""
+    """Return the height of a circle above its lowest point at a given horizontal distance from this point."""
     return np.asarray(radius_m - np.sqrt(np.maximum(radius_m**2 - distance_m**2, 0.0)))

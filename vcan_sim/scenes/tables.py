@@ -50,7 +50,7 @@ _REQUIRED_OF_MOTION: Final[dict[str, tuple[str, ...]]] = {
     "press": (),
 }
 KEY_OF_TRAVEL: Final[dict[str, str]] = {"slide": "by_m", "shear": "by_m", "roll": "by_m", "walk": "reach_m"}
-"""Key that sets the distance along the skin, for each kind of motion that moves the body along the skin."""
+"""Key with the displacement or distance, for each kind of motion along the skin."""
 
 _Coordinate = Annotated[float, Field(ge=-1, le=1, allow_inf_nan=False), Allowed("a number from -1 to 1")]
 _Place = Annotated[
@@ -84,19 +84,19 @@ class SkinConfig(Table):
     """Elastic layer of every patch in the scene, bonded to a rigid base."""
 
     thickness_m: Length | None = None
-    """Thickness of the elastic layer, metres; None: the height of the upper electrodes above the lower
-    electrodes of the patch."""
+    """Thickness of the elastic layer, metres; default: the height of the upper electrodes above the lower
+    electrodes."""
     young_pa: _Modulus | None = None
-    """Young's modulus, Pa; None: ``calibration.young_pa`` of the patch in the hand file."""
+    """Young's modulus, Pa; default: ``calibration.young_pa`` of the patch in the hand file."""
     poisson: _Poisson | None = None
-    """Poisson's ratio; None: ``calibration.poisson`` of the patch in the hand file."""
+    """Poisson's ratio; default: ``calibration.poisson`` of the patch in the hand file."""
 
 
 class BodyConfig(Table):
     """Rigid body that touches the skin."""
 
     name: Name
-    """Name of the body in the touches and in the ground truth."""
+    """Name by which touches and the ground truth refer to the body."""
     shape: Annotated[BodyShape, one_of(BodyShape)]
     """Shape of the part of the body that faces the skin."""
     radius_m: Length | None = None
@@ -105,9 +105,9 @@ class BodyConfig(Table):
     """Rounding radius (m) of the punch's rim (default: a tenth of the punch radius) or of the box's edge
     (default: 1 mm)."""
     length_m: Length | None = None
-    """Length (m) of the box's edge, or of the ridge without its round ends; along x at yaw 0."""
+    """Length (m) of the box's edge, or of the ridge without its round ends. At yaw 0, both lie along x."""
     slope_rad: _Slope | None = None
-    """Angle between the skin and the faces of the box next to its edge, rad; default: π/4."""
+    """Angle between the skin and each of the two faces that meet at the box's edge, rad; default: π/4."""
     radii_m: _Radii | None = None
     """Semi-axes (m) of the ellipsoidal fingertip along x, y (at yaw 0) and z."""
     friction: _Friction = 0.3
@@ -141,23 +141,24 @@ class MotionConfig(Table):
 
     kind: Annotated[MotionKind, one_of(MotionKind)]
     """``slide``: slide along the skin. ``shear``: slide along the skin and back. ``roll``: roll without slip.
-    ``turn``: rotate about z. ``walk``: slide at random. ``press``: change the depth or the force."""
+    ``turn``: rotate about z. ``walk``: slide along a random path. ``press``: change the depth or
+    the force."""
     from_s: _Time
     """Scene time at which the motion starts, s."""
     to_s: _Time
     """Scene time at which the motion ends, s."""
     by_m: _Place | None = None
-    """Displacement [x, y] in metres of ``slide`` and ``roll``, and of the outward half of ``shear``."""
+    """Displacement [x, y] of the body, metres. For ``shear``, the body then returns to its start."""
     by_rad: _Angle | None = None
-    """Angle of the rotation ``turn``, rad, counterclockwise as seen from above the skin."""
+    """Angle of rotation for ``turn``, rad, counterclockwise as seen from above the skin."""
     depth_m: Length | None = None
     """Depth (m) at the end of ``press``, for a touch with ``depth_m``."""
     force_n: _Force | None = None
     """Force (N) at the end of ``press``, for a touch with ``force_n``."""
     reach_m: Length | None = None
-    """Maximum distance of ``walk`` from its start, metres."""
+    """Maximum distance of the body from the start of ``walk``, metres."""
     every_s: _Duration | None = None
-    """Time between consecutive targets of ``walk``, s; default: 0.5."""
+    """Time between consecutive random targets of ``walk``, s; default: 0.5."""
     seed: Annotated[int, Field(ge=0), Allowed("an integer of at least 0")] | None = None
     """Random seed of ``walk``; default: 1."""
 
@@ -183,7 +184,7 @@ class TouchConfig(Table):
     to_s: _Time
     """Scene time of the last contact, s."""
     ramp_s: _Duration = 0.3
-    """Duration of the press at the start and of the lift at the end, s (minimum jerk)."""
+    """Duration of the press at the start and of the lift at the end (minimum-jerk profiles), s."""
     depth_m: Length | None = None
     """Depth of the body's lowest point below the undeformed surface, metres. Set either ``depth_m`` or
     ``force_n``."""
@@ -192,9 +193,9 @@ class TouchConfig(Table):
     yaw_rad: _Angle = 0.0
     """Rotation of the body about z, rad."""
     times: Annotated[int, Field(ge=1, le=1000), Allowed("an integer from 1 to 1000")] = 1
-    """Number of repetitions of the touch including the first, for example in a series of taps."""
+    """Number of times that the touch is performed, for example 5 for a series of five taps."""
     every_s: _Duration | None = None
-    """Time (s) between the starts of consecutive touches, if ``times`` is more than 1."""
+    """Time (s) from the start of one repetition to the start of the next, if ``times`` is more than 1."""
     motions: Annotated[tuple[MotionConfig, ...], Field(strict=False)] = ()
     """Motions of the body during the touch."""
 
@@ -205,13 +206,13 @@ class TouchConfig(Table):
 
     @property
     def each(self) -> tuple[TouchConfig, ...]:
-        """Repetitions of the touch, each as a touch with ``times`` = 1."""
+        """All repetitions of the touch, as separate touches with ``times`` = 1."""
         if self.times == 1:
             return (self,)
         return tuple(self._after(number * (self.every_s or 0.0)) for number in range(self.times))
 
     def _after(self, delay_s: float) -> TouchConfig:
-        """Return a single copy of this touch, delayed by ``delay_s``."""
+        """Return one repetition of this touch, delayed by ``delay_s``."""
 
         def later(table: Any, **changes: Any) -> Any:
             times = {"from_s": table.from_s + delay_s, "to_s": table.to_s + delay_s}
@@ -229,7 +230,7 @@ class TouchConfig(Table):
             raise ConfigError("to_s", self.to_s, f"later than from_s, {self.from_s} s")
         if self.to_s - self.from_s < 2.0 * self.ramp_s * (1.0 - 1e-9):
             most = 0.5 * (self.to_s - self.from_s)
-            raise ConfigError("ramp_s", self.ramp_s, f"at most half the touch, {most:g} s")
+            raise ConfigError("ramp_s", self.ramp_s, f"at most half the duration of the touch, {most:g} s")
         if self.times > 1 and self.every_s is None:
             raise ConfigError(
                 "every_s", NOTHING, "a number from 1e-3 to 86400 (s), because times is more than 1"
@@ -241,7 +242,7 @@ class TouchConfig(Table):
         return self
 
     def _check_motions(self) -> None:
-        """Check that all motions are within the touch's duration and that presses do not overlap in time."""
+        """Check that motions occur only during the touch, and that ``press`` motions do not overlap."""
         pressed_s = 0.0
         for i, motion in enumerate(self.motions):
             key = f"motions[{i}]"
@@ -255,9 +256,11 @@ class TouchConfig(Table):
                 continue
             own, other = ("force_n", "depth_m") if self.by_force else ("depth_m", "force_n")
             if getattr(motion, other) is not None:
-                raise ConfigError(f"{key}.{other}", getattr(motion, other), f"{own}, as in the touch")
+                raise ConfigError(
+                    f"{key}.{other}", getattr(motion, other), f"nothing, because the touch has {own}"
+                )
             if getattr(motion, own) is None:
-                raise ConfigError(f"{key}.{own}", None, f"a {own}, as in the touch")
+                raise ConfigError(f"{key}.{own}", None, f"a value, because the touch has {own}")
             if motion.from_s < pressed_s:
                 raise ConfigError(
                     f"{key}.from_s", motion.from_s, f"at least {pressed_s} s, the end of the preceding press"
@@ -268,7 +271,7 @@ class TouchConfig(Table):
 _FaultText = Annotated[
     str,
     Field(min_length=1, max_length=200),
-    Allowed('the text of a fault, such as "lost=0.1" or "unplugged"'),
+    Allowed('a fault, such as "lost=0.1" or "unplugged"'),
 ]
 
 
@@ -276,14 +279,14 @@ class FaultConfig(Table):
     """Scheduled faults of a patch, a wire or a bus."""
 
     where: Annotated[str, Field(min_length=1, max_length=80), Allowed("the name of a patch, wire or bus")]
-    """Name of the faulty patch or bus, or a wire such as ``palm upper 3``. Wires are numbered from 0."""
+    """Name of the faulty patch or bus, or of a wire, such as ``palm upper 3``. Wires are numbered from 0."""
     fault: _FaultText
     """Faults as in ``vcan-sim --fault``: ``unplugged``, ``lost=0.1``, or several separated by commas. For a
     wire: ``open``, ``shorted``, ``noisy``, ``frozen`` or ``crossed``."""
     from_s: _Time = 0.0
     """Scene time at which the faults start, s."""
     to_s: _Time | None = None
-    """Scene time at which the faults end, s; None: the faults last until the scene ends or repeats."""
+    """Scene time at which the faults end, s; default: the end or repetition of the scene."""
 
     @model_validator(mode="after")
     def _end_after_start(self) -> FaultConfig:
@@ -298,21 +301,22 @@ class SceneConfig(Table):
     name: Name = "scene"
     """Name of the scene."""
     step_s: _Step = 0.03
-    """Time step of the contact mechanics, s. The state between time steps is interpolated smoothly, which
-    blurs motions shorter than four steps."""
+    """Time step of the contact mechanics, s. The state between time steps is interpolated. Motions
+    shorter than four time steps are therefore smoothed."""
     cells: Annotated[int, Field(ge=8, le=128), Allowed("an integer from 8 to 128")] = 20
     """Number of cells across a contact. With 20 cells, errors are below 1 % for forces and below 3 % for
     areas. The computing time grows with the square of this number."""
     repeat_s: _Duration | None = None
-    """Period after which the scene repeats, s; None: the scene plays once."""
+    """Period after which the scene repeats, s; default: the scene plays only once."""
     skin: SkinConfig = SkinConfig()
     imperfections: Annotated[
-        Any,  # with a union, messages would list its members
+        Any,  # with a union type, error messages would list all of its members
         Field(default_factory=dict),
         Allowed('"ordinary", or a table of imperfections'),
     ]
-    """Imperfections of all patches: ``"ordinary"`` for carefully manufactured patches, or a table of sizes,
-    in which ``ordinary = true`` and ``seed`` are also allowed; default: patches that equal their layouts."""
+    """Imperfections of all patches: ``"ordinary"`` for carefully manufactured patches, or a table with the
+    sizes of the imperfections. The table may also contain ``ordinary = true`` and ``seed``. By default, the
+    patches match their layouts exactly."""
     bodies: Annotated[tuple[BodyConfig, ...], Field(strict=False), Allowed("tables [[bodies]]")] = ()
     """Rigid bodies of the scene."""
     touches: Annotated[tuple[TouchConfig, ...], Field(strict=False), Allowed("tables [[touches]]")] = ()
@@ -341,7 +345,7 @@ class SceneConfig(Table):
         return Imperfections.from_table(given)
 
     def where(self, key: str) -> str:
-        """Return ``file:line:column`` of a dotted key, for error messages; empty if there is no file."""
+        """Return the position ``file:line:column`` of a dotted key, or "" if the scene has no file."""
         return self._read_of.where(key_path(key))
 
     @model_validator(mode="after")
@@ -382,7 +386,7 @@ class SceneConfig(Table):
         return self
 
     def _check_motions(self, number: int, touch: TouchConfig) -> None:
-        """Check that only spheres roll, and ridges only across their axis."""
+        """Check that only spheres and ridges roll, and that ridges roll perpendicular to their axis."""
         body, key = self.body(touch.body), f"touches[{number}].motions"
         turns = any(motion.kind == "turn" for motion in touch.motions)
         for j, motion in enumerate(touch.motions):
@@ -390,13 +394,16 @@ class SceneConfig(Table):
                 continue
             if body.shape not in ("sphere", "ridge"):
                 allowed = (
-                    f"another kind; roll requires a sphere or a ridge, and {body.name!r} is a {body.shape}"
+                    "a kind other than roll, which requires a sphere or a ridge; "
+                    f"{body.name!r} is a {body.shape}"
                 )
                 raise ConfigError(f"{key}[{j}].kind", motion.kind, allowed)
             x, y = motion.by_m or (0.0, 0.0)
             along = x * math.cos(touch.yaw_rad) + y * math.sin(touch.yaw_rad)
             if body.shape == "ridge" and (turns or abs(along) > 1e-3 * math.hypot(x, y)):
-                allowed = f"a direction across the ridge, whose yaw is {touch.yaw_rad:g} rad, and no turn"
+                allowed = (
+                    f"a displacement perpendicular to the ridge (yaw {touch.yaw_rad:g} rad), and no turn"
+                )
                 raise ConfigError(f"{key}[{j}].by_m", [x, y], allowed)
 
 
@@ -406,21 +413,23 @@ def _meet(one: TouchConfig, two: TouchConfig) -> bool:
 
 
 def read_scene(path: Path | str) -> SceneConfig:
-    """Read a scene file. :func:`vcan_sim.scenes.load_scene` also checks its touches on the patches of a hand.
+    """Read a scene file without checking the scene for a particular hand.
+
+    :func:`vcan_sim.scenes.load_scene` also performs these checks.
 
     Args:
         path: Scene file.
 
     Raises:
-        ConfigError: If the file cannot be read or is not a scene. The message is one line with line and
-            column.
+        ConfigError: If the file cannot be read or is not a scene. The message states the line and column of
+            the error.
     """
     path = Path(path)
     return _parse(read_toml(path, "scene file"))
 
 
 def parse_scene(table: Mapping[str, Any], *, where: str = "") -> SceneConfig:
-    """Make a scene from a table with the keys of a scene file.
+    """Create a scene from a table with the keys of a scene file.
 
     Args:
         table: Scene as a table, as returned by tomllib.
@@ -448,11 +457,11 @@ def _require_keys(
     allowed: Mapping[str, tuple[str, ...]],
     required: Mapping[str, tuple[str, ...]],
 ) -> None:
-    """Raise ConfigError if a given key is not allowed for a shape or kind, or a required key is missing."""
+    """Raise ConfigError if a key is given but not allowed with ``value``, or required but missing."""
     for name in sorted({each for keys in allowed.values() for each in keys}):
         given = getattr(table, name)
         if given is not None and name not in allowed[value]:
             owners = " or ".join(f'"{each}"' for each, keys in allowed.items() if name in keys)
             raise ConfigError(name, given, f"only with {key} = {owners}")
         if given is None and name in required[value]:
-            raise ConfigError(name, NOTHING, f"a value, because {key} is {value!r}")
+            raise ConfigError(name, NOTHING, f"a value, as required for {key} = {value!r}")

@@ -18,18 +18,18 @@ from vcan_sim.scenes.tables import KEY_OF_TRAVEL, SceneConfig, TouchConfig
 from vcan_sim.scenes.window import FRICTION_MARGIN, MARGIN, BodyKey, TooMuch, Window, window_of
 
 DEEPEST: Final = 0.9
-"""Maximum depth of a body, as a fraction of the smaller of layer thickness and electrode height."""
+"""Maximum depth of a body, as a fraction of the layer thickness or electrode height, whichever is smaller."""
 APART: Final = 3.0
-"""Minimum distance between the contacts of two bodies on a patch, as a multiple of the layer thickness or of
-the larger contact's half width, whichever is smaller. The simulator neglects the displacement that one
-contact causes at another. At the minimum distance, the neglected displacement is at most 3 % of the depth
-(incompressible layer 2 mm thick, sphere of radius 40 mm)."""
+"""Minimum distance between simultaneous contacts on a patch, as a multiple of the layer thickness or of the
+larger contact's half width, whichever is smaller. At this distance or more, the simulator can neglect the
+displacement that one contact causes at another: at most 3 % of the depth for a sphere of radius 40 mm on an
+incompressible layer 2 mm thick."""
 
 
 def window_of_touch(
     scene: SceneConfig, number: int, touch: TouchConfig, layer: Layer, layout: PatchLayout
 ) -> Window:
-    """Return a touch's window of cells. Raises ConfigError if the touch is too deep for the layer."""
+    """Return the window of cells for a touch. Raises ConfigError if the touch is too deep for the layer."""
     most = DEEPEST * min(layer.thickness_m, layout.height_m)
     level, key = highest_level(touch), "force_n" if touch.by_force else "depth_m"
     path = f"touches[{number}].{key}"
@@ -37,7 +37,9 @@ def window_of_touch(
         if motion.kind == "press" and getattr(motion, key) == level != getattr(touch, key):
             path = f"touches[{number}].motions[{j}].{key}"
     if not touch.by_force and level > most:
-        allowed = f"at most {most:.3g} m, nine tenths of the thickness of the layer on {touch.patch!r}"
+        allowed = (
+            f"at most {most:.3g} m, nine tenths of the layer thickness or electrode height on {touch.patch!r}"
+        )
         raise error_at(scene, path, level, allowed)
     body = scene.body(touch.body)
     shape, margin = BodyKey(body.build()), MARGIN + FRICTION_MARGIN * body.friction
@@ -66,7 +68,7 @@ def check_on_patch(  # noqa: PLR0913 - all inputs of the check
     places_m: Float,
     pitch_m: float,
 ) -> None:
-    """Raise ConfigError if a contact would extend more than half a pitch beyond the outermost electrodes."""
+    """Raise ConfigError if a contact extends more than half a pitch beyond the outermost electrodes."""
     half = np.array(window.half_m)
     low = places_m.min(axis=0) - 0.5 * pitch_m + half
     high = places_m.max(axis=0) + 0.5 * pitch_m - half
@@ -113,12 +115,12 @@ def check_apart(
         if float(np.hypot(*beyond)) >= gap:
             continue
         allowed = (
-            f"a place or time at which its contact stays {1e3 * gap:.3g} mm away from that of touches[{j}]; "
-            f"at {number * scene.step_s:.3g} s the distance is {1e3 * float(np.hypot(*beyond)):.3g} mm"
+            f"a position at least {1e3 * gap:.3g} mm from the contact of touches[{j}], or another time; "
+            f"at {number * scene.step_s:.3g} s, the distance is {1e3 * float(np.hypot(*beyond)):.3g} mm"
         )
         raise error_at(scene, f"touches[{i}].at_m", list(touch.at_m), allowed)
 
 
 def error_at(scene: SceneConfig, key: str, got: object, allowed: str) -> ConfigError:
-    """Return a ConfigError for a value in a scene file, with the file, line and column of its key."""
+    """Return a ConfigError that states the file, line and column of an invalid value in a scene file."""
     return ConfigError(key, got, allowed, where=scene.where(key))

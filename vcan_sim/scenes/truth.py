@@ -55,7 +55,7 @@ class BodyContact:
 
 @dataclass(frozen=True, eq=False)
 class PatchTruth:
-    """Contacts on a patch at one instant, and the displacement of its skin.
+    """Contacts on a patch and displacement of the patch's skin at one instant.
 
     Attributes:
         t_s: Scene time, s.

@@ -16,25 +16,25 @@ from vcan_sim.contact.solve import press
 from vcan_sim.scenes.shapes import Float, Shape
 
 MOST_CELLS: Final = 1.4
-"""Maximum number of cells in a window, relative to the squared number of cells across its narrow side. A
-longer window uses cells of up to twice the size instead of more cells."""
+"""Maximum number of cells in a window, as a multiple of n², where n is the requested number of cells across
+the narrow side. Longer windows have larger cells, up to twice the size."""
 MARGIN: Final = 0.1
-"""Margin of the window around the deepest contact, relative to the contact's half width; at least
-``MARGIN_CELLS`` cells."""
+"""Margin of the window around the deepest contact, relative to the contact's half width. The margin is at
+least ``MARGIN_CELLS`` cells wide."""
 FRICTION_MARGIN: Final = 0.15
 """Additional margin per unit of the friction coefficient, because a sliding body piles up the skin in front
 of it."""
 MARGIN_CELLS: Final = 2
 CLOSE: Final = 3e-4
-"""Tolerance of the contact mechanics (:func:`vcan_sim.contact.solve.press`), relative to the depth."""
+"""Tolerance of the contact solver (:func:`vcan_sim.contact.solve.press`), relative to the depth."""
 FORCE_CLOSE: Final = 2e-3
-"""Tolerance of the normal force of a force-controlled touch, relative to the force."""
+"""Relative tolerance of the normal force of a force-controlled touch."""
 _TURNS: Final = 12
-"""Maximum number of window sizes to try."""
+"""Maximum number of window sizes to try for one contact."""
 _SEARCHES: Final = 40
-"""Maximum number of depths to try when searching for a force."""
+"""Maximum number of depths to try when searching for the depth at a given force."""
 _NOWHERE_M: Final = -1.0
-"""Overlap (m) of body and skin where there is no body: any large negative length."""
+"""Lower limit of the overlap (m); the overlap has this value at points outside the body."""
 
 
 class TooMuch(ValueError):
@@ -79,7 +79,7 @@ def overlap_m(grid: Grid, shape: Shape, offset_m: Float, yaw_rad: float, depth_m
 
 
 def centred_m(grid: Grid) -> Float:
-    """Return the centre (2,) of a grid's first cell in metres, relative to the middle of the grid."""
+    """Return the centre (2,) of a grid's first cell relative to the middle of the grid, metres."""
     return -0.5 * grid.size_m * (np.array(grid.shape, float) - 1.0)
 
 
@@ -125,7 +125,7 @@ def window_of(  # noqa: PLR0913 - all inputs of a contact
 
 @dataclass(frozen=True, eq=False)
 class BodyKey:
-    """Shape of a body with equality and hash by the shape's key, so that it can index a cache."""
+    """Hashable wrapper of a body's shape, for use as a cache key."""
 
     shape: Shape
 
@@ -144,15 +144,15 @@ def solve_depth(
 ) -> float:
     """Find the depth at which the contact force reaches a target.
 
-    The search takes bracketed secant steps on logarithms, because the contact force is nearly a power of
-    depth. Every second step halves the bracket, because the force increases more steeply while only a few
-    cells are in contact.
+    The search uses a bracketed secant method for the logarithms of force and depth, because the force is
+    nearly a power of the depth. This is not the case while only a few cells are in contact, so every second
+    step bisects the bracket.
 
     Args:
-        force_n: Function from depth, metres, to force, N. The search calls this function last with the
-            returned depth.
+        force_n: Function from depth (m) to force (N). Its last call is for the returned depth.
         target_n: Target force, N, positive.
-        known: A depth (m) and the force (N) at this depth; the first trial depth assumes F ∝ δ^1.5.
+        known: Known pair of depth (m) and force (N), from which the first trial depth is extrapolated with
+            F ∝ δ^1.5.
         close: Tolerance of the force, relative to the target.
 
     Raises:
@@ -222,7 +222,7 @@ def _grid_of(layer: Layer, shape: tuple[int, int], size_m: float) -> Grid:
 
 
 def _grid(layer: Layer, half_m: Float, across: int) -> Grid:
-    """Return a grid with sides along x and y of at least twice ``half_m`` (2,), in metres."""
+    """Return a grid with side lengths along x and y of at least twice ``half_m`` (2,), metres."""
     wide = 2.0 * half_m
     narrow = float(wide.min())
     size = max(narrow / across, math.sqrt(float(wide.prod()) / MOST_CELLS) / across)
@@ -234,7 +234,7 @@ def _grid(layer: Layer, half_m: Float, across: int) -> Grid:
 
 
 def _extent_m(shape: Shape, yaw_rad: float, depth_m: float) -> Float:
-    """Return a rough upper bound (2,) of a body's half width along x and y, in metres, at a depth."""
+    """Return rough upper bounds (2,) for a body's half width (m) along x and y at a given depth."""
     reach = 1e-5
     for _ in range(20):
         line = np.linspace(-reach, reach, 65)
@@ -244,7 +244,7 @@ def _extent_m(shape: Shape, yaw_rad: float, depth_m: float) -> Float:
         if extent.max() < reach * (1.0 - 1e-9):
             break
         reach *= 2.0
-    for axis in (0, 1):  # the sampling above may miss a narrow body
+    for axis in (0, 1):  # a narrow body may lie between the points sampled above
         line = np.linspace(0.0, extent[axis] + 2.0 * reach / 64, 257)
         places = np.stack([line, 0.0 * line] if axis == 0 else [0.0 * line, line], axis=-1)
         inside = shape.over(places, yaw_rad) <= depth_m

@@ -1,4 +1,4 @@
-"""Simulated skin as manufactured and read out: deviations of a patch from its layout file.
+"""Simulation of imperfect patches: deviations of a patch and its read-out from the layout file.
 
 ::
 
@@ -6,7 +6,7 @@
     scene -> history (hysteresis and creep of the rubber) -> forward (conductance of each path)
         -> crossbar (resistances between wires, as read out) -> front_end (amplifier, converter)
 
-Module ``patch`` runs this chain for one patch at any time. This package shares no code with the solvers. If
-all sizes are zero, the patch is exact: it has point electrodes at the positions of the layout, and its
-readings are resistances between isolated pairs of wires.
+The module ``patch`` performs these calculations for one patch at a given time. This package shares no code
+with the solvers. If all sizes are zero, the patch is exact: it has point electrodes at the positions in the
+layout file, and each reading is the resistance of an isolated pair of wires.
 """

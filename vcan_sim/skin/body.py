@@ -13,9 +13,9 @@ from skinnode.model.layout import Float, PatchLayout
 from vcan_sim.skin.imperfections import Imperfections
 
 CLIPPED_AT: Final = 3.0
-"""Maximum magnitude of a normal random draw, in standard deviations."""
+"""Limit at which normal random draws are clipped, in standard deviations."""
 _LEAST_LEFT: Final = 0.1
-"""Minimum fraction of the nominal gap between an upper electrode and its nearest lower electrode."""
+"""Minimum gap between an upper electrode and its nearest lower electrode, relative to the nominal gap."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,7 +40,7 @@ class Draws:
         self._seed, self._number = seed, number
 
     def stream(self, name: str, *more: int) -> np.random.Generator:
-        """Return the random generator of the imperfection ``name``, or of its occurrence number ``more``."""
+        """Return a random generator for the imperfection ``name``; ``more`` selects an independent one."""
         return np.random.default_rng([self._seed, self._number, *name.encode(), *more])
 
     def normal(self, name: str, *shape: int) -> Float:
@@ -64,7 +64,7 @@ def made(layout: PatchLayout, imperfections: Imperfections, draws: Draws) -> Bod
         Actual electrode positions; the layout's own arrays if no imperfection moves the electrodes.
 
     Raises:
-        ConfigError: If the draws leave too small a gap between an upper and a lower electrode.
+        ConfigError: If the random errors make the gap between an upper and a lower electrode too small.
     """
     sizes, upper, lower = imperfections, layout.upper_m, layout.lower_m
     if not (sizes.placement or sizes.along or sizes.thickness or sizes.tilt):
@@ -89,7 +89,7 @@ def made(layout: PatchLayout, imperfections: Imperfections, draws: Draws) -> Bod
     if left.min() < _LEAST_LEFT:
         raise ConfigError(
             "placement, along, thickness, tilt",
-            Shown(f"draws that leave {left.min():.0%} of the gap at an electrode"),
+            Shown(f"random errors that leave {left.min():.0%} of the gap at an electrode"),
             f"at least {_LEAST_LEFT:.0%}; use smaller sizes or another seed",
         )
     return Body(upper, lower)

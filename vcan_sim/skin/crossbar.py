@@ -1,10 +1,11 @@
-"""Resistances measured by a crossbar read-out, computed by nodal analysis of the whole network.
+"""Resistances measured by a crossbar read-out, computed by nodal analysis of the complete network.
 
-Each electrode of a resistive wire is a node; the wire forms a resistor ladder that starts at the connector. A
-wire without resistance is a single node. Each path between an upper and a lower electrode has a conductance
-C. In series with each wire are its contact and either a multiplexer (upper wires) or an amplifier input
-(lower wires). With the conductances T of the ladders and connectors, the voltages v of the upper nodes and w
-of the lower nodes obey Kirchhoff's current law (Ho, Ruehli and Brennan, IEEE Trans. Circuits Syst. 22, 1975):
+Each electrode of a resistive wire is a node, and the wire is a chain of resistors that starts at the
+connector. A wire without resistance is a single node. Each path between an upper and a lower electrode has a
+conductance C. In series with each wire are its contact and either a multiplexer (upper wires) or an amplifier
+input (lower wires). With the conductances T of the resistor chains and connectors, the voltages v of the
+upper nodes and w of the lower nodes obey Kirchhoff's current law (Ho, Ruehli and Brennan, IEEE Trans.
+Circuits Syst. 22, 1975):
 
     ⎡ A_u   −C ⎤ ⎡ v ⎤   ⎡ currents fed ⎤
     ⎢          ⎥ ⎢   ⎥ = ⎢              ⎥,    A_u = diag(C 1) + T_u,    A_l = diag(Cᵀ 1) + T_l
@@ -29,8 +30,8 @@ class Side:
     """Upper or lower wires of a crossbar, with their resistances.
 
     Args:
-        series_ohm: (W,) float64, ohm: resistance in series with each wire or its ladder: contact plus
-            multiplexer or amplifier input.
+        series_ohm: (W,) float64, ohm: resistance in series with each wire: contact plus multiplexer or
+            amplifier input.
         wire_ohm: Resistance of a wire per electrode pitch, ohm; 0 for wires that are single nodes.
         electrodes: Number of electrodes per wire.
     """
@@ -51,7 +52,7 @@ class Side:
 
     @property
     def ideal(self) -> bool:
-        """Whether the wires have no resistance to their sources or amplifiers."""
+        """Whether the wires are connected to their sources or amplifiers without any resistance."""
         return not self.feed_ohm.any()
 
     def first(self) -> Float:
@@ -62,7 +63,9 @@ class Side:
         return found
 
     def diagonals(self, sums: Float, feed: Float | float) -> tuple[Float, Float]:
-        """Return diag(sums) + T as diagonal (n,) and upper off-diagonal (n,); its first entry is unused.
+        """Return the diagonal (n,) and the superdiagonal (n,) of the matrix diag(sums) + T.
+
+        The first entry of the superdiagonal is unused.
 
         Args:
             sums: (n,) float64, S: conductances of the paths at each node.
@@ -106,7 +109,7 @@ def grounded_ohm(conductance: Float, upper: Side, lower: Side) -> Float:
 
 
 def floating_ohm(conductance: Float, upper: Side, lower: Side) -> Float:
-    """Return each wire pair's resistance (U, K) in ohm while all other wires float (``floating``).
+    """Return the resistance (U, K) in ohm of each wire pair while all other wires float (``floating``).
 
     A reading is the effective resistance between two nodes of the network, Z_uu + Z_kk − 2 Z_uk, with the
     inverse Z of the nodes' conductance matrix (Klein and Randić, J. Math. Chem. 12, 1993), plus the
@@ -122,7 +125,8 @@ def floating_ohm(conductance: Float, upper: Side, lower: Side) -> Float:
     solved = _tridiagonal(lower.diagonals(below, 0.0), np.hstack([conductance.T, ends]))
     across, own = np.split(solved, [len(above)], axis=1)
     schur = _dense(upper.diagonals(above, 0.0)) - conductance @ across
-    # the network floats: adding a constant to all elements fixes the mean of v but no voltage difference
+    # The network floats, so its matrix is singular. Adding a constant to all elements fixes the mean of v
+    # without changing the voltage differences.
     schur += above.mean()
     z = np.linalg.inv(schur)
     between = across[:: lower.nodes] @ z  # (K, upper nodes): Z_lu

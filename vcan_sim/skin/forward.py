@@ -1,19 +1,19 @@
 """Conductances between the electrodes of a patch.
 
 An exact patch has point electrodes. The path between two point electrodes at distance d has the resistance
-ρ d, so its conductance is 1 / (ρ d): the potential of a point charge. :class:`ExactForward` computes the
-exact patch by direct summation. :class:`Paths` adds two effects:
+ρ d. Its conductance 1 / (ρ d) has the form of the potential of a point charge. :class:`ExactForward` sums the
+conductances of an exact patch directly. :class:`Paths` adds two effects:
 
 finite electrodes   A conducting disc of radius a has the potential arcsin(2a / (l₁ + l₂)) / a instead of 1/d,
                     where l₁ and l₂ are the distances to the nearest and the farthest point of its rim
                     (Weber 1873; Jackson, Classical Electrodynamics, 3rd ed., problem 3.3). The conductance
                     between two discs averages this potential over a parallel disc with the charge density
-                    1/√(a² − r²). To order a², the average is the potential of one disc of radius √2 a,
-                    because each disc adds (a²/6) ∇²(1/d), with the Laplacian in the plane. The next order is
-                    (a/d)⁴.
-strain              ρ of a path becomes ρ (1 + β ε), with the path's strain ε = d/d₀ − 1 relative to rest: the
-                    linear piezoresistive law (Smith, Phys. Rev. 94, 1954) for each path separately. This
-                    simplified model neglects strain perpendicular to the path.
+                    1/√(a² − r²). Each of the two discs adds (a²/6) ∇²(1/d), where ∇² is the Laplacian in
+                    the plane. The average is therefore approximated by the potential of one disc of radius
+                    √2 a; the relative error is of order (a/d)⁴.
+strain              The resistivity ρ of a path becomes ρ (1 + β ε), where ε = d/d₀ − 1 is the strain of the
+                    path relative to rest. This is the linear piezoresistive law (Smith, Phys. Rev. 94, 1954)
+                    for each path separately. The model neglects strain perpendicular to the path.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ from skinnode.model.layout import Float
 class ExactForward:
     """Resistances of a patch with point electrodes, by direct summation.
 
-    This class shares no code with the solvers' kernels, so truth and solver cannot share a bug. It is six
-    times as fast as the reference model because it allocates no (…, 3) temporary arrays.
+    This class shares no code with the solvers' kernels, so the ground truth and the solvers
+    cannot share a bug. It allocates no temporary arrays of shape (…, 3), which makes it fast.
 
     Args:
         shape: (U, N, K, M): upper wires, electrodes per upper wire, lower wires, electrodes per lower wire.
@@ -57,7 +57,7 @@ class ExactForward:
 
 
 class Paths:
-    """Conductances of all paths between upper and lower electrodes, for a resistivity of 1 ohm/m.
+    """Conductances of all paths between upper and lower electrodes, multiplied by the resistivity.
 
     Args:
         upper_m: (U, N, 3) float64, m: upper electrodes at rest.
@@ -86,13 +86,13 @@ class Paths:
             axes: Axes of ``shape`` to sum over: 1, 3, both or none.
 
         Returns:
-            (U, N or 1, K, M or 1) float64, 1/m; siemens when divided by the resistivity in ohm/m.
+            (U, N or 1, K, M or 1) float64, 1/m. Divide by the resistivity in ohm/m to obtain siemens.
         """
         with self._lock:
             return np.asarray(self._each(upper_m).reshape(shape).sum(axis=axes, keepdims=True))
 
     def _each(self, upper_m: Float) -> Float:
-        """Return the conductance of every path (U N, K M), 1/m, in an array that the next call overwrites."""
+        """Return the conductances (U N, K M) of all paths, 1/m, in an array that the next call overwrites."""
         plane, square = self._squares(upper_m)
         found: Float = self._work[2]
         with np.errstate(divide="ignore"):
@@ -120,9 +120,10 @@ class Paths:
 
 
 def _disc(plane: Float, square: Float, radius_m: float, out: Float) -> None:
-    """Write the potential in 1/m of a conducting disc of unit charge; overwrites ``plane``.
+    """Write the potential in 1/m of a conducting disc of unit charge to ``out``; overwrites ``plane``.
 
-    (l₁ + l₂)² / 4 = (s + √(s² − 4 a² p)) / 2 with s = d² + a², as l₁² l₂² = s² − 4 a² p.
+    The potential depends on (l₁ + l₂)² / 4 = (s + √(s² − 4 a² p)) / 2, where s = d² + a². This
+    follows from l₁² l₂² = s² − 4 a² p.
 
     Args:
         plane: p, squared distances in m² from the disc's axis.

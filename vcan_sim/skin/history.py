@@ -1,19 +1,19 @@
 """Hysteresis and creep of the rubber: the displacement that a load causes depends on earlier loads.
 
-Hysteresis and creep act on each coordinate of each electrode's displacement, hysteresis first:
+The model is applied to each coordinate of each electrode's displacement, first hysteresis and then creep:
 
-hysteresis   the fraction w of the displacement passes through play operators in parallel, each of which
-             follows its input only outside a band of ±r: p ← max(s − r, min(s + r, p)), p = 0 at first. The
+hysteresis   The fraction w of the displacement passes through parallel play operators. Each operator follows
+             its input s only outside a band of ±r: p ← max(s − r, min(s + r, p)), with p = 0 initially. The
              hysteresis loop does not depend on the rate of loading (Prandtl-Ishlinskii operator; Brokate and
              Sprekels, Hysteresis and Phase Transitions, 1996, section 2.3).
-creep        d = s + c₁ q₁ + c₂ q₂ with τᵢ dqᵢ/dt = s − qᵢ: a Prony series, that of two Kelvin-Voigt elements
-             (Findley, Lai and Onaran, Creep and Relaxation of Nonlinear Viscoelastic Materials, 1976,
-             section 5.5). A step of s gives s (1 + Σ cᵢ (1 − exp(−t/τᵢ))).
+creep        d = s + c₁ q₁ + c₂ q₂, where τᵢ dqᵢ/dt = s − qᵢ. This is the Prony series of two Kelvin-Voigt
+             elements (Findley, Lai and Onaran, Creep and Relaxation of Nonlinear Viscoelastic Materials,
+             1976, section 5.5). The response to a step s is s (1 + Σ cᵢ (1 − exp(−t/τᵢ))).
 
-The output of the two stages is the true displacement of the electrodes. The state advances in time steps of
-:data:`STEP_S` from time 0, and the output of the hysteresis is assumed to be linear within a step. For a time
-within a step, a partial step is computed but not stored. The displacement therefore does not depend on which
-times were requested earlier.
+The result is the true displacement of the electrodes. The state is computed in time steps of :data:`STEP_S`
+from time 0, on the assumption that the output of the hysteresis model is linear within each step. For a time
+between two steps, a partial step is computed but not stored. The displacement therefore does not depend on
+which times were requested earlier.
 """
 
 from __future__ import annotations
@@ -30,26 +30,26 @@ from skinnode.model.layout import Float
 from vcan_sim.skin.imperfections import Imperfections
 
 STEP_S: Final = 1.0 / 32.0
-"""Time step of the rubber's state, s; a power of two, so that the times of all steps are exact."""
+"""Time step of the rubber's state, s. The value is a power of two, so the times of all steps are exact."""
 THRESHOLDS: Final = (0.0025, 0.005, 0.01, 0.02)
 """Thresholds r of the play operators, as fractions of the clearance; the operators have equal weights."""
 _RECENT: Final = 128
-"""Number of recent time steps with stored states."""
+"""Number of most recent time steps whose states are stored."""
 _KEPT_EVERY: Final = 64
-"""Interval between the states in long-term storage, in time steps: 2 s."""
+"""Number of time steps between states that are stored for longer; the interval is 2 s."""
 _KEPT: Final = 300
-"""Number of states in long-term storage: ten minutes. Of the older states, only every ``_THINNED``-th is
-kept."""
+"""Number of states stored at intervals of ``_KEPT_EVERY`` steps, for ten minutes. Of the states older than
+this, only every ``_THINNED``-th is kept."""
 _THINNED: Final = 64
 
 Load = Callable[[float], "Float | None"]
-"""Function of the time (s) that returns the displacement (U, N, 3), in m, of rubber without memory, or None
-at rest."""
+"""Function that takes the time (s) and returns the displacement (U, N, 3) without hysteresis and creep, in m,
+or None at rest."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class State:
-    """State (m) of the rubber at one instant, for each coordinate (U, N, 3) of the displacement."""
+    """State of the rubber at one instant, in m, for each coordinate (U, N, 3) of the displacement."""
 
     play: Float
     """(P, U, N, 3): outputs of the play operators."""
@@ -81,9 +81,9 @@ class History:
         """Return the rubber's displacement (U, N, 3), in m, at ``t_s``; None before the first load.
 
         Args:
-            t_s: Time since the start, s. The history starts at time 0.
-            load: Displacement without memory, as a pure function of time. Passing a different function
-                restarts the history.
+            t_s: Time since the start of the history, s.
+            load: Displacement without hysteresis and creep, as a pure function of time. Passing a different
+                function restarts the history.
         """
         if t_s < 0.0:
             return load(t_s)
@@ -100,7 +100,7 @@ class History:
         return np.asarray(state.followed + np.tensordot(self._creep, state.delayed, axes=1))
 
     def _at(self, step: int, load: Load) -> State | None:
-        """Return the state at a time step, advanced from the latest stored state at or before this step."""
+        """Return the state at a time step, computed from the latest stored state up to this step."""
         known = step
         while known >= 0 and known not in self._recent and known not in self._kept:
             known -= 1
@@ -125,7 +125,7 @@ class History:
             self._recent.popitem(last=False)
 
     def _advanced(self, state: State | None, load_m: Float | None, dt_s: float) -> State | None:
-        """Return the state ``dt_s`` later, when the load is ``load_m``."""
+        """Return the state after a step of ``dt_s`` at whose end the load is ``load_m``."""
         if state is None:
             if load_m is None:
                 return None

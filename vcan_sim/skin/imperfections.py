@@ -1,4 +1,4 @@
-"""Sizes of all imperfections of a simulated patch, as data."""
+"""Sizes of all imperfections of a simulated patch."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ _OF_NETWORK: Final = (
 )
 """Resistances that are modelled only with the read-outs ``grounded`` and ``floating``."""
 _WITHOUT_SIZE: Final = ("seed", "temperature_per_k", "warming_s", "creep_s")
-"""Fields that have no effect while every size is zero."""
+"""Fields that are not sizes; they have no effect if all sizes are zero."""
 _BITS: Final = (8, 32)
 
 
@@ -54,7 +54,7 @@ class Imperfections:
 
     A size marked *drawn* is the standard deviation of normal random draws, which are clipped at three
     standard deviations. Each imperfection has its own random stream, so enabling one imperfection does not
-    change the others.
+    change the random draws of the others.
 
     Raises:
         ConfigError: If a value has the wrong type or is out of range, or a resistance of the network is
@@ -82,12 +82,11 @@ class Imperfections:
     strain: float = 0.0
     """Relative change in resistivity per unit strain of a path between two electrodes."""
     warming_k: float = 0.0
-    """Final rise in temperature after the scene starts, K; the temperature approaches this value
-    exponentially."""
+    """Final temperature rise, K, which is approached exponentially after the start of the scene."""
     temperature_per_k: float = 2e-3
-    """Relative change in resistivity per kelvin; has an effect only with ``warming_k``."""
+    """Relative change in resistivity per kelvin. This value has no effect if ``warming_k`` is 0."""
     warming_s: float = 300.0
-    """Time constant of the rise in temperature, s."""
+    """Time constant of the temperature rise, s."""
     creep: tuple[float, float] = (0.0, 0.0)
     """Delayed displacements of the fast and the slow creep term, as fractions of the immediate
     displacement."""
@@ -98,8 +97,8 @@ class Imperfections:
 
     # --- read-out
     gain: float = 0.0
-    """Gain error of the amplifier, as a fraction of each resistance change from rest; drawn. Half of
-    the variance is common to the whole patch; the other half is independent for each upper wire."""
+    """Gain error of the amplifier, as a fraction of each resistance change from rest; drawn. Half of the
+    variance is common to the whole patch. The other half is independent for each upper wire."""
     offset: float = 0.0
     """Offset error of each upper wire's readings, as a fraction of the median resistance at rest; drawn."""
     readout: Readout = "ideal"
@@ -124,7 +123,7 @@ class Imperfections:
     """Standard deviation of the converter's noise, as a fraction of its full scale. This noise adds to the
     scene's noise, which is relative to the reading."""
     bits: int = 0
-    """Resolution of the converter, 8 to 32 bits; 0: no rounding."""
+    """Resolution of the converter, 8 to 32 bits; 0 for no rounding."""
 
     def __post_init__(self) -> None:
         for name in ("seed", "bits"):
@@ -144,7 +143,7 @@ class Imperfections:
 
     @property
     def exact(self) -> bool:
-        """Whether every size is zero, so that the patch equals its layout."""
+        """Whether every size is zero, so that the patch matches its layout exactly."""
         unsized = {name: getattr(EXACT, name) for name in _WITHOUT_SIZE}
         return dataclasses.replace(self, **unsized) == EXACT
 
@@ -154,7 +153,8 @@ class Imperfections:
 
         Gain, placement, thickness and electrode radius have the values in
         :data:`skinnode.model.tolerances.ORDINARY`; the other sizes are assumptions. The temperature is
-        constant and the read-out is ideal, because the tolerances do not cover their effects.
+        constant and the read-out is ideal, because the tolerances do not include temperature and read-out
+        effects.
 
         Args:
             seed: Random seed.
@@ -180,7 +180,7 @@ class Imperfections:
 
     @classmethod
     def from_text(cls, text: str) -> Self:
-        """Return the imperfections named in a text such as ``ordinary,placement=0.05,seed=3``.
+        """Return the imperfections given as a string, such as ``ordinary,placement=0.05,seed=3``.
 
         Raises:
             ConfigError: If a name is unknown or a value is invalid.
@@ -227,7 +227,7 @@ class Imperfections:
 
 
 def _value(text: str) -> int | float | str:
-    """Return the number that a text represents; other texts are returned unchanged."""
+    """Convert a string to a number if possible; otherwise, return the string unchanged."""
     for kind in (int, float):
         try:
             return kind(text)
@@ -237,7 +237,7 @@ def _value(text: str) -> int | float | str:
 
 
 def _checked(name: str, value: object, least: float, greatest: float, unit: str) -> object:
-    """Return a number as a float, or a pair as a tuple. Raises ConfigError if the value is not allowed."""
+    """Return a number as a float or a pair as a tuple. Raises ConfigError if the value is not allowed."""
     allowed = f"a number from {least:g} to {greatest:g} {unit}".rstrip()
     if not name.startswith("creep"):
         return _number(name, value, least, greatest, allowed)
@@ -247,11 +247,11 @@ def _checked(name: str, value: object, least: float, greatest: float, unit: str)
 
 
 def _number(name: str, value: object, least: float, greatest: float, allowed: str) -> float:
-    """Return a number as a float. Raises ConfigError if it is not between ``least`` and ``greatest``."""
+    """Return a number as a float. Raises ConfigError if the number is out of range."""
     if isinstance(value, bool) or not isinstance(value, int | float) or not least <= value <= greatest:
         raise ConfigError(name, value, allowed)
     return float(value)
 
 
 EXACT: Final = Imperfections()
-"""Imperfections of an exact patch, which equals its layout."""
+"""Imperfections of an exact patch, which has no deviations from its layout."""

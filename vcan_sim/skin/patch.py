@@ -1,4 +1,4 @@
-"""Resistances of a patch as manufactured, at any time of a scene."""
+"""Resistances of a patch with imperfections at a given scene time."""
 
 from __future__ import annotations
 
@@ -20,20 +20,20 @@ ROW_STEP_S: Final = 1e-3
 """Maximum time (s) for which the electrodes' motion during a scan is approximated as linear."""
 
 Surface = Callable[[float], Float]
-"""Function of the time (s) that returns the upper electrodes (U, N, 3), in m, of an exact patch. At rest, the
-function returns ``layout.upper_m`` itself, as :meth:`vcan_sim.scene.Scene.upper_m` does."""
+"""Function that takes the time (s) and returns the positions (U, N, 3) of the upper electrodes, in m, of an
+exact patch. At rest, the function returns ``layout.upper_m`` itself, as :meth:`vcan_sim.scene.Scene.upper_m`
+does."""
 
 
 class PhysicalPatch:
-    """Patch as manufactured, with its read-out.
+    """Patch with imperfections, and its read-out.
 
-    Each electrode has the same displacement as in the exact patch, despite its placement error; hysteresis
-    and creep change this displacement. The same arguments produce the same bytes, regardless of the order in
-    which times are requested. Without imperfections, the resistances are bit-identical to those of
-    :class:`ExactForward`, at the same cost.
+    Placement errors do not change the displacement of an electrode; hysteresis and creep do. The results do
+    not depend on the order in which times are requested. Without imperfections, the resistances are
+    bit-identical to those of :class:`ExactForward`.
 
     With the read-outs ``grounded`` and ``floating``, the conductances of an upper wire's paths are always
-    those at the sampling time of this wire, even when another upper wire is sampled. This simplification
+    those at the sampling time of that wire, even while another upper wire is sampled. This simplification
     affects only sneak currents.
 
     Args:
@@ -42,7 +42,7 @@ class PhysicalPatch:
         number: Number of the patch in the hand; each patch has its own random draws.
 
     Raises:
-        ConfigError: If the draws leave too small a gap between an upper and a lower electrode.
+        ConfigError: If the random errors make the gap between an upper and a lower electrode too small.
     """
 
     def __init__(self, layout: PatchLayout, imperfections: Imperfections = EXACT, number: int = 0) -> None:
@@ -81,10 +81,10 @@ class PhysicalPatch:
             upper_m_at: Motion of the exact patch, as a pure function of time.
 
         Returns:
-            (U, N, 3) float64, m: upper wire u at ``t_s + u · row_time_s``; ``layout.upper_m`` itself if the
-            electrodes have no position errors and the patch is at rest. Subtract :attr:`rest_m` from these
-            positions to obtain the displacement that solvers estimate. The positions include the placement
-            errors, which are unknown to solvers.
+            (U, N, 3) float64, m: positions of the electrodes of upper wire u at ``t_s + u · row_time_s``.
+            These positions include the placement errors, which are unknown to solvers. Subtract
+            :attr:`rest_m` to obtain the displacement that solvers estimate. If the electrodes have no
+            position errors and the patch is at rest, the method returns ``layout.upper_m`` itself.
         """
         if not self.imperfections.row_time_s:
             return self._upper_m(t_s, upper_m_at)
@@ -111,7 +111,7 @@ class PhysicalPatch:
         return self._front_end.amplified_ohm(self._network_ohm(upper_m, self._warmth(t_s)))
 
     def converted_ohm(self, analogue_ohm: Float, reading: int) -> Float:
-        """Return the resistances at the converter's output for the resistances at its input.
+        """Return the resistances at the converter's output for given resistances at its input.
 
         Args:
             analogue_ohm: (U, K) float64, ohm: resistances at the converter's input.
@@ -134,7 +134,7 @@ class PhysicalPatch:
         return self.converted_ohm(self.analogue_ohm(t_s, upper_m_at), abs(round(t_s * 1e9)))
 
     def _upper_m(self, t_s: float, upper_m_at: Surface) -> Float:
-        """Return the true positions (U, N, 3), in m, of the upper electrodes; at rest: ``rest_m`` itself."""
+        """Return the true positions (U, N, 3) of the upper electrodes, in m, or ``rest_m`` itself at rest."""
         layout_m = self.layout.upper_m
         if self._history is None:
             upper = upper_m_at(t_s)
@@ -145,7 +145,7 @@ class PhysicalPatch:
         return self.rest_m if moved is None else np.asarray(self.rest_m + moved)
 
     def _warmth(self, t_s: float) -> Float:
-        """Return the resistivity (U, 1) at each upper wire's sampling time, relative to time 0."""
+        """Return the resistivity (U, 1) at each upper wire's sampling time, relative to that at time 0."""
         sizes = self.imperfections
         since_s = np.maximum(t_s + self._row_s, 0.0)
         risen_k = -sizes.warming_k * np.expm1(-since_s / sizes.warming_s)

@@ -168,7 +168,8 @@ def test_electrodes_that_would_touch_are_refused_in_one_line() -> None:
     close = PatchLayout.preset("symmetric", height_m=1e-4)
     with pytest.raises(ConfigError) as caught:
         PhysicalPatch(close, Imperfections(placement=0.1))
-    line = r"placement, along, thickness, tilt: got random errors that leave -?\d+% of the gap at an electrode, "
+    line = r"placement, along, thickness, tilt: got "
+    line += r"random errors that leave -?\d+% of the gap at an electrode, "
     assert re.fullmatch(line + "allowed: at least 10%; use smaller sizes or another seed", str(caught.value))
 
 

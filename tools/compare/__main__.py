@@ -1,12 +1,12 @@
 """Compare the results of two commits bit by bit: ``python -m tools.compare OLD [NEW]``.
 
 By default, NEW is the working tree. The old commit generates the inputs: recordings of simulated hands, and
-streams of resistances. There are streams for five layouts and two noise levels, each with and without faults.
-Each commit then computes the forward model and solves the streams with every tracker method, with every path
-operator, and with the solver for systems of equations. Each commit also replays the recordings and generates
-files, such as EDS files. For each part, the report contains one hash per commit, computed from all arrays of
-the part. For each array that differs between the commits, the report also contains the largest relative
-difference.
+streams of resistances for five layouts and two noise levels, with and without faults. Each commit then
+processes the inputs. The results include the forward model, the fields from every tracker method and every
+path operator, the replayed recordings, and generated files such as EDS files.
+
+The results are divided into parts. For each part, the report contains one hash per commit and the largest
+relative difference of each array that differs between the commits.
 
 The exit status is 0 if all arrays are equal, or if the relative differences between float arrays do not
 exceed ``--rtol`` and all other arrays are equal. Otherwise, the exit status is 1.
@@ -41,7 +41,7 @@ def tree_of(commit: str | None, folder: Path) -> Path:
 
 
 def run_in(tree: Path, script: str, *arguments: str) -> None:
-    """Run a script from this module's folder with the packages in ``tree``."""
+    """Run a script from the folder of this module, with the packages in ``tree``."""
     code = (
         f"import runpy, sys, skinnode; assert skinnode.__file__.startswith({str(tree)!r}), 'another tree'; "
         f"sys.argv = {[script, *arguments]!r}; runpy.run_path({str(HERE / script)!r}, run_name='__main__')"
@@ -66,7 +66,7 @@ def relative_difference(old: Any, new: Any) -> float:
 
 
 def report(old: Any, new: Any, rtol: float) -> Iterable[tuple[str, bool]]:
-    """Yield pairs of a report line and whether the reported difference is permissible."""
+    """Yield each line of the report, and whether the difference reported in that line is within ``rtol``."""
     names = dict.fromkeys([*old.files, *new.files])
     for part in dict.fromkeys(name.partition(":")[0] for name in names):
         mine = [name for name in names if name.startswith(f"{part}:")]
@@ -93,15 +93,17 @@ def report(old: Any, new: Any, rtol: float) -> Iterable[tuple[str, bool]]:
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("old", metavar="OLD", help="commit, such as HEAD~1 or a tag")
-    parser.add_argument("new", metavar="NEW", nargs="?", help="commit; the working tree by default")
+    parser.add_argument("new", metavar="NEW", nargs="?", help="commit; default: the working tree")
     parser.add_argument(
-        "--rtol", type=float, default=0.0, help="maximum relative difference of floats; default 0"
+        "--rtol", type=float, default=0.0, help="maximum relative difference between floats; default: 0"
     )
-    parser.add_argument("--part", action="append", default=[], help="part to compare; default all")
+    parser.add_argument(
+        "--part", action="append", default=[], help="part of the results to compare; default: all"
+    )
     parser.add_argument(
         "--folder",
         type=Path,
-        help="folder in which trees, inputs and outputs are kept for reuse",
+        help="folder in which source trees, inputs and outputs are stored for reuse",
     )
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as temporary:

@@ -1,8 +1,7 @@
-"""Generates the inputs for comparing two commits: streams of resistances, and recordings of hands.
+"""Generates the inputs for comparing two commits: streams of resistances, and recordings of simulated hands.
 
-Both commits process the same inputs, which should not depend on the code of either commit. The displacements
-are therefore sums of Gaussian bumps instead of solutions of the elastic model, and the noise has a fixed
-seed.
+Both commits process the same inputs. The displacements are sums of Gaussian bumps instead of solutions of the
+elastic model, so that they do not depend on the code under comparison. The noise has a fixed seed.
 
 Run ``python inputs.py FOLDER`` in the old commit's tree. The script uses only the public API.
 """
@@ -50,7 +49,7 @@ node_id = 6
 {tolerances}
 layout = {{ preset = "aligned", {sizes} }}
 """
-TOLERANCES = 'tolerances = "exact"' if hasattr(sk, "Tolerances") else ""  # older commits reject this key
+TOLERANCES = 'tolerances = "exact"' if hasattr(sk, "Tolerances") else ""  # older commits do not have this key
 SIZES = "upper_wires = 6, upper_electrodes = 4, lower_wires = 12, lower_electrodes = 6"
 RECORDINGS = {
     "plain": ("auto", []),
@@ -61,7 +60,7 @@ RECORDINGS = {
 
 
 def layouts() -> dict[str, sk.PatchLayout]:
-    """Return two presets, a layout bent around a cylinder, and two layouts with other numbers of wires."""
+    """Return two preset layouts, one bent around a cylinder, and two with different numbers of wires."""
     flat = sk.PatchLayout.preset("staggered")
     middle, radius_m = flat.upper_m[..., 0].mean(), 25e-3
 
@@ -83,7 +82,7 @@ def layouts() -> dict[str, sk.PatchLayout]:
 
 
 def displacements(layout: sk.PatchLayout) -> Float:
-    """Return the displacements (T, U, N, 3), metres: rest, a sliding press, a second press, and rest."""
+    """Return the displacements (T, U, N, 3) in metres for two sliding presses that overlap in time."""
     pitch, height = layout.pitch_m, layout.height_m
     x, y = layout.upper_m[..., 0], layout.upper_m[..., 1]
     low, high = np.array([x.min(), y.min()]), np.array([x.max(), y.max()])
@@ -102,7 +101,7 @@ def displacements(layout: sk.PatchLayout) -> Float:
 
 
 def streams() -> dict[str, Float]:
-    """Return streams (T, U, K): ``LAYOUT/NOISE/ohm`` and, with bad readings, ``LAYOUT/NOISE/faulty``."""
+    """Return streams (T, U, K) of resistances, without faults (``…/ohm``) and with faults (``…/faulty``)."""
     made: dict[str, Float] = {}
     for number, (name, layout) in enumerate(layouts().items()):
         exact = np.array([sk.resistance_ohm(layout, layout.upper_m + d) for d in displacements(layout)])
@@ -123,7 +122,7 @@ def streams() -> dict[str, Float]:
 
 
 def record(folder: Path, name: str) -> None:
-    """Record a simulated hand with the commands of the simulator and the recorder."""
+    """Record a simulated hand by running ``vcan-sim`` and ``skinnode record``."""
     method, faults = RECORDINGS[name]
     group = f"239.74.{random.randrange(256)}.{random.randrange(1, 255)}"
     hand = folder / f"{name}.toml"

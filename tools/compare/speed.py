@@ -1,9 +1,9 @@
 """Compare the benchmark times of two commits: ``python -m tools.compare.speed OLD [NEW]``.
 
-By default, NEW is the working tree. Each round runs the benchmark once per commit. The order alternates from
-round to round, so that changes in the machine's speed affect both commits equally. For each benchmark row,
-the report contains each commit's shortest time and the ratio of the two times. The rows for NumPy and LAPACK
-do not depend on the commit; their ratios indicate the machine's timing noise.
+By default, NEW is the working tree. Each round runs the benchmark once per commit. The commits take turns to
+run first, so that changes in the machine's speed affect both equally. For each benchmark row, the report
+contains the shortest time of each commit and the ratio of the two times. The times for NumPy and LAPACK do
+not depend on the commit, so their ratios show the timing noise of the machine.
 
 The exit status is 1 if the ratio of new to old time exceeds ``--limit`` in any row, otherwise 0.
 """
@@ -23,7 +23,7 @@ from tools.compare.__main__ import tree_of
 
 
 def rows_of(report: Any) -> dict[str, float]:
-    """Return all times in a benchmark's JSON report; a key consists of a row's name and the time's name."""
+    """Return all times in a benchmark's JSON report, by the name of the row and the name of the time."""
     found: dict[str, float] = {}
 
     def collect(part: Any, label: str) -> None:
@@ -59,11 +59,11 @@ def run(tree: Path, benchmark: str, arguments: list[str], out: Path) -> dict[str
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("old", metavar="OLD", help="commit, such as HEAD~1 or a tag")
-    parser.add_argument("new", metavar="NEW", nargs="?", help="commit; the working tree by default")
-    parser.add_argument("--benchmark", default="kernel", help="name of the benchmark; default kernel")
-    parser.add_argument("--rounds", type=int, default=5, help="number of runs of each commit; default 5")
+    parser.add_argument("new", metavar="NEW", nargs="?", help="commit; default: the working tree")
+    parser.add_argument("--benchmark", default="kernel", help="name of the benchmark; default: kernel")
+    parser.add_argument("--rounds", type=int, default=5, help="number of runs per commit; default: 5")
     parser.add_argument(
-        "--limit", type=float, default=1.05, help="maximum ratio of new to old time; default 1.05"
+        "--limit", type=float, default=1.05, help="maximum ratio of new to old time; default: 1.05"
     )
     options, arguments = parser.parse_known_args()
     with tempfile.TemporaryDirectory() as temporary:

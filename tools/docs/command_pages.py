@@ -13,7 +13,7 @@ from vcan_sim.cli import app as vcan_sim
 
 
 def commands() -> str:
-    """Return one section of Markdown per command."""
+    """Return a Markdown section for each command."""
     programs = {"skinnode": get_command(skinnode), "vcan-sim": get_command(vcan_sim)}
     return "\n\n".join(text for name, command in programs.items() for text in _sections(name, command))
 

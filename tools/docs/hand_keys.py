@@ -1,6 +1,6 @@
-"""Generates the references of hand.toml and scene files from their models.
+"""Generates the reference pages for hand.toml and scene files from the configuration models.
 
-For each key, a reference states purpose, type, unit, default and range.
+For each key, the page states the purpose, type, unit, default and allowed values.
 """
 
 from __future__ import annotations
@@ -46,12 +46,12 @@ _UNITS: Final = {
 
 
 def keys_of_a_hand() -> str:
-    """Return one section of Markdown per table of hand.toml, in the order of the models."""
+    """Return a Markdown section for each table of hand.toml, in the order of the models."""
     return "\n\n".join(_sections("", HandConfig, listed=False))
 
 
 def keys_of_a_scene() -> str:
-    """Return one section of Markdown per table of a scene file."""
+    """Return a Markdown section for each table of a scene file."""
     return "\n\n".join(_sections("", SceneConfig, listed=False))
 
 
@@ -82,7 +82,7 @@ def _row(name: str, field: FieldInfo) -> tuple[str, ...]:
 
 
 def _kind(annotation: Any) -> str:
-    """Return the TOML name of a Python type."""
+    """Return the name of the TOML type for a Python type."""
     origin, inside = get_origin(annotation), [part for part in get_args(annotation) if part is not type(None)]
     if origin in (Union, types.UnionType, Annotated):
         return _kind(inside[0])

@@ -1,4 +1,4 @@
-"""Generates tables of patch conditions and simulator faults from their definitions."""
+"""Generates the tables of patch conditions, simulated faults and imperfections from their definitions."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def bus_faults() -> str:
 
 
 def imperfections() -> str:
-    """Return a table of simulated patches' imperfections, with the values for an ordinary patch."""
+    """Return a table of the imperfections of simulated patches, with the values for an ordinary patch."""
     docs, ordinary = md.member_docs(Imperfections), Imperfections.ordinary()
     rows = [
         (md.code(name), docs[name], _size(getattr(ordinary, name)))

@@ -9,7 +9,7 @@ from collections.abc import Iterable, Sequence
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """Return a Markdown table; vertical bars in cells are escaped, except in code."""
+    """Return a Markdown table. Vertical bars in cells are escaped, except in inline code."""
     lines = [head, ["---"] * len(head), *rows]
     return "\n".join("| " + " | ".join(map(_cell, line)) + " |" for line in lines)
 
@@ -26,7 +26,7 @@ def code(text: object) -> str:
 
 
 def prose(docstring: str) -> str:
-    """Convert a docstring to one line of Markdown; roles and double backticks become code."""
+    """Convert a docstring to one line of Markdown. Roles and double backticks become inline code."""
     text = re.sub(r":[a-z]+:`~?(?:[\w.]+\.)?([\w.]+)`", r"`\1`", docstring)
     return " ".join(text.replace("``", "`").split())
 
@@ -37,7 +37,7 @@ def c_hex(value: int, digits: int = 4) -> str:
 
 
 def member_docs(kind: type) -> dict[str, str]:
-    """Return a mapping from each class member to the docstring that follows the member in the source."""
+    """Return a mapping from class member to docstring; the docstring follows the member in the source."""
     (body,) = ast.parse(inspect.getsource(kind)).body
     assert isinstance(body, ast.ClassDef)
     docs: dict[str, str] = {}

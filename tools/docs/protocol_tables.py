@@ -28,15 +28,15 @@ PROFILE: Final = REFERENCE_PROFILES[0]
 NODE_ID: Final = 4
 _BITRATE_BPS, _DATA_BITRATE_BPS = 1_000_000, 5_000_000
 _HIGHEST: Final = highest(0, 0).name
-"""Name of sub-index 0 in most objects; tables omit it, because its value is evident from the other
-sub-indices."""
+"""Name of sub-index 0 in most objects. The tables omit this sub-index, because its value follows from the
+other sub-indices."""
 _PLUS_NODE_ID: Final = " + node\u2011ID"
 _FEW: Final = 3
-"""Maximum number of equivalent entries that are listed individually instead of in a combined row."""
+"""Maximum number of similar entries with a row each; larger numbers of similar entries share one row."""
 
 
 def cob_ids() -> str:
-    """List a patch's identifiers in order of decreasing bus priority (ascending identifiers)."""
+    """List the CAN identifiers of a patch in ascending order, which means descending bus priority."""
     rows = (
         ("NMT command", od.NMT_COB_ID, od.NMT_COB_ID, "NMT master → node", 2),
         ("SYNC", od.SYNC_COB_ID, od.SYNC_COB_ID, "producer → node", "1 (counter)"),
@@ -100,7 +100,7 @@ def formats() -> str:
 
 
 def example_scan() -> str:
-    """Show the bytes of the frames that the codec generates for a scan of a pressed patch."""
+    """Show the bytes of the frames for a scan of a pressed patch."""
     scale, scan = CodeScale(16), 7
     resistance = np.full((PROFILE.rows, PROFILE.columns), 1500.0)
     baseline = resistance.copy()
@@ -176,7 +176,7 @@ def manufacturer() -> str:
 
 
 def emergencies() -> str:
-    """List the EMCY error codes sent by a node."""
+    """List the EMCY error codes that a node sends."""
     rows = (
         (md.c_hex(code), error_text(code, ours=True), md.c_hex(code.register_bit, 2))
         for code in EmcyCode
@@ -186,7 +186,7 @@ def emergencies() -> str:
 
 
 def aborts() -> str:
-    """List the abort codes sent by the SDO server."""
+    """List the abort codes that the SDO server sends."""
     rows = (
         (md.c_hex(code, 8), SdoAbortedError.CODES.get(code, code.name.replace("_", " ").capitalize()))
         for code in AbortCode
@@ -219,12 +219,12 @@ def _shape(item: Object) -> list[tuple[object, ...]]:
 
 
 def _family(item: Object) -> str:
-    """Return an object's name without the final number, for example `Codes of upper wire`."""
+    """Return an object's name without the number at its end, for example `Codes of upper wire`."""
     return item.name.rstrip("0123456789")
 
 
 def _dictionary(objects: Iterable[Object]) -> str:
-    """Return one row per entry; consecutive equivalent entries or objects are combined in one row."""
+    """Return a table with one row per entry. Similar consecutive entries or objects share a row."""
     runs: list[list[Object]] = []
     for item in objects:
         if runs and _family(item) == _family(runs[-1][-1]) and _shape(item) == _shape(runs[-1][0]):

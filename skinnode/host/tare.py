@@ -31,8 +31,8 @@ def tare(
 
     Args:
         node: Node of the patch.
-        baselines: Function that returns the number of new baselines read so far.
-        health: Function that returns the health of the patch.
+        baselines: Function that returns how many new baselines the host has read so far.
+        health: Function that returns the current health of the patch.
         deadline_s: Maximum time (s) to wait for the new baseline.
 
     Raises:

@@ -36,7 +36,7 @@ def broken_wires(codes: NDArray[Any], scale: CodeScale) -> tuple[WireFault, ...]
 
     Args:
         codes: (U, K) codes of one scan.
-        scale: Scale of the codes.
+        scale: Mapping of R/R0 to codes.
     """
     found = []
     for state, code in ((WireState.OPEN, scale.open), (WireState.SHORT, scale.short)):

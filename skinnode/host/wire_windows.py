@@ -33,8 +33,8 @@ WINDOW: Final = 16
 WINDOWS: Final = 3
 """Number of consecutive windows in which a wire must be noisy or drifting before it is reported."""
 NOISY: Final = 25.0
-"""Minimum ratio of a noisy wire's noise power to the median wire's; corresponds to an amplitude ratio of
-5.
+"""Minimum ratio of a noisy wire's noise power to the median noise power of the wires on its side. It
+corresponds to an amplitude ratio of 5.
 """
 DRIFT: Final = 1e-3
 """Minimum drift of a drifting wire, as a fraction of R0. A light touch changes the resistance of a crossing
@@ -46,14 +46,14 @@ APART: Final = 0.3
 """Minimum difference in R / R0 between a drifting wire and the more similar of its two neighbours, as a
 fraction of the drift."""
 _SHOWN: Final = 8
-"""Number of recent windows from which the noise is determined."""
+"""Number of recent windows from which :attr:`WireWindows.shown_noise` is determined."""
 
 
 class WireWindows:
     """Detector of noise and drift in the wires of one patch. Owned by the mainline.
 
     Args:
-        scale: Scale of the codes.
+        scale: Mapping of R/R0 to codes.
         relative_noise: Converter noise stated in the hand file, as a fraction of the resistance.
     """
 

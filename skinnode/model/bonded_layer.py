@@ -24,8 +24,8 @@ from skinnode.model.elastic import Rubber
 from skinnode.model.layout import Float
 
 BLUR: Final = 0.1
-"""Standard deviation of the Gaussian that blurs the rim of the load, relative to its radius. The blur limits
-the wave numbers that contribute."""
+"""Standard deviation of the Gaussian that blurs the rim of the load, relative to the radius of the load. The
+blur limits the wave numbers that contribute to the displacement."""
 _END: Final = 6.0
 """Upper limit of the integral over the wave number, times the standard deviation of the blur. At this limit,
 the blur attenuates the Fourier transform of the load to 1e-8 of its value."""

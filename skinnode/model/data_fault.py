@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 
 class FaultyPart(enum.StrEnum):
-    """Part of a patch whose readings are faulty."""
+    """Part of a patch that has faulty readings."""
 
     CROSSING = "crossing"
-    """One pair of an upper and a lower wire."""
+    """Crossing of one upper wire and one lower wire."""
     UPPER = "upper wire"
     LOWER = "lower wire"
     PATCH = "patch"

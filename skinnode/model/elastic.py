@@ -92,9 +92,9 @@ def point_compliance(rubber: Rubber, offset_m: ArrayLike, *, softening_m: float 
 def rectangle_compliance(rubber: Rubber, offset_m: ArrayLike, size_m: tuple[float, float]) -> Float:
     """Return the displacement of surface points per unit traction on a rectangle; finite everywhere.
 
-    The result is the closed form for a uniform load on a rectangle (Love, Philosophical Transactions A 228,
-    1929, for the normal part; Johnson eq. 3.25). Each entry of the compliance matrix has an elementary
-    antiderivative in x and y, which is evaluated at the corners.
+    The function evaluates the closed-form solution for a uniform load on a rectangle (Love, Philosophical
+    Transactions A 228, 1929, for the normal part; Johnson eq. 3.25). Each entry of the compliance matrix has
+    an elementary antiderivative in x and y, which is evaluated at the corners.
 
     Args:
         rubber: The material.
@@ -159,8 +159,8 @@ class HertzContact:
 
     Inside the contact circle, the pressure is p = p₀ √(1 − r²/a²) and the traction is (t_x p, t_y p, −p). The
     surface displacement has a closed form everywhere. Since p is radially symmetric, all integrals follow
-    from two radial functions, Φ = ∫ p/|d| (Johnson eqs. 3.41a, 3.42a) and P, the load within r. The model
-    assumes that shear does not change the pressure, which is exact for incompressible rubber and an
+    from two radial functions, Φ = ∫ p/|d| (Johnson eqs. 3.41a, 3.42a) and P, the load within the radius r.
+    The model assumes that shear does not change the pressure, which is exact for incompressible rubber and an
     approximation for ν < 0.5 (Johnson 7.1).
 
     Args:

@@ -23,7 +23,7 @@ class ScanStamp:
     patch: str
     """Name of the patch."""
     scan: int
-    """Scan number since the stream started, unwrapped."""
+    """Number of the scan, counted from the start of the stream without wrap-around."""
     counter: int
     """Scan number in the CAN frames, u8; equal to the SYNC counter if SYNC frames contain a counter."""
     device_time_us: int
@@ -59,12 +59,12 @@ class ResistanceFrame:
 
 @dataclass(frozen=True, slots=True)
 class SolveStats:
-    """Number of evaluations and elapsed time of a solve."""
+    """Number of evaluations in a solve, and time that the solve took."""
 
     evaluations: int
-    """Number of evaluations of F."""
+    """Number of evaluations of the forward model F."""
     jacobians: int
-    """Number of evaluations of J, each of which also yields F."""
+    """Number of evaluations of the Jacobian J; each of them also yields F."""
     steps: int
     """Number of solver iterations; in a posterior solve, number of matrix factorisations."""
     time_s: float
@@ -80,7 +80,7 @@ class Contact:
     """Contact on the skin, with the standard deviation of each value."""
 
     centroid_m: Float
-    """(3,) centre of the normal load on the skin at rest, in the frame of the layout, metres."""
+    """(3,) centre of the normal load on the undeformed skin, in the coordinates of the layout, metres."""
     centroid_std_m: Float
     """(3,) standard deviation of the centre, metres."""
     area_m2: float
@@ -119,7 +119,7 @@ class FieldFrame:
     status: tuple[Status, ...]
     """Status of each upper wire."""
     residual: Float
-    """(U,) RMS of the relative residual F/b − 1 over the valid resistances of a wire."""
+    """(U,) RMS of the relative residuals of each wire's valid resistances."""
     stats: SolveStats
     force_n: Float | None = None
     """(U, N, 3) loads on the skin, in newtons; None if ``contacts`` was switched off. The loads are computed

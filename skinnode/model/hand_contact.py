@@ -1,4 +1,4 @@
-"""Contacts and wrenches in the frame of a link or of the hand, with their covariances.
+"""Contacts and wrenches in the coordinate frame of a link or of the hand, with their covariances.
 
 A contact on a patch exerts the force f on the skin at the point r. In the frame of a link, the contact's
 wrench is the force f and the torque r × f about the origin of the link's frame. To first order, the
@@ -25,7 +25,7 @@ HAND: Final = "hand"
 
 @dataclass(frozen=True, slots=True)
 class Mount:
-    """Place of a patch on the robot."""
+    """Mounting position of a patch on the robot."""
 
     link: str = HAND
     """Name of the link on which the patch is mounted."""
@@ -44,7 +44,7 @@ class HandContact:
     frame: str
     """Name of the frame in which the contact's vectors are expressed: :data:`HAND` or the link."""
     position_m: Float
-    """(3,) centre of the normal load on the skin at rest, metres."""
+    """(3,) centre of the normal load on the undeformed skin, metres."""
     position_covariance_m2: Float
     """(3, 3) covariance of the position, m²."""
     normal: Float
@@ -67,12 +67,12 @@ class HandContact:
 
     @classmethod
     def on_link(cls, contact: Contact, patch: str, mount: Mount, *, trusted: bool) -> HandContact:
-        """Return a contact of a patch in the frame of the patch's link.
+        """Return a contact of a patch, expressed in the coordinate frame of the patch's link.
 
         Args:
             contact: The contact, in the frame of the patch.
             patch: Name of the patch.
-            mount: Place of the patch on the robot.
+            mount: Mounting position of the patch on the robot.
             trusted: Whether the patch's field is trusted.
         """
         to_link = mount.pose.rotation
@@ -108,7 +108,7 @@ class HandContact:
         return np.asarray(np.sqrt(np.diag(self.force_covariance_n2)))
 
     def moved(self, pose: Pose, frame: str = HAND) -> HandContact:
-        """Return the contact in another frame.
+        """Return the contact, expressed in another coordinate frame.
 
         Args:
             pose: Pose of this contact's frame in the other frame.
@@ -160,7 +160,7 @@ class Wrench:
         return np.asarray(np.sqrt(np.diag(self.covariance)[3:]))
 
     def moved(self, pose: Pose, frame: str = HAND) -> Wrench:
-        """Return the same wrench in another frame, with the torque about the origin of that frame.
+        """Return the wrench, expressed in another coordinate frame, with the torque about its origin.
 
         Args:
             pose: Pose of this wrench's frame in the other frame.

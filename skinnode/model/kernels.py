@@ -25,7 +25,7 @@ def lower_rows(lower: Float) -> Float:
 
 
 def relative_residual(a: _T, f: _T) -> _T:
-    """Return a F − 1, the relative deviation of a resistance from its prediction, for numbers or arrays."""
+    """Return the relative residual ``a * f - 1`` of a resistance, for numbers or arrays."""
     return a * f - 1.0
 
 

@@ -29,7 +29,7 @@ MOST_PAIRS: Final = 1 << 22
 all pairs takes 100 MB."""
 
 _HASH_RESOLUTION_M: Final = 1e-9
-"""Resolution of coordinates in the hash, m; differences below a nanometre are ignored."""
+"""Resolution to which coordinates are rounded for the layout hash, m."""
 
 
 def require_array(name: str, value: ArrayLike, shape: tuple[int | str, ...], *, finite: bool = True) -> Float:
@@ -148,7 +148,7 @@ class PatchLayout:
         lower_electrodes: int | None = None,
         resistivity_ohm_per_m: float = 1e7,
     ) -> PatchLayout:
-        """Return a flat layout by name.
+        """Return the preset layout with the given name; all presets are flat.
 
         - ``aligned``: The lower wires run straight along y and are evenly spaced in x. Their electrodes are
           offset from the upper wires by a quarter pitch, as the figure in Xu et al. 2018 suggests.
@@ -164,7 +164,7 @@ class PatchLayout:
             height_m: Height of the upper electrodes above the lower layer, metres.
             upper_wires: Number of upper wires, U.
             upper_electrodes: Number of electrodes per upper wire, N.
-            lower_wires: Number of lower wires, K; the default 3 N makes the systems square.
+            lower_wires: Number of lower wires, K; the default 3 N makes the systems of equations square.
             lower_electrodes: Number of electrodes per lower wire, M; the default is U.
             resistivity_ohm_per_m: ρ of the resistor ρ d between two electrodes at distance d, ohm/m.
 

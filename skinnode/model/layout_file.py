@@ -1,4 +1,4 @@
-"""Layout files: NPZ or TOML with the electrodes, or TOML with the keys of a preset."""
+"""Read layout files, which contain either electrode positions (NPZ or TOML) or preset parameters (TOML)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Poses of frames, such as a patch on a link or a link on the hand, and conversion between frames."""
+"""Poses of coordinate frames, such as a patch's frame on a link, and conversion between frames."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ UNIT_TOLERANCE: Final = 1e-3
 
 @dataclass(frozen=True, slots=True)
 class Pose:
-    """Position and orientation of a frame in its parent frame, such as a patch on its link.
+    """Position and orientation of a coordinate frame in its parent frame, such as a patch on a link.
 
-    The patch's x axis is along its upper wires, and its z axis points out of the skin.
+    The x axis of a patch is along its upper wires, and the z axis points out of the skin.
 
     Args:
         position_m: Origin of the frame, in the parent frame, metres.
@@ -42,7 +42,7 @@ class Pose:
 
     @classmethod
     def from_rpy(cls, position_m: tuple[float, float, float], rpy_rad: tuple[float, float, float]) -> Self:
-        """Return the pose after rotations about the parent's axes x (roll), y (pitch) and z (yaw), in order.
+        """Return the pose after rotations about the parent's axes: x (roll), then y (pitch), then z (yaw).
 
         URDF uses the same convention.
 

@@ -22,7 +22,7 @@ class Tolerances:
     electrode_radius: float = 0.0
     """Radius of the electrodes, in pitches; the forward model treats electrodes as points."""
     gain: float = 0.0
-    """Gain of the front end, as a fraction of the change in each resistance."""
+    """Gain of the front end for changes in resistance, as a fraction of the nominal gain."""
 
     def __post_init__(self) -> None:
         for entry in fields(self):

@@ -15,7 +15,7 @@ from skinnode.monitor.touches import Touch
 from skinnode.monitor.view_model import History, PatchView, View
 
 SETTLE_NS: Final = 3_000_000_000
-"""Time limit, after the start, for all patches of a live hand to become operational, ns."""
+"""Time after the start within which all patches of a running hand must become operational, ns."""
 
 LOOK_S: Final = 0.1
 """Interval at which the source is checked for faults, s."""

@@ -96,7 +96,7 @@ class Source(Protocol):
 
 
 class HostSource:
-    """Data source for a running host, which the caller closes."""
+    """Data source for a running host. The caller must close the host."""
 
     live = True
 

@@ -24,7 +24,7 @@ class Theme:
     dim: Style
     strong: Style
     bar: Style
-    """Style of header and key bar."""
+    """Style of the header and the key bar."""
     key: Style
     good: Style
     note: Style

@@ -42,7 +42,7 @@ class PatchView:
     condition: str
     level: Level
     words: tuple[str, ...]
-    """Faults other than the condition, worst first."""
+    """Descriptions of the patch's faults, most severe first."""
     health: PatchHealth
     stream: StreamStats
     rate_hz: float

@@ -1,10 +1,8 @@
-"""A patch as a CANopen device (CiA 301), and the thread that runs patches on a bus.
+"""CANopen device (CiA 301) for a patch, and the thread that runs such devices on a bus.
 
-::
-
-    runner (thread, CAN port) -> device (a frame to its service) -> one file per service -> device -> runner
-
-The sub-package ``patch`` is the application that uses these services: it samples the skin and sends scans.
+The module ``runner`` owns the thread and the CAN port, and passes received frames to ``device``. The device
+passes each frame to the service that handles it; each service has its own module. The sub-package ``patch``
+is the application that uses these services. It samples the skin and sends scans.
 """
 
 from skinnode.canopen.lss import NOT_CONFIGURED

@@ -16,7 +16,7 @@ Clock = Callable[[], int]
 
 @dataclass(frozen=True, slots=True)
 class Pacing:
-    """Timer precision of a node's thread. A higher precision requires more processor time."""
+    """Timer precision of a node's thread. Higher precision requires more processor time."""
 
     slack_ns: int
     """Maximum time (ns) by which the thread may delay a timer, so that it can handle several timers per
@@ -27,7 +27,7 @@ class Pacing:
 
 
 EXACT: Final = Pacing(slack_ns=0, catch_up_ns=100_000)
-"""Pacing for a node on its own board, whose thread wakes up for every chunk.
+"""Pacing for a node that runs on its own board; its thread wakes up for every chunk.
 
 The interval between two chunks may be up to 100 µs shorter than the inhibit time, to compensate for wake-ups
 that are up to 100 µs late.

@@ -38,7 +38,7 @@ class ErrorControl:
     Args:
         services: resources that all services of the node share.
         listen: called when the handlers returned by :meth:`handlers` have changed.
-        failed: called after a heartbeat event or life guarding event with the time of the event, in ns.
+        failed: called with the time (ns) of each heartbeat event or life guarding event.
     """
 
     def __init__(

@@ -18,7 +18,7 @@ class Guarding:
     Args:
         store: object dictionary.
         emcy: emergency producer, which reports life guarding events.
-        failed: called after the emergency message with the time of the life guarding event, in ns.
+        failed: called with the time (ns) of a life guarding event, after the emergency message.
     """
 
     def __init__(self, store: ObjectStore, emcy: EmcyProducer, failed: Callable[[int], None]) -> None:

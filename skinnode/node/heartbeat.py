@@ -72,7 +72,7 @@ class HeartbeatConsumer:
     Args:
         store: object dictionary.
         emcy: emergency producer, which reports missed heartbeats and restarts of monitored nodes.
-        failed: called after the emergency message with the time of the heartbeat event, in ns.
+        failed: called with the time (ns) of a heartbeat event, after the emergency message.
     """
 
     def __init__(self, store: ObjectStore, emcy: EmcyProducer, failed: Callable[[int], None]) -> None:
@@ -128,7 +128,7 @@ class HeartbeatConsumer:
         self._plan()
 
     def on_timer(self, t_ns: int) -> None:
-        """Report each node with an overdue heartbeat at ``t_ns``, once until its next heartbeat."""
+        """Report each monitored node whose heartbeat is overdue, unless the node was already reported."""
         if t_ns < self.deadline_ns:
             return
         for item in self._monitored.values():

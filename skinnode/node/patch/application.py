@@ -40,7 +40,7 @@ class PatchApplication:
     Args:
         layout: electrodes of the patch.
         serial: serial number (0x2000:11), u32.
-        acquisition: acquisition of the patch's codes, with its baseline.
+        acquisition: source of the codes and the baseline.
         services: services that the device provides.
         pacing: timer precision of the node, also used to pace the chunks.
     """

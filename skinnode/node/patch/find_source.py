@@ -1,4 +1,4 @@
-"""Lookup of sources by name. Users can add sources without changing this project."""
+"""Find resistance sources by name. Other packages can register sources as entry points."""
 
 from __future__ import annotations
 

@@ -74,7 +74,7 @@ class WireFaultReporter:
         self._reported = WireFaults.none(self._profile)
 
     def report(self, faults: WireFaults, t_ns: int) -> None:
-        """Report new wire faults, or the end of all wire faults, by a single emergency message.
+        """Report new wire faults, or the end of all wire faults, in a single emergency message.
 
         The message contains the type and wire number of the first new fault, and the number of faulty wires.
         Several faults that begin in the same scan, for example when a connector is unplugged, cause a single

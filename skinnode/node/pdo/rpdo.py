@@ -146,7 +146,7 @@ class RpdoEngine:
             self._execute(self._rpdos[number], pending[number])
 
     def on_timer(self, t_ns: int) -> None:
-        """Report each RPDO that is overdue at ``t_ns``. Its monitoring restarts when it is received again."""
+        """Report each RPDO that is overdue. Monitoring restarts when the RPDO is received again."""
         for number in self._timers.take(t_ns):
             self._late.add(number)
             self._emcy.report(EmcyCode.RPDO_TIMEOUT, (number + 1).to_bytes(2, "little"), t_ns)

@@ -1,4 +1,4 @@
-"""Tare a patch: the node measures a new baseline, which the host reads and uses to solve scans."""
+"""Tare a patch: the node measures a new baseline, and the host uses it to solve the following scans."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ A tare normally takes 0.1 to 0.3 s, but the host may wait up to 2 s between two 
 """
 
 TARE_DEADLINE_SYNCS: Final = 3
-"""Number of SYNC periods added to the time limit of a tare. The host learns of the new baseline only from the
-summary of the next scan.
+"""Number of SYNC periods added to the time limit of a tare. The node
+announces the new baseline only in the summary of the next scan.
 """
 
 _POLL_S: Final = 0.005

@@ -8,11 +8,11 @@ at a constant rate has no second difference. A wire is noisy if its noise power 
 the wires on its side and the expected noise power by a factor of ``NOISY``.
 
 A wire drifts if the resistances of all its crossings have changed by the same fraction of R0, while the
-resistances of its neighbours have not. The change must exceed ``DRIFT``, compared with both the median wire
-and the baseline. A touch, in contrast, changes the crossings of a wire unevenly, and the rubber spreads the
+resistances of its neighbours have not. The drift, relative to both the median wire and the baseline, must
+exceed ``DRIFT``. A touch, in contrast, changes the crossings of a wire unevenly, and the rubber spreads the
 change to the adjacent wires. Touches changed a wire by more than ``DRIFT`` in 780,000 simulated cases, and
-none of these changes was mistaken for drift. The criterion does not detect adjacent wires that drift equally.
-It also does not detect the drift of a wire that is being touched.
+none of these changes was mistaken for drift. Drift is not detected if adjacent wires drift equally, or if
+the wire is being touched.
 """
 
 from __future__ import annotations
@@ -33,8 +33,8 @@ WINDOW: Final = 16
 WINDOWS: Final = 3
 """Number of consecutive windows in which a wire must be noisy or drifting before it is reported."""
 NOISY: Final = 25.0
-"""Minimum ratio of a noisy wire's noise power to the median noise power of the wires on its side. It
-corresponds to an amplitude ratio of 5.
+"""Minimum ratio of a noisy wire's noise power to the median noise power of the wires on its side. This
+is equivalent to a ratio of 5 between the noise amplitudes.
 """
 DRIFT: Final = 1e-3
 """Minimum drift of a drifting wire, as a fraction of R0. A light touch changes the resistance of a crossing
@@ -65,17 +65,17 @@ class WireWindows:
         """Number of windows evaluated so far."""
         self._odd: dict[WireFault, int] = {}  # number of consecutive windows with each fault
         self._window: list[Codes] = []
-        # crossings measured in every scan of the window; None: all crossings
+        # mask of the crossings measured in every scan of the window; None if all crossings were measured
         self._measured: NDArray[np.bool_] | None = None
         self._shown: deque[float] = deque(maxlen=_SHOWN)
 
     @property
     def shown_noise(self) -> float:
-        """Minimum noise (codes) over the recent windows; 0 if any window had no measurable noise."""
+        """Minimum noise (codes) of the recent windows; 0 if the noise of any window was not measurable."""
         return min(self._shown) if len(self._shown) == _SHOWN else 0.0
 
     def on_scan(self, scan: Scan) -> None:
-        """Add the next scan, which must be complete and contain every code."""
+        """Add the next scan, which must be complete and contain the codes of all crossings."""
         if not scan.valid.all():
             self._measured = scan.valid if self._measured is None else self._measured & scan.valid
         self._window.append(scan.codes)
@@ -124,9 +124,9 @@ def _shown_noise(codes: NDArray[np.float64], power: NDArray[np.float64]) -> floa
     """Return the lower quartile of the crossings' noise (codes); 0 if the noise is not measurable.
 
     The noise of a crossing counts as 0 if its codes span fewer than three values, or if their mean changed
-    significantly from the first to the second half of the window. Two values are not sufficient, because a
-    crossing without noise may alternate between two codes if its resistance is at the edge of a quantization
-    step.
+    significantly from the first to the second half of the window. A range of two values is not sufficient,
+    because a crossing without noise may alternate between two codes if its resistance is at the edge of a
+    quantization step.
 
     Args:
         codes: (WINDOW, U, K) codes of a window.
@@ -157,7 +157,7 @@ def _of_wires(
 ) -> NDArray[np.float64]:
     """Reduce the values of each wire's crossings to one number; NaN if none of the crossings was measured.
 
-    NaN in ``values`` denotes a crossing that was not measured. The reduction by ``plain`` is used if there
+    In ``values``, NaN denotes a crossing that was not measured. The reduction by ``plain`` is used if there
     is no NaN, because it is ten times as fast as ``without_nan``.
     """
     if not np.isnan(values).any():

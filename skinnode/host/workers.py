@@ -17,15 +17,15 @@ from skinnode.process import clock
 
 Job = Callable[[], None]
 OnError = Callable[[Exception], object]
-"""Function called with a job's exception, on the thread that ran the job. The function must not raise
-exceptions.
+"""Error handler, called with a job's exception on the thread that ran the job. An error handler must not
+raise exceptions.
 """
 
 
 class Workers:
     """Pool of ``count`` worker threads that run from construction until :meth:`close`.
 
-    Threads: any thread may submit jobs. Exceptions raised outside the jobs are reported to ``defects``.
+    Threads: any thread may submit jobs. Exceptions in the pool's own code are reported to ``defects``.
     """
 
     def __init__(self, count: int, name: str, defects: Defects | None = None) -> None:

@@ -7,7 +7,7 @@ pressure of amplitude 1 displaces the surface by the amplitudes
     outwards            x²     / (  G k (cosh 2x + 1 + 2x²))
 
 The normal displacement is in the direction of the load. The outward displacement is along the surface, away
-from the load, and 90° out of phase. Both formulas follow from the biharmonic stream function of an
+from the load, with a phase shift of 90°. Both formulas follow from the biharmonic stream function of an
 incompressible layer, with no displacement at z = −h and no shear traction at z = 0. For x → ∞ the normal
 displacement is that of a half-space, 1 / (2 G k), and the outward displacement vanishes.
 """

@@ -11,7 +11,8 @@ from skinnode.model.status import Status
 def why_not(field: FieldFrame) -> str:
     """Return a text that explains why a field is not trusted; empty if the field is trusted.
 
-    If the data of the field were not tested, the text counts the wires by status, except CONVERGED wires.
+    If the data of the field were not tested, the text lists the number of wires with each status other than
+    CONVERGED.
     """
     if field.trusted:
         return ""

@@ -90,7 +90,7 @@ def point_compliance(rubber: Rubber, offset_m: ArrayLike, *, softening_m: float 
 
 
 def rectangle_compliance(rubber: Rubber, offset_m: ArrayLike, size_m: tuple[float, float]) -> Float:
-    """Return the displacement of surface points per unit traction on a rectangle; finite everywhere.
+    """Return the displacement of surface points per unit traction on a rectangle.
 
     The function evaluates the closed-form solution for a uniform load on a rectangle (Love, Philosophical
     Transactions A 228, 1929, for the normal part; Johnson eq. 3.25). Each entry of the compliance matrix has
@@ -258,13 +258,13 @@ def _hertz_integrals(offset: Float, a: float, peak: float) -> tuple[Float, Float
     phi = c * a * a * (2 - s2)
     isotropic = c * a * a * (1 - 0.75 * s2)
     radial = np.full_like(r2, 0.5 * c)
-    # computes (1 − (1 − s²)^{3/2}) / s² without cancellation at the centre
+    # equal to (1 − (1 − s²)^{3/2}) / s², but without cancellation at the centre
     root = np.sqrt(1 - s2)
     enclosed = 2 / 3 * math.pi * peak * (1 + root + (1 - s2)) / (1 + root)
     far = ~near
     q2 = r2[far]
     w = np.sqrt(q2 - a * a)
-    angle = np.arctan2(a, w)  # arcsin(a/r), accurate near the edge
+    angle = np.arctan2(a, w)  # equal to arcsin(a/r), but more accurate near the edge
     c = math.pi * peak / (2 * a)
     outside = c * ((2 * a * a - q2) * angle + a * w)
     mean = c * ((a * a - 0.25 * q2) * angle + (0.75 * a * a + 0.25 * w * w) * a * w / q2)

@@ -59,7 +59,7 @@ class ResistanceFrame:
 
 @dataclass(frozen=True, slots=True)
 class SolveStats:
-    """Number of evaluations in a solve, and time that the solve took."""
+    """Number of function evaluations in a solve, and elapsed time of the solve."""
 
     evaluations: int
     """Number of evaluations of the forward model F."""
@@ -77,7 +77,7 @@ _FLAT.setflags(write=False)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Contact:
-    """Contact on the skin, with the standard deviation of each value."""
+    """Contact between a body and the skin, with the standard deviation of each value."""
 
     centroid_m: Float
     """(3,) centre of the normal load on the undeformed skin, in the coordinates of the layout, metres."""
@@ -91,7 +91,7 @@ class Contact:
     """Normal force, N; positive if the body presses on the skin."""
     normal_force_std_n: float
     shear_force_n: Float
-    """(2,) shear force along and across the wires, N."""
+    """(2,) shear force along and across the upper wires, N."""
     shear_force_std_n: Float
     """(2,) standard deviation of the shear force, N."""
     force_calibrated: bool = False
@@ -100,10 +100,11 @@ class Contact:
 
     Without a calibration, the standard deviation of the normal force also covers the error of the half-space
     model. The force computed for a bonded layer as thick as the clearance is within five standard deviations.
-    The standard deviation of the shear force does not cover this error."""
+    The standard deviation of the shear force does not cover the model error."""
     axes: Float = field(default_factory=lambda: _FLAT)
-    """(3, 3) unit vectors as rows, in the frame of the layout, at the centre of the contact: along the wire,
-    across the wires and out of the skin. On a flat patch, these vectors are the x, y and z axes."""
+    """(3, 3) matrix of unit vectors at the centre of the contact, in the coordinates of the layout. The rows
+    point along the upper wires, across them, and out of the skin. On a flat patch, they are the x, y and z
+    axes."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -131,8 +132,8 @@ class FieldFrame:
     """``exact`` if each wire was solved separately; ``posterior`` if the patch was estimated as a whole."""
     by_prior: NDArray[np.bool_] | None = None
     """(U,) mask of the wires that were estimated with the prior because their own resistances were not
-    sufficient. With the method ``posterior``, these are the wires without any usable resistance. If such a
-    wire is trusted, the reason may be the prior alone."""
+    sufficient. With the method ``posterior``, these are the wires without any usable resistance. The prior
+    may be the only evidence for such a wire, even if the wire is trusted."""
     contacts: tuple[Contact, ...] = ()
     """Contacts, strongest first; empty if nothing touches, if no wire could be solved, or if ``contacts`` was
     switched off. The number of contacts also depends on the previous scan, so that noise does not split or
@@ -140,8 +141,9 @@ class FieldFrame:
     gain: Float | None = None
     """(U,) estimated relative gain error of each wire's resistances; None if gains are not estimated."""
     noise_factor: float = 1.0
-    """Ratio of the estimated noise to the configured noise; exactly 1 while the two are consistent. If the
-    resistances were computed from codes, the ratio excludes quantization noise."""
+    """Ratio of the estimated noise to the configured noise; exactly 1 while the measured noise is consistent
+    with the configured noise. If the resistances were computed from codes, the ratio excludes quantization
+    noise."""
     held: NDArray[np.bool_] | None = None
     """(U,) mask of the wires that were not solved again, because their resistances changed by no more than
     the noise."""
@@ -186,7 +188,7 @@ _Record = TypeVar("_Record", Contact, FieldFrame)
 def sealed(record: _Record, **changes: Any) -> _Record:
     """Return a copy of a record with ``changes`` and read-only arrays, for use by several receivers.
 
-    The arrays are read-only views. The original arrays stay writable.
+    The arrays of the copy are read-only views; the original arrays stay writable.
     """
     twin = object.__new__(type(record))  # five times as fast as ``dataclasses.replace``
     for name in _NAMES[type(record)]:

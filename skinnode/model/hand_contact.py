@@ -54,7 +54,7 @@ class HandContact:
     """Normal force, N; positive if the object presses on the skin."""
     normal_force_std_n: float
     force_n: Float
-    """(3,) force of the object on the skin, the vector sum of normal force and shear, N."""
+    """(3,) force of the object on the skin, N: the vector sum of the normal force and the shear force."""
     force_covariance_n2: Float
     """(3, 3) covariance of the force, N²."""
     area_m2: float
@@ -130,8 +130,8 @@ class HandContact:
 class Wrench:
     """Total force and torque that the contacts on a link, or on the hand, exert on the skin.
 
-    The wrench does not include forces that are too weak to be detected as contacts. It also does not include
-    the torque of each contact about its own normal.
+    The wrench does not include forces that are too weak to be detected as contacts. The torque of each
+    contact about its own normal is not included either.
     """
 
     frame: str
@@ -147,7 +147,7 @@ class Wrench:
     force_calibrated: bool
     """Whether every force is based on a calibration of its patch; True if there are no contacts."""
     trusted: bool
-    """Whether every patch included in the wrench has a field, and all these fields are trusted."""
+    """Whether every patch that may contribute to the wrench has a field that is trusted."""
 
     @property
     def force_std_n(self) -> Float:

@@ -2,8 +2,9 @@
 
 Lower electrodes are stored as (3, M, K), and the Jacobian is stored transposed (3N, K). Values of
 neighbouring lower wires are therefore contiguous in memory, and sums stay in registers. Most of the time is
-spent on the inverse distances of electrode pairs. These are computed by multiplications alone, because
-processors execute square roots and divisions slowly. Lengths may be in any unit; F has the inverse unit.
+spent on the inverse distances of electrode pairs. The inverse distances are computed with multiplications
+only, because processors execute square roots and divisions slowly. Lengths may be in any unit; F has the
+inverse unit.
 """
 
 from __future__ import annotations

@@ -21,8 +21,8 @@ PRESETS: Final = ("aligned", "symmetric", "staggered")
 PRESET_IDS: Final = {"custom": 0, "aligned": 1, "symmetric": 2, "staggered": 3}  # object 0x2000, layout id
 
 MOST_ELECTRODES: Final = 1024
-"""Maximum number of upper electrodes on a patch, for example 32 × 32. A covariance matrix of 3072 coordinates
-takes 75 MB, and the posterior stores several of these matrices."""
+"""Maximum number of upper electrodes on a patch, for example 32 × 32. The posterior method
+stores several covariance matrices of 3072 coordinates, which take 75 MB each."""
 
 MOST_PAIRS: Final = 1 << 22
 """Maximum number of electrode pairs, each with one upper and one lower electrode. Storing the distances of
@@ -42,8 +42,8 @@ def require_array(name: str, value: ArrayLike, shape: tuple[int | str, ...], *, 
         finite: Whether every number must be finite.
 
     Raises:
-        ValueError: If the value cannot be converted. The error message contains the argument's name, its
-            value and the requirement.
+        ValueError: If the value cannot be converted. The error message contains the name of the argument,
+            its value and the requirement.
     """
     if (  # fast path for the arrays that a host passes with every scan
         type(value) is np.ndarray
@@ -211,7 +211,7 @@ class PatchLayout:
 
     @property
     def unknowns(self) -> int:
-        """Number of coordinates of one upper wire, 3 N."""
+        """Number of unknown coordinates per upper wire, 3 N."""
         electrodes: int = self.upper_m.shape[1]
         return 3 * electrodes
 
@@ -219,8 +219,9 @@ class PatchLayout:
     def pitch_m(self) -> float:
         """Length scale of the patch, metres.
 
-        This is the median distance between neighbouring electrodes on an upper wire. If each upper wire has
-        only one electrode, it is the median distance from an upper electrode to the nearest lower electrode.
+        The length scale is the median distance between neighbouring electrodes on an upper wire. If each
+        upper wire has only one electrode, the length scale is the median distance from an upper electrode to
+        the nearest lower electrode.
         """
         steps = np.linalg.norm(np.diff(self.upper_m, axis=1), axis=2)
         if steps.size:

@@ -28,7 +28,7 @@ _MOST_HEADER_BYTES: Final = 10_240
 
 
 def read_npz(path: Path) -> PatchLayout:
-    """Read a layout from an NPZ file without executing any content of the file.
+    """Read a layout from an NPZ file without unpickling objects.
 
     Args:
         path: File with the arrays ``upper_m`` (U, N, 3) and ``lower_m`` (K, M, 3) in metres and, optionally,
@@ -45,7 +45,7 @@ def read_npz(path: Path) -> PatchLayout:
             table = {key: file[key] for key in file.files}
     except ConfigError:
         raise
-    except Exception as error:  # zipfile, its decompressors and NumPy raise about fifteen types of error
+    except Exception as error:  # zipfile, its decompressors and NumPy raise many types of exception
         what = " ".join(str(error).split())[:80] or type(error).__name__
         raise ConfigError("layout file", str(path), f"an NPZ file ({what})") from None
     return from_electrodes(table, path)
@@ -70,7 +70,7 @@ def _require_sizes(data: io.BytesIO, path: Path) -> None:
             if member.compress_type not in (
                 zipfile.ZIP_STORED,
                 zipfile.ZIP_DEFLATED,
-            ):  # other compression methods would unpack a whole member at once
+            ):  # zipfile would unpack a whole member at once for other compression methods
                 got = Shown(f"compression method {member.compress_type}")
                 raise ConfigError(key, got, "stored or deflated, as NumPy writes it", where=str(path))
             most_bytes = _MOST_VALUES[key] * _MOST_ITEM_BYTES

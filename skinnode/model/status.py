@@ -16,15 +16,15 @@ class Status(enum.IntEnum):
     DEADLINE = 2
     """The time limit was reached."""
     RADIUS_TOO_SMALL = 3
-    """No step within the trust region reduces the residual, and the point is not a root."""
+    """The trust region became too small: no step reduces the residual, and the iterate is not a root."""
     STEP_TOO_SMALL = 4
-    """The steps shrank below the tolerance, and the point is not a root."""
+    """The steps became smaller than the tolerance, and the iterate is not a root."""
     ILL_CONDITIONED = 5
     """The Jacobian is singular, resistances are missing, or the root may be wrong."""
     NON_FINITE = 6
-    """A value overflowed, or resistances were not usable."""
+    """A value became too large for a float, or resistances were not usable."""
     INVALID_START = 7
-    """F or J is not finite at the starting point; `solve_system` returns the starting point unchanged."""
+    """F or its Jacobian J is not finite at the starting point, which `solve_system` returns unchanged."""
     INCONSISTENT = 8
     """No deformation explains the resistances: their χ² is far larger than noise can explain."""
 

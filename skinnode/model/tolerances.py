@@ -9,7 +9,7 @@ from typing import Final
 
 @dataclass(frozen=True, slots=True)
 class Tolerances:
-    """Standard deviations of the differences between a patch and its layout; 0 means exact.
+    """Standard deviations of the differences between a patch and its layout; 0 means no difference.
 
     Raises:
         ValueError: If a tolerance is negative, or not below 0.5.
@@ -20,7 +20,7 @@ class Tolerances:
     thickness: float = 0.0
     """Rubber thickness between upper and lower electrodes, as a fraction of their smallest distance."""
     electrode_radius: float = 0.0
-    """Radius of the electrodes, in pitches; the forward model treats electrodes as points."""
+    """Radius of the electrodes, in pitches. The forward model assumes point electrodes."""
     gain: float = 0.0
     """Gain of the front end for changes in resistance, as a fraction of the nominal gain."""
 

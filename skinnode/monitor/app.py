@@ -63,7 +63,7 @@ class MonitorApp(App[None]):
         source: Host or recording; the caller closes it.
         folder: Folder for recordings.
         colours: Colours of the terminal.
-        over: Callback for each screen update; the monitor ends when it returns True.
+        over: Function called at each screen update; the monitor ends when the function returns True.
         seconds: Maximum duration; None for no limit.
     """
 
@@ -110,7 +110,7 @@ class MonitorApp(App[None]):
         self._scale = Scale()
         self._view: View | None = None
         self._tares: queue.SimpleQueue[tuple[str, Level]] = queue.SimpleQueue()
-        """Result of each tare, and the severity of the result."""
+        """Message about each completed tare, and the severity of the message."""
         self._begun_s = time.monotonic()
         self._cpu_s = 0.0
         self._wall_minus_mono_ns = time.time_ns() - time.monotonic_ns()
@@ -169,7 +169,7 @@ class MonitorApp(App[None]):
         self.faults.update(view, time.monotonic_ns(), ending=ending)
         for event in self._source.events():
             begins = event.what == "operational" and time.monotonic() - self._begun_s < _BEGIN_S
-            if not begins:  # omit the events of the start-up
+            if not begins:  # do not log that patches become operational at start-up
                 self._lines.append(log_line(event, self._wall_minus_mono_ns))
         self._settle_tares()
         if not self._paused:

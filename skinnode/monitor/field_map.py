@@ -1,4 +1,4 @@
-"""Renders a displacement field as characters: depth as brightness, shear as arrows.
+"""Renders a displacement field as characters: depth is shown by brightness, shear by arrows.
 
 On the map, the patch's x axis (along the upper wires) points right, and its y axis points up. Each character
 shows two pixels, one above the other, so a pixel is roughly square. Without colours, each character
@@ -37,7 +37,7 @@ LEVELS: Final = 24
 _UNKNOWN: Final = -1
 """Shade level of pixels whose depth is unknown."""
 _SIGNS: Final = "·:-=+*#%@"
-"""Characters that represent depth, from untouched to deepest; denser characters represent deeper skin."""
+"""Characters that represent depth on terminals without colours, in order of increasing depth."""
 _ANSI: Final = ("black", "blue", "magenta", "red", "yellow", "bright_white")
 ARROWS: Final = "→↗↑↖←↙↓↘"
 
@@ -125,7 +125,7 @@ def resample(grid: Float, width: int, height: int) -> Float:
 
 
 def arrow(x: float, y: float) -> str:
-    """Return the arrow, one of eight, closest to the direction (x, y)."""
+    """Return the one of eight arrows that is closest to the direction (x, y)."""
     return ARROWS[round(math.atan2(y, x) / (math.pi / 4)) % 8]
 
 
@@ -140,7 +140,7 @@ def mean_shear_m(surface: Surface) -> tuple[float, float]:
 
 
 class Scale:
-    """Depth drawn at full brightness: the smallest round number above the depth of the deepest recent press.
+    """Brightness scale of the maps. Full brightness is a round number above the depth of recent presses.
 
     All patches share one brightness scale, so that their maps are comparable.
     """
@@ -170,7 +170,7 @@ class MapStyle:
 
     @property
     def full_shear_m(self) -> float:
-        """Shear drawn at full brightness, m. The factor accounts for shear being smaller than depth."""
+        """Shear drawn at full brightness, m. The factor 0.25 reflects that shear is smaller than depth."""
         return 0.25 * self.full_m
 
 

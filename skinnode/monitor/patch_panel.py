@@ -188,7 +188,7 @@ def _caption(text: str, theme: Theme) -> Line:
 
 
 def facts(patch: PatchView, theme: Theme, width: int) -> list[Line]:
-    """Return all values of a patch as lines; each line contains the name of a value and the value."""
+    """Return all values of a patch as lines; each line contains the name and the value."""
     health, stream = patch.health, patch.stream
     counts = stream.assembler
     lines = [

@@ -28,9 +28,9 @@ class FaultBook:
     """Faults of a monitoring session, each listed once, in order of first occurrence.
 
     Args:
-        live: Whether the source is a running hand. Its patches must be operational soon after the start. A
-            recording begins before the patches are started. A patch in a recording is therefore reported
-            only at the end, if it was never operational.
+        live: Whether the source is a running hand. The patches of a running hand must be operational soon
+            after the start. A recording may begin before the patches are started, so they are checked only
+            at the end.
     """
 
     def __init__(self, *, live: bool) -> None:
@@ -75,7 +75,7 @@ class FaultBook:
 
 
 def _lasting(health: PatchHealth) -> list[tuple[str, str]]:
-    """Return the wire faults, duplicate node-ID and last EMCY of a patch as pairs of a key and a text."""
+    """Return pairs (key, text) for the wire faults, duplicate node-ID and last EMCY of a patch."""
     wires = [f"{fault.side} wire {fault.number} {fault.state}" for fault in health.wires]
     found = [(text, text) for text in wires]
     if health.duplicate_id:
@@ -95,7 +95,7 @@ def watch(
         source: Host or recording.
         stop: Event that ends the iteration.
         seconds: Maximum duration; None for no limit.
-        faults: Object to which the faults of the session are added.
+        faults: Faults of the session; updated at each check.
 
     Raises:
         SkinError: The source failed.

@@ -35,7 +35,7 @@ class Snapshot:
     """State of a hand at one instant, as mappings from patch names or bus names."""
 
     t_ns: int
-    """Time on the host's monotonic clock, ns. In a recording, this is the clock of the recorded host."""
+    """Time on the host's monotonic clock, ns. The time in a recording is from the host that made it."""
     health: Mapping[str, PatchHealth]
     bus_health: Mapping[str, BusHealth]
     buses: Mapping[str, BusStats]
@@ -104,7 +104,7 @@ class HostSource:
         self.hand, self.title = host.hand, host.hand.name
         self._host = host
         self._events = host.events(capacity=_EVENTS)
-        self._fields = host.fields(capacity=_CAPACITY)  # also receives the error if the host fails
+        self._fields = host.fields(capacity=_CAPACITY)  # the queue also receives the error if the host fails
         self._recorder: Recorder | None = None
         self._untap: Callable[[], None] | None = None
 

@@ -47,7 +47,7 @@ class _Writer(threading.Thread):
     def end(self) -> None:
         """End the thread when the queue is empty.
 
-        If the thread is blocked by a stalled terminal, it ends with the process.
+        A thread that is blocked by a stalled terminal ends with the process.
         """
         with suppress(queue.Full):
             self.queue.put_nowait(None)
@@ -62,7 +62,7 @@ class PatientDriver(LinuxDriver):
         self._gone = threading.Event()
         self._writer: _Writer | None = None
         self.torn = False
-        """Whether output was discarded because the queue was full. If so, the screen must be redrawn."""
+        """Whether the screen must be redrawn, because output was discarded when the queue was full."""
 
     def start_application_mode(self) -> None:
         """Start the writer thread, then enter application mode."""

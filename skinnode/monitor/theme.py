@@ -140,7 +140,7 @@ def spread(left: Line, right: Line, width: int, theme: Theme, style: Style | Non
 
 
 def beside(blocks: Sequence[tuple[list[Line], int]], height: int, theme: Theme) -> list[Line]:
-    """Join blocks of lines of given widths side by side."""
+    """Place blocks of lines side by side; each block has a given width."""
     return [
         [
             segment

@@ -14,8 +14,8 @@ TOUCH: Final = 0.35
 """Minimum depth of the electrodes in a touch, as a fraction of the maximum depth. In a Hertzian contact, the
 depth at the rim is half the depth at the centre."""
 SURE: Final = 6.0
-"""Minimum depth of the electrodes in a touch, as a multiple of the standard deviation of the depth. On 100
-electrodes, noise exceeds this limit once in 10 million fields."""
+"""Minimum depth of the electrodes in a touch, as a multiple of the standard deviation of the depth. With 100
+electrodes, noise alone exceeds this limit in one of 10 million fields."""
 LEAST_TOUCH_M: Final = 1e-5
 
 
@@ -40,8 +40,8 @@ class Touch:
 def touches_of(field: FieldFrame, rest_m: Float) -> tuple[Touch, ...]:
     """Return the contacts on a patch, strongest first.
 
-    A field computed by the exact inverse may contain no contacts, for example in an old recording. Each
-    connected region of pressed skin is then returned as a contact. The forces on a region are known only if a
+    A field computed by the exact inverse may contain no contacts, for example in an old recording. In this
+    case, each connected region of pressed skin is returned as a contact, whose force is known only if a
     stiffness was specified.
 
     Args:

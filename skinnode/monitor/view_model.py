@@ -130,7 +130,7 @@ class History:
         """Add the newest snapshot and return its view."""
         kept = self._kept
         if kept and kept[-1].t_ns > snapshot.t_ns:
-            kept.clear()  # in a recording, the clock may be set back
+            kept.clear()  # the clock of a recording may be set back
         elif kept and kept[-1].t_ns == snapshot.t_ns:
             kept.pop()
         kept.append(snapshot)
@@ -231,7 +231,7 @@ def upper_m(layout: LayoutConfig) -> Float:
 def judge_patch(
     health: PatchHealth, stream: StreamStats, before: StreamStats
 ) -> tuple[str, Level, tuple[str, ...]]:
-    """Return the condition of a patch, the severity of its faults, and descriptions of its other faults."""
+    """Return the condition of a patch, its severity, and descriptions of the patch's faults."""
     condition = health.condition
     if condition is Condition.STALE and not stream.solved and not stream.withheld:
         return "starting", "note", ()

@@ -39,7 +39,7 @@ THRIFTY: Final = Pacing(slack_ns=2_000_000, catch_up_ns=50_000_000)
 The slack halves the processor load, because a node then sends several chunks per wake-up.
 
 A kernel with 100 timer ticks per second wakes a thread 10 to 20 ms late, or later if the computer is busy. In
-a test with such a kernel, nodes that compensated for delays of only 10 ms skipped a third of their scans.
-Nodes that compensated for 50 ms skipped none. The mean frame rate is the same, but a node that was delayed by
-50 ms sends all chunks of these 50 ms in one burst.
+a test with such a kernel, nodes with a ``catch_up_ns`` of 10 ms skipped a third of their scans, and nodes
+with 50 ms skipped no scans. The mean frame rate does not depend on ``catch_up_ns``. However, after a delay of
+50 ms, a node sends all chunks of these 50 ms in one burst.
 """

@@ -110,7 +110,7 @@ class CanopenDevice:
     # --- events
 
     def power_on(self, t_ns: int) -> None:
-        """Start the application, then boot into PRE-OPERATIONAL or, without a node-ID, wait for LSS.
+        """Start the application, then boot. A device without a node-ID waits until LSS assigns one.
 
         Args:
             t_ns: current time, ns.
@@ -196,7 +196,8 @@ class CanopenDevice:
     def silent_from_ns(self) -> int:
         """Time (ns) from which :meth:`on_timer` reports that the master or a monitored node has gone silent.
 
-        The caller must first pass all frames received before that time to :meth:`on_frame`.
+        The caller must first pass all received frames to :meth:`on_frame`, in case one of them is a heartbeat
+        or guarding request.
         """
         return self._error_control.silent_from_ns
 

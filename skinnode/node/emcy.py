@@ -124,7 +124,7 @@ class EmcyProducer:
         self._queue(_message(EmcyCode.RESET, self.register, code.to_bytes(2, "little")), t_ns)
 
     def _remember(self, code: EmcyCode, detail: bytes) -> None:
-        # The manufacturer-specific upper 16 bits of an entry contain the first two detail bytes.
+        # The upper 16 bits of an error history entry are manufacturer-specific: the first two detail bytes.
         self._history.appendleft(code | int.from_bytes(detail[:2], "little") << 16)
 
     def _queue(self, message: bytes, t_ns: int) -> None:

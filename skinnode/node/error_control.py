@@ -28,7 +28,7 @@ _RIVAL_BEATS: Final = 3
 considered resolved. The number allows for a lost heartbeat of the other node."""
 _RIVAL_NS: Final = 750_000_000
 """Time (ns) without a frame from a node with the same node-ID after which the conflict is considered
-resolved, if this node sends no heartbeats. The value is three default heartbeat periods.
+resolved, if this node sends no heartbeats. This time equals three default heartbeat periods.
 """
 
 

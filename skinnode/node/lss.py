@@ -101,7 +101,8 @@ class LssSlave:
 
         A pending node-ID that was not stored is lost. The caller must then call :meth:`reset_communication`.
 
-        The CANopen stacks c-open (src/co_nmt.c) and CANopenNode (305/CO_LSSslave.h) do the same.
+        The CANopen stacks c-open (src/co_nmt.c) and CANopenNode (305/CO_LSSslave.h) handle the persistent and
+        the pending node-ID in the same way.
         """
         self.pending_node_id = self._persistent_node_id
 
@@ -248,7 +249,7 @@ class BitRateChange:
         self._over_ns = t_ns + 2 * delay_ms * 1_000_000
 
     def silent(self, t_ns: int) -> bool:
-        """Change the bit rate if due; return whether the node must stop sending and receiving."""
+        """Change the bit rate if the delay has elapsed; return whether the node must be silent."""
         if self.deadline_ns == NO_DEADLINE_NS:
             return False
         if t_ns >= self._change_ns:

@@ -16,8 +16,8 @@ from skinnode.protocol.profile import PatchProfile
 from skinnode.protocol.summary import PHASES
 
 TARE_READS: Final = 16
-"""Number of readings averaged to measure a baseline. The baseline then has a quarter of the noise of a single
-reading, so the noise of R/R0 is only 3 % higher than the noise of R."""
+"""Number of readings averaged to measure a baseline. Averaging reduces the noise of the baseline to a quarter
+of the noise of one reading. The relative noise of R/R0 is then only 3 % higher than that of R."""
 
 
 class Acquisition:

@@ -168,7 +168,7 @@ class PatchApplication:
         self._storage.report(self._now())
 
     def _mark_baseline(self) -> None:
-        """Announce a new baseline by a flag in the next summary."""
+        """Announce a new baseline with a flag in the next summary."""
         self._baseline_changed = True
 
     # --- scans
@@ -209,8 +209,8 @@ class PatchApplication:
     def _sample(self, counter: int, t_ns: int) -> tuple[list[bytes], SummaryFlag, Codes]:
         """Take a scan.
 
-        Returns the chunks to send, the summary flags, and the (U, K) codes that a receiver must then have.
-        Raises SourceFailed if the source returns no valid reading.
+        Returns the chunks to send, the summary flags, and the (U, K) codes that a receiver has after this
+        scan. Raises SourceFailed if the source returns no valid reading.
         """
         store, acquisition = self._store, self._acquisition
         if not acquisition.tared:  # no baseline yet, because taring at power-on failed

@@ -82,7 +82,7 @@ class PatchNode(CanopenDevice):
 
     @property
     def scans_sent(self) -> int:
-        """Number of scans sent completely since construction."""
+        """Number of scans sent completely since the node was created."""
         return self._patch.stream.scans_sent
 
     @property

@@ -17,7 +17,7 @@ resistances. The stream therefore requests a timer event immediately after a sca
 to the second chunk is then measured from the time of this timer event.
 
 **Synchronous window (0x1007).** Chunks and summaries in synchronous TPDOs that are still unsent when the
-window closes are discarded. The window does not apply to event-driven TPDOs.
+window closes are discarded. The synchronous window does not apply to event-driven TPDOs.
 
 **Queue.** A scan waits while another scan is being sent; only one scan can wait. Chunks of two scans are
 never interleaved. If the node leaves OPERATIONAL, the scan being sent ends without a summary. If the chunk
@@ -75,13 +75,13 @@ class ScanStream:
         self._whole_record = [(od.CHUNK, sub) for sub in range(1, store.integer(od.CHUNK, 0) + 1)]
         self._scan: OutgoingScan | None = None
         self._next_scan: OutgoingScan | None = None
-        self._carrier: Tpdo | None = None  # TPDO for the current scan's chunks
+        self._carrier: Tpdo | None = None  # TPDO used for the chunks of the current scan
         self._unsent: deque[bytes] = deque()
-        self._verbatim = False  # whether this TPDO contains the whole chunk record
+        self._verbatim = False  # whether the carrier maps exactly the chunk record
         self._chunks_sent = 0
         self._busy_ns = 0  # time since which the stream has been sending without a pause
         self._just_begun = False
-        self._paced_ns = 0  # sum of the inhibit times since then
+        self._paced_ns = 0  # sum of the inhibit times since ``_busy_ns``
         self.chunk = chunk
         """Content of the chunk record (0x2010): the last chunk sent."""
         self.summary = bytes(12)
@@ -99,7 +99,7 @@ class ScanStream:
     def is_held_up(self, t_ns: int) -> bool:
         """Return whether the stream is sending the current scans more slowly than the inhibit time permits.
 
-        If so, the thread receives too little processor time, or the bus refuses frames.
+        Slow sending means that the thread receives too little processor time, or that the bus refuses frames.
         """
         busy_ns = t_ns - self._busy_ns
         lost_ns = busy_ns - self._paced_ns

@@ -20,8 +20,8 @@ from skinnode.protocol.self_test import SelfTest, SelfTestFault
 READINGS: Final = 16
 """Number of readings in a self-test, as in a tare.
 
-With this number, the noise of one crossing is measured with a relative standard error of 18 % (1/√30). For a
-patch with 300 crossings, the standard error of the RMS noise is 1 %.
+From 16 readings, the noise of one crossing is estimated with a relative standard error of 18 % (1/√30). For a
+patch with 300 crossings, the relative standard error of the RMS noise is 1 %.
 """
 
 NOISE_LIMIT: Final = 1e-3

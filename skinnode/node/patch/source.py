@@ -12,9 +12,9 @@ from skinnode.model.layout import Float, require_array
 class ResistanceSource(Protocol):
     """Source of the resistances between a patch's upper and lower wires.
 
-    A source may also have an attribute ``conversions``: the number of conversions of all crossings completed
-    by the converter, an integer of any size. The node reads ``conversions`` after :meth:`read`. Each summary
-    indicates whether the number has changed, so the host detects a stopped converter immediately. If the
+    A source may also have an integer attribute ``conversions``, which counts how often the converter has
+    measured all crossings. The node reads ``conversions`` after :meth:`read`. Each summary indicates whether
+    the number has changed, so the host detects a stopped converter immediately. If the
     attribute ``conversions`` is missing or None, the host must detect a stopped converter from the codes. The
     conversions must be counted in the converter itself, not in :meth:`read`. A source may have this attribute
     only if its converter completes at least one conversion of all crossings per scan.
@@ -33,7 +33,7 @@ class ResistanceSource(Protocol):
 
 
 def conversions_of(source: ResistanceSource) -> int | None:
-    """Return a source's number of completed conversions; None if it does not count conversions.
+    """Return a source's number of completed conversions; None if the source does not count conversions.
 
     Raises:
         SourceFailed: if the attribute raises an exception or is not an integer.

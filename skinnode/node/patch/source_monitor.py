@@ -1,4 +1,4 @@
-"""Monitor that counts failures of a patch's source and reports them by EMCY 0xFF00."""
+"""Count failures of a patch's source, and report them in EMCY messages (0xFF00)."""
 
 from __future__ import annotations
 

@@ -191,7 +191,7 @@ class PdoRecords:
             raise Refused(AbortCode.UNSUPPORTED_ACCESS)
         if not subindex:
             self._check_mapping(value)
-        elif value:  # an entry of 0 is unused; sub-index 0 must not include it in its count
+        elif value:  # an unused entry is 0; sub-index 0 must not count unused entries
             self._mapped_bytes(value)
 
     def _check_mapping(self, count: int) -> None:

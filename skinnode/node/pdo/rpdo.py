@@ -119,7 +119,8 @@ class RpdoEngine:
     def enter(self, *, operational: bool) -> None:
         """Handle a change of the NMT state: drop the pending RPDOs, and end deadline monitoring.
 
-        Deadlines are monitored only in OPERATIONAL (CiA 301 v4.2, 7.5.2.33), so RPDO timeout errors end.
+        Deadlines are monitored only in OPERATIONAL (CiA 301 v4.2, 7.5.2.33), so active RPDO timeout errors
+        end.
         """
         self._operational = operational
         self._pending.clear()

@@ -14,10 +14,11 @@ class ResistanceSource(Protocol):
 
     A source may also have an integer attribute ``conversions``, which counts how often the converter has
     measured all crossings. The node reads ``conversions`` after :meth:`read`. Each summary indicates whether
-    the number has changed, so the host detects a stopped converter immediately. If the
-    attribute ``conversions`` is missing or None, the host must detect a stopped converter from the codes. The
-    conversions must be counted in the converter itself, not in :meth:`read`. A source may have this attribute
-    only if its converter completes at least one conversion of all crossings per scan.
+    the number has changed, so the host detects a stopped converter immediately. If the attribute
+    ``conversions`` is missing or None, the host must detect a stopped converter from the codes.
+
+    The conversions must be counted in the converter itself, not in :meth:`read`. A source may have the
+    attribute ``conversions`` only if its converter measures all crossings at least once per scan.
     """
 
     def read(self, t_ns: int) -> Float:

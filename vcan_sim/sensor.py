@@ -105,11 +105,15 @@ class SimulatedPatch:
         self.reads += 1
         self.last_read_ns = t_ns
         self._remember(t_ns)
-        t_s = self.scene_s(t_ns)
-        resistance = self.skin.rest_ohm if t_s is None else self.skin.analogue_ohm(t_s, self.scene.upper_m)
+        resistance = self.exact_ohm(t_ns)
         noisy = resistance * (1.0 + self._noise * self._random.standard_normal(resistance.shape))
         read = self.skin.converted_ohm(noisy, self.reads)
         return read if self.fault is None else self.fault(read, t_ns)
+
+    def exact_ohm(self, t_ns: int) -> Float:
+        """Return the resistances (U, K) in ohm at ``t_ns``, without converter noise."""
+        t_s = self.scene_s(t_ns)
+        return self.skin.rest_ohm if t_s is None else self.skin.analogue_ohm(t_s, self.scene.upper_m)
 
     def read_ns(self, device_time_us: int) -> int:
         """Return the time of a reading, ns.

@@ -18,8 +18,12 @@ from collections.abc import Sequence
 from typing import Any, Final
 
 from skinnode.bench.timing import machine, take_turns
+from skinnode.canopen import indices as od
 from skinnode.config import HandConfig, parse_hand
 from skinnode.host import Host
+from skinnode.process import clock
+from skinnode.protocol.command import SendMode, pack_command
+from skinnode.transport import CanPort
 from vcan_sim.fleet import Fleet
 from vcan_sim.scenes import PatchScene, SceneConfig, bind_scene, parse_scene
 from vcan_sim.sensor import SimulatedPatch
@@ -50,41 +54,47 @@ def run(patches: Sequence[int] = PATCHES, scans: int = 20) -> dict[str, Any]:
         scans: Number of scans per measurement.
 
     Returns:
-        Processor and library versions (``machine``), the lists of rows ``area`` and ``contact``, and the
-        result of :func:`physics`. A row contains the numbers of ``patches`` and ``touched`` patches, the CPU
-        times per patch and scan in ms (``nodes_ms``, ``bus_ms``, ``host_ms``), the number of solved
-        ``fields``, the ratio of virtual to real time (``faster``), and the memory of the process
-        (``memory_mb``).
+        Processor and library versions (``machine``), the lists of rows ``area``, ``contact`` and
+        ``changed``, and the result of :func:`physics`. In ``changed``, the patches send only changed chunks.
+        A row contains the numbers of ``patches`` and ``touched`` patches, whether only changed chunks are
+        sent (``changed_only``), the CPU times per patch and scan in ms (``nodes_ms``, ``bus_ms``,
+        ``host_ms``), the number of solved ``fields``, the ratio of virtual to real time (``faster``), and the
+        memory of the process (``memory_mb``).
     """
     measure(1, 1, 2)  # compile the kernels and fill the caches
     contact = [measure(FIXED, count, scans) for count in TOUCHED]
+    changed = [measure(FIXED, count, scans, changed_only=True) for count in TOUCHED[:2]]
     return {
         "machine": machine(),
         "area": [
             measure(count, 1, scans) for count in sorted(patches)
         ],  # ascending, because peak memory never decreases
         "contact": contact,
+        "changed": changed,
         "physics": physics(),
     }
 
 
-def measure(patches: int, touched: int, scans: int) -> Row:
+def measure(patches: int, touched: int, scans: int, *, changed_only: bool = False) -> Row:
     """Measure a hand in which ``touched`` patches are touched.
 
     Args:
         patches: Number of patches.
         touched: Number of touched patches.
         scans: Number of scans to measure.
+        changed_only: Whether the patches send only changed chunks.
 
     Returns:
         A row as in :func:`run`.
     """
     hand = hand_of(patches)
-    with VirtualClock() as clock:
+    with VirtualClock() as virtual:
         rates = BitRates(hand.buses[0].bitrate_bps)
-        segments = [segment(bus.channel, clock, rates) for bus in hand.buses]
+        segments = [segment(bus.channel, virtual, rates) for bus in hand.buses]
         with Fleet(hand, scene=scene_of(touched)) as fleet, Host.from_config(hand) as host:
             clock.sleep(_SETTLED_S)
+            if changed_only:
+                _send_changed_only(hand)
             solved, start = _solved(host), time.perf_counter()
             clock.sleep(scans * PERIOD_MS * 1e-3)
             real_s = time.perf_counter() - start
@@ -99,6 +109,7 @@ def measure(patches: int, touched: int, scans: int) -> Row:
     return {
         "patches": patches,
         "touched": touched,
+        "changed_only": changed_only,
         "nodes_ms": spent["nodes"] * each,
         "bus_ms": spent["bus"] * each,
         "host_ms": spent["host"] * each,
@@ -109,26 +120,36 @@ def measure(patches: int, touched: int, scans: int) -> Row:
 
 
 def physics() -> dict[str, float]:
-    """Time one reading of an untouched and of a touched simulated patch, without sending frames.
+    """Time the simulation of one scan, without the node and its frames.
 
     Returns:
-        ``untouched_us`` and ``touched_us``, µs.
+        ``untouched_us`` and ``touched_us``, the time to compute the resistances of an untouched and of a
+        pressed patch, µs; ``converter_us``, the time to add the noise of the converter, µs.
     """
     scenes = bind_scene(scene_of(1), hand_of(2))
-    timed = take_turns({"touched": _Reading(scenes["patch0"]), "untouched": _Reading(scenes["patch1"])})
-    return {f"{name}_us": timing.call_us for name, timing in timed.items()}
+    patches = {"touched": _Skin(scenes["patch0"]), "untouched": _Skin(scenes["patch1"])}
+    timed = take_turns({**patches, "read": patches["untouched"].read})
+    times_us = {f"{name}_us": timed[name].call_us for name in patches}
+    return {**times_us, "converter_us": timed["read"].call_us - timed["untouched"].call_us}
 
 
-class _Reading:
-    """Reads a simulated patch; the simulated time advances with every call."""
+class _Skin:
+    """Simulates a patch at a new time in every call."""
 
     def __init__(self, scene: PatchScene) -> None:
         self._patch, self._t_ns = SimulatedPatch(scene), 1_500_000_000
         self._patch.start(0)
 
     def __call__(self) -> None:
+        self._patch.exact_ohm(self._next_ns())
+
+    def read(self) -> None:
+        """Simulate the patch and the noise of its converter."""
+        self._patch.read(self._next_ns())
+
+    def _next_ns(self) -> int:
         self._t_ns += 1_000_000
-        self._patch.read(self._t_ns)
+        return self._t_ns
 
 
 def hand_of(patches: int) -> HandConfig:
@@ -167,6 +188,17 @@ def scene_of(touched: int) -> SceneConfig:
     )
 
 
+def _send_changed_only(hand: HandConfig) -> None:
+    """Command all patches to send only changed chunks, and wait until they do."""
+    command = pack_command(send_mode=SendMode.CHANGED)
+    for bus in hand.buses:
+        with CanPort(bus) as port:
+            for patch in hand.patches:
+                if patch.bus == bus.name:
+                    port.send(od.command_cob_id(patch.node_id), command)
+            clock.sleep(2 * PERIOD_MS * 1e-3)
+
+
 def _solved(host: Host) -> int:
     return sum(patch.solved for patch in host.stats().patches.values())
 
@@ -181,6 +213,6 @@ def _cpu_ns(segments: Sequence[Segment]) -> Counter[str]:
         if thread is threading.main_thread() or thread.ident is None:
             continue
         owner = "nodes" if thread.name.startswith("nodes ") else "host"
-        clock = time.pthread_getcpuclockid(thread.ident)
-        spent[owner] += time.clock_gettime_ns(clock) - by_bus[thread.name]
+        cpu_clock = time.pthread_getcpuclockid(thread.ident)
+        spent[owner] += time.clock_gettime_ns(cpu_clock) - by_bus[thread.name]
     return spent

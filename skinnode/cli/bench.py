@@ -251,16 +251,22 @@ def scale(
     _print_machine(figures)
     typer.echo("CPU time per patch and scan, ms")
     typer.echo(
-        f"{'patches':>8}{'touched':>9}{'nodes':>8}{'bus':>8}{'host':>8}{'virtual/real time':>19}{'MB':>7}"
+        f"{'patches':>8}{'touched':>9}{'chunks':>9}{'nodes':>8}{'bus':>8}{'host':>8}"
+        f"{'virtual/real time':>19}{'MB':>7}"
     )
-    for row in figures["area"] + figures["contact"]:
+    for row in figures["area"] + figures["contact"] + figures["changed"]:
         times = "".join(f"{row[key]:8.2f}" for key in ("nodes_ms", "bus_ms", "host_ms"))
-        typer.echo(f"{row['patches']:8}{row['touched']:9}{times}{row['faster']:19.2f}{row['memory_mb']:7.0f}")
+        chunks = "changed" if row["changed_only"] else "all"
+        typer.echo(
+            f"{row['patches']:8}{row['touched']:9}{chunks:>9}{times}"
+            f"{row['faster']:19.2f}{row['memory_mb']:7.0f}"
+        )
     reading = figures["physics"]
     share = 100 * reading["untouched_us"] / reading["touched_us"]
     typer.echo(
-        f"time to simulate one reading, without frames: touched {reading['touched_us']:.0f} µs, "
-        f"untouched {reading['untouched_us']:.1f} µs ({share:.1f} %)"
+        f"time to simulate the skin for one scan: touched {reading['touched_us']:.0f} µs, "
+        f"untouched {reading['untouched_us']:.1f} µs ({share:.1f} %); "
+        f"noise of the converter {reading['converter_us']:.1f} µs"
     )
     _write(json, figures)
     if plot is not None:

@@ -72,13 +72,16 @@ def unpack_chunk(data: bytes, bits: int = 16, *, cob_id: int = _COB_ID) -> Chunk
     return Chunk(data[0], data[1], codes)
 
 
-def pack_scan(codes: ArrayLike, scan: int, profile: PatchProfile) -> list[bytes]:
+def pack_scan(
+    codes: ArrayLike, scan: int, profile: PatchProfile, only: Sequence[int] | None = None
+) -> list[bytes]:
     """Pack the codes of a scan into the payloads of its chunks, in order.
 
     Args:
         codes: (U, K) codes.
         scan: scan counter, 0 to 255.
         profile: sizes of the patch.
+        only: indices of the chunks to pack, in order; None for all chunks.
 
     Raises:
         ValueError: if the codes have the wrong shape, or if a code is wider than ``profile`` allows.
@@ -88,6 +91,8 @@ def pack_scan(codes: ArrayLike, scan: int, profile: PatchProfile) -> list[bytes]
         raise ValueError(f"codes: got shape {array.shape}, must be ({profile.rows}, {profile.columns})")
     if int(array.max()) >> profile.code_bits:
         raise ValueError(f"codes: got {int(array.max())}, must be below {1 << profile.code_bits}")
+    if only is not None and not len(only):
+        return []
     width, per, size, n = (
         profile.code_bits // 8,
         profile.codes_per_chunk,
@@ -97,18 +102,26 @@ def pack_scan(codes: ArrayLike, scan: int, profile: PatchProfile) -> list[bytes]
     lines = array.reshape(profile.lines, -1)
     padded = np.zeros((profile.lines, profile.chunks_per_line * per), dtype="<u4")
     padded[:, : lines.shape[1]] = lines
-    frames = np.zeros((n, size), dtype=np.uint8)
-    if profile.bus == "classic":
-        frames[:, 0] = np.arange(n)
-    else:
-        wire, part = np.divmod(np.arange(n), profile.chunks_per_line)
-        frames[:, 0] = wire
-        frames[:, 2:4] = (part * per).astype("<u2")[:, None].view(np.uint8)
+    frames = _empty_chunks(profile).copy()
     frames[:, 1] = scan
     head = profile.chunk_head_bytes
     frames[:, head : head + per * width] = padded.view(np.uint8).reshape(-1, 4)[:, :width].reshape(n, -1)
     payload = frames.tobytes()
-    return [payload[at : at + size] for at in range(0, len(payload), size)]
+    return [payload[at * size : (at + 1) * size] for at in (range(n) if only is None else only)]
+
+
+@functools.cache
+def _empty_chunks(profile: PatchProfile) -> NDArray[np.uint8]:
+    """Return the payloads of all chunks, (chunks, bytes), without the scan counter and the codes."""
+    n = profile.n_chunks
+    chunks = np.zeros((n, profile.chunk_bytes), dtype=np.uint8)
+    if profile.bus == "classic":
+        chunks[:, 0] = np.arange(n)
+    else:
+        wire, part = np.divmod(np.arange(n), profile.chunks_per_line)
+        chunks[:, 0] = wire
+        chunks[:, 2:4] = (part * profile.codes_per_chunk).astype("<u2")[:, None].view(np.uint8)
+    return chunks
 
 
 def unpack_scan(frames: bytes, profile: PatchProfile) -> Codes:

@@ -223,17 +223,17 @@ class PatchApplication:
         if self._baseline_changed:
             flags |= SummaryFlag.BASELINE_CHANGED
             self._baseline_changed = False
-        codes = acquisition.codes
-        chunks = pack_scan(codes, counter, self._profile)
+        codes, changed = acquisition.codes, None
         if store.integer(od.SEND_POLICY, od.SEND_MODE) == SendMode.CHANGED:
             changed = acquisition.selection.changed_chunks(
                 codes,
                 store.integer(od.SEND_POLICY, od.SEND_THRESHOLD),
                 store.integer(od.SEND_POLICY, od.SEND_REFRESH),
             )
-            if changed is not None:
-                flags |= SummaryFlag.CHANGED_ONLY
-                chunks, codes = [chunks[index] for index in changed], acquisition.selection.sent
+        chunks = pack_scan(codes, counter, self._profile, changed)
+        if changed is not None:
+            flags |= SummaryFlag.CHANGED_ONLY
+            codes = acquisition.selection.sent
         return chunks, flags, codes
 
     def _tare(self, t_ns: int) -> None:

@@ -17,11 +17,11 @@ from vcan_sim.skin.imperfections import EXACT, Imperfections
 from vcan_sim.skin.patch import PhysicalPatch
 
 REMEMBERED_READINGS: Final = 4096
-"""Number of readings whose times are stored: more than five minutes of scans at 12.5 per second."""
+"""Number of most recent readings whose times are stored, enough for five minutes at 12.5 scans per second."""
 
 Fault = Callable[[Float, int], Float]
-"""Function of the true resistances (U, K) in ohm and the time in ns that returns the measured resistances;
-inf means an open pair of wires, 0 a shorted pair."""
+"""Function that takes a reading (U, K) in ohm and its time in ns, and returns the faulty reading. The value
+inf stands for an open pair of wires, and 0 for a shorted pair."""
 
 
 class SkinMotion(Protocol):
@@ -40,7 +40,10 @@ class SkinMotion(Protocol):
         """Number of the patch in the hand; the noise differs between patches."""
 
     def upper_m(self, t_s: float) -> Float:
-        """Return the upper electrodes (U, N, 3), in m, at a scene time; at rest: ``layout.upper_m``."""
+        """Return the positions (U, N, 3) of the upper electrodes in m at a scene time.
+
+        At rest, the method returns ``layout.upper_m`` itself.
+        """
 
 
 class SimulatedPatch:
@@ -48,18 +51,19 @@ class SimulatedPatch:
 
     This class implements :class:`skinnode.node.ResistanceSource`. The skin stays at rest until :meth:`start`
     sets the scene's time origin, so that the patch is untouched during the tare at power-on. The ground truth
-    is a pure function of time and is not stored: :meth:`truth_m` returns the truth at any time, and
-    :meth:`read_ns` returns the time of a scan.
+    is computed on demand: :meth:`truth_m` returns it for any time, and :meth:`read_ns` returns the time of a
+    scan.
 
     Args:
         scene: Motion of the skin.
         converter_noise: Standard deviation of a reading, relative to the resistance. Default: the value in
             the scene's simulation settings.
-        fault: Function applied to each reading, after the noise.
-        imperfections: Deviations of the patch from its layout; random draws depend on the patch number.
+        fault: Function applied to each reading after noise has been added.
+        imperfections: Deviations of the patch from its layout. Patches with different numbers have different
+            random errors.
 
     Raises:
-        ConfigError: If the draws leave too small a gap between an upper and a lower electrode.
+        ConfigError: If the random errors make the gap between an upper and a lower electrode too small.
     """
 
     def __init__(
@@ -79,13 +83,13 @@ class SimulatedPatch:
         self._noise = scene.simulation.converter_noise if converter_noise is None else converter_noise
         self._random = np.random.default_rng([scene.simulation.seed, scene.number])
         self.skin: Final = PhysicalPatch(scene.layout, imperfections, scene.number)
-        """Patch as manufactured, with its imperfections."""
+        """Patch with its imperfections."""
         self._origin_ns: int | None = None
         self._read_ns: OrderedDict[int, int] = OrderedDict()
 
     @property
     def conversions(self) -> int:
-        """Number of conversions so far; each reading converts the whole matrix once."""
+        """Number of conversions so far. Each reading is one conversion of the whole matrix."""
         return self.reads
 
     @property
@@ -120,10 +124,10 @@ class SimulatedPatch:
 
         Args:
             device_time_us: Lower 32 bits of the reading's time on the node's clock, µs. The lowest 6 bits are
-                ignored, because a checked summary does not contain them.
+                ignored, because a summary with a scan check does not contain them.
 
         Raises:
-            LookupError: If no reading has this time, or the reading is too old.
+            LookupError: If no stored reading has this time.
         """
         try:
             return self._read_ns[(device_time_us & 0xFFFF_FFFF) // TIME_STEP_US]
@@ -137,10 +141,10 @@ class SimulatedPatch:
         return list(self._read_ns.values())
 
     def truth_m(self, t_ns: int) -> Float:
-        """Return the true electrode positions in a reading at ``t_ns``.
+        """Return the true electrode positions during a reading at ``t_ns``.
 
         Returns:
-            (U, N, 3) float64, m: actual positions of the upper electrodes, each wire at its own sampling
+            (U, N, 3) float64, m: actual positions of the electrodes of each upper wire at the wire's sampling
             time. With imperfections, these positions differ from ``layout.upper_m`` even at rest; see
             :meth:`displacement_m`.
         """
@@ -148,7 +152,7 @@ class SimulatedPatch:
         return self.skin.rest_m if t_s is None else self.skin.upper_m(t_s, self.scene.upper_m)
 
     def displacement_m(self, t_ns: int) -> Float:
-        """Return the true displacement of the electrodes in a reading at ``t_ns``.
+        """Return the true displacement of the electrodes during a reading at ``t_ns``.
 
         Returns:
             (U, N, 3) float64, m: :meth:`truth_m` minus the positions of the same electrodes at rest. Solvers
@@ -167,7 +171,7 @@ class SimulatedPatch:
 
 
 def simulated(layout: PatchLayout) -> SimulatedPatch:
-    """Return a simulated patch under random strokes: the source ``simulated`` of ``skinnode node``.
+    """Return a simulated patch that is touched at random: the source ``simulated`` of ``skinnode node``.
 
     The scene starts immediately. The first touch occurs after 0.8 s, so that the patch is untouched during
     the tare at power-on.

@@ -1,4 +1,4 @@
-"""Counts of frames by kind, for comparing a simulated node's frames with those received by a host."""
+"""Counts of frames by kind, to compare the frames of a simulated node with those that a host receives."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ class Tally:
         self.refused: Counter[Kind] = Counter()
         """Frames that the bus refused."""
         self.waiting: Counter[Kind] = Counter()
-        """Frames queued for later sending: late chunks, and chunks that swap places with the next frame."""
+        """Chunks that are held back by faults that delay or reorder chunks."""
         self.heard: Counter[Kind] = Counter()
         """Frames that reached the node's controller."""
         self.taken: Counter[Kind] = Counter()
@@ -90,22 +90,22 @@ class Tally:
         self.lost_in: Counter[Kind] = Counter()
         """Frames dropped by a fault on the way to the node."""
         self.unheard: Counter[Kind] = Counter()
-        """Frames missed while the node was deaf or unplugged."""
+        """Frames not received because the node was deaf or unplugged."""
 
     def discrepancies(self) -> list[str]:
-        """Return one line per kind of frame with inconsistent counts.
+        """Return one line of text for each kind of frame with inconsistent counts.
 
-        Call this method when the node is idle.
+        Call this method only while the node is idle.
         """
         out = self.emitted + self.lost + self.silenced + self.refused + self.waiting
         into = self.taken + self.lost_in + self.unheard
         found = [
-            f"{kind} frames: {self.handed[kind]} to send, {out[kind]} accounted for"
+            f"{kind} frames: {self.handed[kind]} submitted for sending, but {out[kind]} accounted for"
             for kind in Kind
             if self.handed[kind] != out[kind]
         ]
         return found + [
-            f"{kind} frames: {self.heard[kind]} received, {into[kind]} accounted for"
+            f"{kind} frames: {self.heard[kind]} received, but {into[kind]} accounted for"
             for kind in Kind
             if self.heard[kind] != into[kind]
         ]

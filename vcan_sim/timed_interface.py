@@ -1,4 +1,4 @@
-"""python-can interface ``timed``: simulated CAN bus with exact times, in virtual time.
+"""python-can interface ``timed``: endpoints of a simulated CAN bus in virtual time.
 
 Endpoints that open the same channel under the same virtual clock are stations on the same
 :class:`~vcan_sim.timed_bus.TimedBus`. Any program that uses python-can can open such an endpoint.
@@ -31,15 +31,15 @@ from vcan_sim.virtual_time import Mailbox, VirtualClock
 COALESCED_NS: Final = 1_000_000
 """Minimum time (ns) between two wake-ups of a thread that reads frames."""
 MOST_STATIONS: Final = 64
-"""Maximum total number of endpoints opened on a bus."""
+"""Maximum number of endpoints on a bus, including endpoints that have been closed."""
 
 
 class Inbox:
     """Queue of frames that a station has received but not read yet.
 
-    The first frame after a pause wakes the reader immediately. All frames in the next :data:`COALESCED_NS`
-    wake the reader only once, like the coalesced interrupts of a busy controller. Each frame keeps its own
-    time stamp.
+    The first frame after a pause wakes the reader immediately. Frames that arrive within the next
+    :data:`COALESCED_NS` wake the reader once, at the end of this interval. Interrupt coalescing in CAN
+    controllers has the same effect. Each frame has its own time stamp.
 
     Args:
         clock: Virtual clock of the reader.
@@ -51,11 +51,11 @@ class Inbox:
 
     @property
     def quiet_until_ns(self) -> int:
-        """Time (ns) before which a further frame does not wake the reader."""
+        """Time (ns) before which new frames do not wake the reader."""
         return self._quiet_until_ns
 
     def put(self, delivered: Delivered) -> None:
-        """Append a frame. The virtual clock calls this method while no thread runs."""
+        """Append a frame, and wake the reader immediately or at :attr:`quiet_until_ns`."""
         self._queue.store(delivered)
         if self._due:
             return
@@ -108,13 +108,13 @@ class Segment:
         self._connected: set[int] = set()
         self._due_ns: int | None = None
         self.cpu_ns: Counter[str] | None = None
-        """CPU time (ns) spent on simulating the bus, by thread name; None (default): not measured."""
+        """CPU time (ns) spent on simulating the bus, by thread name; None if the time is not measured."""
 
     def join(self) -> int:
         """Connect a new station and return its number."""
         station = len(self._inboxes)
         if station == MOST_STATIONS:
-            raise can.CanInitializationError(f"{self.channel}: got {station} endpoints, cannot open another")
+            raise can.CanInitializationError(f"{self.channel}: cannot open another endpoint after {station}")
         self._inboxes.append(Inbox(self.clock))
         self._connected.add(station)
         self.bus.connect(self.clock.now_ns, station)
@@ -143,10 +143,10 @@ class Segment:
         self.bus.undisturb(rule)
 
     def catch_up(self) -> None:
-        """Deliver all frames and call all listeners up to the present.
+        """Simulate the bus up to the current virtual time.
 
-        The segment simulates the bus only when a frame has to wake a reader, at most
-        :data:`COALESCED_NS` late; the time stamps are exact.
+        Without this call, the bus is simulated only when a frame has to wake a reader, at most
+        :data:`COALESCED_NS` after the frame. The time stamps are exact in both cases.
         """
         self._deliver()
 
@@ -164,7 +164,7 @@ class Segment:
             self.clock.call_at(due_ns, self._advance)
 
     def _quiet_until_ns(self) -> int:
-        """Return the time before which no frame of the stations that want to send can wake a reader."""
+        """Return the time (ns) before which no pending frame can wake a reader."""
         sender = self.bus.only_sender
         inboxes = self._inboxes
         return min(
@@ -192,7 +192,7 @@ class Segment:
         self._plan()
 
     def _disconnect(self) -> None:
-        """Disconnect closing stations that have sent all frames, or all if no other station remains."""
+        """Disconnect each closing station that has sent its frames, or all stations if all are closing."""
         for station in sorted(self._leaving):
             if not self.bus.waiting(station) or self._connected <= self._leaving:
                 self.bus.clear(self.clock.now_ns, station)
@@ -202,7 +202,7 @@ class Segment:
 
 
 def segment(channel: str, clock: VirtualClock, rates: BitRates) -> Segment:
-    """Return the bus named ``channel`` of a virtual clock; the first call creates the bus.
+    """Return the bus named ``channel`` under a virtual clock. The first call creates the bus.
 
     Raises:
         can.CanInitializationError: If the bus already exists with different bit rates.
@@ -212,7 +212,9 @@ def segment(channel: str, clock: VirtualClock, rates: BitRates) -> Segment:
         clock.shared[name] = Segment(channel, clock, rates)
     found = cast(Segment, clock.shared[name])
     if found.rates != rates:
-        raise can.CanInitializationError(f"{channel}: got {rates}, the bus has {found.rates}")
+        raise can.CanInitializationError(
+            f"{channel}: got {rates}, must be {found.rates} as at the first call"
+        )
     return found
 
 
@@ -228,8 +230,8 @@ class TimedInterface(can.BusABC):
         **options: Further options, which are ignored.
 
     Raises:
-        can.CanInitializationError: If the thread does not run in virtual time, or the bus already exists with
-            different bit rates.
+        can.CanInitializationError: If the calling thread does not run in virtual time, or the bus already
+            exists with different bit rates.
     """
 
     def __init__(
@@ -254,7 +256,7 @@ class TimedInterface(can.BusABC):
         super().__init__(channel, can_filters)
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
-        """Queue a frame for transmission; the frame is sent when it wins arbitration."""
+        """Queue a frame for transmission without waiting until it is sent."""
         self._check_open()
         if msg.is_error_frame:
             raise can.CanOperationError(
@@ -322,7 +324,7 @@ class TimedInterface(can.BusABC):
             raise can.CanOperationError(f"{self.channel_info} is closed")
 
     def shutdown(self) -> None:
-        """Close the endpoint and leave the bus."""
+        """Close the endpoint and disconnect its station from the bus."""
         if not self._is_shutdown:
             self._segment.leave(self._station)
         super().shutdown()

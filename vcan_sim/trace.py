@@ -14,14 +14,14 @@ from vcan_sim.timed_bus import CanFrame, Delivered, Event
 from vcan_sim.timed_interface import Segment
 
 _POLL_S: Final = 0.05
-"""Maximum time to wait for a frame, s; :meth:`Listener.__exit__` also waits at most this long."""
+"""Maximum time to wait for the next frame, s."""
 
 _LAST_FRAMES: Final = 10_000
-"""Maximum number of remaining frames that a listener reads before it stops, in case frames keep arriving."""
+"""Maximum number of frames that a listener reads after it has been told to stop."""
 
 
 class Trace:
-    """Record of all further frames on a timed bus, each with the time at which the frame ended.
+    """Recorder of all subsequent frames on a timed bus, with the time at which each frame ends.
 
     Args:
         of: Bus to record.
@@ -49,13 +49,13 @@ class Trace:
 
 
 class Listener:
-    """Record of every frame on a bus during a ``with`` block, received by a separate endpoint.
+    """Recorder of all frames on a bus during a ``with`` block. It opens its own endpoint on the bus.
 
     Args:
         bus: Bus to record.
-        write: Function called with each line in the listener's thread; None to store the lines for
-            :meth:`text`.
-        channel: Channel name in the lines; None for the channel of the bus.
+        write: Function that is called with each line of the trace, in the listener's thread. By default, the
+            lines are stored for :meth:`text`.
+        channel: Channel name in the trace; default: the channel of the bus.
 
     Raises:
         BusError: If the bus cannot be opened.

@@ -50,17 +50,17 @@ class VirtualClock:
     When the block ends, all threads that were started in the block must have ended.
 
     Attributes:
-        shared: Objects that belong to the clock, by name: the simulated buses.
+        shared: Objects that exist once per clock, by name, such as the simulated buses.
 
     Raises:
-        Deadlock: In the first thread, while it waits, if every thread waits for another thread.
+        Deadlock: In the thread that entered the block, if every thread waits for another thread.
         RuntimeError: On leaving the block, if any thread has not ended.
     """
 
     def __init__(self) -> None:
         self.shared: dict[str, object] = {}
         self._now_ns = START_NS
-        self._readings = 0  # clock readings by the running thread since its last suspension
+        self._readings = 0  # number of clock readings by the running thread since its last wait
         self._ready: deque[_Turn] = deque()
         self._timers: list[tuple[int, int, int, _Turn | Callable[[], None]]] = []
         self._number = itertools.count()
@@ -99,7 +99,7 @@ class VirtualClock:
 
     @property
     def now_ns(self) -> int:
-        """Monotonic time (ns), for code that does not run in a thread of the program."""
+        """Monotonic time (ns). Unlike :meth:`monotonic_ns`, this property does not count as a reading."""
         return self._now_ns
 
     def monotonic_ns(self) -> int:
@@ -115,10 +115,10 @@ class VirtualClock:
         return self._now_ns
 
     def made_progress(self) -> None:
-        """Reset the current thread's number of clock readings, as after a wait.
+        """Reset the current thread's number of clock readings to zero.
 
-        A thread that takes items from a queue is not considered to poll the clock, because it stops when
-        the queue is empty.
+        A thread that takes items from a queue does not poll the clock, because it stops when the queue is
+        empty.
         """
         self._readings = 0
 
@@ -138,7 +138,8 @@ class VirtualClock:
         The function must not wait.
 
         Args:
-            t_ns: Monotonic time of the call, ns; a time in the past means now.
+            t_ns: Monotonic time of the call, ns. If this time is in the past, the call is made as soon as
+                possible.
             function: Function to call.
         """
         heapq.heappush(self._timers, (t_ns, next(self._number), 0, function))
@@ -172,11 +173,11 @@ class VirtualClock:
     # --- turns
 
     def wait(self, waiting: deque[_Turn], seconds: float | None) -> bool:
-        """Suspend the current thread until :meth:`wake` is called with the same deque, or until a time-out.
+        """Suspend the current thread until :meth:`wake` is called with ``waiting``, or until a time-out.
 
         Args:
-            waiting: Scheduling states of the threads that wait for the same condition.
-            seconds: Maximum wait, s; None: no limit.
+            waiting: Threads that wait for the same condition, oldest first.
+            seconds: Maximum wait, s; None for no limit.
 
         Returns:
             True if :meth:`wake` woke the thread, False after a time-out.
@@ -226,7 +227,9 @@ class VirtualClock:
         while not self._ready:
             if not self._timers:
                 names = ", ".join(repr(turn.name) for turn in self._alive)
-                self._first.error = Deadlock(f"virtual time: nothing will happen any more; waiting: {names}")
+                self._first.error = Deadlock(
+                    f"virtual time: every thread waits for another thread; waiting: {names}"
+                )
                 self._first.waits += 1
                 self._first.waiting.remove(self._first)
                 return self._first
@@ -253,10 +256,9 @@ class _Turn:
         self.woken = False
         """Whether the last wait ended because the thread was woken."""
         self.waiting: deque[_Turn] = deque()
-        """Turns of the threads that wait for the same condition."""
+        """Threads that wait for the same condition as this thread, including this thread."""
         self.waits = 0
-        """Number of completed waits; a timer with a smaller number belongs to an earlier wait and is
-        invalid."""
+        """Number of completed waits. A timer with a smaller number is from an earlier wait and is ignored."""
         self.error: Exception | None = None
 
 

@@ -290,7 +290,9 @@ def test_bad_calls_name_the_argument() -> None:
         bus.send(1000, 2, CanFrame(1))
     with pytest.raises(ValueError, match="frame: got a CAN FD frame, must be a classic frame"):
         bus.send(1000, 0, CanFrame(1, fd=True))
-    with pytest.raises(ValueError, match="interval: got 0 to 2000 ns, must end after its start, by 1000 ns"):
+    with pytest.raises(
+        ValueError, match="interval: got 0 to 2000 ns, must not be empty and must end by 1000 ns"
+    ):
         bus.busy_share(0, 2000)
     for arguments, line in (
         ({"queue": "lifo"}, "queue: got 'lifo', allowed: fifo or priority"),

@@ -612,7 +612,7 @@ def test_a_rule_that_is_removed_disturbs_no_more() -> None:
     bus = bus_of(3, rule)
     bus.send(0, 0, FRAME)
     assert errors(bus.advance(200 * US))
-    with pytest.raises(ValueError, match="a rule in force"):
+    with pytest.raises(ValueError, match="an active rule"):
         bus.undisturb(other)  # equal, but another rule
     bus.undisturb(rule)
     late = bus.advance(FOREVER)

@@ -1,4 +1,4 @@
-"""Deterministic model of a CAN bus with exact times; the model needs no threads or clock.
+"""Deterministic model of a CAN bus with exact event times. The model uses neither threads nor a clock.
 
 ::
 
@@ -8,9 +8,9 @@
         -> attempt (delivered or destroyed, and when) -> bus
     confinement (error counters and states), bit_rates (exact times), occupancy (bus load) -> bus
 
-The caller controls the time. ``TimedBus.send`` queues a frame at a given time, ``TimedBus.advance`` returns
+The caller supplies the time. ``TimedBus.send`` queues a frame at a given time, ``TimedBus.advance`` returns
 all events up to a given time, and ``TimedBus.next_event_ns`` is the time to pass to the next call of
-``advance``. The same calls produce the same events. The docstrings of the modules ``bus``, ``attempt`` and
+``advance``. Identical calls produce identical events. The docstrings of the modules ``bus``, ``attempt`` and
 ``confinement`` list the simplifications of the model.
 """
 

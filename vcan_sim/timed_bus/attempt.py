@@ -6,12 +6,12 @@ individual bits of the frame.
 Error frames (ISO 11898-1:2015; Bosch CAN 2.0, part B, sections 3.1.3 and 7): The first station to detect an
 error starts an error flag of 6 bits at the next bit. The other stations start their error flags when they
 detect the first flag as an error, up to 6 bits later, so the superposed flags are 6 to 12 bits long. An error
-delimiter of 8 recessive bits and the intermission of 3 bits follow. Error flags use the nominal bit rate; the
-delay of the second flag is counted at the bit rate of the phase in which the error occurs.
+delimiter of 8 recessive bits and the intermission of 3 bits follow. Error flags are sent at the nominal bit
+rate. The delay of the second flag is computed with the bit rate of the phase in which the error occurs.
 
 Simplifications: A disturbance seen by all stations destroys the frame, even if it inverts a recessive bit of
-the arbitration field. Error flags and delimiters are never disturbed. A passive error flag ends at the same
-time as the superposed flags. Overload frames are not modelled.
+the arbitration field. Error flags and delimiters are never disturbed. A passive error flag ends together with
+the other error flags. Overload frames are not modelled.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ class BitError:
     bit: int
     cause: Cause
     detected_by: tuple[int, ...]
-    """Stations that detect the error in bit ``bit``."""
+    """Stations that detect the error at the bit position ``bit``."""
 
 
 class Course(NamedTuple):
@@ -95,7 +95,7 @@ def undisturbed(senders: tuple[int, ...], frame: CanFrame, esi: bool, rates: Bit
 def disturbed(
     senders: Sequence[Participant], receivers: Sequence[Participant], hit: Hit | None, rates: BitRates
 ) -> Course:
-    """Return the course of a transmission attempt that is disturbed, unacknowledged or has a collision.
+    """Return the course of a transmission attempt with a disturbance, a collision or no acknowledgement.
 
     Args:
         senders: stations that send frames with the same arbitration field.
@@ -114,7 +114,7 @@ def disturbed(
             receiver = bus.receiving.get(hit.station)
             if receiver is not None and not receiver.passive:
                 return _destroyed_by_receiver(hit, wire, bus)
-            if receiver is not None:  # this receiver does not acknowledge an invalid frame
+            if receiver is not None:  # an error-passive receiver cannot destroy the frame
                 bus.side_errors.append(_bit_error(wire, hit.bit, Cause.DISTURBED, (hit.station,), rates))
                 del bus.receiving[hit.station]
             hit = None
@@ -144,7 +144,7 @@ def cut_off(
     receivers: Sequence[Participant],
     rates: BitRates,
 ) -> Course:
-    """Return the course of a transmission attempt in which the only sender is disconnected.
+    """Return the course of a transmission attempt whose only sender is disconnected during the frame.
 
     Args:
         frame: frame on the bus.
@@ -163,7 +163,7 @@ def cut_off(
 
 @dataclass(slots=True)
 class _OnBus:
-    """Active senders and receivers of a transmission attempt, and the non-destructive errors so far."""
+    """Stations that still take part in a transmission attempt, and errors that did not destroy the frame."""
 
     sending: dict[int, Participant]
     receiving: dict[int, Participant]
@@ -222,7 +222,7 @@ def _sender_lag(wire: WireFrame, bit: int) -> int:
 
 
 def _first_difference(streams: Sequence[tuple[int, ...]]) -> int | None:
-    """Return the first bit position at which several senders' frames differ, or None."""
+    """Return the first bit position at which the frames of several senders differ, or None."""
     for position, bits in enumerate(zip(*streams, strict=False)):
         if 0 < sum(bits) < len(bits):
             return position

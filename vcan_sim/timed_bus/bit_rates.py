@@ -1,4 +1,4 @@
-"""Bit rates of a bus, and the tick, a unit of time in which all bit times are whole numbers."""
+"""Bit rates of a bus, and the unit of time (tick) in which all bit times are whole numbers."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ class BitRates:
             object.__setattr__(self, name, value)
 
     def ticks(self, bits: tuple[int, int]) -> int:
-        """Return the duration in ticks of a number of nominal bits and a number of data bits."""
+        """Return the duration in ticks of the given numbers of nominal bits and data bits."""
         return bits[0] * self.nominal_ticks + bits[1] * self.data_ticks
 
     def ceil_ns(self, ticks: int) -> int:

@@ -227,7 +227,6 @@ class TimedBus:
         """Time (ns) to pass to the next call of :meth:`advance`; None if no event is pending.
 
         At some of these times, the bus only makes an internal decision, and ``advance`` returns no event.
-
         """
         if self._events:
             return self._rates.ceil_ns(self._now)
@@ -275,7 +274,7 @@ class TimedBus:
 
     @property
     def frames(self) -> Mapping[tuple[int, bool], int]:
-        """Number of delivered frames by identifier and whether the identifier is extended."""
+        """Number of delivered frames. Each key is an identifier and whether it is an extended identifier."""
         return MappingProxyType(self._frames)
 
     def busy_share(self, from_ns: int, to_ns: int) -> float:
@@ -283,7 +282,7 @@ class TimedBus:
 
         Args:
             from_ns: start of the interval, ns.
-            to_ns: end of the interval, ns; at most the time of the last call.
+            to_ns: end of the interval, ns; not later than the time passed to the most recent call.
 
         Raises:
             ValueError: if the interval is empty or ends in the future.
@@ -291,7 +290,7 @@ class TimedBus:
         if not from_ns < to_ns <= self._rates.ceil_ns(self._now):
             now_ns = self._rates.ceil_ns(self._now)
             raise ValueError(
-                f"interval: got {from_ns} to {to_ns} ns, must end after its start, by {now_ns} ns"
+                f"interval: got {from_ns} to {to_ns} ns, must not be empty and must end by {now_ns} ns"
             )
         busy_ns = self._occupancy.busy_ns(from_ns, to_ns)
         if self._flight is None and self._start is not None:  # arbitration is pending
@@ -299,10 +298,10 @@ class TimedBus:
         return busy_ns / (to_ns - from_ns)
 
     def forget_load(self, before_ns: int) -> None:
-        """Free the memory that :meth:`busy_share` needs for times before ``before_ns``.
+        """Delete the records of the bus load before a given time, to free memory.
 
         Args:
-            before_ns: earliest start of any interval passed to :meth:`busy_share` from now on, ns.
+            before_ns: given time, ns. Later calls of :meth:`busy_share` must not start before this time.
         """
         self._occupancy.forget(before_ns)
 
@@ -327,13 +326,13 @@ class TimedBus:
     def _deliver_burst(self, until: int) -> bool:
         """Deliver the frame being sent and its sender's further frames, if no other station can interfere.
 
-        The result is the same as that of :meth:`_step`, at a third of the cost.
+        The result is the same as that of :meth:`_step`, but this method takes about a third of the time.
 
         Args:
             until: time up to which to deliver frames, ticks.
 
         Returns:
-            Whether the conditions were met.
+            False if the conditions are not met; in this case, nothing has been delivered.
         """
         flight, pending = self._flight, self._pending
         if flight is None or self._recovering or self._disturbances or not self._counts_are_zero:
@@ -410,7 +409,7 @@ class TimedBus:
         self._next = due
 
     def _offer(self, sender: Station) -> None:
-        """Enter a station into the next arbitration if it has a frame to send."""
+        """Include a station in the next arbitration if it has a frame to send."""
         if not len(sender.queue) or not sender.on_bus:
             return
         self._pending[sender.index] = sender
@@ -441,7 +440,7 @@ class TimedBus:
         start = now - self._bit
         self._start = None
         contenders = [station for station in self._pending.values() if station.ready <= start]
-        if not contenders:  # all frames have been removed from the queues since the start of frame
+        if not contenders:  # all pending frames have been removed from the queues since the start of frame
             self._choose_start(now)
             return
         if len(contenders) == 1:
@@ -570,7 +569,7 @@ class TimedBus:
                 self._set_counters(now, station, reception_failed(station.counters))
 
     def _still_receiving(self, flight: Flight) -> tuple[int, ...]:
-        """Return the stations that have received an attempt without error since its start of frame."""
+        """Return the stations that have received the frame in progress without error so far."""
         receivers, side_errors = flight.receivers, flight.course.side_errors
         if not side_errors and self._receivers.get(flight.senders) is receivers:
             return receivers
@@ -578,7 +577,7 @@ class TimedBus:
         return tuple(index for index in receivers if self._stations[index].on_bus and index not in lost)
 
     def _land(self, now: int, flight: Flight) -> None:
-        """End the attempt in progress; the bus is free after the intermission."""
+        """End the transmission attempt in progress."""
         self._flight = None
         self._free = flight.start + flight.course.free
         for index in flight.course.senders:
@@ -600,7 +599,7 @@ class TimedBus:
             station.ready = free + SUSPEND_BITS * self._rates.nominal_ticks
 
     def _leave(self, leaving: Station, flight: Flight) -> None:
-        """Change the course of the attempt in progress after a station has been disconnected."""
+        """Update the course of the transmission attempt in progress after a station has been disconnected."""
         course = flight.course
         if course.error is not None:
             return
@@ -668,7 +667,7 @@ class TimedBus:
         return since + missing * self._rates.nominal_ticks
 
     def _recover(self, now: int) -> bool:
-        """End all complete recoveries from bus-off; return whether there was at least one."""
+        """Complete all recoveries from bus-off that are due; return whether there were any."""
         complete = [station for station in self._recovering if self._recovery_end(station) == now]
         if self._start is not None and self._start < now:
             return False

@@ -17,7 +17,7 @@ BUS_OFF_FROM: Final = 256
 """Bus-off limit: a station goes bus-off when its transmit error counter reaches this value."""
 
 MAX_RECEIVE_ERRORS: Final = 255
-"""Maximum receive error counter. The standard sets no limit; controllers use 7-bit or 8-bit counters."""
+"""Maximum receive error counter. The standard sets no maximum; controllers use 7-bit or 8-bit counters."""
 
 _BACK_TO_ACTIVE: Final = 119
 """Receive error counter after a successful reception if the counter was above 127; the standard allows 119 to
@@ -30,7 +30,7 @@ RECOVERY_RUN_BITS: Final = 11
 """Length (bits) of a recessive run that counts towards recovery from bus-off."""
 
 SUSPEND_BITS: Final = 8
-"""Additional pause of an error-passive station after its own frame and the intermission, bits."""
+"""Time for which an error-passive station waits after its own frame and the intermission, bits."""
 
 
 class ErrorState(enum.StrEnum):
@@ -69,8 +69,8 @@ def transmission_failed(counters: Counters, *, unanswered: bool = False) -> Coun
 
     Args:
         counters: error counters before the error.
-        unanswered: whether the error is a missing acknowledgement and no other station sends a dominant bit
-            during the error flag; an error-passive transmitter does not count such an error.
+        unanswered: whether no other station acknowledges the frame or sends a dominant bit during the error
+            flag. An error-passive transmitter does not count this error.
 
     Returns:
         Error counters after the error.

@@ -30,7 +30,7 @@ class NthFrame:
     """Number of disturbed attempts."""
     bit: int = 20
     """Position of the disturbed bit, including stuff bits; the start of frame is 0. Larger positions are
-    limited to the last but one bit of the end of frame."""
+    limited to the second-to-last bit of the end of frame."""
     extended: bool = False
     station: int | None = None
     """Only station that sees the disturbance; None if all stations see it."""
@@ -46,7 +46,7 @@ class RandomShare:
     """Rule that disturbs each transmission attempt with a given probability.
 
     Raises:
-        ConfigError: if the share is not a probability, or the position is negative.
+        ConfigError: if ``share`` is not a probability, or ``bit`` is negative.
     """
 
     share: float
@@ -88,18 +88,18 @@ Disturbance = NthFrame | RandomShare | AtTime
 
 
 class Attempt(NamedTuple):
-    """Transmission attempt, with the data that the rules need."""
+    """Transmission attempt, as passed to the disturbance rules."""
 
     frame: CanFrame
     n_bits: Callable[[], int]
-    """Function that returns the number of bit positions in the frame that can be disturbed."""
+    """Function that returns the number of bits in the frame that can be disturbed."""
     bit_at: Callable[[int], int | None]
-    """Function that returns the position of the bit on the bus at a given time (ns), or None if the frame is
-    not on the bus at that time."""
+    """Function that takes a time (ns) and returns the position of the bit that is being sent at this time, or
+    None if the frame is not being sent."""
 
 
 class Hit(NamedTuple):
-    """Disturbed bit of a frame; hits sort by bit position."""
+    """Disturbed bit of a frame. Instances are ordered by bit position."""
 
     bit: int
     station: int
@@ -110,10 +110,10 @@ Rule = Callable[[Attempt], int | None]
 
 
 class Disturbances:
-    """Active disturbance rules, with their counts of attempts and random generators.
+    """Active disturbance rules.
 
     Args:
-        rules: disturbance rules to start with.
+        rules: initial disturbance rules.
     """
 
     def __init__(self, rules: Sequence[Disturbance] = ()) -> None:
@@ -144,13 +144,13 @@ class Disturbances:
         """
         kept = [each for each in self._rules if each[0] is not rule]
         if len(kept) == len(self._rules):
-            raise ValueError(f"rule: got {rule}, must be a rule in force")
+            raise ValueError(f"rule: got {rule}, must be an active rule")
         self._rules = kept
 
     def hit(self, attempt: Attempt) -> Hit | None:
         """Return the first bit of a transmission attempt that any rule disturbs, or None.
 
-        Call this method exactly once per attempt, because the rules count their calls.
+        Call this method exactly once per attempt, because the rules count the calls.
 
         Args:
             attempt: transmission attempt to check.

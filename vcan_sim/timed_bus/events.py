@@ -30,8 +30,8 @@ class Delivered(NamedTuple):
     """Station that sent the frame."""
     frame: CanFrame
     receivers: tuple[int, ...]
-    """Stations that received the frame. If several stations sent the same bits simultaneously, only the first
-    event lists the receivers; the tuple of every further event is empty."""
+    """Stations that received the frame. If several stations sent identical frames simultaneously, each has
+    its own event, but only the first event lists the receivers."""
     queued_ns: int
     """Time (ns) when the station queued the frame."""
     started_ns: int
@@ -47,12 +47,12 @@ class ErrorFrame(NamedTuple):
     frames: tuple[CanFrame, ...]
     """Frame on the bus; if different frames collided, all colliding frames in the order of ``stations``."""
     bit: int
-    """Position of the bit in which the error was detected, counted from the start of frame at 0."""
+    """Position of the bit in which the error was detected; the start of frame has position 0."""
     cause: Cause
     detected_by: tuple[int, ...]
     """Stations that detected the error in bit ``bit``; other stations detect the resulting error flag."""
     destroyed: bool
-    """Whether the error flag destroyed the frame; passive error flags of receivers do not destroy frames."""
+    """Whether the error flag destroyed the frame. Passive error flags of receivers do not."""
 
 
 class CountersChanged(NamedTuple):

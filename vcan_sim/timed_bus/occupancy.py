@@ -19,7 +19,7 @@ class Occupancy:
         self._busy_before = array("q")
 
     def add(self, start_ns: int, end_ns: int) -> None:
-        """Add a busy interval, which must not start before the end of the last interval.
+        """Add a busy interval, which must not start before the end of the previous interval.
 
         Args:
             start_ns: start of the interval, ns.
@@ -43,7 +43,7 @@ class Occupancy:
         return self._busy_until(to_ns) - self._busy_until(from_ns)
 
     def forget(self, before_ns: int) -> None:
-        """Drop all intervals that ended before ``before_ns``; later queries must not start earlier."""
+        """Delete all intervals that ended before ``before_ns``; later queries must not start before then."""
         n = bisect.bisect_left(self._ends, before_ns)
         for column in (self._starts, self._ends, self._busy_before):
             del column[:n]

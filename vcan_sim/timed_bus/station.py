@@ -23,13 +23,13 @@ class StationOptions:
     """
 
     queue: Literal["fifo", "priority"] = "fifo"
-    """Transmission order: first in, first out (``fifo``), as a SocketCAN interface does, or highest priority
-    first."""
+    """Transmission order: ``fifo`` for first in, first out, as in a SocketCAN interface; ``priority`` for
+    highest priority first."""
     capacity: int | None = None
     """Maximum number of queued frames, including the frame being sent; None for no limit."""
     restart_ns: int | None = 0
-    """Delay from bus-off to the start of the recovery, ns; None to wait for a call of
-    :meth:`vcan_sim.timed_bus.bus.TimedBus.restart`."""
+    """Delay from bus-off to the start of the recovery, ns. If None, the recovery starts only when
+    :meth:`vcan_sim.timed_bus.bus.TimedBus.restart` is called."""
 
     def __post_init__(self) -> None:
         if self.queue not in ("fifo", "priority"):
@@ -98,9 +98,9 @@ class Flight:
         self.senders = senders
         """Stations that were sending at the start of frame."""
         self.receivers = receivers
-        """Stations that were on the bus at the start of frame and only receive."""
+        """Stations that were on the bus at the start of frame but do not send."""
         self.side = 0
-        """Number of past errors in the course that do not destroy the frame."""
+        """Number of errors in ``course.side_errors`` that have already occurred."""
 
     @property
     def next(self) -> int:

@@ -21,7 +21,7 @@ class Waiting(NamedTuple):
 
 
 class TransmitQueue(Protocol):
-    """Transmit queue of one station; excludes the frame being sent."""
+    """Transmit queue of one station, without the frame that is being sent."""
 
     def push(self, waiting: Waiting) -> None:
         """Add a frame to the queue."""

@@ -52,7 +52,7 @@ class WireFrame:
         return self.delimiter + 1
 
     def bits_through(self, position: int) -> tuple[int, int]:
-        """Return the numbers of nominal and data bits from the start of frame through a position."""
+        """Return the numbers of nominal and data bits from the start of frame to ``position``, inclusive."""
         fast = max(0, min(position + 1, self.data_phase.stop) - self.data_phase.start)
         return position + 1 - fast, fast
 
@@ -103,9 +103,9 @@ def receiver_lag(wire: WireFrame, position: int, seen: int, flag: int) -> int:
     """Return the number of error flag bits that a receiver sees before it detects an error itself.
 
     The error flag starts after ``position``. The flag violates the stuff rule, the rule for fixed stuff bits,
-    or the form of the delimiters and the end of frame. If the flag violates none of these, the CRC is wrong,
-    which a receiver reports after the ACK delimiter (ISO 11898-1:2015). The receiver removes stuff bits from
-    the bits it sees.
+    or the fixed form of the delimiters and the end of frame. If the flag violates none of these, the CRC is
+    wrong, which a receiver reports after the ACK delimiter (ISO 11898-1:2015). The receiver removes stuff
+    bits from the bits it sees.
 
     Args:
         wire: bits of the frame on the bus.
@@ -124,7 +124,7 @@ def receiver_lag(wire: WireFrame, position: int, seen: int, flag: int) -> int:
         if plain == wire.plain and (wire.fixed_stuff or run < _STUFF_AFTER):
             start = at
             break
-        if run == _STUFF_AFTER:  # a stuff bit is due
+        if run == _STUFF_AFTER:  # this bit must be a stuff bit
             if bit == last:
                 return at - position
             run = 1

@@ -116,7 +116,7 @@ class FleetFaults:
             key: Name of the command-line option, for error messages.
 
         Raises:
-            ConfigError: If a string is invalid. In this case, no fault is changed.
+            ConfigError: If a string is invalid; all faults then remain unchanged.
         """
         places = self._places
         self._change(parse_changes(texts, places.patches, places.buses, key))
@@ -128,8 +128,8 @@ class FleetFaults:
             faults: New faults by patch.
 
         Raises:
-            ConfigError: If a patch is not in the hand or cannot have the faults. In this case, no fault
-                is changed.
+            ConfigError: If a patch is not in the hand or cannot have the faults; all faults then remain
+                unchanged.
         """
         for name in faults:
             if name not in self._places.patches:
@@ -145,8 +145,8 @@ class FleetFaults:
             faults: New faults.
 
         Raises:
-            ConfigError: If the bus is not in the hand or cannot have the faults. In this case, no fault
-                is changed.
+            ConfigError: If the bus is not in the hand or cannot have the faults; all faults then remain
+                unchanged.
         """
         if name not in self._places.buses:
             raise ConfigError("bus", name, f"a bus of the hand: {', '.join(self._places.buses)}")

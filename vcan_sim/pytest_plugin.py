@@ -43,8 +43,7 @@ BUSES: Final = {
 """python-can interface and channel for each choice of ``--skin-bus``. The braces stand for the number of the
 bus in the hand. If the channel is empty, each test chooses a random channel."""
 TRUTH_READINGS: Final = 200
-"""Maximum number of readings per patch for which the ground truth is saved when a test fails. The newest
-readings are saved."""
+"""Number of newest readings per patch for which the ground truth is saved when a test fails."""
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:

@@ -93,7 +93,7 @@ class Recording:
         np.savez_compressed(self._folder / TRUTH, **arrays)
 
     def poll(self) -> None:
-        """Record the ground truth of all scans since the last call, and all fault changes since then."""
+        """Record the ground truth of all scans and all fault changes since the previous call."""
         if self._failure is not None:
             raise self._failure
         wall_ns = clock.time_ns() - clock.monotonic_ns()

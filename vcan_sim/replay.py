@@ -89,7 +89,7 @@ def replay(
         frames: Recorded frames. If a frame has an earlier time than the preceding frame, it is sent
             immediately.
         ports: Open endpoint for each channel; frames of channels without an endpoint are not sent.
-        wait: Function that waits for a given number of seconds. It returns True to end the replay.
+        wait: Function that waits for a given number of seconds, and returns whether to end the replay.
         from_nodes: Whether to send only the frames that nodes send.
 
     Returns:

@@ -1,4 +1,4 @@
-"""Convert a scene's ``[[faults]]`` tables to a fault schedule, and check that they are possible."""
+"""Convert a scene's ``[[faults]]`` tables to a fault schedule, and check that the faults are possible."""
 
 from __future__ import annotations
 

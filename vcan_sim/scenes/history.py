@@ -25,7 +25,7 @@ from vcan_sim.scenes.window import CLOSE, Window, centred_m, overlap_m, solve_de
 _LEAST: Final = 1e-5
 """Depth or force below which the body does not touch the skin, relative to the maximum of the touch."""
 _LOOSER: Final = (1.0, 10.0, 100.0)
-"""Factors by which the contact solver's tolerance is multiplied, tried in order until it converges."""
+"""Factors for the tolerance of the contact solver, tried in this order until the solver converges."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,9 +2,9 @@
 
 The state at a given time is the mean of the four nearest time steps, weighted by the uniform cubic B-spline
 (de Boor, A Practical Guide to Splines, 1978, chapter IX). The weights are positive and sum to 1. The mean is
-therefore physically consistent like each time step: its pressure is not negative, its shear traction does not
-exceed the friction limit, and its displacement is the layer's response to its tractions. All quantities are
-twice continuously differentiable in time. Motions shorter than four time steps are smoothed.
+therefore physically consistent: its pressure is not negative, its shear traction does not exceed the friction
+limit, and its displacement is the layer's response to its tractions. All quantities are twice continuously
+differentiable in time. Motions shorter than four time steps are smoothed.
 """
 
 from __future__ import annotations

@@ -415,7 +415,7 @@ def _meet(one: TouchConfig, two: TouchConfig) -> bool:
 def read_scene(path: Path | str) -> SceneConfig:
     """Read a scene file without checking the scene for a particular hand.
 
-    :func:`vcan_sim.scenes.load_scene` also performs these checks.
+    To check the scene for a hand as well, use :func:`vcan_sim.scenes.load_scene`.
 
     Args:
         path: Scene file.

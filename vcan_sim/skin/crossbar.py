@@ -125,8 +125,8 @@ def floating_ohm(conductance: Float, upper: Side, lower: Side) -> Float:
     solved = _tridiagonal(lower.diagonals(below, 0.0), np.hstack([conductance.T, ends]))
     across, own = np.split(solved, [len(above)], axis=1)
     schur = _dense(upper.diagonals(above, 0.0)) - conductance @ across
-    # The network floats, so its matrix is singular. Adding a constant to all elements fixes the mean of v
-    # without changing the voltage differences.
+    # The network floats, so its matrix is singular. Adding a constant to all elements of the matrix fixes the
+    # mean of v without changing any voltage difference.
     schur += above.mean()
     z = np.linalg.inv(schur)
     between = across[:: lower.nodes] @ z  # (K, upper nodes): Z_lu

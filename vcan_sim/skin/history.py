@@ -125,7 +125,7 @@ class History:
             self._recent.popitem(last=False)
 
     def _advanced(self, state: State | None, load_m: Float | None, dt_s: float) -> State | None:
-        """Return the state after a step of ``dt_s`` at whose end the load is ``load_m``."""
+        """Return the state after a step of ``dt_s``, given the load ``load_m`` at the end of the step."""
         if state is None:
             if load_m is None:
                 return None

@@ -176,7 +176,7 @@ def _destroyed_by_hit(hit: Hit, wire: WireFrame, bus: _OnBus) -> Course:
     flag = _PASSIVE if all(bus.sending[station].passive for station in detecting) else _ACTIVE
     seen = wire.bits[hit.bit] ^ (hit.station == -1)
     lag = receiver_lag(wire, hit.bit, seen, flag) if bus.receiving else 0
-    if hit.station == -1 and lag == 0:  # the disturbed bit itself is an error for the receivers
+    if hit.station == -1 and lag == 0:  # the receivers also detect the disturbed bit as an error
         detecting += tuple(bus.receiving)
     error = _bit_error(wire, hit.bit, Cause.DISTURBED, detecting, bus.rates)
     return _destroyed(error, _lag_ticks(wire, hit.bit, lag, bus.rates), bus)

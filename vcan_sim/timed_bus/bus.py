@@ -266,7 +266,7 @@ class TimedBus:
 
     @property
     def only_sender(self) -> int | None:
-        """Index of the only station that is sending or wants to send; None for no station or several."""
+        """Index of the only station that sends or has a frame to send; None unless there is exactly one."""
         senders = set(self._pending)
         if self._flight is not None:
             senders.update(self._flight.senders)

@@ -35,7 +35,7 @@ class Occupancy:
         self._busy_before.append(before)
 
     def end_last_at(self, end_ns: int) -> None:
-        """Set the end of the last busy interval, ns."""
+        """Set the end of the most recent busy interval, ns."""
         self._ends[-1] = end_ns
 
     def busy_ns(self, from_ns: int, to_ns: int) -> int:

@@ -92,16 +92,20 @@ def exact_bits(
         data, code = b"", dlc or 0
     else:
         code = len(data)
-    if not extended:
-        return stuffing.classic_frame_bits(can_id << 7 | remote << 6 | code, data)
-    base, extension = can_id >> 18, can_id & 0x3FFFF
-    head = (base << 20 | 0b11 << 18 | extension) << 7 | remote << 6 | code
+    if extended:
+        base, extension = can_id >> 18, can_id & 0x3FFFF
+        head = (base << 20 | 0b11 << 18 | extension) << 7 | remote << 6 | code
+        head_bits = _EXTENDED_HEAD_BITS
+    else:
+        head = can_id << 7 | remote << 6 | code
+        head_bits = HEAD_BITS
+    head_bytes = -(-head_bits // 8)
     crc_table, next_run, stuffed = tables()
     crc = 0
-    for byte in head.to_bytes(-(-_EXTENDED_HEAD_BITS // 8), "big") + data:
+    for byte in head.to_bytes(head_bytes, "big") + data:
         crc = (crc << 8 & 0x7FFF) ^ crc_table[crc >> 7 ^ byte]
 
-    n_bits = _EXTENDED_HEAD_BITS + 8 * len(data) + CRC_BITS
+    n_bits = head_bits + 8 * len(data) + CRC_BITS
     bits = (head << 8 * len(data) | int.from_bytes(data, "big")) << CRC_BITS | crc
     n_bytes = -(-n_bits // 8)
     filler = ALTERNATING & ((1 << 8 * n_bytes - n_bits) - 1)

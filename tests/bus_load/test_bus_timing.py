@@ -139,7 +139,8 @@ def test_bus_load_counts_foreign_frames_and_many_of_them() -> None:
 def test_kernels_are_not_loaded_in_passing(monkeypatch: pytest.MonkeyPatch) -> None:
     """The thread that receives would stand still for half a second, and answers to questions be late."""
     monkeypatch.setattr(stuffing, "are_loaded", lambda: False)
-    monkeypatch.delattr(stuffing, "classic_bits")
+    for kernel in ("classic_bits", "classic_frame_bits"):
+        monkeypatch.delattr(stuffing, kernel)
     load = BusLoad()
     for _ in range(1000):
         load.add(0, b"")

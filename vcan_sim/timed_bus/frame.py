@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Final
 
+from skinnode.bus_load.stuffing import classic_frame_bits
 from skinnode.bus_load.timing import exact_bits, exact_fd_bits
 from skinnode.canopen.data_length import FD_LENGTHS
 from skinnode.text.words import counted
@@ -90,7 +91,7 @@ def frame_bits(frame: CanFrame, esi: bool = False) -> tuple[int, int]:
     """
     if frame.fd:
         return exact_fd_bits(frame.can_id, frame.data, extended=frame.extended, brs=frame.brs, esi=esi)
-    return (
-        exact_bits(frame.can_id, frame.data, extended=frame.extended, remote=frame.remote, dlc=frame.dlc),
-        0,
-    )
+    if frame.extended:
+        return exact_bits(frame.can_id, frame.data, extended=True, remote=frame.remote, dlc=frame.dlc), 0
+    length = frame.dlc if frame.remote else len(frame.data)
+    return classic_frame_bits(frame.can_id << 7 | frame.remote << 6 | length, frame.data), 0

@@ -1,19 +1,19 @@
-"""Rubber as an elastic half-space: surface displacements caused by surface loads.
+"""Surface displacement of an elastic half-space under surface loads.
 
-The body fills z < 0, its surface is z = 0, and z points outwards. A body that presses on the surface
-therefore exerts a load with a negative z component. With the offset d = (x, y) from load to point, r = |d|,
-shear modulus G and Poisson's ratio ν, a point load f displaces the surface by (Boussinesq 1885, Cerruti 1882;
-Johnson, Contact Mechanics, 1985, eqs. 3.18 and 3.75 at z = 0, in our axes)
+The rubber fills z ≤ 0, and z points out of it. An object that presses on the surface exerts a load with a
+negative z component. A point load f displaces the surface by u (Boussinesq 1885, Cerruti 1882; Johnson,
+Contact Mechanics, 1985, eqs. 3.18 and 3.75 at z = 0, with the axes changed to those used here):
 
     ⎡ u_x ⎤      1   ⎡ (1−ν)/r + ν x²/r³    ν x y/r³              (½−ν) x/r² ⎤ ⎡ f_x ⎤
     ⎢ u_y ⎥  =  ───  ⎢ ν x y/r³             (1−ν)/r + ν y²/r³     (½−ν) y/r² ⎥ ⎢ f_y ⎥
     ⎣ u_z ⎦     2πG  ⎣ −(½−ν) x/r²          −(½−ν) y/r²           (1−ν)/r    ⎦ ⎣ f_z ⎦
 
-This module evaluates the matrix at a point (:func:`point_compliance`), and integrates it over a rectangle of
-uniform traction (:func:`rectangle_compliance`) or over the pressure under a sphere (:class:`HertzContact`).
+Here d = (x, y) is the offset of the surface point from the load, r = |d|, G is the shear modulus, and ν is
+Poisson's ratio. :func:`point_compliance` evaluates the matrix. :func:`rectangle_compliance` integrates it over
+a uniformly loaded rectangle, and :class:`HertzContact` over the pressure distribution under a sphere.
 
-The model neglects large strain, the curvature of the skin and the finite thickness of the rubber. A bonded
-layer is stiffer than a half-space, and its displacement decays faster than 1/r.
+The model neglects large strains, the curvature of the skin and the finite thickness of the rubber. A thin
+layer bonded to a rigid base is stiffer than a half-space, and its displacement decays faster than 1/r.
 """
 
 from __future__ import annotations
@@ -33,9 +33,10 @@ class Rubber:
     """Linear elastic, isotropic material.
 
     Args:
-        young_pa: Young's modulus, Pa. The default is typical of a soft silicone, about 20 Shore A.
-        poisson: Poisson's ratio. Rubber is nearly incompressible, so the default is 0.5. At 0.5, normal and
-            tangential loads do not couple at the surface, and Hertz's theory remains exact under friction.
+        young_pa: Young's modulus, Pa. The default is typical of a soft silicone of about 20 Shore A.
+        poisson: Poisson's ratio. The default, 0.5, describes an incompressible material; rubber is nearly
+            incompressible. At 0.5, normal and tangential loads do not couple at the surface, and Hertz's
+            theory remains exact under friction.
 
     Raises:
         ValueError: If the modulus is not positive and finite or the ratio is outside 0 … 0.5.
@@ -67,9 +68,9 @@ def point_compliance(rubber: Rubber, offset_m: ArrayLike, *, softening_m: float 
     Args:
         rubber: The material.
         offset_m: (P, 2) offset of each point from the load, metres.
-        softening_m: Softening length ε, metres; r is replaced with √(r² + ε²). The softening spreads the load
-            over a spot of about the radius ε, so that the displacement at the load stays finite. A value of 0
-            means an ideal point load.
+        softening_m: Softening length ε, metres; r is replaced with √(r² + ε²). This spreads the load over a
+            spot with a radius of about ε and keeps the displacement at the load finite. 0 gives an ideal
+            point load.
 
     Returns:
         (P, 3, 3) compliance, m/N. The last axis is the component of the load; the second-to-last axis is the
@@ -92,9 +93,9 @@ def point_compliance(rubber: Rubber, offset_m: ArrayLike, *, softening_m: float 
 def rectangle_compliance(rubber: Rubber, offset_m: ArrayLike, size_m: tuple[float, float]) -> Float:
     """Return the displacement of surface points per unit traction on a rectangle.
 
-    The function evaluates the closed-form solution for a uniform load on a rectangle (Love, Philosophical
-    Transactions A 228, 1929, for the normal part; Johnson eq. 3.25). Each entry of the compliance matrix has
-    an elementary antiderivative in x and y, which is evaluated at the corners.
+    Each entry of the compliance matrix has an elementary antiderivative in x and y, which is evaluated at the
+    corners of the rectangle. Sources for the normal part: Love, Philosophical Transactions A 228, 1929;
+    Johnson eq. 3.25.
 
     Args:
         rubber: The material.
@@ -120,12 +121,12 @@ def rectangle_compliance(rubber: Rubber, offset_m: ArrayLike, size_m: tuple[floa
 
 
 def _antiderivatives(x: Float, y: Float) -> Float:
-    """Return antiderivatives (5, P), in both x and y, of x²/r³, y²/r³, xy/r³, x/r² and y/r²."""
+    """Return the double antiderivatives (5, P) of x²/r³, y²/r³, xy/r³, x/r² and y/r² over x and y."""
     r = np.hypot(x, y)
     ax, ay = np.abs(x), np.abs(y)
     with np.errstate(divide="ignore", invalid="ignore"):
-        # asinh(x/|y|) replaces ln(x + r), which loses digits if x is negative. The two differ by ln|y|, which
-        # cancels in the sum over the corners.
+        # asinh(x/|y|) replaces ln(x + r), which suffers from cancellation for x < 0. The two differ by ln|y|,
+        # which drops out of the sum over the corners.
         xx = np.where(ay > 0, y * np.arcsinh(x / ay), 0.0)
         yy = np.where(ax > 0, x * np.arcsinh(y / ax), 0.0)
         log_r = np.where(r > 0, np.log(r), 0.0)
@@ -138,7 +139,7 @@ def _antiderivatives(x: Float, y: Float) -> Float:
 def _compliance(  # noqa: PLR0913 - the six functions in the matrix
     rubber: Rubber, inverse: Float, xx: Float, yy: Float, xy: Float, x_r2: Float, y_r2: Float
 ) -> Float:
-    """Assemble the compliance matrices (P, 3, 3) from the six functions of x and y, or their integrals."""
+    """Assemble compliance matrices (P, 3, 3) from 1/r, x²/r³, y²/r³, xy/r³, x/r² and y/r², or their integrals."""
     nu = rubber.poisson
     matrix = np.empty((*inverse.shape, 3, 3))
     matrix[..., 0, 0] = (1 - nu) * inverse + nu * xx
@@ -155,13 +156,13 @@ def _compliance(  # noqa: PLR0913 - the six functions in the matrix
 
 @dataclass(frozen=True)
 class HertzContact:
-    """Hertzian contact between the rubber and a rigid sphere that presses on the rubber and slides over it.
+    """Hertzian contact of a rigid sphere that presses on the rubber and slides over it.
 
     Inside the contact circle, the pressure is p = p₀ √(1 − r²/a²) and the traction is (t_x p, t_y p, −p). The
-    surface displacement has a closed form everywhere. Since p is radially symmetric, all integrals follow
-    from two radial functions, Φ = ∫ p/|d| (Johnson eqs. 3.41a, 3.42a) and P, the load within the radius r.
-    The model assumes that shear does not change the pressure, which is exact for incompressible rubber and an
-    approximation for ν < 0.5 (Johnson 7.1).
+    surface displacement has a closed form both inside and outside the circle. Since p is radially symmetric,
+    all integrals follow from two functions of r: Φ = ∫ p/|d| (Johnson eqs. 3.41a, 3.42a), and P, the load
+    within the radius r. The shear traction is assumed not to change the pressure. This is exact for
+    ν = 0.5 and an approximation for ν < 0.5 (Johnson 7.1).
 
     Args:
         rubber: The material.
@@ -169,8 +170,8 @@ class HertzContact:
         indentation_m: Approach δ of the sphere, metres; 0 means no contact. The normal displacement at the
             centre of the contact equals δ if there is no shear or if ν = 0.5.
         center_m: Centre (x, y) of the contact circle, metres.
-        traction_ratio: (t_x, t_y) ratio of the shear traction on the rubber to the pressure. The vector
-            points in the sliding direction of the sphere; its length is the coefficient of friction.
+        traction_ratio: Ratio (t_x, t_y) of the shear traction on the rubber to the pressure. It points in the
+            sliding direction of the sphere, and its length is the coefficient of friction.
 
     Raises:
         ValueError: If a value is not finite, the radius is not positive, or the indentation is negative.
@@ -208,7 +209,7 @@ class HertzContact:
         return self.traction_ratio[0] * normal, self.traction_ratio[1] * normal, -normal
 
     def traction_pa(self, points_m: ArrayLike) -> Float:
-        """Return the traction (P, 3) in Pa at surface points (P, 2) in metres; 0 outside the contact.
+        """Return the traction (P, 3), Pa, at surface points (P, 2), metres; 0 outside the contact circle.
 
         Raises:
             ValueError: If the array has the wrong shape or contains NaN.
@@ -222,7 +223,7 @@ class HertzContact:
         return np.asarray(pressure[:, None] * np.array([*self.traction_ratio, -1.0]))
 
     def displacement_m(self, points_m: ArrayLike) -> Float:
-        """Return the displacement (P, 3) in m of surface points (P, 2) in m; exactly 0 without contact.
+        """Return the displacement (P, 3), metres, of surface points (P, 2), metres; 0 if there is no contact.
 
         Raises:
             ValueError: If the array has the wrong shape or contains NaN.
@@ -247,9 +248,9 @@ class HertzContact:
 def _hertz_integrals(offset: Float, a: float, peak: float) -> tuple[Float, Float, Float, Float]:
     """Return Φ, Φ − S, (2S − Φ)/r² and P/r² at offsets (P, 2) from the centre of a Hertzian pressure p.
 
-    χ = ∫ p |d| has the Laplacian Φ, so its gradient is d S with S = ∫₀ʳ Φ s ds / r², its second derivatives
-    are S I + (Φ − 2S) d dᵀ/r², and ∫ p d dᵀ/|d|³ = Φ I − ∇∇χ. ∫ p d/|d|² is the field of a planar
-    charge, which is d P/r² by Gauss's law in the plane.
+    Let χ = ∫ p |d|, whose Laplacian is Φ. Its gradient is d S with S = ∫₀ʳ Φ s ds / r², and its second
+    derivatives are S I + (Φ − 2S) d dᵀ/r². The tensor ∫ p d dᵀ/|d|³ equals Φ I − ∇∇χ. The vector ∫ p d/|d|²
+    is the field of a charge distribution in two dimensions, which is d P/r² by Gauss's law.
     """
     r2 = np.einsum("pi,pi->p", offset, offset)
     near = r2 <= a * a
@@ -258,13 +259,13 @@ def _hertz_integrals(offset: Float, a: float, peak: float) -> tuple[Float, Float
     phi = c * a * a * (2 - s2)
     isotropic = c * a * a * (1 - 0.75 * s2)
     radial = np.full_like(r2, 0.5 * c)
-    # equal to (1 − (1 − s²)^{3/2}) / s², but without cancellation at the centre
+    # (1 − (1 − s²)^{3/2}) / s², rearranged to avoid cancellation at the centre
     root = np.sqrt(1 - s2)
     enclosed = 2 / 3 * math.pi * peak * (1 + root + (1 - s2)) / (1 + root)
     far = ~near
     q2 = r2[far]
     w = np.sqrt(q2 - a * a)
-    angle = np.arctan2(a, w)  # equal to arcsin(a/r), but more accurate near the edge
+    angle = np.arctan2(a, w)  # arcsin(a/r), more accurate near r = a in this form
     c = math.pi * peak / (2 * a)
     outside = c * ((2 * a * a - q2) * angle + a * w)
     mean = c * ((a * a - 0.25 * q2) * angle + (0.75 * a * a + 0.25 * w * w) * a * w / q2)

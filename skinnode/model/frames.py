@@ -1,4 +1,4 @@
-"""Records of the resistances in a scan and of the displacement field computed from them."""
+"""Data classes for the resistances of a scan and the displacement field computed from them."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ Z_95_TWO_SIDED: Final = 1.959964
 
 @dataclass(frozen=True, slots=True)
 class ScanStamp:
-    """Number and times of a scan. All times except ``device_time_us`` are on the host's monotonic clock."""
+    """Number and times of a scan. Times with the suffix ``_ns`` are on the host's monotonic clock."""
 
     patch: str
     """Name of the patch."""
@@ -29,8 +29,8 @@ class ScanStamp:
     device_time_us: int
     """Time of the scan's SYNC on the node's own clock, µs, modulo 2³²; 0 if the summary was lost.
 
-    The resolution is 64 µs. A summary contains only the lower 22 bits of the time, and the host adds the
-    upper 10 bits. Object 0x2011:4 of the node contains the time with a resolution of 1 µs."""
+    The resolution is 64 µs. The summary contains only the lower 22 bits of the time; the host adds the upper
+    10 bits. Object 0x2011:4 contains the time of the node with a resolution of 1 µs."""
     t_sync_ns: int
     """Time at which the SYNC of this scan was sent or received; 0 if unknown."""
     t_receive_ns: int
@@ -39,7 +39,7 @@ class ScanStamp:
     """Time at which the displacement field was ready; 0 if it is not ready yet."""
 
     def solved_at(self, t_ns: int) -> ScanStamp:
-        """Return a copy of the stamp for a displacement field that was ready at ``t_ns``."""
+        """Return a copy of the stamp with ``t_solved_ns`` set to ``t_ns``."""
         return ScanStamp(
             self.patch, self.scan, self.counter, self.device_time_us, self.t_sync_ns, self.t_receive_ns, t_ns
         )
@@ -50,7 +50,7 @@ class ResistanceFrame:
     """One scan of a patch."""
 
     resistance_ohm: Float
-    """(U, K) wire-to-wire resistances, ohm; NaN if not valid."""
+    """(U, K) wire-to-wire resistances, ohm; NaN where invalid."""
     valid: NDArray[np.bool_]
     """(U, K) mask of the valid resistances; False if a chunk is missing, a wire is open or shorted, or a code
     is out of range."""
@@ -59,14 +59,14 @@ class ResistanceFrame:
 
 @dataclass(frozen=True, slots=True)
 class SolveStats:
-    """Number of function evaluations in a solve, and elapsed time of the solve."""
+    """Cost of a solve: numbers of evaluations and steps, and elapsed time."""
 
     evaluations: int
     """Number of evaluations of the forward model F."""
     jacobians: int
-    """Number of evaluations of the Jacobian J; each of them also yields F."""
+    """Number of evaluations of the Jacobian J, each of which also evaluates F."""
     steps: int
-    """Number of solver iterations; in a posterior solve, number of matrix factorisations."""
+    """Number of solver iterations; for the posterior method, number of matrix factorisations."""
     time_s: float
     """Elapsed time, s."""
 
@@ -84,8 +84,8 @@ class Contact:
     centroid_std_m: Float
     """(3,) standard deviation of the centre, metres."""
     area_m2: float
-    """Contact area of a smooth body (Hertz), m². A contact that is too small to resolve has the area of one
-    electrode cell."""
+    """Contact area, m², estimated for a smooth body (Hertz). If the contact is too small to be resolved, this is
+    the area of one electrode cell."""
     area_std_m2: float
     normal_force_n: float
     """Normal force, N; positive if the body presses on the skin."""
@@ -99,11 +99,11 @@ class Contact:
     ``[patches.calibration]``).
 
     Without a calibration, the standard deviation of the normal force also covers the error of the half-space
-    model. The force computed for a bonded layer as thick as the clearance is within five standard deviations.
-    The standard deviation of the shear force does not cover the model error."""
+    model: for a bonded layer as thick as the clearance, the error is below five standard deviations. The
+    standard deviation of the shear force does not cover the error of the model."""
     axes: Float = field(default_factory=lambda: _FLAT)
-    """(3, 3) matrix of unit vectors at the centre of the contact, in the coordinates of the layout. The rows
-    point along the upper wires, across them, and out of the skin. On a flat patch, they are the x, y and z
+    """(3, 3) axes at the centre of the contact, as rows, in the coordinates of the layout. The rows are unit
+    vectors along the upper wires, across them, and out of the skin. On a flat patch, they are the x, y and z
     axes."""
 
 
@@ -114,8 +114,8 @@ class FieldFrame:
     displacement_m: Float
     """(U, N, 3) displacement from the rest position, metres."""
     displacement_std_m: Float
-    """(U, N, 3) standard deviation due to noise in the resistances, metres; inf if the displacement is
-    unknown. If a prior contributes to the displacement, the standard deviation is enlarged to cover rare
+    """(U, N, 3) standard deviation due to noise in the resistances, metres; inf where the displacement is
+    unknown. Where the prior contributes to the displacement, the standard deviation is enlarged to cover rare
     large errors of the prior. An error above five standard deviations therefore indicates a fault."""
     status: tuple[Status, ...]
     """Status of each upper wire."""
@@ -123,45 +123,42 @@ class FieldFrame:
     """(U,) RMS of the relative residuals of each wire's valid resistances."""
     stats: SolveStats
     force_n: Float | None = None
-    """(U, N, 3) loads on the skin, in newtons; None if ``contacts`` was switched off. The loads are computed
-    with the model of an elastic half-space. If the method is ``exact`` and a stiffness k was specified, they
-    are computed as F = k Δs instead."""
+    """(U, N, 3) load on the skin at each electrode, N; None if ``contacts`` was switched off. Loads are computed
+    with the half-space model, or as F = k Δs if the method is ``exact`` and a stiffness k was specified."""
     stamp: ScanStamp | None = None
-    """Number and times of the scan from which the field was computed; None without a host."""
+    """Number and times of the scan from which the field was computed; None if no host was involved."""
     method: str = "exact"
     """``exact`` if each wire was solved separately; ``posterior`` if the patch was estimated as a whole."""
     by_prior: NDArray[np.bool_] | None = None
-    """(U,) mask of the wires that were estimated with the prior because their own resistances were not
-    sufficient. With the method ``posterior``, these are the wires without any usable resistance. The prior
-    may be the only evidence for such a wire, even if the wire is trusted."""
+    """(U,) mask of the wires that were estimated with the prior because their own resistances were
+    insufficient. With the method ``posterior``, these are the wires without any usable resistance. The
+    displacement of such a wire may rest on the prior alone, even if the wire is trusted."""
     contacts: tuple[Contact, ...] = ()
-    """Contacts, strongest first; empty if nothing touches, if no wire could be solved, or if ``contacts`` was
-    switched off. The number of contacts also depends on the previous scan, so that noise does not split or
+    """Contacts, strongest first; empty if nothing touches the skin, if no wire could be solved, or if
+    ``contacts`` was switched off. Detection uses hysteresis from scan to scan, so that noise does not split or
     remove a contact."""
     gain: Float | None = None
     """(U,) estimated relative gain error of each wire's resistances; None if gains are not estimated."""
     noise_factor: float = 1.0
-    """Ratio of the estimated noise to the configured noise; exactly 1 while the measured noise is consistent
-    with the configured noise. If the resistances were computed from codes, the ratio excludes quantization
-    noise."""
+    """Ratio of the estimated noise to the configured noise; exactly 1 as long as the data are consistent with
+    the configured noise. If the resistances were computed from codes, the ratio excludes quantization noise."""
     held: NDArray[np.bool_] | None = None
     """(U,) mask of the wires that were not solved again, because their resistances changed by no more than
     the noise."""
     core_std_m: Float | None = None
-    """(U, N, 3) standard deviation that is not enlarged to cover rare large errors of the prior, metres; None
-    if equal to ``displacement_std_m``."""
+    """(U, N, 3) standard deviation without the enlargement for rare large errors of the prior, metres; None if
+    equal to ``displacement_std_m``."""
 
     distrust: str | None = None
-    """Text that explains why the field is not trusted; empty if the field is trusted. None: not tested."""
+    """Reason why the field is not trusted; empty if the field is trusted, None if it was not tested."""
     wires_trusted: NDArray[np.bool_] | None = None
-    """(U,) mask of the wires with enough usable readings that passed every test; None if the readings were
-    not tested."""
+    """(U,) mask of the wires that converged and have enough usable readings; None if the readings were not
+    tested."""
     precise: bool = True
     """Whether the standard deviations are within the limits ``max_std_m`` and ``max_force_std_n``."""
     data_share: Float | None = None
-    """(U, N, 3) fraction of each displacement that comes from the data of this scan rather than the prior;
-    None if all fractions are 1. The fraction is 1 minus the ratio of the posterior variance to the prior
-    variance."""
+    """(U, N, 3) fraction of each displacement that is determined by the data of this scan rather than by the
+    prior: 1 minus the ratio of the posterior variance to the prior variance. None if all fractions are 1."""
     faults: tuple[DataFault, ...] = ()
     """Readings that failed a test and were not used to compute the field."""
 
@@ -172,10 +169,9 @@ class FieldFrame:
 
     @property
     def trusted(self) -> bool:
-        """Whether the data passed all tests, enough data arrived, and the patch's converter is running.
+        """Whether the field passed all tests; if not, ``distrust`` contains the reason.
 
-        If the field is not trusted, ``distrust`` contains the reason. If the data were not tested, the field
-        is trusted if every wire has the status CONVERGED.
+        A field that was not tested is trusted if every wire has the status CONVERGED.
         """
         if self.distrust is None:
             return all(status is Status.CONVERGED for status in self.status)
@@ -186,9 +182,9 @@ _Record = TypeVar("_Record", Contact, FieldFrame)
 
 
 def sealed(record: _Record, **changes: Any) -> _Record:
-    """Return a copy of a record with ``changes`` and read-only arrays, for use by several receivers.
+    """Return a copy of a record with ``changes`` applied and all arrays read-only.
 
-    The arrays of the copy are read-only views; the original arrays stay writable.
+    The arrays of the copy are views; the original arrays stay writable. Several readers can share the copy.
     """
     twin = object.__new__(type(record))  # five times as fast as ``dataclasses.replace``
     for name in _NAMES[type(record)]:
@@ -201,7 +197,7 @@ def sealed(record: _Record, **changes: Any) -> _Record:
 
 
 def amended(field: FieldFrame, **changes: Any) -> FieldFrame:
-    """Return a copy of a field with ``changes``; five times as fast as ``dataclasses.replace``."""
+    """Return a copy of a field with ``changes`` applied; five times as fast as ``dataclasses.replace``."""
     twin = object.__new__(FieldFrame)
     for name in _NAMES[FieldFrame]:
         object.__setattr__(twin, name, changes[name] if name in changes else getattr(field, name))

@@ -1,9 +1,8 @@
 """Contacts and wrenches in the coordinate frame of a link or of the hand, with their covariances.
 
-A contact on a patch exerts the force f on the skin at the point r. In the frame of a link, the contact's
-wrench is the force f and the torque r × f about the origin of the link's frame. To first order, the
-covariance of the wrench follows from the covariances of f and r, whose errors are assumed to be independent
-of each other.
+A contact exerts a force f on the skin at a point r. Its wrench is the force f and the torque r × f about the
+origin of the frame. The covariance of the wrench is propagated to first order from the covariances of f and
+r. The errors of f and r are assumed to be independent.
 """
 
 from __future__ import annotations
@@ -20,12 +19,12 @@ from skinnode.model.layout import Float
 from skinnode.model.pose import Pose
 
 HAND: Final = "hand"
-"""Name of the hand's coordinate frame; also the link name of patches mounted on the hand itself."""
+"""Name of the hand's coordinate frame, and of the link of patches that are mounted on the hand itself."""
 
 
 @dataclass(frozen=True, slots=True)
 class Mount:
-    """Mounting position of a patch on the robot."""
+    """Link and pose at which a patch is mounted on the robot."""
 
     link: str = HAND
     """Name of the link on which the patch is mounted."""
@@ -48,13 +47,13 @@ class HandContact:
     position_covariance_m2: Float
     """(3, 3) covariance of the position, m²."""
     normal: Float
-    """(3,) unit normal at the contact, pointing out of the skin. A pressing object exerts its normal force in
-    the opposite direction."""
+    """(3,) unit normal of the skin at the contact, pointing outwards. An object presses in the opposite
+    direction."""
     normal_force_n: float
     """Normal force, N; positive if the object presses on the skin."""
     normal_force_std_n: float
     force_n: Float
-    """(3,) force of the object on the skin, N: the vector sum of the normal force and the shear force."""
+    """(3,) force on the skin, N: vector sum of the normal force and the shear force."""
     force_covariance_n2: Float
     """(3, 3) covariance of the force, N²."""
     area_m2: float
@@ -67,12 +66,12 @@ class HandContact:
 
     @classmethod
     def on_link(cls, contact: Contact, patch: str, mount: Mount, *, trusted: bool) -> HandContact:
-        """Return a contact of a patch, expressed in the coordinate frame of the patch's link.
+        """Return a contact, expressed in the coordinate frame of the patch's link.
 
         Args:
             contact: The contact, in the frame of the patch.
             patch: Name of the patch.
-            mount: Mounting position of the patch on the robot.
+            mount: Link and pose of the patch.
             trusted: Whether the patch's field is trusted.
         """
         to_link = mount.pose.rotation
@@ -130,8 +129,8 @@ class HandContact:
 class Wrench:
     """Total force and torque that the contacts on a link, or on the hand, exert on the skin.
 
-    The wrench does not include forces that are too weak to be detected as contacts. The torque of each
-    contact about its own normal is not included either.
+    Forces that are too weak to be detected as contacts, and the torque of a contact about its own normal, are
+    not included.
     """
 
     frame: str
@@ -147,7 +146,7 @@ class Wrench:
     force_calibrated: bool
     """Whether every force is based on a calibration of its patch; True if there are no contacts."""
     trusted: bool
-    """Whether every patch that may contribute to the wrench has a field that is trusted."""
+    """Whether the fields of all patches on the link, or on the hand, are trusted."""
 
     @property
     def force_std_n(self) -> Float:
@@ -181,17 +180,17 @@ class Wrench:
 
 
 def wrench_of(contacts: Iterable[HandContact], frame: str, *, trusted: bool) -> Wrench:
-    """Return the total wrench of contacts whose vectors are all in the same frame.
+    """Return the total wrench of contacts that are expressed in the same frame.
 
     Errors of contacts on different patches are assumed to be independent. Errors of contacts on the same
-    patch may be correlated: noise may shift load between neighbouring contacts, and an error in the layer's
-    stiffness scales all forces. As the correlation is unknown, the covariances of contacts on the same patch
-    are combined into a bound that is valid for any correlation.
+    patch are correlated: noise shifts load between neighbouring contacts, and an error in the assumed
+    stiffness scales all forces. Since the correlation is unknown, their covariances are combined into an
+    upper bound that holds for any correlation.
 
     Args:
         contacts: The contacts, all in ``frame``.
         frame: Name of the frame.
-        trusted: Whether the fields of all patches that may contribute are present and trusted.
+        trusted: Value of :attr:`Wrench.trusted`.
     """
     force_n, torque_nm, covariance = np.zeros(3), np.zeros(3), np.zeros((6, 6))
     of_patch: dict[str, list[HandContact]] = {}
@@ -200,8 +199,8 @@ def wrench_of(contacts: Iterable[HandContact], frame: str, *, trusted: bool) -> 
         force_n += contact.force_n
         torque_nm += np.cross(contact.position_m, contact.force_n)
     for group in of_patch.values():
-        # For weights w with Σ w = 1, (Σ e)(Σ e)ᵀ ≤ Σ e eᵀ / w. If w is proportional to the standard
-        # deviation, the bound is exact for fully correlated errors.
+        # For errors e and weights w with Σ w = 1, (Σ e)(Σ e)ᵀ ≤ Σ e eᵀ / w. With weights proportional to the
+        # standard deviations, equality holds if the errors are fully correlated.
         stds = [math.sqrt(float(np.trace(contact.force_covariance_n2))) for contact in group]
         total = sum(stds)
         for contact, std in zip(group, stds, strict=True):
@@ -212,7 +211,7 @@ def wrench_of(contacts: Iterable[HandContact], frame: str, *, trusted: bool) -> 
 
 
 def _covariance(contact: HandContact) -> Float:
-    """Return the first-order covariance (6, 6) of one contact's wrench."""
+    """Return the covariance (6, 6) of a contact's wrench to first order."""
     by_force = np.vstack([np.eye(3), _cross(contact.position_m)])
     by_position = np.vstack([np.zeros((3, 3)), -_cross(contact.force_n)])
     return np.asarray(

@@ -1,10 +1,9 @@
-"""Compiled forward model of one upper wire, for arrays in structure-of-arrays order.
+"""Compiled forward model of one upper wire.
 
-Lower electrodes are stored as (3, M, K), and the Jacobian is stored transposed (3N, K). Values of
-neighbouring lower wires are therefore contiguous in memory, and sums stay in registers. Most of the time is
-spent on the inverse distances of electrode pairs. The inverse distances are computed with multiplications
-only, because processors execute square roots and divisions slowly. Lengths may be in any unit; F has the
-inverse unit.
+Lower electrodes are stored as (3, M, K), and the Jacobian is stored transposed as (3N, K). Values of
+neighbouring lower wires are thus contiguous in memory, and the sums over electrodes stay in registers. Most
+of the run time goes into the inverse distances of electrode pairs. They are computed without square roots or
+divisions, which are slow on all processors. Lengths may be in any unit; F has the inverse unit.
 """
 
 from __future__ import annotations
@@ -21,26 +20,26 @@ _T = TypeVar("_T", float, Float)
 
 
 def lower_rows(lower: Float) -> Float:
-    """Return lower electrodes (K, M, 3) in the axis order (3, M, K) that the kernels expect."""
+    """Transpose lower electrodes (K, M, 3) to the axis order (3, M, K) of the kernels."""
     return np.ascontiguousarray(lower.transpose(2, 1, 0))
 
 
 def relative_residual(a: _T, f: _T) -> _T:
-    """Return the relative residual ``a * f - 1`` of a resistance, for numbers or arrays."""
+    """Return the relative residual ``a * f - 1`` of a resistance, where ``a`` is R/ρ and ``f`` is F."""
     return a * f - 1.0
 
 
 relative_residual_part = njit_body(relative_residual)
-"""Version of ``relative_residual`` that kernels can call."""
+"""``relative_residual`` as a function that kernels can call."""
 
 
 @njit_part
 def _inverse_root(square: Lanes) -> Lanes:
     """Return 1 / √``square`` with an error below 1.5 ulp; NaN for subnormal numbers and inf.
 
-    With e = 1 − square y², the result is y (1 + e/2 + 3/8 e² + 5/16 e³ + 35/128 e⁴ …). The series
-    is evaluated twice without the e⁴ term. The first evaluation reduces e from 0.07 to 1e-5, and the second
-    reduces e to rounding errors.
+    For an estimate y with e = 1 − square y², the inverse root is y (1 + e/2 + 3/8 e² + 5/16 e³ + …). Two
+    iterations use the terms up to e³. The first reduces e from 0.07 to 1e-5, and the second to the level of
+    rounding errors.
     """
     y = rough_inverse_root(square)
     for _ in range(2):
@@ -54,8 +53,8 @@ def _inverse_root(square: Lanes) -> Lanes:
 def potential(x: Float, lower: Float, f: Float) -> None:
     """Write F of one wire into ``f`` (K,).
 
-    ``x`` (3N,) contains the wire's electrodes as x₁ y₁ z₁ x₂ …, and ``lower`` (3, M, K) contains the lower
-    electrodes.
+    ``x`` (3N,) contains the coordinates of the wire's electrodes in the order x₁ y₁ z₁ x₂ …, and ``lower``
+    (3, M, K) contains the lower electrodes.
     """
     charges, wires = lower.shape[1], lower.shape[2]
     for k in range(0, wires, LANES):
@@ -99,11 +98,10 @@ def potential_jacobian(x: Float, lower: Float, f: Float, jt: Float) -> None:
 
 @njit
 def surface_laplacian(x: Float, lower: Float, normal: Float, out: Float, slope_t: Float) -> None:
-    """Write the surface Laplacian of F, which equals −∂²F/∂n², into ``out`` (K,) for one wire.
+    """Write the surface Laplacian of F, −∂²F/∂n², into ``out`` (K,), and its derivative into ``slope_t``.
 
-    ``normal`` (3N,) contains the unit normal at each electrode; ``x`` and ``lower`` are as in
-    :func:`potential`. ``slope_t`` (3N, K) receives the transposed derivative of the Laplacian with respect to
-    ``x``.
+    ``x`` and ``lower`` are as in :func:`potential`. ``normal`` (3N,) contains the unit normal at each
+    electrode. ``slope_t`` (3N, K) receives the derivative with respect to ``x``, transposed.
     """
     charges, wires = lower.shape[1], lower.shape[2]
     for k in range(0, wires, LANES):

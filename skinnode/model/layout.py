@@ -1,6 +1,6 @@
 """Geometry of a patch: the positions of its electrodes at rest.
 
-The x axis is along an upper wire, y across the upper wires and z out of the skin; the lower layer is at
+x points along the upper wires, y across them, and z out of the skin. In the presets, the lower layer is at
 z = 0.
 """
 
@@ -21,15 +21,15 @@ PRESETS: Final = ("aligned", "symmetric", "staggered")
 PRESET_IDS: Final = {"custom": 0, "aligned": 1, "symmetric": 2, "staggered": 3}  # object 0x2000, layout id
 
 MOST_ELECTRODES: Final = 1024
-"""Maximum number of upper electrodes on a patch, for example 32 × 32. The posterior method
-stores several covariance matrices of 3072 coordinates, which take 75 MB each."""
+"""Maximum number of upper electrodes on a patch, such as 32 × 32. At this number, each covariance matrix of the
+posterior method has 3072 rows and takes 75 MB."""
 
 MOST_PAIRS: Final = 1 << 22
-"""Maximum number of electrode pairs, each with one upper and one lower electrode. Storing the distances of
-all pairs takes 100 MB."""
+"""Maximum number of pairs of an upper and a lower electrode on a patch. At this number, the offset vectors of
+all pairs take 100 MB."""
 
 _HASH_RESOLUTION_M: Final = 1e-9
-"""Resolution to which coordinates are rounded for the layout hash, m."""
+"""Rounding unit of the coordinates in the layout hash, metres."""
 
 
 def require_array(name: str, value: ArrayLike, shape: tuple[int | str, ...], *, finite: bool = True) -> Float:
@@ -38,14 +38,13 @@ def require_array(name: str, value: ArrayLike, shape: tuple[int | str, ...], *, 
     Args:
         name: Name of the argument, for error messages.
         value: The value; not copied if it is already a C-ordered float64 array.
-        shape: Required shape; a letter stands for any length of at least 1.
-        finite: Whether every number must be finite.
+        shape: Required shape; a string such as ``"U"`` stands for any length of at least 1.
+        finite: Whether to reject NaN and infinity.
 
     Raises:
-        ValueError: If the value cannot be converted. The error message contains the name of the argument,
-            its value and the requirement.
+        ValueError: If the value cannot be converted, has the wrong shape, or must be finite but is not.
     """
-    if (  # fast path for the arrays that a host passes with every scan
+    if (  # fast path for the resistances of a scan
         type(value) is np.ndarray
         and value.dtype == np.float64
         and value.shape == shape
@@ -55,7 +54,7 @@ def require_array(name: str, value: ArrayLike, shape: tuple[int | str, ...], *, 
         return value
     try:
         kind = np.asarray(value).dtype.kind
-        if kind not in "biufO":  # a cast would discard imaginary parts, and convert dates to numbers
+        if kind not in "biufO":  # a cast would drop imaginary parts and turn dates into numbers
             raise TypeError(f"of {np.asarray(value).dtype}")
         array = np.ascontiguousarray(value, dtype=np.float64)
     except (TypeError, ValueError) as error:
@@ -89,14 +88,14 @@ def _require_size(upper_wires: int, upper_electrodes: int, lower_wires: int, low
 
 @dataclass(frozen=True, eq=False)
 class PatchLayout:
-    """Positions of a patch's electrodes at rest.
+    """Positions of a patch's electrodes at rest, and the resistivity of the rubber.
 
     Args:
-        upper_m: (U, N, 3) electrodes of the U upper wires, metres; they move with the surface.
-        lower_m: (K, M, 3) electrodes of the K lower wires, metres; they do not move.
+        upper_m: (U, N, 3) electrodes of the upper wires, metres. These electrodes move with the surface.
+        lower_m: (K, M, 3) electrodes of the lower wires, metres. These electrodes are fixed.
         resistivity_ohm_per_m: Resistance of the rubber between two electrodes, per metre of their distance;
             called g in Xu et al. 2018.
-        name: Name of the layout; need not be the name of a preset.
+        name: Name of the layout; it need not be the name of a preset.
 
     Raises:
         ValueError: If a shape is wrong, a coordinate is NaN, the resistivity is not positive, an upper
@@ -148,15 +147,14 @@ class PatchLayout:
         lower_electrodes: int | None = None,
         resistivity_ohm_per_m: float = 1e7,
     ) -> PatchLayout:
-        """Return the preset layout with the given name; all presets are flat.
+        """Return a flat layout of a given size.
 
-        - ``aligned``: The lower wires run straight along y and are evenly spaced in x. Their electrodes are
-          offset from the upper wires by a quarter pitch, as the figure in Xu et al. 2018 suggests.
-        - ``symmetric``: The layout is the same as ``aligned``, except that there is no offset. The
-          Jacobian is close to singular.
-        - ``staggered``: The lower layer is half a pitch wider than the patch, its electrodes are 1.2 pitches
-          apart, and lower wire k is shifted in y by 0.43 (k mod 3 − 1) pitches. The condition
-          number of the Jacobian is up to a thousand times lower than for the other presets.
+        - ``aligned``: The lower wires run along y and are evenly spaced in x. Their electrodes are offset
+          from the upper wires by a quarter pitch in y, as the figure in Xu et al. 2018 suggests.
+        - ``symmetric``: Same as ``aligned``, but without the offset. The Jacobian is nearly singular.
+        - ``staggered``: The lower layer is half a pitch wider in x than the upper layer. The electrodes of a
+          lower wire are 1.2 pitches apart, and lower wire k is shifted in y by 0.43 (k mod 3 − 1) pitches.
+          The condition number of the Jacobian is up to a thousand times lower than for the other presets.
 
         Args:
             name: ``aligned``, ``symmetric`` or ``staggered``.
@@ -164,7 +162,8 @@ class PatchLayout:
             height_m: Height of the upper electrodes above the lower layer, metres.
             upper_wires: Number of upper wires, U.
             upper_electrodes: Number of electrodes per upper wire, N.
-            lower_wires: Number of lower wires, K; the default 3 N makes the systems of equations square.
+            lower_wires: Number of lower wires, K. The default, 3 N, gives each upper wire as many resistances
+                as unknown coordinates.
             lower_electrodes: Number of electrodes per lower wire, M; the default is U.
             resistivity_ohm_per_m: ρ of the resistor ρ d between two electrodes at distance d, ohm/m.
 
@@ -217,11 +216,10 @@ class PatchLayout:
 
     @functools.cached_property
     def pitch_m(self) -> float:
-        """Length scale of the patch, metres.
+        """Median distance between neighbouring electrodes of an upper wire, metres.
 
-        The length scale is the median distance between neighbouring electrodes on an upper wire. If each
-        upper wire has only one electrode, the length scale is the median distance from an upper electrode to
-        the nearest lower electrode.
+        If each upper wire has only one electrode, the median distance from an upper electrode to the nearest
+        lower electrode is used instead.
         """
         steps = np.linalg.norm(np.diff(self.upper_m, axis=1), axis=2)
         if steps.size:
@@ -236,7 +234,7 @@ class PatchLayout:
 
     @functools.cached_property
     def layout_hash(self) -> int:
-        """CRC-32 of the sizes and all coordinates in nm; a host compares it with object 0x2000 of a node."""
+        """CRC-32 of the array shapes and the coordinates in nm; the host compares it with object 0x2000."""
         sizes = np.array([*self.upper_m.shape, *self.lower_m.shape], dtype="<i8")
         parts = [np.rint(a / _HASH_RESOLUTION_M).astype("<i8") for a in (self.upper_m, self.lower_m)]
         return zlib.crc32(b"".join(a.tobytes() for a in (sizes, *parts)))

@@ -9,8 +9,8 @@ Contact Mechanics, 1985, eqs. 3.18 and 3.75 at z = 0, with the axes changed to t
     ⎣ u_z ⎦     2πG  ⎣ −(½−ν) x/r²          −(½−ν) y/r²           (1−ν)/r    ⎦ ⎣ f_z ⎦
 
 Here d = (x, y) is the offset of the surface point from the load, r = |d|, G is the shear modulus, and ν is
-Poisson's ratio. :func:`point_compliance` evaluates the matrix. :func:`rectangle_compliance` integrates it over
-a uniformly loaded rectangle, and :class:`HertzContact` over the pressure distribution under a sphere.
+Poisson's ratio. :func:`point_compliance` evaluates the matrix. :func:`rectangle_compliance` integrates it
+over a uniformly loaded rectangle, and :class:`HertzContact` over the pressure distribution under a sphere.
 
 The model neglects large strains, the curvature of the skin and the finite thickness of the rubber. A thin
 layer bonded to a rigid base is stiffer than a half-space, and its displacement decays faster than 1/r.
@@ -139,7 +139,7 @@ def _antiderivatives(x: Float, y: Float) -> Float:
 def _compliance(  # noqa: PLR0913 - the six functions in the matrix
     rubber: Rubber, inverse: Float, xx: Float, yy: Float, xy: Float, x_r2: Float, y_r2: Float
 ) -> Float:
-    """Assemble compliance matrices (P, 3, 3) from 1/r, x²/r³, y²/r³, xy/r³, x/r² and y/r², or their integrals."""
+    """Assemble compliance matrices (P, 3, 3) from the values or integrals of 1/r, x²/r³ and so on."""
     nu = rubber.poisson
     matrix = np.empty((*inverse.shape, 3, 3))
     matrix[..., 0, 0] = (1 - nu) * inverse + nu * xx

@@ -84,8 +84,8 @@ class Contact:
     centroid_std_m: Float
     """(3,) standard deviation of the centre, metres."""
     area_m2: float
-    """Contact area, m², estimated for a smooth body (Hertz). If the contact is too small to be resolved, this is
-    the area of one electrode cell."""
+    """Contact area, m², estimated for a smooth body (Hertz). If the contact is too small to be resolved, this
+    is the area of one electrode cell."""
     area_std_m2: float
     normal_force_n: float
     """Normal force, N; positive if the body presses on the skin."""
@@ -123,8 +123,9 @@ class FieldFrame:
     """(U,) RMS of the relative residuals of each wire's valid resistances."""
     stats: SolveStats
     force_n: Float | None = None
-    """(U, N, 3) load on the skin at each electrode, N; None if ``contacts`` was switched off. Loads are computed
-    with the half-space model, or as F = k Δs if the method is ``exact`` and a stiffness k was specified."""
+    """(U, N, 3) load on the skin at each electrode, N; None if ``contacts`` was switched off. Loads are
+    computed with the half-space model, or as F = k Δs if the method is ``exact`` and a stiffness k was
+    specified."""
     stamp: ScanStamp | None = None
     """Number and times of the scan from which the field was computed; None if no host was involved."""
     method: str = "exact"
@@ -135,19 +136,20 @@ class FieldFrame:
     displacement of such a wire may rest on the prior alone, even if the wire is trusted."""
     contacts: tuple[Contact, ...] = ()
     """Contacts, strongest first; empty if nothing touches the skin, if no wire could be solved, or if
-    ``contacts`` was switched off. Detection uses hysteresis from scan to scan, so that noise does not split or
-    remove a contact."""
+    ``contacts`` was switched off. Detection uses hysteresis from scan to scan, so that noise does not split
+    or remove a contact."""
     gain: Float | None = None
     """(U,) estimated relative gain error of each wire's resistances; None if gains are not estimated."""
     noise_factor: float = 1.0
     """Ratio of the estimated noise to the configured noise; exactly 1 as long as the data are consistent with
-    the configured noise. If the resistances were computed from codes, the ratio excludes quantization noise."""
+    the configured noise. If the resistances were computed from codes, the ratio excludes quantization
+    noise."""
     held: NDArray[np.bool_] | None = None
     """(U,) mask of the wires that were not solved again, because their resistances changed by no more than
     the noise."""
     core_std_m: Float | None = None
-    """(U, N, 3) standard deviation without the enlargement for rare large errors of the prior, metres; None if
-    equal to ``displacement_std_m``."""
+    """(U, N, 3) standard deviation without the enlargement for rare large errors of the prior, metres; None
+    if equal to ``displacement_std_m``."""
 
     distrust: str | None = None
     """Reason why the field is not trusted; empty if the field is trusted, None if it was not tested."""

@@ -21,8 +21,8 @@ PRESETS: Final = ("aligned", "symmetric", "staggered")
 PRESET_IDS: Final = {"custom": 0, "aligned": 1, "symmetric": 2, "staggered": 3}  # object 0x2000, layout id
 
 MOST_ELECTRODES: Final = 1024
-"""Maximum number of upper electrodes on a patch, such as 32 × 32. At this number, each covariance matrix of the
-posterior method has 3072 rows and takes 75 MB."""
+"""Maximum number of upper electrodes on a patch, such as 32 × 32. At this number, each covariance matrix of
+the posterior method has 3072 rows and takes 75 MB."""
 
 MOST_PAIRS: Final = 1 << 22
 """Maximum number of pairs of an upper and a lower electrode on a patch. At this number, the offset vectors of

@@ -1,14 +1,14 @@
 """Crossed wires: two wires of the same layer whose readings are exchanged.
 
-If two wires were already crossed when the readings at rest were measured, the error is invisible until the
-skin moves. The displacements of each crossed wire are then attributed to the other wire. Exchanging the
-readings of two wires changes the log evidence of a frame by −αᵀδ − ½ δᵀPδ. Here P is the precision of the
-readings z, α = P z, and δ is the change of z due to the exchange. The exchange fits no parameters to
-the frame, so an increase by a few nats is significant.
+If two wires were already crossed when the resistances at rest were measured, the error is invisible until the
+skin moves. The displacements under one wire are then attributed to the other. To test a pair of wires, their
+readings are exchanged in a frame. The log evidence of the frame changes by −αᵀδ − ½ δᵀPδ, where z are the
+readings, P is their precision, α = P z, and δ is the change in z. No parameter is fitted to the frame, so an
+increase of a few nats is significant.
 
-In 108 healthy frames with six kinds of presses (staggered layout, h = 0.5, noise 1e-4), an exchange of two
-wires changed the log evidence by at most 2.8 nats. If two upper wires were actually crossed, the median
-change was 125 nats; for two lower wires, the median change was 43 nats.
+In 108 healthy frames with six kinds of presses (staggered layout, h = 0.5, noise 1e-4), no exchange increased
+the log evidence by more than 2.8 nats. Where two wires were in fact crossed, exchanging them increased it by
+a median of 125 nats for upper wires and 43 nats for lower wires.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class WirePair:
 
 
 def exchanged(z: Float, present: Mask, pair: WirePair) -> tuple[Float, Mask]:
-    """Return copies of the readings and of their mask, with two wires exchanged."""
+    """Return copies of the readings ``z`` and of the mask ``present``, with the two wires exchanged."""
     here, there = [pair.one, pair.other], [pair.other, pair.one]
     z, present = z.copy(), present.copy()
     for values in (z, present):
@@ -50,15 +50,16 @@ def exchanged(z: Float, present: Mask, pair: WirePair) -> tuple[Float, Mask]:
 def likeliest(
     p: Float, alpha: Float, z: Float, present: Mask, *, far: bool = False
 ) -> tuple[float, WirePair]:
-    """Return the largest gain in log evidence (nats) from exchanging two wires, and these two wires.
+    """Return the largest gain in log evidence (nats) from exchanging two wires, and these wires.
 
     Args:
         p: (m, m) precision of the readings.
         alpha: (m,) P z.
         z: (U, K) changes of the readings since rest, in units of their noise.
-        present: (U, K) mask of the available readings; unavailable readings are not exchanged.
-        far: Whether to compare all pairs of wires; by default, only neighbours are compared. Comparing all
-            pairs takes ten times as long as comparing neighbours.
+        present: (U, K) mask of the available readings. A reading is exchanged only if both readings are
+            available.
+        far: Whether to test all pairs of wires rather than only neighbours. Testing all pairs takes ten times
+            as long.
     """
     upper_wires, lower_wires = z.shape
     longest = max(upper_wires, lower_wires)
@@ -73,10 +74,10 @@ def likeliest(
 def best_exchange(  # noqa: PLR0913 - a kernel: arrays by name
     p: Float, alpha: Float, z: Float, present: Mask, upper: int, lower: int, reach: int, delta: Float
 ) -> tuple[float, bool, int, int]:
-    """Return the largest gain from an exchange, whether the wires are upper wires, and the wire numbers.
+    """Return the largest gain from an exchange, nats; whether the wires are upper wires; and their numbers.
 
-    The gain in log evidence is in nats. The search covers wires whose numbers differ by up to ``reach``.
-    Because n pairs are compared, ln n is subtracted from the gain. ``delta`` (max(U, K),) is a work array.
+    Only wires whose numbers differ by at most ``reach`` are tested. The gain is reduced by ln n, because the
+    best of n pairs is chosen. ``delta`` (max(U, K),) is a work array.
     """
     best, is_upper, one, other, pairs = -math.inf, True, 0, 0, 0
     for apart in range(1, reach + 1):
@@ -108,9 +109,10 @@ def _gain(  # noqa: PLR0913 - a kernel: arrays by name
 ) -> float:
     """Return the gain in log evidence from exchanging the ``count`` readings of two wires.
 
-    The first wire's readings have the indices ``start``, ``start + step``, …; add ``across`` to obtain the
-    indices of the second wire's readings. The upper bound −αᵀδ of the gain is computed first. If the bound
-    does not exceed ``enough``, the bound is returned instead of the gain.
+    The readings of the first wire have the indices ``start``, ``start + step``, …. Those of the second wire
+    are offset by ``across``. The function first computes the upper bound −αᵀδ. If the bound is at most
+    ``enough``, it is returned in place of the gain. The gain is −inf if fewer than half of the pairs of
+    readings are available.
     """
     linear, both = 0.0, 0
     for i in range(count):

@@ -1,10 +1,9 @@
-"""Finds the readings of a frame that contradict the others, solves without them, and assesses trust.
+"""Data check: find the readings that contradict the others, and decide whether to trust the field.
 
-Each frame is first solved with all readings except those with confirmed faults. The displacements are then
-converted to changes of the readings, linearised at rest. The model in
-:mod:`skinnode.solve.checks.reading_model` tests these changes.
-If a reading or a wire contradicts the others, the frame is solved again without this reading or wire. At
-most :data:`ROUNDS` groups of readings are left out.
+Each frame is first solved with all readings except those with a confirmed fault. The check linearises the
+readings about rest and tests them with :mod:`skinnode.solve.checks.reading_model`. If a reading or a whole
+wire contradicts the others, the frame is solved again without it. The check stops when no contradiction
+remains, or when :data:`ROUNDS` groups of readings have been left out.
 """
 
 from __future__ import annotations
@@ -35,53 +34,53 @@ from skinnode.solve.linalg.cholesky import multiply_vector, solve_positive
 from skinnode.solve.wires.problem import PatchProblem
 
 ROUNDS: Final = 3
-"""Maximum number of groups of readings left out of a frame; after that, the frame is not solved again."""
+"""Number of left-out groups of readings at which the check stops solving the frame again."""
 WRONG: Final = 0.1
-"""Expected relative error of a wrong reading. This value is not tuned; a value of 0.01 would change the cost
-of a wrong reading by only 2 nats."""
+"""Expected relative error of a wrong reading. Not tuned: reducing it to 0.01 would change the cost of a wrong
+reading by only 2 nats."""
 SUSPICIOUS: Final = 5.0
 """Gain in log evidence (nats) from assuming a fault, above which a frame is suspicious. The check examines
-suspicious frames, i.e. it searches for explanations."""
+suspicious frames: it searches for the most likely explanation of their readings."""
 OFFSETS: Final = (0, 1, 3, 5)
-"""Differences between the index of the best-fitting κ and those of the κ at which single readings are
-tested."""
+"""Prior scales at which single readings are tested, as numbers of indices below the best-fitting κ."""
 CLEAR: Final = -30.0
-"""Log evidence of faults minus that of loads (nats), below which loads clearly explain a frame. Subsequent
-similar frames are then not examined."""
+"""Log evidence of faults minus that of loads (nats), below which loads clearly explain a frame. The check
+then skips similar frames for a while."""
 EXCUSED: Final = 10.0
-"""Increase of the gain (nats) since the last examination, above which a similar frame is examined again."""
+"""Maximum amount (nats) by which the gain of a frame may exceed that of an examined frame, for the two frames
+to count as similar."""
 EXCUSED_FRAMES: Final = 8
-"""Number of frames after an examination during which similar frames are not examined again; an examination
-takes 9 ms."""
+"""Number of frames after an examination at which similar frames are examined again. An examination takes 9
+ms."""
 PATIENCE: Final = 4
-"""Interval, in suspicious frames, at which a frame is examined even if the deadline leaves no time. A fault
-makes all subsequent frames suspicious; a press rarely does."""
+"""One in this many suspicious frames is examined even if the deadline leaves no time. A fault makes every
+subsequent frame suspicious; a press rarely does."""
 EXAMINATION_S: Final = 3e-3
-"""Expected duration of the first examination, s. Later examinations use measured durations."""
+"""Assumed duration of the first examination, s. Later examinations are timed."""
 CROSSED_FRAMES: Final = 5
-"""If only one of two crossed wires is found within this number of frames after both were detected, both are
-reported."""
+"""Number of frames for which a crossed pair is remembered. If either of its wires is found again within this
+time, both wires are reported."""
 NOISE_RATIOS: Final = (2.0, 4.0, 8.0, 16.0)
-"""Ratios of actual to stated noise that are tried as explanations of a suspicious frame."""
+"""Ratios of actual to stated noise that the check tries as explanations of a suspicious frame."""
 COARSE: Final = 0.1
-"""Assumed error of the linearised readings if several upper wires have no solution, as a fraction of the
-90 % quantile of the readings' changes since rest."""
+"""Assumed error of the linearised readings if several upper wires have no solution, as a fraction of the 90 %
+quantile of their changes since rest."""
 COARSE_GROUPS: Final = 3
-"""Maximum number of groups of readings that are left out at once if several upper wires have no solution. If
-the search finds more groups, only the first is left out."""
+"""Maximum number of groups of readings left out at once if several upper wires have no solution. If the
+search finds more groups, only the first is left out."""
 UNSOLVED: Final = 1
-"""If no more than this number of upper wires have no solution, they are reported as faulty. If more
-upper wires have no solution, none is reported, because a lower wire may be the cause."""
+"""Maximum number of upper wires without a solution that are reported as faulty. If there are more, none is
+reported, because the cause may be a lower wire."""
 SPARED: Final = 3
-"""If the solver left out no more than this number of upper wires, they are reported as faulty. If the
-solver left out more wires, none is reported."""
+"""Maximum number of upper wires left out by the solver that are reported as faulty. If there are more, none
+is reported."""
 
 Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Solved:
-    """A field, and the readings from which the field was computed."""
+    """A field, and the readings from which it was computed."""
 
     field: FieldFrame
     a: Float
@@ -89,7 +88,7 @@ class Solved:
     noise: Float
     """(U, K) relative standard deviation of the resistances R."""
     used: Mask
-    """(U, K) mask of the readings used."""
+    """(U, K) mask of the readings used in the solve."""
 
 
 class DataCheck:
@@ -97,14 +96,15 @@ class DataCheck:
 
     Args:
         problem: The patch.
-        sigma: Usual relative noise of a reading, used by :meth:`prepare`.
+        sigma: Typical relative noise of a reading, for :meth:`prepare`.
         model_std: Standard deviation of the forward model's error, relative to the largest change of a
             reading; 0 if the patch matches its layout exactly.
-        drift: Gain errors that are expected and not reported as faults: ``none``, ``patch`` or ``wire``.
+        drift: Gain errors that are not faults: ``none``, ``patch`` (one error for the patch) or ``wire`` (one
+            for each upper wire).
 
     Attributes:
-        scan: Scan number of the next frame, shown in reported faults; None to show the number of checked
-            frames instead.
+        scan: Scan number of the next frame, to be reported with its faults. If None, frames are numbered in
+            the order in which they are checked.
     """
 
     def __init__(
@@ -129,53 +129,55 @@ class DataCheck:
         at_rest = np.zeros((shape[0], 3 * problem.layout.upper_m.shape[1]))
         changes(self._model.jacobian, at_rest, 1.0, self._z)
         self._residuals(at_rest, np.ones(shape), np.ones(shape[0], bool))
-        self._explainer.wrong_readings(self._z, every, self._evidence, 0, 1.0, 1.0)  # compiles the kernels
+        self._explainer.wrong_readings(self._z, every, self._evidence, 0, 1.0, 1.0)  # compile the kernels
         self._largest_gains(every, self._evidences(every), 1.0, 1.0)
         every[0, 0] = False
-        self._evidences(every)  # also compile the kernels for missing readings
+        self._evidences(every)  # compile the kernels for missing readings
         self.reset()
 
     def prepare(self) -> None:
-        """Precompute tables, so that the first suspicious frames of a stream are not delayed."""
+        """Compute the tables in advance, so that the first suspicious frames of a stream are not delayed."""
         self._model.prepare(self._sigma)
 
     def reset(self) -> None:
         """Discard the state of the stream, including all faults."""
         self._list.reset()
         self._frame, self._doubtful, self._noisy = 0, False, False
-        self._lead = 0.0  # gain in log evidence from more noise if the last frame was noisy; else 0
+        self._lead = 0.0  # gain from assuming more noise if the last frame was noisy, nats; else 0
         self._excused, self._excused_where, self._excused_until = -math.inf, -1, 0
         self._where = -1
         self._crossed: tuple[Group, ...] = ()
         self._crossed_until = 0
         self._last: FieldFrame | None = None
         self._unexamined, self._overdue, self._waiting = False, False, 0
-        # last examined frame without a fault: gain, reading, number
+        # gain, suspected reading and number of the last examined frame that had no fault
         self._faultless = 0.0, -1, -EXCUSED_FRAMES
 
     @property
     def left_out(self) -> Mask | None:
-        """(U, K) mask of the readings to leave out of the next frame; None if all readings are used."""
+        """(U, K) mask of the readings to leave out of the next frame; None if there are none."""
         return self._list.mask
 
     def check(
         self, solved: Solved, solve_without: Callable[[Mask], Solved], until: float = math.inf
     ) -> FieldFrame:
-        """Check the readings of a frame, and return its field, including faults and trust.
+        """Check the readings of a frame, and return its field with faults and trust.
+
+        If readings are found to be wrong, the returned field is that of a new solve without them.
 
         Args:
             solved: The frame, solved without the readings in :attr:`left_out`.
             solve_without: Function that solves the frame without the given readings (U, K) and without those
                 in :attr:`left_out`.
-            until: Deadline as a value of :func:`skinnode.process.clock.perf_counter`, s; −inf if the solver
-                ran out of time. In that case, unsolved wires do not indicate a fault. A suspicious frame that
-                cannot be examined before the deadline is not trusted. However, every :data:`PATIENCE`-th
-                such frame is examined despite the deadline.
+            until: Deadline as a value of :func:`skinnode.process.clock.perf_counter`, s. A suspicious frame
+                that cannot be examined in time is not trusted; every :data:`PATIENCE`-th such frame is
+                examined regardless. Pass −inf if the solver ran out of time: unsolved wires are then no
+                evidence of a fault.
         """
         self._frame += 1
         last = self._last
         if last is not None and last.noise_factor != solved.field.noise_factor:
-            self._list.reset()  # faults found at the previous noise level may not be faults at the new level
+            self._list.reset()  # the faults were found at a different noise level
             self._lead = 0.0
         if self._list.mask is None and self._is_clean(solved):
             field = amended(solved.field, distrust="", wires_trusted=self._all_trusted)
@@ -219,9 +221,10 @@ class DataCheck:
         return field
 
     def _is_clean(self, solved: Solved) -> bool:
-        """Return whether a field of the exact inverse, solved from all readings, passes the test for faults.
+        """Return whether a frame is free of faults according to a quick test.
 
-        This test is the fast path of :meth:`_find` for most frames.
+        The test applies only to fields of the exact inverse that converged with all readings. For such
+        fields, it replaces :meth:`_find`.
         """
         field, layout = solved.field, self._problem.layout
         clean = (
@@ -242,11 +245,12 @@ class DataCheck:
         return self._needs_no_explanation(max(self._largest_gains(self._present, best, cost, sigma)))
 
     def _needs_no_explanation(self, gain: float) -> bool:
-        """Return whether a frame needs no examination; ``gain`` is the gain from assuming a fault, nats.
+        """Return whether a frame can be accepted without an examination.
 
-        A frame needs no examination if ``gain`` is small, or if loads clearly explained a recent frame with a
-        similar gain and the same suspected reading. A frame with a different suspected reading is examined,
-        because a reading may become wrong during a press. The frame after a noisy frame is always examined.
+        This is the case if the gain from assuming a fault, ``gain`` (nats), is small. It is also the case if
+        loads clearly explained a recent frame with a similar gain and the same suspected reading. The
+        suspected reading matters because a reading can become wrong during a press. A frame that follows a
+        noisy frame is always examined.
         """
         excused = (
             self._frame < self._excused_until
@@ -256,7 +260,7 @@ class DataCheck:
         return not self._lead and (gain < SUSPICIOUS or excused)
 
     def _find(self, solved: Solved, until: float) -> tuple[Group, ...]:
-        """Return the groups of readings that contradict the others; an empty tuple if no readings do."""
+        """Return the groups of readings that contradict the others; empty if there are none."""
         self._doubtful = self._noisy = self._unexamined = False
         status = np.array(solved.field.status)
         enough = solved.used.mean(axis=1) >= OF_WIRE
@@ -301,10 +305,10 @@ class DataCheck:
         return found
 
     def _may_examine(self, gain: float, until: float) -> bool:
-        """Return whether there is time to examine a suspicious frame.
+        """Return whether a suspicious frame may be examined in view of the deadline.
 
-        If there is no time, the frame is marked as unexamined, unless a similar frame was recently examined
-        and had no fault.
+        If there is no time, the frame is marked as unexamined. It is not marked if a similar frame was
+        examined recently and found to be free of faults.
         """
         if self._overdue or perf_counter() + self._examination_s <= until:
             return True
@@ -317,9 +321,9 @@ class DataCheck:
         return not self._unexamined
 
     def _in_time(self, seconds: float, until: float) -> bool:
-        """Return whether the check may spend ``seconds`` on a suspicious frame.
+        """Return whether a step that takes ``seconds`` may be started for a suspicious frame.
 
-        The deadline is ignored for every :data:`PATIENCE`-th suspicious frame that would exceed it.
+        The deadline is ignored for every :data:`PATIENCE`-th suspicious frame that would miss it.
         """
         if self._overdue or perf_counter() + seconds <= until:
             return True
@@ -330,7 +334,7 @@ class DataCheck:
         return self._overdue
 
     def _noisier(self) -> float:
-        """Return the log evidence of the frame if all its readings have more than the stated noise.
+        """Return the log evidence of the frame if its noise is above the stated level.
 
         If the noise is ``ratio`` times the stated noise, the log evidence is that of z / ratio, minus
         ln(ratio) for each reading.
@@ -346,7 +350,7 @@ class DataCheck:
         return most - math.log(len(NOISE_RATIOS))
 
     def _with_both_crossed(self, found: tuple[Group, ...]) -> tuple[Group, ...]:
-        """Return both recently crossed wires if one of the two was found; otherwise, return ``found``."""
+        """Return both wires of a recent crossed pair if either is in ``found``; else return ``found``."""
         if any(group.kind is FaultKind.CROSSED for group in found):
             self._crossed, self._crossed_until = found, self._frame + CROSSED_FRAMES
         elif self._frame <= self._crossed_until:
@@ -356,7 +360,7 @@ class DataCheck:
         return found
 
     def _linearised(self, solved: Solved, present: Mask) -> float:
-        """Write the linearised changes since rest into ``_z``, and return the readings' relative noise."""
+        """Write the linearised changes, in units of the noise, into ``_z``, and return the relative noise."""
         field, layout = solved.field, self._problem.layout
         sigma = float(np.median(solved.noise[present]))
         moved = field.displacement_m.reshape(layout.shape[0], -1) / layout.pitch_m
@@ -377,7 +381,7 @@ class DataCheck:
     def _remove_gain(self, present: Mask, std: float) -> None:
         """Estimate the remaining gain errors with the prior N(0, ``std``²), and subtract them from ``_z``.
 
-        The solver underestimates gain errors, because its prior attributes part of each gain error to a
+        The gain errors from the solver are too small, because its prior attributes part of each error to a
         displacement of the wire.
         """
         upper, lower = self._z.shape
@@ -392,17 +396,17 @@ class DataCheck:
         self._z[~present] = 0.0
 
     def _residuals(self, moved: Float, a: Float, wires: Mask) -> Float:
-        """Return the residuals a F − 1 (n, K) of the n upper wires selected by ``wires``."""
+        """Return the residuals a F − 1 (n, K) of the n upper wires in the mask ``wires`` (U,)."""
         for u in np.flatnonzero(wires).tolist():
             potential(self._problem.rest[u] + moved[u], self._problem.lower, self._f[u])
         return np.asarray(a[wires] * self._f[wires] - 1.0)
 
     def _evidences(self, present: Mask) -> int:
-        """Fill in missing readings, compute the log evidence at every κ, and return the maximum's index."""
+        """Fill in missing readings, compute the log evidence at every κ, and return the best κ's index."""
         model, z = self._model, self._z.ravel()
         best = evidences(model.vectors_t, model.shrink, model.log_det, z, self._c, self._evidence)
         missing = np.flatnonzero(~present) if present is not self._present else ()
-        if len(missing):  # replace missing readings with their conditional mean
+        if len(missing):  # replace missing readings with their conditional means
             p, count = model.level(best).precision[missing], len(missing)
             block, unknown = np.ascontiguousarray(p[:, missing]), np.empty(count)
             block.flat[:: count + 1] += LEAST
@@ -413,7 +417,7 @@ class DataCheck:
         return best
 
     def _largest_gains(self, present: Mask, best: int, cost: float, sigma: float) -> tuple[float, float]:
-        """Return the largest gain from a wrong reading or crossed wires, and that from a faulty wire."""
+        """Return the largest gain from a wrong reading or crossed wires, and that from one faulty wire."""
         most, of_wires, z = -math.inf, -math.inf, self._z.ravel()
         for offset in OFFSETS:
             number = best - offset
@@ -432,11 +436,10 @@ class DataCheck:
         return most, of_wires
 
     def _find_coarsely(self, solved: Solved) -> tuple[Group, ...]:
-        """Return the most likely wrong readings if several upper wires have no solution.
+        """Return the most likely wrong readings of a frame in which several upper wires have no solution.
 
-        If several upper wires have no solution, loads cannot explain the frame, so the search omits loads.
-        The method :meth:`check` later solves the frame without these readings, and reports only those that
-        disagree with the resulting field.
+        Loads cannot explain such a frame, so the search considers only wrong readings. :meth:`check` solves
+        the frame without the readings found, and reports those that disagree with the new field.
         """
         with np.errstate(divide="ignore", invalid="ignore"):
             np.log(self._problem.a_rest / solved.a, out=self._z)
@@ -455,11 +458,14 @@ class DataCheck:
         return groups if len(groups) <= COARSE_GROUPS else groups[:1]
 
     def _follow(self, solved: Solved) -> None:
-        """Compare the readings that have confirmed faults with the field, and update the fault list."""
+        """Compare the readings that have a confirmed fault with the field, and update the fault list."""
         self._list.follow(*self._deviations(solved))
 
     def _deviations(self, solved: Solved) -> tuple[Float, Mask]:
-        """Return the readings' standardised deviations (U, K) from the field, and a mask of valid values."""
+        """Return the deviations (U, K) of the readings from the field, in standard deviations.
+
+        The second value is a mask (U, K) of the valid deviations; the others are infinite.
+        """
         layout = self._problem.layout
         moved = solved.field.displacement_m.reshape(layout.shape[0], -1) / layout.pitch_m
         residual = self._residuals(moved, solved.a, np.ones(len(moved), bool))
@@ -471,7 +477,7 @@ class DataCheck:
         return np.where(known, deviation, np.inf), known
 
     def _contradicting(self, groups: list[Group], solved: Solved) -> list[Group]:
-        """Return the groups; omit those that the coarse search found but that agree with the field."""
+        """Return ``groups`` without those from the coarse search whose readings agree with the field."""
         if not self._coarse:
             return groups
         deviation, known = self._deviations(solved)
@@ -485,7 +491,7 @@ class DataCheck:
 
 
 def _spared(solved: Solved) -> tuple[Solved, list[Group]]:
-    """Return the frame without the upper wires that its solver left out, and a list of these wires."""
+    """Return the frame without the wires that the solver left out, and these wires as groups."""
     field = solved.field
     status = np.array(field.status)
     out = (status != Status.CONVERGED) & (solved.used.mean(axis=1) >= OF_WIRE)
@@ -497,6 +503,6 @@ def _spared(solved: Solved) -> tuple[Solved, list[Group]]:
 
 
 def _still(solved: Solved, last: FieldFrame) -> bool:
-    """Return whether no wire was solved again, and every status is the same as in the last field."""
+    """Return whether all wires were held, and no status has changed since the last field."""
     held = solved.field.held
     return held is not None and bool(held.all()) and solved.field.status == last.status

@@ -1,11 +1,12 @@
 """Explanations of a frame: loads on the skin, wrong readings, or two crossed wires.
 
-A frame that is unlikely under the elastic prior has one of three causes: wrong readings, two crossed wires,
-or loads that the prior does not expect, such as a contact much narrower than the patch. A greedy search, as
-in orthogonal matching pursuit, adds one load or one group of wrong readings at a time: the candidate with the
-largest gain in log evidence. Readings are reported as wrong only if the best explanation with faults exceeds
-the best explanation by loads alone by more than :data:`MARGIN` in log evidence. The same margin applies to
-crossed wires. Their log evidence is that of loads alone after the two wires have been exchanged.
+A frame can be unlikely under the elastic prior for three reasons: some readings are wrong, two wires are
+crossed, or the loads are unusual, such as a contact much narrower than the patch. A greedy search, similar to
+orthogonal matching pursuit, builds an explanation step by step. Each step adds the load or the group of wrong
+readings with the largest gain in log evidence. An explanation with faults is accepted only if its log
+evidence exceeds that of the best explanation by loads alone by more than :data:`MARGIN`. The same applies to
+crossed wires. Their log evidence is that of loads alone after the readings of the two wires have been
+exchanged.
 """
 
 from __future__ import annotations
@@ -27,23 +28,22 @@ from skinnode.solve.checks.wire_tests import GAIN_STD, LEAST, WireFinding, least
 from skinnode.solve.linalg.cholesky import multiply_vector
 
 MARGIN: Final = 20.0
-"""Minimum margin (nats) for faults to be reported: log evidence of an explanation with faults minus that of
-loads alone. With this margin, no fault was falsely reported in 6,800 frames of deep slides at a noise of
-3e-6, nor in 270 frames with six kinds of presses at a noise of 1e-5."""
+"""Minimum margin for a fault to be reported, nats. The margin is the log evidence with faults minus that of
+loads alone. At this value, no faults were reported in 6,800 healthy frames of deep slides (noise 3e-6), nor
+in 270 frames with six kinds of presses (noise 1e-5)."""
 MARGIN_OF_READING: Final = 50.0
-"""Minimum margin (nats) for a single wrong reading to be reported. Single readings are tested at every prior
-scale. In 36,000 frames with correct readings, a narrow load at the edge of a patch produced a margin of up to
-29 nats (``bench trust --seed 1 --only hours``)."""
+"""Minimum margin for a single wrong reading to be reported, nats. In 36,000 healthy frames, narrow loads at
+the edge of a patch produced margins of up to 29 nats (``bench trust --seed 1 --only hours``)."""
 DOUBT: Final = 5.0
-"""Minimum margin (nats) for a frame to be marked doubtful. In 144 healthy frames, no explanation with faults
-had a higher log evidence than the best explanation by up to 8 loads."""
+"""Minimum margin for a frame to be doubtful, nats. In 144 healthy frames, the margin over explanations by up
+to 8 loads was never positive."""
 SCALES: Final = 4
-"""Number of prior scales searched for explanations: the best-fitting scale and smaller scales. A wrong
-reading can inflate the best-fitting scale by a factor of up to 2⁴, and a narrow contact by up to 2³."""
+"""Number of prior scales searched for explanations: the best-fitting scale and smaller ones. A wrong reading
+can inflate the best-fitting scale by a factor of up to 2⁴, a narrow contact by up to 2³."""
 STRIDE: Final = 2
-"""Step in log2 κ between the prior scales that are searched for explanations."""
+"""Step in log2 κ between these prior scales."""
 HOPELESS: Final = 150.0
-"""Log evidence of loads minus that of faults at one prior scale (nats), above which smaller scales are not
+"""Log evidence of loads minus that of faults at one prior scale, nats, above which smaller scales are not
 searched for faults. In 163 frames with a fault, the difference was at most 114 nats."""
 
 _PARTS: Final = {CROSSING: FaultyPart.CROSSING, LOWER: FaultyPart.LOWER, UPPER: FaultyPart.UPPER}
@@ -53,7 +53,7 @@ Mask = NDArray[np.bool_]
 
 @dataclass(frozen=True, slots=True)
 class Group:
-    """Group of wrong readings: the reading of one crossing, or all readings of a wire."""
+    """Group of wrong readings: the reading of one crossing, or all readings of one wire."""
 
     part: FaultyPart
     upper: int | None
@@ -63,7 +63,7 @@ class Group:
     kind: FaultKind = FaultKind.CONTRADICTS
 
     def mask(self, shape: tuple[int, int]) -> Mask:
-        """Return the (U, K) bool mask of the group's readings."""
+        """Return a (U, K) mask of the group's readings."""
         found = np.zeros(shape, bool)
         rows = slice(None) if self.upper is None else self.upper
         found[rows, slice(None) if self.lower is None else self.lower] = True
@@ -71,7 +71,7 @@ class Group:
 
 
 class Explainer:
-    """Finds the most likely explanation of a frame. Each stream needs its own instance.
+    """Search for the most likely explanation of a frame. Each stream needs its own instance.
 
     Args:
         model: Joint distribution of the readings.
@@ -82,9 +82,9 @@ class Explainer:
         self._search = GreedySearch(model)
         self._alpha, self._row = np.empty(len(model.response)), np.empty(max(model.shape) + 1)
         self.margin = -math.inf
-        """Log evidence of faults minus that of loads or noise in the last frame, nats."""
+        """Margin of the last frame, nats: log evidence with faults minus that of loads or more noise."""
         self.is_noisier = False
-        """Whether the last frame was explained better by noise above the stated level than by loads."""
+        """Whether more noise than stated explains the last frame better than loads do."""
 
     def wrong_readings(  # noqa: PLR0913 - the frame, and what is known of it
         self,
@@ -97,20 +97,19 @@ class Explainer:
         noisier: float = -math.inf,
         whole_wires_only: bool = False,
     ) -> tuple[Group, ...]:
-        """Return the groups of wrong readings; an empty tuple if loads alone explain the frame well enough.
+        """Return the groups of wrong readings; empty if loads or noise explain the frame well enough.
 
         Args:
             z: (U, K) changes of the readings since rest, in units of their noise.
-            present: (U, K) bool, the readings to use.
+            present: (U, K) mask of the readings to use.
             evidence: (L,) log evidence of the frame at each κ.
             best: Index of the κ with the largest log evidence.
-            cost: Log evidence subtracted for each wrong reading: the logarithm of the reading's expected
-                error divided by the noise.
+            cost: Log evidence subtracted for each wrong reading, nats: the logarithm of its expected error
+                divided by the noise.
             sigma: Relative noise of the readings.
-            noisier: Log evidence of the frame under the assumption of noise above the stated level, without
-                loads or faults.
-            whole_wires_only: Whether to search only for inconsistent wires, and to skip single wrong readings
-                and crossed wires.
+            noisier: Log evidence of the frame for more noise than stated, without additional loads or faults.
+            whole_wires_only: Whether to search only for wires that contradict the others. Single wrong
+                readings and crossed wires are then skipped.
         """
         by_loads, by_faults = -math.inf, -math.inf
         groups: tuple[Group, ...] = ()
@@ -134,16 +133,16 @@ class Explainer:
             if by_pair > by_faults:
                 by_faults, groups = by_pair, _crossed(pair, by_pair - by_loads)
             by_reading, number = self._by_reading(z, present, evidence, best, cost)
-            # A narrow load at the edge of a patch resembles a wrong reading, so a reading with a smaller
-            # margin does not make the frame doubtful.
+            # A narrow load at the edge of a patch looks like a wrong reading. A smaller margin is therefore
+            # no reason to doubt the frame.
             if by_reading > max(by_faults, by_loads + MARGIN_OF_READING):
                 by_faults, groups = by_reading, (self._reading(number, by_reading - by_loads),)
         self.margin = by_faults - by_loads
         finding = least_fitting(level.wires, z, alpha, present, sigma, self._row)
         if finding.gain > DOUBT:
             by_wire = self._by_wire(z, present, cost, finding, alpha, best, GAIN_STD / sigma)
-            # A load on only one wire also makes this wire inconsistent with the others, so a wire with a
-            # smaller margin does not make the frame doubtful.
+            # A load on only one wire makes this wire contradict the others. A smaller margin is therefore no
+            # reason to doubt the frame.
             if by_wire > max(by_faults, by_loads + MARGIN):
                 self.margin, groups = by_wire - by_loads, (self._wire(finding.wire, by_wire - by_loads),)
         return groups if self.margin > MARGIN else ()
@@ -151,7 +150,7 @@ class Explainer:
     def wrong_without_loads(
         self, z: Float, present: Mask, evidence: Float, best: int, cost: float
     ) -> tuple[Group, ...]:
-        """Return the groups of wrong readings in a frame that loads cannot explain.
+        """Return the most likely groups of wrong readings of a frame that loads cannot explain.
 
         The arguments are those of :meth:`wrong_readings`.
         """
@@ -167,10 +166,10 @@ class Explainer:
     def _by_reading(
         self, z: Float, present: Mask, evidence: Float, best: int, cost: float
     ) -> tuple[float, int]:
-        """Return the highest log evidence for loads and one wrong reading, and the number of this reading.
+        """Return the highest log evidence for loads and one wrong reading, and the index of this reading.
 
-        A single wrong reading needs its own search, because at small prior scales the greedy search would
-        first leave out the whole wire.
+        A single reading needs its own search. At small prior scales, the greedy search would first leave out
+        the whole wire of this reading.
         """
         level = self._model.level(best)
         multiply_vector(level.precision, z.ravel(), self._alpha)
@@ -196,7 +195,7 @@ class Explainer:
     def _by_exchange(
         self, z: Float, present: Mask, cost: float, alpha: Float, level: Level
     ) -> tuple[float, WirePair]:
-        """Return the highest log evidence for two exchanged wires and loads, and these two wires."""
+        """Return the highest log evidence for loads and two exchanged wires, and these wires."""
         gain, pair = likeliest(level.precision, alpha, z, present, far=True)
         if gain < DOUBT:
             return -math.inf, pair
@@ -207,7 +206,7 @@ class Explainer:
     def _by_wire(  # noqa: PLR0913 - the frame, and what was found in it
         self, z: Float, present: Mask, cost: float, finding: WireFinding, alpha: Float, best: int, tau: float
     ) -> float:
-        """Return the highest log evidence for loads and a faulty wire."""
+        """Return the highest log evidence for loads and the faulty wire ``finding``."""
         upper, lower = self._model.shape
         wire, choice = finding.wire, math.log(2.0 * (upper + lower))
         rows = (slice(wire, wire + 1), slice(None)) if wire < upper else (slice(None), wire - upper)
@@ -225,7 +224,7 @@ class Explainer:
         tables = self._model.level(best).wires
         of_p = tables.upper_p[wire] if wire < upper else tables.lower_p[wire - upper]
         error = np.linalg.solve(of_p @ of_p.T, alpha.reshape(z.shape)[rows].ravel())
-        z[rows] = (own - error).reshape(z[rows].shape)  # readings predicted from the other wires
+        z[rows] = (own - error).reshape(z[rows].shape)  # prediction from the other wires
         present[rows] = False
 
         def alone(level: Level) -> float:
@@ -237,7 +236,7 @@ class Explainer:
         return self._by_loads(z, present, cost, alone)
 
     def _by_loads(self, z: Float, present: Mask, cost: float, extra: Callable[[Level], float]) -> float:
-        """Return the highest log evidence for loads alone, plus ``extra``."""
+        """Return the highest log evidence for loads alone, with ``extra`` added at each κ."""
         model = self._model
         evidence, scratch = np.empty(len(model.kappa)), np.empty(z.size)
         best = evidences(model.vectors_t, model.shrink, model.log_det, z.ravel(), scratch, evidence)
@@ -249,14 +248,14 @@ class Explainer:
         )
 
     def _wire(self, wire: int, gain: float) -> Group:
-        """Return all readings of a wire as one group of wrong readings."""
+        """Return all readings of a wire as one group."""
         upper = self._model.shape[0]
         if wire < upper:
             return Group(FaultyPart.UPPER, wire, None, gain)
         return Group(FaultyPart.LOWER, None, wire - upper, gain)
 
     def _groups(self) -> tuple[Group, ...]:
-        """Return the groups of wrong readings found by the last search."""
+        """Return the groups of wrong readings found in the last search."""
         found, search = [], self._search
         for kind, number, gain in zip(
             search.kinds.tolist(), search.numbers.tolist(), search.gains.tolist(), strict=True
@@ -275,12 +274,12 @@ class Explainer:
 
 
 def _scales(best: int) -> range:
-    """Return the indices of κ to search for explanations: ``best`` and smaller indices."""
+    """Return the indices of the κ to search for explanations, in descending order from ``best``."""
     return range(best, max(best - STRIDE * SCALES, -1), -STRIDE)
 
 
 def _crossed(pair: WirePair, gain: float) -> tuple[Group, ...]:
-    """Return the two wires of a crossed pair as two groups of wrong readings."""
+    """Return the wires of a crossed pair as two groups of wrong readings."""
     wires = pair.one, pair.other
     if pair.part is FaultyPart.UPPER:
         return tuple(Group(pair.part, wire, None, gain, FaultKind.CROSSED) for wire in wires)

@@ -1,6 +1,7 @@
-"""Confirmed faults of a stream of frames.
+"""Fault list: the faults of a stream, and the readings left out because of them.
 
-The list determines which readings are left out of the next frames, and when they are used again.
+A fault is confirmed if it is found in several frames. Its readings are left out until they have agreed with
+the field for long enough.
 """
 
 from __future__ import annotations
@@ -18,22 +19,21 @@ from skinnode.model.layout import Float
 from skinnode.solve.checks.explanations import Group
 
 FRAMES: Final = 3
-"""Number of frames, out of :data:`WITHIN` successive frames, in which a fault must be found in order to be
-confirmed. Not tuned."""
+"""Number of frames, out of the last :data:`WITHIN`, in which a fault must be found to be confirmed. Not
+tuned."""
 WITHIN: Final = 10
-"""Number of successive frames over which detections are counted to confirm a fault."""
+"""Number of successive frames in which the detections of a fault are counted."""
 ADMIT: Final = 64
-"""Number of consecutive frames in which readings with a confirmed fault must agree with the field before they
-are used again. The required number doubles each time the fault returns. Not tuned."""
+"""Number of consecutive frames in which the readings of a confirmed fault must agree with the field before
+they are used again. The number doubles each time the fault returns. Not tuned."""
 AGREE: Final = 3.0
-"""Maximum RMS difference between readings and a field, in standard deviations, for the readings to agree with
-the field."""
+"""Maximum RMS deviation of readings that agree with a field, in standard deviations."""
 
 Mask = NDArray[np.bool_]
 
 
 def agree(deviation: Float) -> bool:
-    """Return whether readings agree with a field; ``deviation`` is in standard deviations."""
+    """Return whether readings agree with a field, given their deviations in standard deviations."""
     return float(np.mean(deviation**2)) <= AGREE**2
 
 
@@ -49,7 +49,7 @@ class FaultList:
     """Faults of one patch, updated frame by frame. Each stream needs its own instance.
 
     Args:
-        shape: Number of upper and lower wires.
+        shape: Numbers of upper and lower wires.
     """
 
     def __init__(self, shape: tuple[int, int]) -> None:
@@ -57,7 +57,7 @@ class FaultList:
         self.reset()
 
     def reset(self) -> None:
-        """Forget all faults."""
+        """Discard all faults."""
         self._named: dict[tuple[int | None, int | None], _Named] = {}
         self._seen: dict[tuple[int | None, int | None], list[int]] = {}
         self._needed: dict[tuple[int | None, int | None], int] = {}
@@ -69,7 +69,7 @@ class FaultList:
 
     @property
     def mask(self) -> Mask | None:
-        """(U, K) mask of the readings with a confirmed fault; None if there are no confirmed faults."""
+        """(U, K) mask of the readings with a confirmed fault; None if there are none."""
         if not self._named:
             return None
         found = np.zeros(self._shape, bool)
@@ -78,12 +78,12 @@ class FaultList:
         return found
 
     def add(self, groups: Sequence[Group], frame: int, scan: int) -> tuple[DataFault, ...]:
-        """Record a frame's groups of wrong readings, and return the faults that are not yet confirmed.
+        """Record the groups of wrong readings of a frame, and return the faults that are not yet confirmed.
 
         Args:
             groups: Groups of wrong readings.
-            frame: Number of the frame, counted by the data check.
-            scan: Scan number of the frame, shown in reported faults.
+            frame: Number of the frame, as counted by the data check.
+            scan: Scan number of the frame, to be reported with its faults.
         """
         passing = []
         for group in groups:
@@ -100,11 +100,11 @@ class FaultList:
         return tuple(passing)
 
     def follow(self, deviation: Float, known: Mask) -> None:
-        """Remove each fault whose readings agreed with the field in enough successive frames.
+        """Update the faults with a new field, and remove those whose readings have agreed for long enough.
 
         Args:
-            deviation: (U, K) differences between the readings and the field, in standard deviations.
-            known: (U, K) mask of the readings that were received.
+            deviation: (U, K) deviations of the readings from the field, in standard deviations.
+            known: (U, K) mask of the readings whose deviation is known.
         """
         for key, named in list(self._named.items()):
             here = named.mask & known

@@ -1,10 +1,11 @@
 """Greedy search for the loads and the wrong readings that explain a frame.
 
-The matrix A = [I B] has one column for each of the m readings and one for the response to each of the 4Q
-loads. The search needs Aᵀ P z and the diagonal of the Gram matrix E = Aᵀ P A. Adding a load or leaving out a
-reading is a rank-one update of the precision, P' = P − share · v vᵀ. Each such step stores one vector Aᵀ v,
-from which Aᵀ P z and the diagonal are updated, as in batch orthogonal matching pursuit. Only the blocks of P'
-that belong to a single wire are computed, in order to test whether all readings of the wire are wrong.
+The search is a form of batch orthogonal matching pursuit. Its dictionary is A = [I B], with one column for
+each of the m readings and one for the readings' response to each of the 4Q loads. It needs Aᵀ P z and the
+diagonal of the Gram matrix E = Aᵀ P A. Adding a load, or leaving out a reading, is a rank-one update of the
+precision: P' = P − share · v vᵀ. For each update, the search stores the vector Aᵀ v, with which it updates Aᵀ
+P z and the diagonal. Of P' itself, only the block of each wire is computed; the blocks are needed to test
+whether all readings of a wire are wrong.
 """
 
 from __future__ import annotations
@@ -23,16 +24,16 @@ from skinnode.solve.linalg.cholesky import cholesky, multiply_vector, solve_lowe
 from skinnode.solve.linalg.vectors import Index
 
 STEPS: Final = 8
-"""Maximum total number of loads and groups of wrong readings in an explanation with faults."""
+"""Maximum number of loads and groups of wrong readings in an explanation with faults."""
 LOADS: Final = 60
-"""Maximum number of loads in an explanation by loads alone. A contact covers up to twenty cells, and each
-cell has three loads. With a maximum of 8 loads, at a noise of 3e-6, faults were falsely reported in half of
-all healthy frames of a deep slide."""
+"""Maximum number of loads in an explanation by loads alone. A contact covers up to twenty cells, with three
+loads each. With a maximum of 8, half of the healthy frames of a deep slide were reported as faulty (noise
+3e-6)."""
 ENOUGH: Final = 1.0
-"""Minimum gain in log evidence (nats) from a load or fault that the search adds to an explanation."""
+"""Minimum gain in log evidence (nats) for a load or a group of wrong readings to be added."""
 LOAD, CROSSING, LOWER, UPPER = range(4)
-"""Kinds of search steps: add a load, leave out the reading of a crossing, or leave out all readings of a
-lower or an upper wire."""
+"""Kinds of search steps: add a load; leave out one reading; leave out all readings of a lower wire, or of an
+upper wire."""
 
 Mask = NDArray[np.bool_]
 
@@ -41,11 +42,11 @@ class GreedySearch:
     """Greedy search and its work arrays. Each stream needs its own instance.
 
     Args:
-        model: Distribution of the readings.
+        model: Joint distribution of the readings.
 
     Attributes:
-        kinds: (LOADS,) kind of each step of the last search; −1 marks unused entries.
-        numbers: (LOADS,) number of the load, reading or wire of each step.
+        kinds: (LOADS,) kind of each step of the last search; −1 for unused entries.
+        numbers: (LOADS,) index of the load, reading or wire of each step.
         gains: (LOADS,) gain of each step in log evidence, nats.
     """
 
@@ -64,7 +65,7 @@ class GreedySearch:
     def run(  # noqa: PLR0913 - the frame, and which explanations are allowed
         self, number: int, z: Float, present: Mask, cost: float, *, faults: bool, loads: bool = True
     ) -> float:
-        """Find the best explanation, store its steps in the attributes, and return its gain in log evidence.
+        """Find the best explanation of a frame, store its steps in the attributes, and return its gain, nats.
 
         Args:
             number: Index of κ.
@@ -89,9 +90,9 @@ class GreedySearch:
 
 @njit
 def crossing_gain(d: Float, alpha: Float, present: Mask, cost: float) -> tuple[float, int]:
-    """Return the largest gain in log evidence from treating a reading as wrong, and that reading's number.
+    """Return the largest gain in log evidence from treating one reading as wrong, and the reading's index.
 
-    ``d`` is the diagonal of P. Because m readings are compared, ln m is subtracted from the gain.
+    ``d`` is the diagonal of P. The gain is reduced by ln m, because the best of m readings is chosen.
     """
     best, where = -math.inf, -1
     for i in range(present.size):
@@ -109,8 +110,8 @@ def _group_gain(  # noqa: PLR0913 - a kernel: arrays by name
 ) -> float:
     """Return the gain in log evidence from treating readings ``first``, ``first + step``, … as wrong.
 
-    The gain is ½ α_Gᵀ P_GG⁻¹ α_G − ½ ln det P_GG minus the cost of each reading, or −inf if fewer than two
-    readings are available. ``p`` is the readings' block of P; ``block`` and ``right`` are work arrays.
+    The gain is ½ α_Gᵀ P_GG⁻¹ α_G − ½ ln det P_GG, minus the cost of each reading. It is −inf if fewer than
+    two of the readings are available. ``p`` is the block P_GG; ``block`` and ``right`` are work arrays.
     """
     n, here = len(p), 0
     for i in range(n):
@@ -143,10 +144,10 @@ def _best_group(  # noqa: PLR0913 - a kernel: arrays by name
     block: Float,
     right: Float,
 ) -> tuple[float, int, int]:
-    """Return the largest gain from treating a group of readings as wrong, and the group's kind and number.
+    """Return the largest gain from treating a group of readings as wrong, and the group's kind and index.
 
-    A group is a single reading or all readings of a wire. Because n groups of each kind are compared, ln n is
-    subtracted from the gain. ``block`` and ``right`` are work arrays.
+    A group is a single reading or all readings of a wire. The gain of each group is reduced by ln n, where n
+    is the number of groups of its kind. ``block`` and ``right`` are work arrays.
     """
     upper, lower = len(of_upper), len(of_lower)
     gain, number = crossing_gain(d, alpha, present, cost)
@@ -166,7 +167,7 @@ def _best_group(  # noqa: PLR0913 - a kernel: arrays by name
 def _gram_row(  # noqa: PLR0913 - a kernel: arrays by name
     item: int, p: Float, moved: Float, gram: Float, response_t: Float, row: Float
 ) -> None:
-    """Write row ``item`` of E into ``row`` (m + 4Q,); use the tables ``moved`` and ``gram`` if not empty."""
+    """Write row ``item`` of E into ``row`` (m + 4Q,); use the tables ``moved`` and ``gram`` unless empty."""
     m = len(p)
     if item < m:
         for j in range(m):
@@ -198,10 +199,10 @@ def _update(  # noqa: PLR0913 - a kernel: arrays by name
     vectors: Float,
     share: Float,
 ) -> None:
-    """Update the search vectors for step ``count``, which leaves out a reading or adds a load.
+    """Update the search vectors for step ``count``, which adds a load or leaves out a reading.
 
-    An added load is assigned its most likely variance, (b² − h) / h²; here b is the load's element of
-    Aᵀ P z, and h is its diagonal element of E. Elements before ``first`` are not updated.
+    ``item`` is the column of A. A load is given its most likely variance (b² − h) / h², where b is its
+    element of Aᵀ P z and h its diagonal element of E. Elements before ``first`` are not updated.
     """
     row = vectors[count]
     _gram_row(item, p, moved, gram, response_t, row)
@@ -227,7 +228,7 @@ def _update(  # noqa: PLR0913 - a kernel: arrays by name
 
 @njit
 def _copy_blocks(p: Float, of_upper: Float, of_lower: Float) -> None:
-    """Copy the block of P of each upper and lower wire."""
+    """Copy the block of P of each upper and lower wire into ``of_upper`` and ``of_lower``."""
     upper, lower = len(of_upper), len(of_lower)
     for u in range(upper):
         for i in range(lower):
@@ -241,7 +242,7 @@ def _copy_blocks(p: Float, of_upper: Float, of_lower: Float) -> None:
 
 @njit
 def _update_blocks(share: float, row: Float, of_upper: Float, of_lower: Float) -> None:
-    """Subtract share · v vᵀ from the block of P of each upper and lower wire."""
+    """Subtract share · v vᵀ from the block of each upper and lower wire."""
     upper, lower = len(of_upper), len(of_lower)
     for u in range(upper):
         block, first = of_upper[u], u * lower
@@ -259,7 +260,7 @@ def _update_blocks(share: float, row: Float, of_upper: Float, of_lower: Float) -
 
 @njit
 def _best_load(weighted: Float, diagonal: Float, m: int, least: float) -> tuple[float, int]:
-    """Return the largest gain from adding a load, and the load's number; −1 if no load has a gain."""
+    """Return the largest gain from adding a load, and the load's index; −1 if no load has a gain."""
     most, number = 1.0, -1
     for j in range(m, diagonal.size):
         if diagonal[j] > least:
@@ -295,7 +296,7 @@ def _search(  # noqa: PLR0913, C901 - a kernel: arrays by name, a greedy search
     numbers: Index,
     gains: Float,
 ) -> float:
-    """Write the best explanation of ``z`` (m,) into ``kinds``, ``numbers`` and ``gains``; return its gain."""
+    """Write the best explanation into ``kinds``, ``numbers`` and ``gains``; return its gain, nats."""
     m = z.size
     multiply_vector(p, z, weighted[:m])
     multiply_vector(response_t, weighted[:m], weighted[m:])
@@ -324,7 +325,9 @@ def _search(  # noqa: PLR0913, C901 - a kernel: arrays by name, a greedy search
         total += gain
         kinds[step], numbers[step], gains[step] = kind, number, gain
         if kind == LOAD:
-            first = 0 if faults else m  # a search for loads alone does not use the first m elements
+            first = (
+                0 if faults else m
+            )  # the first m elements, for the readings, are needed only to find faults
             _update(m + number, count, first, p, moved, gram, response_t, weighted, diagonal, vectors, share)
             if faults:
                 _update_blocks(share[count], vectors[count], of_upper, of_lower)

@@ -1,17 +1,16 @@
-"""Joint distribution of the readings of one layout, linearised at rest.
+"""Joint distribution of the readings of a layout, linearised at rest.
 
-A displacement u of the electrodes changes the logarithm of the readings by J u, in units of their noise σ.
-With the elastic prior u ~ N(0, s² C), the changes z have the distribution N(0, S) with S = I + κ² J C Jᵀ and
-κ = s / σ. The evidence of a frame at every κ follows from one eigendecomposition of J C Jᵀ. The leave-out
-tests follow from the precision P = S⁻¹: with α = P z, the χ² of predicting a group of readings from all
-others is α_Gᵀ P_GG⁻¹ α_G (Rasmussen and Williams, Gaussian Processes for Machine Learning, 2006, section
-5.4.2).
+A displacement u of the electrodes changes the logarithms of the readings by J u, in units of their noise σ.
+The elastic prior is u ~ N(0, s² C). The changes z are therefore distributed as N(0, S), with S = I + κ² J C
+Jᵀ and κ = s / σ. One eigendecomposition of J C Jᵀ yields the evidence of a frame at every κ. The leave-out
+tests use the precision P = S⁻¹. With α = P z, the χ² of a group G of readings, given all others, is α_Gᵀ
+P_GG⁻¹ α_G (Rasmussen and Williams, Gaussian Processes for Machine Learning, 2006, section 5.4.2).
 
-The response to loads is computed for two models of the rubber: a half-space, as in the elastic prior (three
-loads per cell), and a thin bonded layer (one normal load per cell). With the half-space alone, correct
-readings of a patch with a thin layer were reported as contradictory: in
-``tests/solve/test_trust_on_a_thin_layer.py``, 91 of 210 fields were not trusted, and 88 faults were reported.
-With both models of the rubber, only 1 of the 210 fields was not trusted, and no faults were reported.
+The responses to loads are computed for two models of the rubber. One is the half-space of the elastic prior,
+with three loads per cell. The other is a thin bonded layer, with one normal load per cell. With the
+half-space alone, correct readings of a thin layer appear to contradict each other: 91 of the 210 fields in
+``tests/solve/test_trust_on_a_thin_layer.py`` were not trusted. With both models, only 1 field was not
+trusted, and no faults were reported.
 """
 
 from __future__ import annotations
@@ -30,16 +29,15 @@ from skinnode.solve.linalg.cholesky import multiply, multiply_vector
 from skinnode.solve.posterior.elastic_prior import SLACK, ElasticPrior, bonded_response
 
 USUAL: Final = (-17, -3)
-"""Range of log2 s for which load tables are precomputed; s is the prior scale in pitches."""
+"""Range of log2 s for which load tables are computed in advance, where s is the prior scale in pitches."""
 MOST_USUAL: Final = 9
-"""Number of prior scales for which tables are precomputed if the patch is large: the largest scales in
-:data:`USUAL`."""
+"""Number of prior scales prepared for a large patch: the largest scales in :data:`USUAL`."""
 STORED: Final = 125_000_000
-"""Maximum size of precomputed tables, in bytes. Computing the tables during the stream would delay the first
-frame with a touch by up to 0.1 s. The tables of the reference patch take 122 MB. For larger patches, the
-products with the loads are computed when they are needed."""
+"""Maximum size of all stored tables, bytes. Computing the tables during a stream would delay the first
+touched frame by up to 0.1 s. The tables of the reference patch take 122 MB. For larger patches, products with
+the loads are computed when they are needed."""
 OCTAVES: Final = (-7, 21)
-"""Range of log2 κ, which covers noise from 1e-6 to 1e-2 and prior scales from 1e-4 to 1 pitch."""
+"""Range of log2 κ; covers noise from 1e-6 to 1e-2 and prior scales from 1e-4 to 1 pitch."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,12 +54,12 @@ class Level:
 
 @dataclass(frozen=True, eq=False)
 class LoadTables:
-    """Products of the precision P at one κ with B, the responses of the readings to loads on Q cells."""
+    """Products, at one κ, of the precision P and the readings' responses B to the loads on Q cells."""
 
     diagonal: Float
-    """(m + 4Q,) diagonals of P and of Bᵀ P B."""
+    """(m + 4Q,) diagonal of P, followed by the diagonal of Bᵀ P B."""
     moved: Float
-    """(m, 4Q) P B. ``moved`` and ``gram`` are empty if the tables would exceed :data:`STORED`."""
+    """(m, 4Q) P B. ``moved`` and ``gram`` are empty if the tables are too large to store (:data:`STORED`)."""
     gram: Float
     """(4Q, 4Q) Bᵀ P B."""
 
@@ -69,19 +67,19 @@ class LoadTables:
 class ReadingModel:
     """Joint distribution of the readings of one layout.
 
-    The model is immutable and shared by all patches with this layout.
+    A model is immutable apart from its cached tables, and is shared by all patches with the same layout.
 
     Args:
         layout: The patch.
 
     Attributes:
         jacobian: (U, K, 3N) ∂(ln F)/∂x at rest, 1/pitch.
-        response: (m, 4Q) matrix B of the readings' responses to unit loads.
+        response: (m, 4Q) matrix B, the responses of the readings to unit loads.
         response_t: (4Q, m) Bᵀ.
         kappa: (L,) values of κ.
-        log_det: (L,) ln det S.
-        shrink: (L, m) 1 / (1 + κ² λ) for each eigenvalue λ.
-        vectors_t: (m, m) eigenvectors of J C Jᵀ as rows.
+        log_det: (L,) ln det S at each κ.
+        shrink: (L, m) 1 / (1 + κ² λ) for the eigenvalues λ of J C Jᵀ.
+        vectors_t: (m, m) eigenvectors of J C Jᵀ, as rows.
     """
 
     def __init__(self, layout: PatchLayout) -> None:
@@ -114,27 +112,27 @@ class ReadingModel:
 
     @classmethod
     def of(cls, layout: PatchLayout) -> ReadingModel:
-        """Return the cached model of ``layout``, and create the model on first use."""
+        """Return the model of ``layout`` from a cache; the model is created on first use."""
         return _model(layout)
 
     def level(self, number: int) -> Level:
-        """Return the distribution at ``kappa[number]``, computed on first use."""
+        """Return the distribution at ``kappa[number]``; it is computed on first use."""
         found = self._levels.get(number)
         if found is None:
             found = self._levels[number] = self._compute(number)
         return found
 
     def loads(self, number: int) -> LoadTables:
-        """Return the products of the precision at ``kappa[number]`` with the loads, computed on first use."""
+        """Return the load tables at ``kappa[number]``; they are computed on first use."""
         found = self._loads.get(number)
         if found is None:
             found = self._loads[number] = self._load_tables(number)
         return found
 
     def prepare(self, sigma: float) -> None:
-        """Precompute the tables that a stream with the relative noise ``sigma`` usually needs.
+        """Compute the tables that a stream with the relative noise ``sigma`` usually needs.
 
-        Other tables are computed on first use. The computation takes 0.25 s for the reference patch.
+        Other tables are computed on first use. For the reference patch, this method takes 0.25 s.
         """
         octaves = np.log2(self.kappa * sigma)
         usual: list[int] = np.flatnonzero((octaves >= USUAL[0]) & (octaves <= USUAL[1])).tolist()
@@ -178,7 +176,7 @@ def _model(layout: PatchLayout) -> ReadingModel:
 
 @njit
 def changes(jacobian_: Float, moved: Float, sigma: float, z: Float) -> None:
-    """Write J u / σ into ``z`` (U, K); the displacements u are ``moved`` (U, 3N), in pitches."""
+    """Write J u / σ into ``z`` (U, K), for the displacement u = ``moved`` (U, 3N), pitches."""
     for u in range(z.shape[0]):
         multiply_vector(jacobian_[u], moved[u], z[u])
         for k in range(z.shape[1]):
@@ -189,7 +187,7 @@ def changes(jacobian_: Float, moved: Float, sigma: float, z: Float) -> None:
 def evidences(  # noqa: PLR0913 - a kernel: arrays by name
     vectors_t: Float, shrink: Float, log_det: Float, z: Float, c: Float, out: Float
 ) -> int:
-    """Write the log evidence of ``z`` (m,) at every κ into ``out`` (L,); return the index of the maximum.
+    """Write the log evidence of ``z`` (m,) at every κ into ``out`` (L,), and return the index of the maximum.
 
     The constant −½ m ln 2π is omitted. ``c`` (m,) is a work array.
     """

@@ -1,7 +1,7 @@
-"""Decides whether a field is trusted and, if it is not, states the reason.
+"""Trust: decide whether a field is trusted, and state the reason if it is not.
 
-A field is trusted if all upper wires in use converged, if enough readings and upper wires are in use, and
-if the readings do not contradict each other. The host additionally requires the patch to be alive.
+A field is trusted if all upper wires in use converged, enough readings and upper wires are in use, and no
+readings contradict each other. The host also requires the patch to be alive.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ from skinnode.model.data_fault import DataFault
 from skinnode.model.status import Status
 
 OF_PATCH: Final = 0.75
-"""Minimum fraction of usable readings, and minimum fraction of trusted upper wires, for a field to be
-trusted. The field of the reference patch is trusted if two upper wires and one lower wire are missing
-(fraction 0.77), but not if three upper wires are missing (0.7)."""
+"""Minimum fraction of usable readings, and of trusted upper wires, in a trusted field. With this limit, the
+field of the reference patch is trusted if two upper wires and one lower wire are missing (77 % of the
+readings remain), but not if three upper wires are missing (70 %)."""
 OF_WIRE: Final = 0.8
-"""Minimum fraction of a wire's readings that must be usable for the wire to be trusted."""
+"""Minimum fraction of usable readings of a trusted wire."""
 CONTRADICTION: Final = (
     "the readings contradict each other, and no faulty wire or crossing explains the contradiction"
 )
@@ -39,14 +39,13 @@ def assess(
     """Return the reason why a field is not trusted, and a mask of its trusted upper wires.
 
     Args:
-        status: Status of each of the U wires.
-        used: (U, K) mask of the readings used.
+        status: (U,) statuses of the upper wires.
+        used: (U, K) mask of the readings used in the solve.
         faults: Faults whose readings were left out.
-        contradiction: Description of a contradiction that remains among the used readings; empty if there is
-            none.
+        contradiction: Description of a contradiction between the readings used; empty if there is none.
 
     Returns:
-        The reason as text (empty if the field is trusted), and the (U,) mask of the trusted upper wires.
+        The reason (empty if the field is trusted), and a (U,) mask of the trusted upper wires.
     """
     share = used.mean(axis=1)
     converged = np.array([each is Status.CONVERGED for each in status])

@@ -1,16 +1,16 @@
-"""Tests whether the readings of a wire are consistent with the other wires, and whether its gain is correct.
+"""Tests of whole wires: are a wire's readings consistent with the other wires, and is its gain correct?
 
-If a wire's readings are delayed or belong to another wire, each reading deviates only slightly from the
-prediction by the other wires. A test of single readings does not detect these small deviations. Let G be the
-readings of a wire, P the precision, S = P⁻¹ the covariance and α = P z. Two fault hypotheses are compared
-with the hypothesis that the wire is healthy:
+If the readings of a wire are delayed, or belong to another wire, each single reading may agree with the
+others within its uncertainty. Only a test of all readings of the wire then detects the fault. Let G be the
+readings of a wire, P the precision of all readings, S = P⁻¹ their covariance, and α = P z. The tests compare
+two hypotheses with that of a healthy wire:
 
-- Unrelated: z_G has its own distribution N(0, S_GG), independent of the other wires. The log evidence changes
+- Unrelated: z_G is independent of the other wires, with the distribution N(0, S_GG). The log evidence changes
   by ½ α_Gᵀ P_GG⁻¹ α_G − ½ z_Gᵀ S_GG⁻¹ z_G − ½ ln det P_GG S_GG.
 - Gain: all readings of the wire are wrong by the same factor 1 + c, c ~ N(0, τ²). The log evidence changes by
-  ½ (1ᵀα_G)² / (q + τ⁻²) − ½ ln(1 + τ² q) with q = 1ᵀ P_GG 1.
+  ½ (1ᵀα_G)² / (q + τ⁻²) − ½ ln(1 + τ² q), with q = 1ᵀ P_GG 1.
 
-The changes of the log evidence follow from the rules for conditioning a normal distribution.
+Both expressions follow from the conditional distributions of a multivariate normal.
 """
 
 from __future__ import annotations
@@ -26,37 +26,37 @@ from skinnode.compiled.jit import njit, njit_part
 from skinnode.model.layout import Float
 
 GAIN_STD: Final = 0.02
-"""Assumed standard deviation of a wire's relative gain error; the same value is used for gain drift. Not
+"""Assumed standard deviation of a relative gain error, for the gain of a wire and for gain drift. Not
 tuned."""
 LEAST: Final = 1e-9
-"""Minimum precision of a reading, in units of 1 / noise²; smaller values result from rounding errors."""
+"""Minimum precision of a reading, in units of 1 / noise². Smaller values are due to rounding errors."""
 
 Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, eq=False)
 class WireTables:
-    """Cholesky factors of each wire's blocks of P and S at one κ.
+    """Cholesky factors of each wire's blocks of P and S, at one κ.
 
-    The arrays of upper wires have the shape (U, K, K), those of lower wires (K, U, U).
+    The arrays for upper wires have the shape (U, K, K), those for lower wires (K, U, U).
     """
 
     upper_p: Float
-    """Cholesky factors of P_GG."""
+    """Cholesky factors of P_GG for the upper wires."""
     upper_s: Float
-    """Cholesky factors of S_GG."""
+    """Cholesky factors of S_GG for the upper wires."""
     lower_p: Float
     lower_s: Float
     log_det_p: Float
-    """(U + K,) half the log determinant of each wire's block of P, ½ ln det P_GG."""
+    """(U + K,) ½ ln det P_GG of each wire."""
     log_det_s: Float
-    """(U + K,) half the log determinant of each wire's block of S, ½ ln det S_GG."""
+    """(U + K,) ½ ln det S_GG of each wire."""
     sums: Float
-    """(U + K,) sum of the elements of each wire's block of P, 1ᵀ P_GG 1."""
+    """(U + K,) sum 1ᵀ P_GG 1 of the elements of P_GG of each wire."""
 
     @classmethod
     def of(cls, p: Float, s: Float, shape: tuple[int, int]) -> WireTables:
-        """Compute the tables from the precision ``p`` and the covariance ``s``, both (m, m)."""
+        """Compute the tables from the precision ``p`` (m, m) and the covariance ``s`` (m, m)."""
         upper, lower = shape
         blocks = [np.arange(u * lower, (u + 1) * lower) for u in range(upper)]
         blocks += [np.arange(k, upper * lower, lower) for k in range(lower)]
@@ -75,28 +75,29 @@ class WireTables:
 
 @dataclass(frozen=True, slots=True)
 class WireFinding:
-    """The wire that is least consistent with the other wires."""
+    """The wire that is least consistent with the others."""
 
     gain: float
-    """Gain in log evidence, nats."""
+    """Gain in log evidence from assuming that the wire is faulty, nats."""
     wire: int
-    """Number of the wire; for a lower wire, U plus its number."""
+    """Index of the wire: 0 to U − 1 for upper wires, U to U + K − 1 for lower wires."""
     factor: float
-    """Error common to all readings of the wire, in units of their noise; nan if the wire is unrelated to the
-    others."""
+    """Error common to all readings of the wire, in units of their noise; nan if the more likely fault is that
+    the wire is unrelated to the others."""
 
 
 def least_fitting(  # noqa: PLR0913 - the frame, its tables and scratch
     tables: WireTables, z: Float, alpha: Float, present: Mask, sigma: float, work: Float
 ) -> WireFinding:
-    """Return the wire and the hypothesis (unrelated, or wrong gain) with the largest gain in log evidence.
+    """Return the wire and the fault (unrelated, or wrong gain) with the largest gain in log evidence.
+
+    A wire is skipped if fewer than half of its readings are available.
 
     Args:
         tables: Cholesky factors of the wires' blocks of P and S.
         z: (U, K) changes of the readings since rest, in units of their noise.
         alpha: (m,) P z.
-        present: (U, K) mask of the available readings; a wire is skipped if fewer than half of its readings
-            are available.
+        present: (U, K) mask of the available readings.
         sigma: Relative noise of the readings.
         work: (max(U, K),) work array.
     """
@@ -149,7 +150,7 @@ def _least_fitting(  # noqa: PLR0913 - a kernel: arrays by name
 
 @njit_part
 def _square(factor: Float, values: Float, first: int, step: int, work: Float) -> float:
-    """Return xᵀ (L Lᵀ)⁻¹ x for the Cholesky factor L and the elements x at ``first``, ``first + step``, …."""
+    """Return xᵀ (L Lᵀ)⁻¹ x for the Cholesky factor L and the values x at ``first``, ``first + step``, …."""
     square = 0.0
     for i in range(factor.shape[0]):
         value = values[first + i * step]

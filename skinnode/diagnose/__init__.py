@@ -1,12 +1,16 @@
-"""Operations on an open bus: finding nodes, reading and writing their objects, taring, and diagnosis.
+"""Finds, reads, configures and diagnoses the nodes on a bus, for the commands of :mod:`skinnode.cli`.
 
-``bus_connection`` opens a bus and ``bus_listener`` records the messages received on it. The commands of
-:mod:`skinnode.cli` call plain functions that take a connection: ``discovery`` (which nodes are present),
-``node_info``, ``object_dictionary`` with ``data_sheet``, ``standard_objects`` and ``dcf``,
-``pdo_parameters``, ``nmt_commands``, ``lss_commissioning``, ``tare``. A function writes to a node only if its
-name indicates a write.
+``bus_connection`` opens a bus, and ``bus_listener`` records the messages received on it. The other modules
+contain functions that take a connection:
 
-``skinnode doctor`` builds on these modules. ``collect_facts`` uses ``scan_capture`` to gather the
-facts about a bus. :mod:`skinnode.diagnose.checks` uses ``noise`` to derive findings from the facts.
-``root_causes`` groups findings by cause, and ``html_report`` writes the report as a page.
+* ``discovery`` finds the nodes.
+* ``node_info`` and ``pdo_parameters`` read the settings of a node.
+* ``object_dictionary`` reads and compares objects. ``data_sheet``, ``standard_objects`` and ``dcf`` supply
+their
+  names, types and expected values.
+* ``nmt_commands``, ``lss_commissioning`` and ``tare`` change the state or the settings of a node.
+
+``skinnode doctor`` uses ``collect_facts`` and ``scan_capture`` to collect facts about a bus,
+:mod:`skinnode.diagnose.checks` and ``noise`` to derive findings from the facts, ``root_causes`` to group the
+findings, and ``html_report`` to write the report.
 """

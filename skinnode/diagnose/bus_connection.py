@@ -1,4 +1,4 @@
-"""Opens a bus for SDO, LSS and NMT services, and records all messages received."""
+"""Opens a bus for SDO, LSS and NMT, and records the messages received on it."""
 
 from __future__ import annotations
 
@@ -19,33 +19,33 @@ from skinnode.host.mainline import Mainline
 from skinnode.host.sdo_client import RemoteOd
 
 LONGEST_HEARTBEAT_S: Final = 2.5
-"""Maximum time (s) to wait for a heartbeat; heartbeats with a longer period are not detected."""
+"""Maximum wait for a heartbeat, s. Heartbeats with a longer period are missed."""
 
 GUARD_ANSWERS_S: Final = (0.15, 0.5)
-"""Maximum times (s) to wait for a response to the first and to the second remote frame.
+"""Maximum wait for the response to the first and to the second remote frame, s.
 
-A busy node may miss the first remote frame.
+The second remote frame is for a node that was too busy to answer the first.
 """
 
 _POLL_S: Final = 0.002
 
 
 class State(NamedTuple):
-    """NMT state of a node, and the source of this information."""
+    """NMT state of a node, and how it was determined."""
 
     state: int | None
     """NMT state; None if unknown."""
     how: str
-    """Source of the state: ``heartbeat`` or ``guarding``; if the state is unknown, the reason."""
+    """``heartbeat`` or ``guarding``; if the state is unknown, the reason."""
 
     def __str__(self) -> str:
         return "unknown" if self.state is None else state_name(self.state)
 
 
 def no_answer(wrong: str) -> str:
-    """Return a message about a node that sent no valid SDO response.
+    """Describe a node that sent no valid SDO response.
 
-    ``wrong`` is the newest invalid response of the node; empty if the node did not respond.
+    ``wrong`` is its newest invalid response, in hexadecimal; empty if the node did not respond at all.
     """
     if not wrong:
         return "does not answer SDO requests"
@@ -53,7 +53,7 @@ def no_answer(wrong: str) -> str:
 
 
 class BusConnection:
-    """Connection to a bus, closed by :meth:`close` or a ``with`` block.
+    """Open bus; use it in a ``with`` block, or call :meth:`close`.
 
     Args:
         bus: The bus.
@@ -66,7 +66,7 @@ class BusConnection:
         self.bus = bus
         self.listener = BusListener()
         self.defect: SkinError | None = None
-        """Internal error raised on the receiving thread."""
+        """Internal error of the receiving thread; None if there is none."""
         self._remotes: dict[int, RemoteOd] = {}
         self._abandoned = threading.Event()
         self.link = BusLink(bus, {}, self._on_defect)
@@ -76,25 +76,25 @@ class BusConnection:
         self._mainline = Mainline([self.link])
 
     def od(self, node_id: int) -> RemoteOd:
-        """Return the object dictionary of a node."""
+        """Return an SDO client for the object dictionary of a node."""
         if node_id not in self._remotes:
             remote = self._remotes[node_id] = self.link.remote_od(node_id)
             remote.abandoned = self._abandoned.is_set
         return self._remotes[node_id]
 
     def abandon(self) -> None:
-        """Abort the transfers of all threads; each transfer then raises Abandoned."""
+        """Make the SDO transfers of all threads end by raising Abandoned."""
         self._abandoned.set()
 
     def wait_until(self, condition: Callable[[], object], within_s: float) -> bool:
-        """Wait for a condition.
+        """Wait until a condition is true.
 
         Args:
-            condition: Called repeatedly until it returns a true value.
+            condition: Polled until it returns a true value.
             within_s: Maximum wait, s.
 
         Returns:
-            Whether the condition became true.
+            True if the condition became true, False after ``within_s``.
 
         Raises:
             BusError: The bus failed during the wait.
@@ -111,7 +111,7 @@ class BusConnection:
         return True
 
     def ask_all(self, node_id: int, request: bytes, within_s: float) -> list[bytes]:
-        """Send one SDO request and return all responses: two if two nodes share the node-ID."""
+        """Send an SDO request and return all responses; there are several if nodes share the node-ID."""
         since_ns = time.monotonic_ns()
         self.link.send(od.sdo_request_cob_id(node_id), request.ljust(8, b"\0"))
         self.wait_until(lambda: False, within_s)
@@ -119,11 +119,11 @@ class BusConnection:
         return [data for t_ns, data in answers if t_ns >= since_ns]
 
     def require_answer(self, node_id: int, more: Callable[[], str] = str) -> None:
-        """Read the device type of a node, with one retry.
+        """Check that a node answers SDO requests; one retry is made.
 
         Args:
             node_id: The node.
-            more: Callback that returns text to append to the error message.
+            more: Callback that returns a suffix for the error message.
 
         Raises:
             NodeError: The node sends no valid response.
@@ -133,14 +133,14 @@ class BusConnection:
             raise NodeError(node_id, no_answer(self.wrong_answer(node_id, since_ns)) + more())
 
     def wrong_answer(self, node_id: int, since_ns: int) -> str:
-        """Return the newest frame received instead of a valid SDO response.
+        """Return the newest frame that a node sent on the COB-ID of its SDO responses.
 
         Args:
             node_id: A node that sent no valid response.
-            since_ns: Earliest reception time of the frame, ns.
+            since_ns: Frames received before this time (monotonic clock, ns) are ignored.
 
         Returns:
-            Hexadecimal text; empty if there was no frame.
+            The data in hexadecimal; empty if there was no frame.
         """
         newest = self.listener.node(node_id).newest_sdo
         if newest is None or newest[0] < since_ns:
@@ -148,16 +148,16 @@ class BusConnection:
         return newest[1].hex(" ") or "no data"
 
     def heartbeat_s(self, node_id: int) -> float | None:
-        """Read a node's heartbeat period (0x1017) in s; 0 if disabled, None if the node does not answer."""
+        """Read the heartbeat period of a node (0x1017), s; 0 if disabled, None if it cannot be read."""
         try:
             return float(self.od(node_id).read(od.HEARTBEAT_PRODUCER, 0, "u16")) * 1e-3
         except NodeError:
             return None
 
     def guarded(self, node_id: int) -> bool:
-        """Return whether the node has life guarding enabled, which a remote frame would start.
+        """Return whether life guarding is configured on the node; the first remote frame would start it.
 
-        After this program stops sending remote frames, such a node would report the loss of its master.
+        Such a node would report a life guarding error as soon as this program stopped sending remote frames.
         """
         remote = self.od(node_id)
         try:
@@ -166,13 +166,13 @@ class BusConnection:
             return False
 
     def state(self, node_id: int, heartbeat_s: float | None, *, guarding: bool, since_ns: int = 0) -> State:
-        """Return the NMT state from the next heartbeat, or from guarding if no heartbeat arrives.
+        """Determine the NMT state of a node from its heartbeat, or by node guarding if there is none.
 
         Args:
             node_id: The node.
             heartbeat_s: Result of :meth:`heartbeat_s`.
-            guarding: Whether remote frames are allowed.
-            since_ns: Earliest reception time of the heartbeat, ns.
+            guarding: Whether remote frames may be sent.
+            since_ns: Heartbeats received before this time (monotonic clock, ns) are ignored.
         """
         if heartbeat_s != 0:
             wait_s = LONGEST_HEARTBEAT_S if heartbeat_s is None else 1.5 * heartbeat_s + 0.1
@@ -192,7 +192,7 @@ class BusConnection:
         return State(None, "no heartbeat, no guarding")
 
     def close(self) -> None:
-        """Close the bus and join its thread."""
+        """Close the bus and wait for its receiving thread to end."""
         self._mainline.stop()
         self.link.close()
 

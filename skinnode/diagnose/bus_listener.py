@@ -1,6 +1,7 @@
-"""Records the messages received on a bus: heartbeats, emergencies, SDO responses and the COB-IDs in use.
+"""Records the messages received on a bus: heartbeats, emergency messages, SDO responses and frame counts.
 
-One thread writes the record; other threads read copies, because the record has no lock.
+The receiving thread writes the record without a lock. Other threads must copy a container before they
+iterate over it.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from skinnode.canopen.nmt import STATE_MASK, NmtState
 from skinnode.transport import Frame
 
 _KEPT: Final = 256
-"""Maximum number of messages kept per kind and node: about a minute of heartbeats at 4 Hz."""
+"""Number of newest messages kept of each kind and node, such as one minute of heartbeats at 4 Hz."""
 
 
 class Beat(NamedTuple):
@@ -23,7 +24,7 @@ class Beat(NamedTuple):
 
     t_ns: int
     state: int
-    """NMT state without the toggle bit of guarding; 0 for a boot-up message."""
+    """NMT state without the toggle bit of node guarding; 0 for a boot-up message."""
 
 
 class Emergency(NamedTuple):
@@ -43,36 +44,36 @@ class NodeTraffic:
     boot_ups: int = 0
     emergencies: deque[Emergency] = field(default_factory=lambda: deque(maxlen=_KEPT))
     sdo_answers: deque[tuple[int, bytes]] = field(default_factory=lambda: deque(maxlen=_KEPT))
-    """Reception time in ns and the eight data bytes of each SDO response."""
+    """Reception time (ns) and eight data bytes of each SDO response."""
     newest_sdo: tuple[int, bytes] | None = None
-    """Reception time in ns and data of the newest frame of any length on the COB-ID for SDO
-    responses."""
+    """Reception time (ns) and data of the newest frame on the COB-ID of SDO responses, whatever its
+    length."""
 
 
 class BusListener:
-    """Record of the messages received since construction. The bus link calls :meth:`on_frames`."""
+    """Record of the messages received since construction; the bus link calls :meth:`on_frames`."""
 
     def __init__(self) -> None:
         self._nodes: dict[int, NodeTraffic] = {}
         self.cob_ids: Counter[int] = Counter()
-        """Number of data frames, keyed by 11-bit COB-ID."""
+        """Number of data frames by 11-bit COB-ID."""
         self.nmt: Counter[bytes] = Counter()
-        """Number of NMT commands, keyed by their two data bytes (command specifier and node-ID). Commands
-        of any other length are counted under ``b""``."""
+        """Number of NMT commands by their two data bytes: command specifier and node-ID. The key ``b""``
+        counts commands of any other length."""
         self.extended = self.remote = self.errors = 0
-        """Counts of frames with 29-bit identifiers, remote frames and error frames."""
+        """Numbers of frames with 29-bit identifiers, of remote frames, and of error frames."""
 
     @property
     def nodes(self) -> dict[int, NodeTraffic]:
-        """Copy of the messages received, keyed by node-ID."""
+        """Messages received, by node-ID; a copy."""
         return dict(self._nodes)
 
     def node(self, node_id: int) -> NodeTraffic:
-        """Return the messages received from one node-ID; empty if none were received."""
+        """Return the messages received from one node-ID; the record is empty if there were none."""
         return self._nodes.get(node_id) or NodeTraffic()
 
     def newest_beat(self, node_id: int, since_ns: int = 0) -> Beat | None:
-        """Return the newest heartbeat or guarding response received after ``since_ns``, or None."""
+        """Return the newest heartbeat, boot-up or guarding message after ``since_ns``, if any."""
         beats = self.node(node_id).beats
         newest = beats[-1] if beats else None
         return newest if newest is not None and newest.t_ns > since_ns else None

@@ -1,7 +1,6 @@
-"""Collects the facts about one bus.
+"""Collects the facts about one bus by listening and by reading objects.
 
-Facts are collected by listening and by reading objects. Unless ``active`` is set, no node is started
-and no SYNC is sent, so a running hand is not disturbed.
+A running hand is not disturbed: nodes are started and SYNC is sent only if ``active`` is set.
 """
 
 from __future__ import annotations
@@ -33,17 +32,17 @@ from skinnode.protocol.codes import CodeScale
 from skinnode.protocol.profile import DEFAULT_PERIOD_MS, PatchProfile
 
 SCANS: Final = 50
-"""Number of scans needed for a noise estimate accurate to 10 %."""
+"""Number of scans to capture; with 50 scans, the error of the estimated noise is about 10 %."""
 
 LONGEST_S: Final = 15.0
-"""Maximum time (s) to wait for scans, regardless of the SYNC period."""
+"""Maximum duration of the capture, s, whatever the SYNC period."""
 
 DEFAULT_NOISE: Final = 3e-6
-"""Relative noise assumed for the converter if there is no hand file."""
+"""Relative noise of the converter, assumed if there is no hand file."""
 
 _PAUSES_S: Final = (0.0, 0.1, 0.3, 0.6)
-"""Pauses (s) before successive attempts to read a node. While a host reads the baseline, the SDO server is
-busy for 0.1 to 0.3 s."""
+"""Pauses before successive attempts to read a node, s. A node's SDO server is busy for 0.1 to 0.3 s while a
+host reads the baseline."""
 
 _FIRST_SYNC_S: Final = 0.5
 _KNOWN_TO_ALL: Final = frozenset(
@@ -57,13 +56,13 @@ Answer = TypeVar("Answer")
 def collect_facts(
     bus: BusConfig, hand: HandConfig | None, *, active: bool = False, progress: Progress = lambda _: None
 ) -> BusFacts:
-    """Collect all facts about one bus; a bus failure is recorded as a fact, not raised.
+    """Collect the facts about one bus. A failure of the bus is recorded in the facts and not raised.
 
     Args:
         bus: The bus.
-        hand: The hand; None if no hand file is given.
-        active: Whether to start nodes that are not running, and to send SYNC if no other node does. The
-            started nodes are returned to PRE-OPERATIONAL at the end.
+        hand: The hand; None if there is no hand file.
+        active: Whether to start nodes that are not running, and to send SYNC if nobody else does. Nodes
+            started here return to PRE-OPERATIONAL at the end.
         progress: Called with a description of each step.
     """
     facts = BusFacts(
@@ -169,10 +168,10 @@ def _examine(
 
 
 def _asked(question: Callable[[], Answer]) -> tuple[Answer | None, str]:
-    """Call ``question`` up to four times; return its answer, or None and the reason for the last failure.
+    """Return the result of ``question`` and "", or None and the reason if four attempts fail.
 
-    Retries are needed because a running host may access the node at the same time, and an SDO server handles
-    only one transfer at a time.
+    An attempt fails if a running host accesses the node at the same time, because an SDO server handles only
+    one transfer at a time.
     """
     failure = ""
     for pause_s in _PAUSES_S:
@@ -194,10 +193,10 @@ def _listen(  # noqa: PLR0913 - one call, the state of one examination
     active: bool,
     progress: Callable[[str], None],
 ) -> tuple[bool, float]:
-    """Capture scans of the running patches; if ``active`` is true, start the other patches first.
+    """Capture scans of the running patches; if ``active`` is set, start the other patches first.
 
     Returns:
-        Whether this program sent SYNC, and the bus load in the busiest second.
+        Whether this program sent SYNC, and the bus load (fraction) in the busiest second.
     """
     overflows: dict[int, int] = {}
     for node_id, profile in profiles.items():
@@ -234,10 +233,10 @@ def _listen(  # noqa: PLR0913 - one call, the state of one examination
 
 
 def _scan_s(patch: PatchFacts, profiles: dict[int, PatchProfile]) -> float:
-    """Return the minimum SYNC period in s for a node that no host has configured; 0 for any other node.
+    """Return the minimum SYNC period of a node that has its default inhibit time, s; 0 for any other node.
 
-    With its default inhibit time, a node needs at least this period to finish each scan before the next SYNC.
-    At bring-up, the host sets an inhibit time that suits the hand's SYNC period.
+    With a shorter period, the node would not finish a scan before the next SYNC. A host replaces the default
+    with an inhibit time that suits the hand's SYNC period.
     """
     profile = profiles.get(patch.node_id)
     if profile is None or patch.info is None or patch.found is None or patch.found.state == "operational":
@@ -274,8 +273,8 @@ def _with_scans(
 def _commands_of_others(heard: BusListener, node_ids: Collection[int]) -> int:
     """Count the NMT commands that a host of this hand would not send.
 
-    A host sends only start and enter pre-operational, addressed to one patch at a time. A second host of
-    the same hand is detected by its SYNCs.
+    A host sends only *start* and *enter pre-operational*, each addressed to a single patch. A second host of
+    the same hand therefore goes unnoticed here; it is detected by its SYNCs.
     """
     return sum(
         count
@@ -287,12 +286,11 @@ def _commands_of_others(heard: BusListener, node_ids: Collection[int]) -> int:
 
 
 def _foreign(heard: BusListener, node_ids: Collection[int], bus: BusConfig) -> dict[int, int]:
-    """Return the number of unexplained frames, keyed by COB-ID.
+    """Count the frames of unknown origin, by COB-ID.
 
-    A frame is explained if a CANopen service, a detected node or an entry of ``others`` in the hand file uses
-    its COB-ID. COB-IDs in the pre-defined connection set of a detected node are attributed to that node, even
-    if the node is not a patch. Frames with the COB-IDs of a patch that does not answer are attributed to a
-    host that polls the patch.
+    The origin of a frame is known if its COB-ID belongs to a CANopen service, to the pre-defined connection
+    set of a node in ``node_ids``, or to an entry of ``others`` in the hand file. The patches of the hand are
+    included even if they do not answer, because a host may be polling them.
     """
     explained = _KNOWN_TO_ALL.union(*map(od.predefined_cob_ids, node_ids))
     explained |= {other.can_id for other in bus.others}
@@ -300,7 +298,7 @@ def _foreign(heard: BusListener, node_ids: Collection[int], bus: BusConfig) -> d
 
 
 def link_facts(bus: BusConfig) -> tuple[str | None, int | None]:
-    """Return the state and bit rate of a kernel interface, as reported by ``ip``; None if unknown."""
+    """Return the controller state and bit rate of a SocketCAN interface from ``ip``; None if unknown."""
     if bus.interface != "socketcan":
         return None, None
     try:

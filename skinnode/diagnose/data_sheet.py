@@ -1,7 +1,7 @@
 """Provides the electronic data sheet (EDS) of a node: generated for a patch, otherwise read from a file.
 
-This module uses the conformance suite's EDS reader, which preserves default values as written; the canopen
-library does not. The host uses the canopen library as an independent reader to check a patch's EDS.
+The EDS is parsed with the reader of the conformance suite, which preserves default values as written. The
+canopen library does not; the host uses that library as a second, independent reader of a patch's EDS.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from skinnode.protocol.profile import BusType, PatchProfile
 
 
 class DataSheet(NamedTuple):
-    """An electronic data sheet as text and in parsed form."""
+    """An EDS or DCF, parsed and as text."""
 
     eds: Eds
     text: str
@@ -26,13 +26,13 @@ class DataSheet(NamedTuple):
     codec: str = "utf-8"
     """Codec of the non-ASCII characters in the text."""
     note: str = ""
-    """One line that names the assumed encoding; empty for an ASCII file."""
+    """Message about the assumed encoding; empty for an ASCII file."""
 
 
 def read_profile(remote: RemoteOd) -> PatchProfile | None:
-    """Read the numbers of wires and code bits of a patch; None if the device is not a patch.
+    """Read the profile of a patch from its descriptor (0x2000); None if the device is not a patch.
 
-    Raises NodeError if the device does not answer.
+    Raises NodeError if the device does not answer or the descriptor is invalid.
     """
     try:
         identity = [remote.read(od.IDENTITY, sub, "u32") for sub in (od.IDENTITY_VENDOR, od.IDENTITY_PRODUCT)]

@@ -1,9 +1,9 @@
-"""Writes and reads the configuration of one device as a DCF (CiA 306); every value is preserved byte by byte.
+"""Writes and reads the configuration of one device as a DCF (CiA 306), without changing any byte of a value.
 
-Numbers and printable ASCII text are written to ``ParameterValue`` as CiA 306 specifies. An OCTET_STRING or a
-DOMAIN is written there in hexadecimal. CiA 306 has no notation for text that an INI reader would change, such
-as bytes other than printable ASCII, leading or trailing blanks, and comment signs. Such text is written as a
-comment, which other tools skip and :func:`expected` reads::
+Numbers and printable ASCII strings are written to ``ParameterValue`` as CiA 306 specifies, and values of type
+OCTET_STRING or DOMAIN are written there in hexadecimal. CiA 306 has no notation for other strings: INI
+readers would change non-ASCII characters, leading or trailing blanks, and comment signs. The bytes of such a
+string are written as a comment, which :func:`expected` reads and other tools skip::
 
     ;ParameterBytes=63 61 66 c3 a9
 """
@@ -32,31 +32,30 @@ _STRINGS: Final = {"VISIBLE_STRING": "ascii", "UNICODE_STRING": "utf-16-le"}
 _OCTETS: Final = ("OCTET_STRING", "DOMAIN")
 _VISIBLE_STRING: Final = 0x09
 _AMBIGUOUS: Final = ";#$%\"'\\"
-"""Characters that begin comments, formulas, substitutions, quotations or escapes in some INI readers."""
+"""Characters with a special meaning in some INI readers (comment, formula, substitution, quote, escape)."""
 
 
 class Dcf(NamedTuple):
-    """Text of a DCF, with a summary of its content."""
+    """A DCF, and which values it contains."""
 
     text: str
     values: int
-    """Number of node values written to the file."""
+    """Number of values in the file that were read from the node."""
     as_bytes: tuple[Reading, ...]
-    """Readings that CiA 306 notation cannot express; their bytes are written as comments."""
+    """Values that CiA 306 cannot express and that are therefore written as comments."""
 
 
 def as_dcf(sheet: DataSheet, readings: Sequence[Reading], node_id: int, bitrate_bps: int, name: str) -> Dcf:
-    """Return the DCF of a device: its EDS, device commissioning and the values of its writable objects.
+    """Return the DCF of a device: its EDS with commissioning data and the values of its writable objects.
 
-    The file is in UTF-8, even if the EDS has another encoding. A string that UTF-8 would change is written
-    as bytes.
+    The text is meant for a UTF-8 file, even if the EDS has another encoding.
 
     Args:
-        sheet: The EDS.
-        readings: Values of the node.
-        node_id: Its node-ID.
-        bitrate_bps: Bit rate of the bus.
-        name: The node's name.
+        sheet: EDS of the device.
+        readings: Values read from the node.
+        node_id: Node-ID of the node.
+        bitrate_bps: Bit rate of the bus, bit/s.
+        name: Name of the node.
     """
     parser = _parser(sheet.text)
     sections = {title.lower(): title for title in parser.sections()}
@@ -93,7 +92,7 @@ def as_dcf(sheet: DataSheet, readings: Sequence[Reading], node_id: int, bitrate_
 
 
 def expected(sheet: DataSheet) -> Eds:
-    """Return the EDS with its defaults replaced by DCF values; unchanged if the sheet has no DCF values."""
+    """Return the EDS with each default value replaced by the value that a DCF specifies for the object."""
     parser = _parser(_BYTES_LINE.sub(r"\1", sheet.text))
     entries = dict(sheet.eds.entries)
     for section in parser.sections():
@@ -111,23 +110,24 @@ def _with_value(entry: EdsEntry, value: str | None, as_bytes: str | None) -> Eds
         try:
             return replace(entry, given=bytes.fromhex(as_bytes))
         except ValueError:
-            return entry  # Another tool wrote this text.
-    if value and entry.data_type == _VISIBLE_STRING:  # Text with trailing zeros is written as bytes.
+            return entry  # not written by this program
+    if value and entry.data_type == _VISIBLE_STRING:  # trailing NULs would be in ParameterBytes
         return replace(entry, given=octets(value.strip()))
     return replace(entry, default=value.strip()) if value else entry
 
 
 def _is_configuration(reading: Reading) -> bool:
-    """Return whether a tool that configures a device from its DCF must write this value."""
+    """Return whether the object is part of the configuration that a tool downloads from a DCF."""
     measured = reading.index in (*NOT_CONFIGURATION, od.BASELINE_DOMAIN)
     command = (reading.index, reading.subindex) in od.COMMANDS
     return reading.access in ("rw", "rww", "rwr") and not measured and not command
 
 
 def _standard_form(reading: Reading, data: bytes) -> str | None:
-    """Return the value in CiA 306 notation; None if that notation does not preserve its bytes.
+    """Return the value in CiA 306 notation; None if this would change its bytes.
 
-    Integers are hexadecimal and reals are bit patterns, as conforming tools expect.
+    Integers from 10 on are written in hexadecimal, and reals as their bit patterns, as conforming tools
+    expect.
     """
     if reading.data_type in _STRINGS:
         return _plain(data, _STRINGS[reading.data_type])
@@ -141,7 +141,7 @@ def _standard_form(reading: Reading, data: bytes) -> str | None:
 
 
 def _plain(data: bytes, codec: str) -> str | None:
-    """Return the bytes as text if every INI reader preserves that text, otherwise None."""
+    """Decode a string; None if some INI reader would change it."""
     try:
         text = data.decode(codec)
     except UnicodeDecodeError:

@@ -1,7 +1,7 @@
-"""Finds the nodes on a bus, by SDO, by heartbeats and by LSS.
+"""Finds the nodes on a bus by SDO, heartbeat and LSS.
 
-The device type of every node-ID is requested while heartbeats are recorded. LSS finds nodes without a
-node-ID. The only writes are LSS mode switches, which affect only nodes without a node-ID.
+The search requests the device type (0x1000) from every node-ID and records heartbeats meanwhile. Nodes
+without a node-ID are found by LSS, which switches their LSS mode. Nothing else on any node is changed.
 """
 
 from __future__ import annotations
@@ -21,24 +21,22 @@ from skinnode.text.printable import printable
 from skinnode.text.words import counted
 
 PACE_S: Final = 0.001
-"""Interval between requests, s. At 1 Mbit/s, the requests use a sixth of the bus capacity."""
+"""Interval between requests of a sweep, s. At 1 Mbit/s, the requests cause a bus load of one sixth."""
 
 ANSWER_S: Final = 0.12
-"""Time (s) to wait for responses after the last request of a sweep."""
+"""Waiting time for responses after the last request of a sweep, s."""
 
 SWEEPS: Final = 2
-"""Number of sweeps over all node-IDs; a node that is busy during the first sweep receives a second
-request."""
+"""Number of sweeps over all node-IDs. The second sweep reaches nodes that were busy during the first."""
 
 LISTEN_S: Final = 1.2
-"""Minimum listening time, s. Stopped nodes are detected only by their heartbeats."""
+"""Minimum listening time, s. A stopped node answers no SDO request and is found only by its heartbeats."""
 
 LSS_S: Final = 1.5
-"""Maximum time (s) to search for nodes without a node-ID. After this time, the search ends even
-if further nodes are known to exist."""
+"""Maximum duration of the search for nodes without a node-ID, s. Further nodes are then left unidentified."""
 
 OTHERS_S: Final = 1.0
-"""Maximum wait for other SDO clients to finish, s."""
+"""Maximum wait for the SDO transfers of other clients to end, s."""
 
 _QUIET_S: Final = 0.1
 _THREADS: Final = 16
@@ -48,18 +46,18 @@ _ASK_SERIAL: Final = upload_request(od.IDENTITY, od.IDENTITY_SERIAL)
 
 @dataclass(frozen=True, slots=True)
 class FoundNode:
-    """Node found on a bus. A value is None if the node lacks the object or did not answer."""
+    """Node found on a bus; None stands for a value that the node did not return."""
 
     node_id: int
     answers: bool
     """Whether the node answers SDO requests; a stopped node does not."""
     state: str
     state_known_by: str
-    """Source of the state, or why the state is unknown."""
+    """Source of the NMT state, or the reason why the state is unknown."""
     name: str | None
     """Device name (0x1008)."""
     device_type: int | None
-    """Device type (0x1000); the lower half is the number of the device profile."""
+    """Device type (0x1000); the lower 16 bits are the number of the device profile."""
     error_register: int | None
     """Error register (0x1001)."""
     vendor_id: int | None
@@ -68,15 +66,15 @@ class FoundNode:
     serial: int | None
     heartbeat_ms: int | None
     boot_ups: int
-    """Boot-up messages received during the search."""
+    """Number of boot-up messages received during the search."""
     duplicate: str
     """Evidence that two nodes have this node-ID; empty if there is none."""
     wrong_answer: str = ""
-    """Newest invalid SDO response as hexadecimal text, if there was no valid response."""
+    """Newest invalid SDO response in hexadecimal; empty if there was a valid response or none at all."""
 
     @property
     def profile(self) -> str:
-        """Device profile in words; empty if the node does not report it."""
+        """Device profile as text; empty if the device type is unknown."""
         if self.device_type is None:
             return ""
         number = self.device_type & 0xFFFF
@@ -84,7 +82,7 @@ class FoundNode:
 
     @property
     def identity(self) -> list[str]:
-        """Profile, vendor and product as text; values that the node does not report are omitted."""
+        """Profile, vendor and product as text; unknown values are omitted."""
         known = [self.profile] if self.profile else []
         for what, number in (("vendor", self.vendor_id), ("product", self.product_code)):
             if number is not None:
@@ -106,7 +104,7 @@ class Discovery:
     unconfigured: tuple[LssAddress, ...]
     """Nodes without a node-ID."""
     more_unconfigured: bool
-    """Whether there are further nodes without a node-ID that were not found in time."""
+    """Whether further nodes without a node-ID exist that the search did not identify."""
     seconds: float
 
 
@@ -133,7 +131,7 @@ def discover(connection: BusConnection, progress: Callable[[str], None] = lambda
             nodes = [job.result() for job in jobs]
             connection.wait_until(lambda: False, max(0.0, begun_s + LISTEN_S - time.monotonic()))
             unconfigured, more = lss.result()
-        except BaseException:  # Ctrl-C must also end the pool's threads
+        except BaseException:  # on Ctrl-C, the pool's threads must end, too
             connection.abandon()
             raise
     heard = connection.listener.nodes
@@ -143,9 +141,9 @@ def discover(connection: BusConnection, progress: Callable[[str], None] = lambda
 
 
 def _let_others_finish(connection: BusConnection) -> None:
-    """Wait until other clients' SDO transfers have ended, because a new request would abort them.
+    """Wait until the SDO transfers of other clients have ended; a request from here would abort them.
 
-    A host performs SDO transfers during bring-up, but normally not afterwards.
+    A host performs SDO transfers mainly during bring-up.
     """
     end_s = time.monotonic() + OTHERS_S
     while time.monotonic() < end_s:
@@ -161,9 +159,10 @@ def _sdo_frames(connection: BusConnection) -> int:
 
 
 def find_unconfigured(connection: BusConnection) -> tuple[tuple[LssAddress, ...], bool]:
-    """Find the nodes without a node-ID; return these nodes, and whether the search was incomplete.
+    """Find the nodes without a node-ID, and return them to LSS waiting mode.
 
-    The nodes return to LSS waiting mode.
+    Returns:
+        The LSS addresses found, and whether further nodes exist.
     """
     found: list[LssAddress] = []
     end_s = time.monotonic() + LSS_S
@@ -181,7 +180,7 @@ def find_unconfigured(connection: BusConnection) -> tuple[tuple[LssAddress, ...]
 
 
 def _sweep(connection: BusConnection) -> dict[int, int]:
-    """Query all node-IDs; return the number of responses to one request, keyed by node-ID."""
+    """Request the device type from all node-IDs; return the number of responses by node-ID."""
     answers: dict[int, int] = {}
     for _ in range(SWEEPS):
         asked_ns = time.monotonic_ns()
@@ -230,7 +229,7 @@ def _examine(connection: BusConnection, node_id: int, answers: int) -> FoundNode
 
 
 def _only_heard(connection: BusConnection, node_id: int, asked_ns: int) -> FoundNode | None:
-    """Return a node that sends heartbeats but no valid SDO response; None if it sends no heartbeats."""
+    """Describe a node that gave no valid SDO response; None if it sent no heartbeat either."""
     beat = connection.listener.newest_beat(node_id)
     if beat is None:
         return None
@@ -252,7 +251,10 @@ def _only_heard(connection: BusConnection, node_id: int, asked_ns: int) -> Found
 
 
 def _two_serials(connection: BusConnection, node_id: int) -> str:
-    """Return evidence of a shared node-ID; empty if the second response belonged to an earlier request."""
+    """Return evidence that two nodes have this node-ID.
+
+    Empty if a new request gets only one response: the extra response seen before answered another request.
+    """
     answers = connection.ask_all(node_id, _ASK_SERIAL, ANSWER_S)
     answers = [data for data in answers if data[1:4] == _ASK_SERIAL[1:4]]
     if len(answers) < 2:

@@ -1,4 +1,4 @@
-"""Defines the facts about a bus and its patches as plain data, the only input of the checks."""
+"""Data classes for the facts about a bus and its patches. The checks use no other input."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ class Sure(StrEnum):
     """Certainty of a finding."""
 
     CERTAIN = "certain"
-    """A node or a counter reports the fault."""
+    """A node or a counter reports the fault directly."""
     LIKELY = "likely"
-    """Hardly any other cause can explain the evidence."""
+    """The evidence has hardly any other explanation."""
     POSSIBLE = "possible"
-    """The condition may be intentional; the user must decide."""
+    """The condition may be intended; only the user can tell."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,7 +36,7 @@ class Finding:
     """Fault found by a check."""
 
     area: str
-    """Area: bus, nodes, configuration, wires, baseline, timing or losses."""
+    """One of bus, nodes, configuration, wires, baseline, timing and losses."""
     where: str
     what: str
     sure: Sure
@@ -46,32 +46,32 @@ class Finding:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ScanFacts:
-    """Captured scans of one patch: T scans, U upper wires, K lower wires."""
+    """T captured scans of a patch with U upper and K lower wires."""
 
     ratio: Float
-    """(T, U, K) R/R0; NaN for a crossing without a measurement."""
+    """(T, U, K) R/R0; NaN where there is no valid code."""
     n_open: Counts
     n_short: Counts
     n_over: Counts
-    """(U, K) numbers of scans in which each crossing was open, shorted or out of range, respectively."""
+    """(U, K) number of scans in which each crossing was open, shorted or out of range, respectively."""
     t_s: Float
-    """(T,) time from the end of the first scan to the end of each scan, s."""
+    """(T,) reception time of the last frame of each scan, relative to the first scan, s."""
     latency_s: Float
-    """(T,) time from SYNC to the last frame of the scan, s; NaN if no SYNC was received."""
+    """(T,) time from SYNC to the last frame of the scan, s; NaN if its SYNC was not received."""
     device_us: Counts
-    """(T,) clock of the node, µs; -1 if the summary was lost."""
+    """(T,) time of the scan on the node's clock, µs; -1 if the summary was lost."""
     complete: NDArray[np.bool_]
-    """(T,) whether each scan is complete."""
+    """(T,) mask of the complete scans."""
     step: float
     """Size of one code step relative to R0."""
     stated_noise: float
-    """Relative noise of the converter, from the hand file."""
+    """Relative noise of the converter, according to the hand file."""
     stats: AssemblerStats
     conversions: int | None = None
-    """Number of scans whose conversion differs from the previous scan's; None if the patch does not count its
+    """Number of scans with a new conversion since the previous scan; None if the patch does not count its
     conversions."""
     repeated: int = 0
-    """Number of scans that repeat the conversion of the previous scan."""
+    """Number of scans without a new conversion since the previous scan."""
 
     @property
     def scans(self) -> int:
@@ -81,7 +81,7 @@ class ScanFacts:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PatchFacts:
-    """Configuration and observations of one patch; an observation is None if unknown."""
+    """Configuration and observations of one patch; None stands for an unknown value."""
 
     name: str
     node_id: int
@@ -89,16 +89,16 @@ class PatchFacts:
     layout_hash: int | None = None
     """Hash of the layout in the hand file."""
     inhibit_100us: int | None = None
-    """Inhibit time that the host sets, in units of 100 µs; None if the host does not configure the nodes of
-    this bus."""
+    """Inhibit time that the host sets, in units of 100 µs; None if the host does not configure the nodes on
+    the bus."""
     eds_problem: str = ""
-    """Why the EDS in the hand file does not match the patch; empty if it matches or no EDS is given."""
+    """Difference between the EDS and the patch in the hand file; empty if they match or there is no EDS."""
     found: FoundNode | None = None
     info: NodeInfo | None = None
     failure: str = ""
-    """Why ``info`` is missing although the node was found."""
+    """Reason why ``info`` is missing although the node was found."""
     boot_ups: int = 0
-    """Boot-up messages received while listening."""
+    """Number of boot-up messages received."""
     emergencies: tuple[Emergency, ...] = ()
     scans: ScanFacts | None = None
 
@@ -112,43 +112,44 @@ class BusFacts:
     channel: str
     bitrate_bps: int
     failure: str = ""
-    """Why the bus could not be opened or why it failed; empty if it works."""
+    """Reason why the bus could not be opened or failed later; empty if it works."""
     link_state: str | None = None
-    """State of the CAN controller according to the kernel (ERROR-ACTIVE …)."""
+    """State of the CAN controller reported by the kernel, such as ``ERROR-ACTIVE``."""
     link_bitrate_bps: int | None = None
     seconds: float = 0.0
     """Listening time, s."""
     frames: int = 0
     load: float = 0.0
-    """Bus load (fraction) in the busiest second of the capture, or in the last second if no scan arrived."""
+    """Bus load (fraction) in the busiest second of the capture, or in the last second if nothing was
+    captured."""
     error_frames: int = 0
     dropped: int = 0
     outages: int = 0
     foreign: Mapping[int, int] = field(default_factory=dict)
-    """Number of unexplained frames, keyed by COB-ID."""
+    """Number of frames of unknown origin, by COB-ID."""
     unconfigured: tuple[LssAddress, ...] = ()
     strangers: tuple[FoundNode, ...] = ()
     """Nodes that are not in the hand file."""
     period_s: float | None = None
     """SYNC period from the hand file, s."""
     sync_s: Float = field(default_factory=lambda: np.empty(0))
-    """Times of the SYNCs received, s; empty if the doctor sends SYNC."""
+    """Reception times of the SYNCs, s; empty if the doctor sent SYNC."""
     sync_counters: tuple[int, ...] = ()
     """Counters of the SYNCs received; 0 for a SYNC without a counter."""
     sync_ours: bool = False
     own_period_s: float = 0.0
-    """Period of the SYNC that the doctor sends, s; 0 if another node sends SYNC. It is
-    longer than ``period_s`` if an unconfigured node needs more time for a scan."""
+    """SYNC period of the doctor, s; 0 if it sent no SYNC. The period is longer than ``period_s`` if a node
+    that no host has configured needs more time for a scan."""
     active: bool = False
     """Whether the doctor was allowed to start nodes that were not running."""
     role: str = "master"
     """Host's role on this bus, from the hand file."""
     nmt_commands: int = 0
-    """Number of NMT commands received that a host of this hand would not send."""
+    """Number of received NMT commands that a host of this hand would not send."""
     master_node_id: int | None = None
-    """Node-ID in the host's heartbeat, from the hand file."""
+    """Node-ID of the host's own heartbeat, from the hand file; None if the host sends none."""
     master_beats_s: Float | None = None
-    """Times at which the host's heartbeat was received, s."""
+    """Reception times of the host's heartbeat, s."""
     heartbeat_ms: int | None = None
     """Heartbeat period from the hand file, ms."""
     patches: tuple[PatchFacts, ...] = ()

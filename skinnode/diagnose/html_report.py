@@ -1,4 +1,4 @@
-"""Writes the doctor's report as one self-contained HTML file: findings, values, and plots as inline SVG."""
+"""Formats the doctor's report as a self-contained HTML page with findings, measured values and plots."""
 
 from __future__ import annotations
 
@@ -31,12 +31,12 @@ svg { max-width: 100%; height: auto; margin-top: 1.2rem }
 
 
 def as_html(buses: Sequence[BusFacts], groups: Sequence[Group], title: str) -> str:
-    """Return the report. Requires matplotlib if scans were captured.
+    """Return the report as an HTML page. If scans were captured, matplotlib is required.
 
     Args:
         buses: Facts about each bus.
-        groups: Findings by root cause.
-        title: Name of the hand, or of the bus.
+        groups: Findings, grouped by root cause.
+        title: Name of the hand or of the bus.
     """
     when = datetime.datetime.now().astimezone().isoformat(" ", "seconds")
     parts = [
@@ -54,7 +54,7 @@ def as_html(buses: Sequence[BusFacts], groups: Sequence[Group], title: str) -> s
 
 
 def _group(group: Group) -> str:
-    """Render a cause with its probable consequences below it."""
+    """Format a cause, followed by its probable consequences."""
     below = "".join(_finding(finding) for finding in group.consequences)
     return _finding(group.cause, f"<p>Probable consequences:</p>{below}" if below else "")
 
@@ -105,7 +105,7 @@ def _table(rows: Sequence[tuple[str, object]]) -> str:
 
 
 def _maps(scans: ScanFacts) -> str:
-    """Plot maps of noise and R/R0."""
+    """Plot the noise and R/R0 of all crossings."""
     analysis = analyse_noise(scans)
     figure, axes = _figure(2, 1, height_in=5.6)
     title = "noise / stated noise (grey: no value)" + (
@@ -122,16 +122,16 @@ def _maps(scans: ScanFacts) -> str:
 def _map(  # noqa: PLR0913 - one image
     figure: Any, axes: Any, values: Float, title: str, colours: str, low: float, high: float | None
 ) -> None:
-    axes.set_facecolor("#888")  # colour of crossings without a value
+    axes.set_facecolor("#888")  # shown where a crossing has no value
     image = axes.imshow(values, cmap=colours, vmin=low, vmax=high, aspect="auto", interpolation="nearest")
     axes.set(title=title, xlabel="lower wire", ylabel="upper wire")
     figure.colorbar(image, ax=axes, pad=0.01)
 
 
 def _timeline(scans: ScanFacts) -> str:
-    """Plot each scan's delay after its SYNC, and mark incomplete scans."""
+    """Plot the delay of each scan after its SYNC (or the scan interval), and mark incomplete scans."""
     figure, (axes,) = _figure(1, 1, height_in=2.6)
-    late_ms = np.where(scans.complete, 1e3 * scans.latency_s, np.nan)  # an incomplete scan has no last frame
+    late_ms = np.where(scans.complete, 1e3 * scans.latency_s, np.nan)  # if torn, the last frame may be lost
     if np.isfinite(late_ms).any():
         axes.plot(scans.t_s, late_ms, ".-", color="#2b6cb0", lw=0.8, label="last frame after SYNC, ms")
         axes.set_ylabel("ms after SYNC")

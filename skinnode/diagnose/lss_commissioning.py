@@ -17,7 +17,7 @@ from skinnode.errors import ConfigError
 from skinnode.host.lss_master import LssFailed
 
 BOOT_S: Final = 5.0
-"""Maximum time (s) for a node to boot with its new node-ID."""
+"""Maximum time for a node to boot with its new node-ID, s."""
 
 _ASKED_S: Final = 0.15
 _ASK_DEVICE_TYPE: Final = upload_request(od.DEVICE_TYPE, 0)
@@ -33,15 +33,19 @@ class Commissioned:
     node_id: int | None
     """New node-ID; None if unchanged."""
     bitrate_bps: int | None
-    """New bit rate, valid from the next power-on; None if unchanged."""
+    """New bit rate, bit/s, which takes effect at the next power-on; None if unchanged."""
     stored: bool
     booted: bool
-    """Whether the node booted with its new node-ID; also True if the node-ID is unchanged."""
+    """Whether the node booted with its new node-ID; True if the node-ID is unchanged."""
     faults: tuple[str, ...]
 
 
 def only_unconfigured(connection: BusConnection) -> LssAddress:
-    """Return the only node without a node-ID. Raises ConfigError unless exactly one exists."""
+    """Return the LSS address of the only node without a node-ID.
+
+    Raises:
+        ConfigError: There is no such node, or more than one.
+    """
     found, more = find_unconfigured(connection)
     if len(found) != 1 or more:
         serials = ", ".join(str(address.serial_number) for address in found)
@@ -54,14 +58,14 @@ def only_unconfigured(connection: BusConnection) -> LssAddress:
 
 @dataclass(frozen=True, slots=True)
 class Commissioning:
-    """Node-ID and bit rate to set in a node by LSS."""
+    """Settings of a node to change by LSS."""
 
     node_id: int | None
-    """New node-ID; None to keep it."""
+    """New node-ID; None to keep the current one."""
     bitrate_bps: int | None
-    """New bit rate; None to keep it."""
+    """New bit rate, bit/s; None to keep the current one."""
     store: bool
-    """Whether to store both settings, so that they survive power-off."""
+    """Whether to store the settings in non-volatile memory."""
 
 
 def commission(
@@ -70,20 +74,20 @@ def commission(
     wanted: Commissioning,
     agreed: Callable[[int | None], bool],
 ) -> Commissioned | None:
-    """Set the node-ID of a node, its bit rate or both.
+    """Set the node-ID and the bit rate of a node by LSS.
 
     Args:
         connection: The bus.
-        address: The node.
-        wanted: Values to set.
-        agreed: Callback that receives the current node-ID; if it returns False, nothing is written.
+        address: LSS address of the node.
+        wanted: New settings.
+        agreed: Callback that is given the current node-ID and returns whether to proceed.
 
     Returns:
-        The result; None if ``agreed`` returned False.
+        The result; None if ``agreed`` returned False, in which case the node keeps its settings.
 
     Raises:
-        ConfigError: Another node has the new node-ID, or no node has the LSS address.
-        LssFailed: The node refuses.
+        ConfigError: The new node-ID is in use, or no node has the LSS address.
+        LssFailed: The node refuses a setting or does not respond.
     """
     node_id = wanted.node_id
     if node_id is not None and connection.ask_all(node_id, _ASK_DEVICE_TYPE, _ASKED_S):
@@ -96,7 +100,7 @@ def commission(
         if not agreed(before):
             return None
         fault = _configure(connection, wanted)
-    finally:  # leaving LSS configuration mode lets a node without a node-ID boot
+    finally:  # a node without a node-ID boots when it leaves LSS configuration mode
         connection.lss.release()
     faults = [fault] if fault else []
     booted = True
@@ -112,7 +116,7 @@ def commission(
 
 
 def _configure(connection: BusConnection, wanted: Commissioning) -> str:
-    """Set the values in the selected node and store them; return why storing failed, or an empty string."""
+    """Change the settings of the selected node; return the reason if they could not be stored, else ""."""
     if wanted.bitrate_bps is not None:
         connection.lss.set_bit_rate(wanted.bitrate_bps)
     if wanted.node_id is not None:

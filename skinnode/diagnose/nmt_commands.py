@@ -13,7 +13,7 @@ from skinnode.canopen.nmt import AFTER_COMMAND, ALL_NODES, NmtCommand, encode, s
 from skinnode.diagnose.bus_connection import BusConnection, State
 
 FOLLOW_S: Final = 1.5
-"""Maximum time (s), in addition to two heartbeat periods, for a node to report its new state."""
+"""Maximum time for a node to report its new state, s, in addition to two heartbeat periods."""
 
 BOOT_S: Final = 5.0
 """Maximum boot time of a node, s."""
@@ -54,12 +54,12 @@ class Change:
     after: str
     followed: bool
     known_by: str
-    """Source of the new state, or why the command is considered to have failed."""
+    """How the new state was determined; if the command failed, the reason."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Watch:
-    """State of a node before an NMT command."""
+    """State and settings of a node before an NMT command."""
 
     node_id: int
     heartbeat_s: float | None
@@ -71,13 +71,13 @@ class _Watch:
 def command_nodes(
     connection: BusConnection, node_ids: Sequence[int], command: Command, *, at_once: bool
 ) -> list[Change]:
-    """Send an NMT command to nodes and observe its effect.
+    """Send an NMT command to nodes, and wait for its effect.
 
     Args:
         connection: The bus.
         node_ids: The nodes.
         command: The command.
-        at_once: Whether to send a single message addressed to all nodes instead of one message per node.
+        at_once: Whether to address all nodes on the bus with one message instead of one message per node.
 
     Raises:
         BusError: The bus failed.
@@ -92,7 +92,7 @@ def command_nodes(
 
 
 def _watch(connection: BusConnection, node_id: int) -> _Watch:
-    """Read a node's state and settings before the command; a stopped node would not return them."""
+    """Determine a node's state and settings before the command; a stopped node answers no SDO request."""
     heartbeat_s = connection.heartbeat_s(node_id)
     guarding = not connection.guarded(node_id)
     before = connection.state(node_id, heartbeat_s, guarding=guarding)
@@ -100,7 +100,7 @@ def _watch(connection: BusConnection, node_id: int) -> _Watch:
 
 
 def _followed(connection: BusConnection, watch: _Watch, command: Command, sent_ns: int) -> Change:
-    """Wait until the node reports the commanded state, or until the time limit is reached."""
+    """Wait until the node reports the commanded state, or until the time is up."""
     wanted, since_ns = AFTER_COMMAND[_SPECIFIERS[command]], sent_ns
     end_s = time.monotonic() + FOLLOW_S + 2 * (watch.heartbeat_s or 0.0)
     while True:
@@ -115,7 +115,7 @@ def _followed(connection: BusConnection, watch: _Watch, command: Command, sent_n
 
 
 def _booted(connection: BusConnection, watch: _Watch, sent_ns: int) -> Change:
-    """Wait until the node has booted, and read its NMT state."""
+    """Wait for the node's boot-up message, and determine its NMT state."""
     node_id = watch.node_id
     if not connection.wait_until(lambda: connection.listener.node(node_id).boot_ups > watch.boot_ups, BOOT_S):
         why = f"no boot-up message within {BOOT_S:g} s"

@@ -1,4 +1,4 @@
-"""Reads all information about one node without writing to the node."""
+"""Reads the identity, state, settings and errors of a node. Nothing is written to the node."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from skinnode.text.words import counted
 
 @dataclass(frozen=True, slots=True)
 class PatchInfo:
-    """Information that only a skinnode patch provides."""
+    """Information that is specific to a skinnode patch."""
 
     upper_wires: int
     lower_wires: int
@@ -40,14 +40,14 @@ class PatchInfo:
     code_hi: float
     pdo_bytes: int
     baseline_missing: int
-    """Number of crossings without R0."""
+    """Number of crossings without a baseline."""
     baseline_ohm: tuple[float, float, float] | None
-    """Minimum, median and maximum R0 in ohm; None without a baseline."""
+    """Minimum, median and maximum R0, ohm; None if there is no baseline."""
     send_changed_only: bool
     send_threshold_codes: int
     send_refresh_scans: int
     period_ms: int
-    """Period of the node's own scan timer in ms; 0 for one scan per SYNC."""
+    """Period of the node's own scan timer, ms; 0 if the node scans at SYNC."""
     averaging: int
     open_upper: tuple[int, ...]
     shorted_upper: tuple[int, ...]
@@ -56,12 +56,12 @@ class PatchInfo:
     """Numbers of the open and the shorted wires, counted from 0."""
     self_test: str
     rejected: dict[str, int]
-    """Number of frames that the node ignored, by reason; reasons with a count of 0 are omitted."""
+    """Number of received frames that the node rejected, by reason; counts of 0 are omitted."""
 
 
 @dataclass(frozen=True, slots=True)
 class NodeInfo:
-    """Information about a node; a value is None if the node does not provide it."""
+    """Information about a node; None stands for an object that the node does not have."""
 
     node_id: int
     state: str
@@ -89,7 +89,7 @@ class NodeInfo:
 
     @property
     def faults(self) -> tuple[str, ...]:
-        """Faults that the node itself reports."""
+        """Faults that the node reports, as text."""
         found = [f"error register: {register_text(self.error_register)}"] if self.error_register else []
         if self.patch is not None:
             if self.patch.baseline_missing:
@@ -106,7 +106,7 @@ class NodeInfo:
 
 
 class _Reader:
-    """Reads the optional objects of a node."""
+    """Reads objects of a node; None stands for an object that the node refuses to return."""
 
     def __init__(self, remote: RemoteOd) -> None:
         self.remote = remote
@@ -136,7 +136,7 @@ def read_info(connection: BusConnection, node_id: int, sheet: Eds | None = None)
     Args:
         connection: The bus.
         node_id: The node.
-        sheet: EDS with the object names of a device other than a patch.
+        sheet: EDS of the node, for the names of mapped objects; not needed for a patch.
 
     Raises:
         NodeError: The node does not answer.
@@ -150,7 +150,7 @@ def read_info(connection: BusConnection, node_id: int, sheet: Eds | None = None)
     read = _Reader(remote)
     try:
         profile = read_profile(remote)
-    except SdoAbort:  # the node has no identity, or the patch has no descriptor
+    except SdoAbort:  # no identity object, or no patch descriptor
         profile = None
     if profile is not None and sheet is None:
         sheet = parse_eds(eds_text(profile), "profile")
@@ -273,9 +273,9 @@ def _spread(values: Float) -> tuple[float, float, float]:
 
 
 def read_baseline(remote: RemoteOd, profile: PatchProfile) -> Float:
-    """Read the (U, K) baseline R0 in ohm; 0 for a crossing without a baseline.
+    """Read the (U, K) baseline R0, ohm; 0 for a crossing without a baseline.
 
-    Raises NodeError if the upload fails or has the wrong size.
+    Raises NodeError if the transfer fails or the data have the wrong size.
     """
     data = remote.read_large(od.BASELINE_DOMAIN)
     if len(data) != 4 * profile.n_codes:
@@ -287,7 +287,7 @@ def read_baseline(remote: RemoteOd, profile: PatchProfile) -> Float:
 
 
 def _masks(read: _Reader, index: int) -> tuple[tuple[int, ...], tuple[int, ...]]:
-    """Return the numbers of the open and of the shorted wires from the fault masks in 0x2030 or 0x2031."""
+    """Return the open wires and the shorted wires from the fault masks in 0x2030 or 0x2031."""
     wires: tuple[list[int], list[int]] = ([], [])
     for sub in range(1, (read.number(index) or 0) + 1):
         word, first = read.number(index, sub) or 0, (sub - 1) // 2 * 32

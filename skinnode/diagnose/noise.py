@@ -1,14 +1,14 @@
-"""Estimates the noise at each crossing and on each wire, even while the skin is touched.
+"""Estimates the noise of each crossing and of each wire, even while the skin is touched.
 
-The functions are pure and compute two estimates of the noise. Second differences of successive scans
-(variance 6 σ²) are insensitive to slow touches. The part of a crossing's signal that the other wires do not
-explain is insensitive to quick touches: a touch changes the values of many crossings by linear combinations
-of a few functions of time, whereas the noise is independent at each crossing. Both estimates are upper bounds
-on the noise, so the smaller of the two is used.
+The noise of a crossing is the smaller of two estimates. A touch can only increase them. The first estimate
+uses the second differences of successive scans, whose variance is 6 σ²; it is insensitive to slow touches.
+The second estimate is the part of a crossing's signal that the signals of other wires do not explain; it is
+insensitive to quick touches. It relies on the fact that a touch changes all crossings by linear combinations
+of a few functions of time, whereas noise is independent at each crossing.
 
-A quick, deep and small touch affects both estimates, but hardly affects the smallest singular values of a
-wire's signals. On touched skin, these singular values are therefore compared with those of the neighbouring
-wires. The patch as a whole is assessed by its own smallest singular values.
+A touch that is quick, deep and small increases both estimates, but hardly affects the smallest singular
+values of a wire's signals. These determine the noise of wires and of the whole patch while the skin is
+touched.
 """
 
 from __future__ import annotations
@@ -24,64 +24,62 @@ from skinnode.diagnose.facts import Counts, ScanFacts
 from skinnode.model.layout import Float
 
 LEAST_SCANS: Final = 20
-"""Minimum number of scans for a noise analysis; with fewer scans, the error of the estimated standard
+"""Minimum number of scans for a noise analysis. With fewer scans, the error of the estimated standard
 deviation exceeds 25 %."""
 
 _MOST_SCANS: Final = 64
-"""Maximum number of scans used, from the newest; computing time grows with the square of this number."""
+"""Number of scans analysed, counted back from the newest. The computing time grows with the square of it."""
 
 _FLOOR: Final = 8
-"""Number of singular values that form a patch's noise floor; they determine the noise level to within 20
-%."""
+"""Number of singular values in the noise floor of a patch. They determine the noise to within 20 %."""
 
 _MOVED: Final = 6.0
-"""Minimum standard deviation of a touched crossing's values, in units of the stated noise."""
+"""Minimum standard deviation of the signal of a touched crossing, relative to the stated noise."""
 _EXPLAINED: Final = 2.0
-"""Minimum ratio of a touched crossing's standard deviation to the part that other wires do not explain.
-
-For pure noise with 25 degrees of freedom, the probability of exceeding this ratio is 1e-6.
-"""
+"""Minimum standard deviation of the signal of a touched crossing, relative to the part that other wires do
+not explain. Pure noise with 25 degrees of freedom exceeds this ratio with a probability of 1e-6."""
 _TOUCHED: Final = 2
-"""Minimum number of crossings that a touch affects at the same time; a loose contact affects one crossing."""
+"""Minimum number of crossings affected by a touch. A loose contact affects a single crossing."""
 _STEP: Final = 20.0
-"""Minimum height of a jump, in units of the stated noise."""
+"""Minimum height of a jump, relative to the stated noise."""
 _STAYS: Final = 0.3
-"""Maximum difference between a jump and the resulting change of the median, as a fraction of the jump."""
+"""Maximum difference between the height of a jump and the change of the median, as a fraction of the
+height."""
 _STILL: Final = 0.1
-"""Maximum standard deviation of a crossing after its jump is removed, as a fraction of the jump."""
+"""Maximum standard deviation of a signal after its jump has been removed, as a fraction of the height."""
 _EVEN: Final = 0.2
-"""Ratio of a crossing's own noise to the noise common to all crossings; below this ratio, the supply is
-considered noisy."""
+"""Ratio of the individual noise of the crossings to their common noise, below which the common noise is
+attributed to the supply."""
 
 Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class NoiseAnalysis:
-    """Noise of a patch; arrays are (U, K), one value per crossing, unless stated otherwise."""
+    """Noise of a patch. Arrays are (U, K) unless stated otherwise."""
 
     noise: Float
-    """Noise relative to R0, including the residual effect of a touch; NaN if unknown."""
+    """Measured noise relative to R0; NaN if unknown. It is too large if a touch affects both estimates."""
     stated: Float
-    """Noise expected from the converter and from rounding to whole codes, relative to R0."""
+    """Expected noise relative to R0: noise of the converter and quantization noise."""
     level: Float
     """Median R/R0."""
     touched: Mask
-    """Whether the crossing's value varied together with those of other crossings."""
+    """Mask of the crossings whose value varied together with those of other crossings."""
     steps: Mask
-    """Whether the crossing was constant except for a single jump."""
+    """Mask of the crossings that were constant except for a single jump."""
     step_at: Counts
     step_by: Float
     upper: Float
-    """(U,) noise of each upper wire divided by the stated noise; the effect of a touch is removed as far as
-    possible."""
+    """(U,) noise of each upper wire relative to the stated noise, with little influence of a touch; 0 if
+    unknown."""
     lower: Float
-    """(K,) noise of each lower wire, divided by the stated noise as in ``upper``."""
+    """(K,) noise of each lower wire, like ``upper``."""
     floor: float
-    """Noise of all crossings together, divided by the stated noise as in ``upper``."""
+    """Noise of the whole patch, like ``upper``."""
     supply: float
-    """Noise common to all crossings divided by the stated noise; 0 unless each
-    crossing's own noise is much smaller."""
+    """Noise common to all crossings, relative to the stated noise; 0 unless the individual noise of the
+    crossings is much smaller."""
 
     @property
     def is_touched(self) -> bool:
@@ -90,7 +88,7 @@ class NoiseAnalysis:
 
 
 def analyse_noise(scans: ScanFacts) -> NoiseAnalysis:
-    """Analyse the noise of at least LEAST_SCANS scans."""
+    """Analyse the noise of a patch; ``scans`` must contain at least :data:`LEAST_SCANS` scans."""
     ratio = scans.ratio[scans.complete] if scans.complete.sum() >= LEAST_SCANS else scans.ratio
     ratio = ratio[-_MOST_SCANS:]
     known: Mask = np.asarray(np.isfinite(ratio).all(axis=0))
@@ -127,11 +125,12 @@ def _roughness(series: Float) -> Float:
 
 
 def _unexplained(moved: Float) -> Float:
-    """Return the (U, K) standard deviations of the variation that the other wires do not explain.
+    """Return the (U, K) standard deviations of the part of each signal that other wires do not explain.
 
-    From the signals of each upper wire, the leading half of the temporal components of all other upper wires
-    is removed. Lower wires are treated in the same way. Each crossing therefore has two residuals; the larger
-    standard deviation is returned. ``moved`` has mean 0.
+    The signals of each upper wire are projected onto the complement of the leading principal components of
+    all other upper wires; half of the components count as leading. The same is done for lower wires. Each
+    crossing thus has two residuals, of which the larger standard deviation is returned. ``moved`` must have
+    mean 0.
     """
     count = len(moved)
     flat = moved.reshape(count, -1)
@@ -149,7 +148,7 @@ def _unexplained(moved: Float) -> Float:
 
 
 def _of_wires(moved: Float, noise: Float, known: Mask) -> Float:
-    """Return each wire's noise floor or median noise, whichever is smaller; 0 if unknown."""
+    """Return the noise of each wire: its noise floor or its median noise, whichever is smaller."""
     levels = np.zeros(moved.shape[1])
     for wire, there in enumerate(known):
         if there.any():
@@ -159,7 +158,7 @@ def _of_wires(moved: Float, noise: Float, known: Mask) -> Float:
 
 
 def _floor(moved: Float, values: int) -> float:
-    """Return the norm of the smallest singular values of (T, n) data, divided by the norm for unit noise."""
+    """Return the norm of the smallest singular values of (T, n) data, relative to that of unit noise."""
     return _smallest(moved, values) / _of_noise(moved.shape, values) if moved.shape[1] else 0.0
 
 
@@ -175,10 +174,10 @@ def _of_noise(shape: tuple[int, int], values: int) -> float:
 
 
 def _steps(safe: Float) -> tuple[Counts, Float, Mask]:
-    """Return the scan and height of each crossing's largest jump, and whether it is otherwise constant.
+    """Return the scan and the height of each crossing's largest jump, and a mask of the lasting jumps.
 
-    A crossing is otherwise constant if its medians before and after the jump differ by the jump's height and
-    the remaining variation is small.
+    A jump is lasting if the medians before and after it differ by its height, and if the signal is otherwise
+    nearly constant.
     """
     jumps = np.diff(safe, axis=0)
     at = np.abs(jumps).argmax(axis=0)

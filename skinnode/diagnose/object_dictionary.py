@@ -1,6 +1,7 @@
-"""Reads, writes, dumps and compares a node's object dictionary, with names and types from its EDS (CiA 306).
+"""Reads, decodes and compares the objects of a node.
 
-Without an EDS, objects are named as in CiA 301 (``standard_objects``).
+Names and data types are taken from the node's EDS (CiA 306), or from CiA 301 (``standard_objects``) if there
+is no EDS.
 """
 
 from __future__ import annotations
@@ -39,7 +40,8 @@ _BOOLEAN, _TEXT = 0x01, 0x09
 _REALS: Final = {0x08: "<f", 0x11: "<d"}
 _STRINGS: Final = ("VISIBLE_STRING", "OCTET_STRING", "UNICODE_STRING", "DOMAIN")
 NOT_CONFIGURATION: Final = (od.ERROR_REGISTER, od.ERROR_FIELD, od.STORE, od.RESTORE)
-"""Objects that contain a node's state instead of its configuration, even if the EDS specifies a default."""
+"""Indices of objects that contain state or trigger an action. They are not configuration, even if the EDS
+specifies a default."""
 _LONGEST_SHOWN: Final = 16
 _ADDRESS: Final = re.compile(r"(?:0[xX])?([0-9A-Fa-f]{1,4})(?::(0[xX][0-9A-Fa-f]{1,2}|[0-9]{1,3}))?")
 
@@ -54,19 +56,20 @@ class Reading:
     data_type: str
     access: str
     value: Value | None
-    """The value; None if the bytes do not represent a simple value, or if the node refused the request."""
+    """Decoded value; None if the data are neither a number nor text, or if the transfer was aborted."""
     data: bytes | None
-    """The bytes transferred; None if the node refused the request."""
+    """Data of the SDO transfer; None if it was aborted."""
     refused: str
-    """Reason for the refusal; empty if the read succeeded."""
+    """Reason for the abort; empty if the transfer succeeded."""
     refused_code: int = 0
-    """SDO abort code of the refusal; 0 if the read succeeded."""
+    """SDO abort code; 0 if the transfer succeeded."""
 
     @property
     def content(self) -> bytes | None:
-        """Value as bytes; None if the node refused the request.
+        """Value as bytes; None if the transfer was aborted.
 
-        Many nodes refuse to return an empty string, because it has no data; the value is then ``b""``.
+        Many nodes abort the upload of an empty string with the code "no data available"; the result is then
+        ``b""``.
         """
         if self.refused_code == AbortCode.NO_DATA and self.data_type in _STRINGS:
             return b""
@@ -74,7 +77,7 @@ class Reading:
 
     @property
     def text(self) -> str:
-        """The value as text."""
+        """Value for display, or the reason for the abort."""
         if self.data is None:
             return self.refused
         if isinstance(self.value, str):
@@ -95,12 +98,15 @@ class Difference:
     subindex: int
     name: str
     node: str
-    """The node's value, or why it is unknown."""
+    """Value on the node, or the reason why it could not be read."""
     file: str
 
 
 def parse_address(text: str) -> tuple[int, int | None]:
-    """Parse an address such as ``1018:4`` or ``0x1018``: hexadecimal index, decimal or 0x… sub-index.
+    """Return index and sub-index of an address such as ``1018:4`` or ``0x1018``.
+
+    The index is hexadecimal. The sub-index is decimal, or hexadecimal with the prefix ``0x``; it is None if
+    the address has none.
 
     Raises:
         ConfigError: The text is not an address.
@@ -113,13 +119,13 @@ def parse_address(text: str) -> tuple[int, int | None]:
 
 
 def hex_text(data: bytes) -> str:
-    """Return bytes as hexadecimal text; long data is abbreviated."""
+    """Return ``data`` in hexadecimal; only the first 16 bytes of longer data are shown."""
     shown = data[:_LONGEST_SHOWN].hex(" ")
     return shown if len(data) <= _LONGEST_SHOWN else f"{shown} … ({len(data)} bytes)"
 
 
 def decode(entry: EdsEntry, data: bytes) -> Value | None:
-    """Return the value in ``data``; None if it is neither a number nor text, or has the wrong length."""
+    """Decode ``data``; None if the type is neither numeric nor text, or if the length is wrong."""
     if entry.data_type == _TEXT:
         return printable(data)
     if entry.size != len(data):
@@ -132,12 +138,12 @@ def decode(entry: EdsEntry, data: bytes) -> Value | None:
 
 
 def encode(entry: EdsEntry, text: str, node_id: int) -> bytes:
-    """Return the bytes of a value that the user entered.
+    """Encode a value entered by the user.
 
     Args:
         entry: The object.
         text: The value.
-        node_id: Replaces $NODEID.
+        node_id: Value of $NODEID in the text.
 
     Raises:
         ConfigError: The text is not a value of the object's type.
@@ -164,7 +170,7 @@ def encode(entry: EdsEntry, text: str, node_id: int) -> bytes:
 
 
 def read_entry(remote: RemoteOd, entry: EdsEntry) -> Reading:
-    """Read a value, or the reason for an SDO abort. Raises NodeError if the node does not answer."""
+    """Read one value. An SDO abort is part of the result; NodeError is raised if the node does not answer."""
     named = entry.index, entry.subindex, entry.name, type_name(entry), entry.access
     try:
         data = remote.read_bytes(entry.index, entry.subindex, MAX_UPLOAD_BYTES)
@@ -175,7 +181,7 @@ def read_entry(remote: RemoteOd, entry: EdsEntry) -> Reading:
 
 
 def type_name(entry: EdsEntry) -> str:
-    """Return the CiA 301 name of the entry's data type."""
+    """Return the name of the entry's data type, as in CiA 301."""
     return _TYPES.get(entry.data_type, "" if not entry.data_type else f"0x{entry.data_type:X}")
 
 
@@ -194,10 +200,10 @@ def entries_at(eds: Eds, index: int, subindex: int | None, count: Callable[[], i
     """Return the entries at an address.
 
     Args:
-        eds: Names of the objects; an object missing from the EDS has its CiA 301 name, if any.
+        eds: EDS of the node; an object that it does not list is described as in CiA 301, if possible.
         index: Index.
-        subindex: Sub-index of one value; None for all values of the object.
-        count: Callback that reads sub-index 0 of the object.
+        subindex: Sub-index; None for all sub-indices of the object.
+        count: Callback that reads the number of entries from sub-index 0.
     """
     if subindex is None:
         listed = list(eds.between(index, index))
@@ -209,7 +215,7 @@ def entries_at(eds: Eds, index: int, subindex: int | None, count: Callable[[], i
 
 
 def dump_standard(remote: RemoteOd, progress: Callable[[str], None] = lambda _: None) -> Iterator[Reading]:
-    """Read every CiA 301 object that the node has; no EDS is needed."""
+    """Read all CiA 301 objects of a node without an EDS."""
     progress("objects of CiA 301")
     for index in SINGLE:
         yield from _standard(remote, index)
@@ -222,7 +228,7 @@ def dump_standard(remote: RemoteOd, progress: Callable[[str], None] = lambda _: 
 
 
 def _standard(remote: RemoteOd, index: int) -> Iterator[Reading]:
-    """Read the values of an object; yield nothing if the node lacks the object."""
+    """Read all values of an object; yield nothing if the node does not have the object."""
     try:
         count = remote.read_bytes(index, 0)
     except SdoAbort as abort:
@@ -231,7 +237,7 @@ def _standard(remote: RemoteOd, index: int) -> Iterator[Reading]:
         count = b""
     for entry in standard_entries(index, count[0] if count and has_subindices(index) else 0):
         reading = read_entry(remote, entry)
-        if reading.refused_code != AbortCode.NO_SUBINDEX:  # an object may omit sub-indices
+        if reading.refused_code != AbortCode.NO_SUBINDEX:  # sub-indices need not be contiguous
             yield reading
 
 
@@ -247,16 +253,17 @@ def dump(remote: RemoteOd, eds: Eds, progress: Callable[[str], None] = lambda _:
 def compare(
     remote: RemoteOd, eds: Eds, node_id: int, progress: Callable[[str], None] = lambda _: None
 ) -> list[Difference]:
-    """Compare a node with a file.
+    """Compare the values on a node with the values in an EDS or DCF.
 
     Args:
         remote: The node.
-        eds: The file. Its readable values are compared, except objects that contain the node's state.
-        node_id: Replaces $NODEID.
-        progress: Called repeatedly with a description of the progress.
+        eds: The file. All readable objects with a value are compared, except :data:`NOT_CONFIGURATION` and
+            commands.
+        node_id: Value of $NODEID in the file.
+        progress: Called with the current position.
 
     Returns:
-        The values that differ.
+        The objects whose values differ.
     """
     found: list[Difference] = []
     given = [
@@ -283,19 +290,19 @@ def compare(
 
 
 def _same(entry: EdsEntry, data: bytes, wanted: bytes) -> bool:
-    """Return whether the node's value equals the value in the file.
+    """Return whether the value on the node equals the value in the file.
 
-    Ignores trailing zeros of a string unless the file specifies its bytes, because an EDS default cannot
-    express trailing zeros.
+    Trailing NULs of a string are ignored, because the default of an EDS cannot express them. They count if
+    the file gives the value byte by byte.
     """
     spelt_out = entry.data_type != _TEXT or entry.given is not None
     return data == wanted or (not spelt_out and data.rstrip(b"\0") == wanted)
 
 
 def _distinct(got: Reading, expected: Reading) -> tuple[str, str]:
-    """Format two different values so that their texts differ.
+    """Format two different values for display.
 
-    If the plain texts are equal, the bytes from the first difference onwards are appended.
+    If both would be displayed alike, the bytes from the first difference onwards are appended.
     """
     if got.data is None or expected.data is None or got.text != expected.text:
         return got.text, expected.text

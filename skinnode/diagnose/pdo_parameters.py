@@ -25,9 +25,9 @@ _KINDS: Final = {
 
 @dataclass(frozen=True, slots=True)
 class Pdo:
-    """Parameters of one PDO, with times in the units of CiA 301.
+    """Communication and mapping parameters of a PDO.
 
-    A value is None if the node lacks its sub-index.
+    Times are in the units of CiA 301. None stands for a sub-index that the node does not have.
     """
 
     direction: Direction
@@ -41,7 +41,7 @@ class Pdo:
     event_timer_ms: int | None
     sync_start: int | None
     mapped: tuple[int, ...]
-    """Mapping entries, each made up of index, sub-index and length in bits."""
+    """Mapping entries: index (16 bits), sub-index (8 bits) and length in bits (8 bits)."""
 
     @property
     def bits(self) -> int:
@@ -55,7 +55,7 @@ def read_pdos(remote: RemoteOd) -> tuple[Pdo, ...]:
 
 
 def read_pdo(remote: RemoteOd, direction: Direction, number: int) -> Pdo | None:
-    """Read the parameters of one PDO; None if the node does not have the PDO."""
+    """Read the parameters of one PDO; None if the node does not have it."""
     first = od.TPDO1_PARAMETER if direction == "TPDO" else od.RPDO1_PARAMETER
     index = first + number - 1
     cob_id = _optional(remote, index, od.PDO_COB_ID, "u32")
@@ -95,7 +95,7 @@ def _optional(remote: RemoteOd, index: int, subindex: int, kind: str) -> int | N
 
 
 def kind_text(pdo: Pdo) -> str:
-    """Describe in words when a TPDO is sent, or when the data of an RPDO is used."""
+    """Return in words when a TPDO is sent, or when the data of an RPDO take effect."""
     if 1 <= pdo.kind <= 240:
         every = "every SYNC" if pdo.kind == 1 else f"every {pdo.kind} SYNCs"
         return every if pdo.direction == "TPDO" or pdo.kind == 1 else "at the next SYNC"
@@ -105,7 +105,7 @@ def kind_text(pdo: Pdo) -> str:
 
 
 def pdo_text(pdo: Pdo, name_of: Callable[[int, int], str]) -> str:
-    """Return the PDO as one line of text; ``name_of`` returns the name of an object."""
+    """Describe a PDO in one line; ``name_of`` returns the name of an object by index and sub-index."""
     name = f"{pdo.direction}{pdo.number}"
     if not pdo.enabled:
         return f"{name} off"
@@ -123,7 +123,7 @@ def pdo_text(pdo: Pdo, name_of: Callable[[int, int], str]) -> str:
 
 
 def _shortened(names: list[str]) -> str:
-    """Merge consecutive names that differ only in their number."""
+    """Join names, merging successive names that differ only in their number."""
     shown: list[str] = []
     for name in names:
         stem, _, number = name.rpartition(" ")

@@ -1,9 +1,10 @@
-"""Groups findings by root cause: a finding that follows from another is listed below it.
+"""Groups findings by root cause.
 
-For example, an overloaded bus causes torn scans, skipped scans and emergencies at every patch on it. All
-these findings are true, but only the overload needs to be corrected. A rule names a cause and its possible
-consequences, at the same patch or at every patch on a bus. If a finding's text is ambiguous, the rule also
-tests its evidence: emergencies follow from an overload only if each of their texts reports an overrun.
+For example, an overloaded bus causes torn scans, missing scans and emergency messages at every patch on it.
+All these findings are true, but only the overload needs to be corrected. A rule therefore names a cause and
+the findings that it can explain, either at the same patch or, for a cause that concerns the whole bus, at all
+of its patches. Where the text of a finding is not specific enough, the rule also tests the evidence: an
+overload explains emergency messages only if all of them report an overrun.
 """
 
 from __future__ import annotations
@@ -21,26 +22,26 @@ _RANK: Final = {sure: rank for rank, sure in enumerate(Sure)}
 
 @dataclass(frozen=True, slots=True)
 class Group:
-    """A finding that no other finding causes, and its consequences."""
+    """A root cause and its consequences."""
 
     cause: Finding
     consequences: tuple[Finding, ...] = ()
 
     @property
     def rank(self) -> int:
-        """Certainty rank of the group's most certain finding; 0 means certain."""
+        """Rank of the most certain finding in the group; 0 means certain."""
         return min(_RANK[finding.sure] for finding in (self.cause, *self.consequences))
 
 
 @dataclass(frozen=True, slots=True)
 class Rule:
-    """A cause and its consequences, as patterns matched at the beginning of a finding's text."""
+    """A cause and its possible consequences, as regular expressions for the start of a finding's text."""
 
     cause: str
     follow: tuple[str, ...]
     evidence: Mapping[str, str]
-    """Evidence pattern for each pattern in ``follow``; a finding is a consequence only if every part of its
-    evidence matches."""
+    """Regular expressions for the evidence, by pattern in ``follow``. A finding is a consequence only if
+    every part of its evidence matches; parts are separated by semicolons."""
 
 
 _HOLES: Final = ("incomplete scans", "whole scans are missing")
@@ -56,7 +57,7 @@ _CONFIGURED_BY_OTHERS: Final = (
     "the patch scans on its own timer",
 )
 _UNEXPLAINED: Final = "^error register 0x|^last: none reported$"
-"""Pattern for the evidence of a finding that reports an error without its cause."""
+"""Pattern for evidence that reports an error without saying what caused it."""
 _OVERRUN: Final = dict.fromkeys(_ERRORS, f"overrun|{_UNEXPLAINED}")
 _WIRE: Final = dict.fromkeys(_ERRORS, f"wire open or shorted|overrun|{_UNEXPLAINED}")
 _RESTARTED: Final = dict.fromkeys(_ERRORS, f"SYNC of unexpected length|heartbeat|overrun|{_UNEXPLAINED}")
@@ -64,8 +65,8 @@ _COLLISION: Final = dict.fromkeys(_ERRORS, f"collision|{_UNEXPLAINED}")
 _CONTROLLER: Final = dict.fromkeys(_ERRORS, f"passive|bus-off|{_UNEXPLAINED}")
 _ANYTHING: Final[Mapping[str, str]] = {}
 
-# The first rule that matches a finding applies. Rules about a patch precede rules about its bus. If the cause
-# of one rule may be a consequence of another rule's cause, the other rule comes first.
+# The first matching rule applies. Rules about a patch come before rules about a bus. A rule whose cause can
+# explain the cause of another rule comes before that rule.
 RULES: Final = (
     Rule(
         "two nodes have the patch's node-ID",
@@ -158,19 +159,16 @@ RULES: Final = (
 
 
 def grouped(buses: Sequence[BusFacts]) -> list[Group]:
-    """Return all findings about these buses, grouped by root cause.
+    """Run all checks on the facts and group the findings by root cause.
 
-    Groups are sorted by their most certain finding, then by their number of consequences.
+    Groups are sorted by the certainty of their most certain finding, then by the number of consequences.
     """
     groups = [group for facts in buses for group in _of_bus(facts.name, run_checks(facts))]
     return sorted(groups, key=lambda group: (group.rank, -len(group.consequences)))
 
 
 def merged(findings: Sequence[Finding]) -> list[tuple[Finding, tuple[str, ...]]]:
-    """Return each distinct finding once, with all places where it occurred.
-
-    For example, an overload affects every patch on a bus.
-    """
+    """Merge findings with the same text, and list the places where each occurred."""
     places: dict[str, list[Finding]] = {}
     for finding in findings:
         places.setdefault(finding.what, []).append(finding)
@@ -178,7 +176,7 @@ def merged(findings: Sequence[Finding]) -> list[tuple[Finding, tuple[str, ...]]]
 
 
 def _of_bus(bus: str, findings: list[Finding]) -> list[Group]:
-    """Assign each finding to its cause by the first matching rule, and group all findings by root cause."""
+    """Group the findings about one bus by root cause."""
     cause_of: dict[int, int] = {}
     for rule in RULES:
         for at, cause in enumerate(findings):

@@ -1,4 +1,4 @@
-"""Assembles scans as the host does, without solving them."""
+"""Assembles the scans of patches as the host does, and records SYNCs. Nothing is solved."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ _LONGEST_NS: Final = 10_000_000_000
 class ScanCapture:
     """Assembles the scans of several patches and records every SYNC.
 
-    :meth:`on_frames` runs on the receiving thread of a link; read the results only after that thread has
+    The receiving thread of a bus link calls :meth:`on_frames`. Call :meth:`facts` only after that thread has
     stopped.
     """
 
     def __init__(self) -> None:
         self.syncs: deque[tuple[int, int]] = deque(maxlen=_MOST_SYNCS)
-        """Time (ns) and counter of each SYNC; 0 for a SYNC without a counter."""
+        """Time (monotonic clock, ns) and counter of each SYNC; the counter is 0 for a SYNC without data."""
         self._patches: dict[int, _Patch] = {}
         self._takers: dict[int, tuple[_Patch, bool]] = {}
 
@@ -42,8 +42,8 @@ class ScanCapture:
 
         Args:
             node_id: The node.
-            profile: Sizes of the patch.
-            overflow: Overflow value of the SYNC counter.
+            profile: Numbers of wires and other sizes of the patch.
+            overflow: Overflow value of the SYNC counter; 0 if SYNC has no counter.
             period_s: SYNC period, s.
         """
         assembler = ScanAssembler(
@@ -54,7 +54,7 @@ class ScanCapture:
         self._takers = {**takers, od.summary_cob_id(node_id): (patch, False)}
 
     def scans(self, node_id: int) -> int:
-        """Return the number of scans captured from a patch."""
+        """Return the number of captured scans of a patch."""
         return len(self._patches[node_id].scans)
 
     def on_frames(self, frames: Sequence[Frame]) -> None:
@@ -66,7 +66,7 @@ class ScanCapture:
                 self.note_sync(frame.t_ns, frame.data[0] if frame.data else 0)
             elif (taker := self._takers.get(frame.can_id)) is not None:
                 patch, chunk = taker
-                if not patch.begun:  # the first scan may have begun before the capture
+                if not patch.begun:  # wait for a summary: the current scan may have begun earlier
                     patch.begun = not chunk
                     continue
                 take = patch.assembler.on_chunk if chunk else patch.assembler.on_summary
@@ -79,12 +79,12 @@ class ScanCapture:
         self.syncs.append((t_ns, counter))
 
     def facts(self, node_id: int, scale: CodeScale, stated_noise: float) -> ScanFacts | None:
-        """Return the scans captured from a patch; None if no scan was captured.
+        """Return the captured scans of a patch; None if there are none.
 
         Args:
             node_id: The node.
             scale: Scale of the patch's codes.
-            stated_noise: Relative noise of the patch's converter, from the hand file.
+            stated_noise: Relative noise of the patch's converter, according to the hand file.
         """
         patch = self._patches[node_id]
         patch.keep(patch.assembler.poll(time.monotonic_ns()), self._sync_ns)
@@ -114,11 +114,11 @@ class ScanCapture:
         )
 
     def _sync_ns(self, scan: Scan) -> int | None:
-        """Return the time of the last SYNC before ``scan`` whose counter equals the scan's.
+        """Return the time of the SYNC that started a scan, ns; None if it was not received.
 
-        A SYNC without a counter always matches.
+        This is the last SYNC before the first frame of the scan that has the scan's counter or no counter.
         """
-        for t_ns, number in reversed(list(self.syncs)):  # another thread may append
+        for t_ns, number in reversed(list(self.syncs)):  # copied, because another thread may append
             if scan.t_first_ns - t_ns > _LONGEST_NS:
                 return None
             if t_ns <= scan.t_first_ns and number in (scan.counter, 0):
@@ -127,9 +127,9 @@ class ScanCapture:
 
 
 def _conversions(scans: Sequence[Scan]) -> tuple[int | None, int]:
-    """Return the number of scans with a new conversion and the number with a repeated conversion.
+    """Return the numbers of scans with and without a new conversion since the previous scan.
 
-    Returns None and 0 if the scans contain no conversion phase.
+    Returns None and 0 if the patch does not count its conversions.
     """
     pairs = [
         (before.phase, scan.phase)

@@ -1,6 +1,6 @@
-"""Defines the names and types of CiA 301 v4.2 objects (7.5.2), used to describe a device without an EDS.
+"""Names and data types of the CiA 301 objects (v4.2, 7.5.2), for devices without an EDS.
 
-Sub-index 0 of an array or record contains its number of entries, which is read from the device.
+The number of entries of an array or record is read from sub-index 0 on the device.
 """
 
 from __future__ import annotations
@@ -12,18 +12,18 @@ from skinnode.conformance.eds_reader import EdsEntry
 
 _U8, _U16, _U32, _STRING, _DOMAIN = 0x05, 0x06, 0x07, 0x09, 0x0F
 _GROUPS: Final = {1: "all", 2: "communication", 3: "application"}
-"""Parameter groups by sub-index of 0x1010 and 0x1011; higher sub-indices are manufacturer-specific."""
+"""Parameter groups of 0x1010 and 0x1011, by sub-index; higher sub-indices are manufacturer-specific."""
 
 
 class _Object(NamedTuple):
-    """One object, or a range of objects with the same structure."""
+    """Description of an object, or of several objects with the same structure."""
 
     name: str
     data_type: int
     access: str
     array: bool = False
     subs: tuple[tuple[str, int], ...] = ()
-    """Name and data type of each sub-index of a record, starting at sub-index 1."""
+    """Name and data type of the sub-indices of a record, from sub-index 1."""
 
 
 _SDO: Final = (
@@ -86,13 +86,13 @@ _MANY: Final = (
     (range(0x1A00, 0x1C00), _Object("TPDO mapping parameter", _U32, "rw", array=True)),
 )
 SINGLE: Final = tuple(_ONE)
-"""Indices of objects that occur once."""
+"""Indices of the objects that a device has at most once."""
 SERIES: Final = tuple(indices for indices, _ in _MANY)
-"""Index ranges of objects that may occur several times, numbered consecutively from the first index."""
+"""Index ranges of the objects that a device may have several times. A device uses the first indices."""
 
 
 def standard_entry(index: int, subindex: int) -> EdsEntry | None:
-    """Return the entry as CiA 301 defines it; None if CiA 301 has no such object or sub-index."""
+    """Return the CiA 301 description of a value; None if CiA 301 does not define it."""
     item = _find(index)
     if item is None:
         return None
@@ -113,11 +113,11 @@ def standard_entry(index: int, subindex: int) -> EdsEntry | None:
 
 
 def standard_entries(index: int, count: int) -> Iterator[EdsEntry]:
-    """Yield all entries of an object.
+    """Yield the CiA 301 descriptions of all values of an object.
 
     Args:
         index: Index.
-        count: Value of its sub-index 0; ignored for an object without sub-indices.
+        count: Number of entries according to sub-index 0; ignored for an object without sub-indices.
     """
     item = _find(index)
     if item is None:

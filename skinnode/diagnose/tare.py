@@ -1,9 +1,9 @@
 """Tares patches by SDO, even while a host is running on the bus.
 
-The node responds to the write to 0x2021:4 only after the measurement, so the response confirms the tare. The
-summary of the next scan reports that the baseline changed, and a running host then reads the baseline. An SDO
-server handles one transfer at a time, so a request from this program would abort the host's upload. The
-baseline is therefore read back only when the node's SDO channel is idle.
+A write to 0x2021:4 starts the tare. The node responds only after the measurement, so the response confirms
+the tare. The summary of the next scan reports the change, and a running host then uploads the new baseline.
+An SDO server handles one transfer at a time: a request from this program would abort the host's upload. This
+program therefore reads the baseline back only when the node's SDO channel is idle.
 """
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ from skinnode.model.layout import Float
 from skinnode.protocol.profile import PatchProfile
 
 QUIET_S: Final = 0.3
-"""Time (s) without SDO frames, after which no other client can have a transfer in progress."""
+"""Time without SDO frames after which an SDO channel is considered idle, s."""
 
 HOST_BEGINS_S: Final = 1.0
-"""Maximum time (s) from the tare to the host's first SDO request, in addition to a SYNC period. An idle host
-needs 0.3 s."""
+"""Maximum time from the tare to the first SDO request of a running host, s, in addition to one SYNC period. A
+host on an idle machine needs 0.3 s."""
 
 OTHERS_S: Final = 4.0
-"""Maximum wait for other SDO clients to finish, s."""
+"""Maximum wait for the SDO transfers of other clients to end, s."""
 
 _ATTEMPTS: Final = 3
 _POLL_S: Final = 0.02
@@ -45,7 +45,7 @@ class Tared:
     """Result of taring one patch."""
 
     patch: str
-    """Name of the patch; empty if no hand file names it."""
+    """Name of the patch; empty if there is no hand file."""
     node_id: int
     bus: str
     problem: str
@@ -53,7 +53,7 @@ class Tared:
     crossings: int = 0
     """Number of crossings with a new R0."""
     median_ohm: float | None = None
-    """Median R0 after the tare, in ohm."""
+    """Median of the new R0, ohm."""
     median_change: float | None = None
     """Median of (new R0 / old R0) − 1; None if there was no old R0."""
 
@@ -64,7 +64,7 @@ class Tared:
 
 
 def refusal(patch: PatchConfig, bus: BusConfig) -> str:
-    """Return why the hand file forbids taring this patch; empty if taring is allowed."""
+    """Return the reason why the hand file rules out taring this patch; empty if there is none."""
     if patch.baseline is not None:
         return f"a host would overwrite the new baseline with {patch.baseline}"
     if bus.role == "guest" and bus.guest_sends == "nothing":
@@ -85,12 +85,12 @@ def tare(
     Args:
         connection: The bus.
         node_id: The node.
-        patch: Name of the patch; empty if no hand file names it.
-        sync_period_s: SYNC period of a host that may be running, s.
+        patch: Name of the patch; empty if there is no hand file.
+        sync_period_s: SYNC period of the hand, s.
         progress: Called with a description of each step.
 
     Returns:
-        The result, even if the node does not answer or refuses.
+        The result, which also reports a node that does not answer or refuses.
 
     Raises:
         BusError: The bus failed.
@@ -137,16 +137,16 @@ def _tare(
 
 
 def _runs(connection: BusConnection, node_id: int) -> bool:
-    """Return whether a host has started the node, as indicated by chunks or operational heartbeats."""
+    """Return whether the node has been started: it sends chunks, or its heartbeat reports OPERATIONAL."""
     beat = connection.listener.newest_beat(node_id)
     operational = beat is not None and beat.state == NmtState.OPERATIONAL
     return operational or connection.listener.cob_ids[od.chunk_cob_id(node_id)] > 0
 
 
 def _baseline(connection: BusConnection, remote: RemoteOd, profile: PatchProfile) -> Float:
-    """Read the (U, K) baseline R0 in ohm; repeat the upload if another client interrupts it.
+    """Read the (U, K) baseline R0, ohm. An upload that another client interrupts is repeated.
 
-    Raises NodeError if the upload fails or has the wrong size.
+    Raises NodeError if all attempts fail, or if the data have the wrong size.
     """
     for attempt in range(1, _ATTEMPTS + 1):
         try:
@@ -164,9 +164,9 @@ def _baseline(connection: BusConnection, remote: RemoteOd, profile: PatchProfile
 
 
 def _let_others_finish(connection: BusConnection, node_id: int, *, at_least_s: float) -> None:
-    """Wait until the node's SDO channel has been idle for QUIET_S, but at most OTHERS_S.
+    """Wait until the node's SDO channel has been idle for QUIET_S, but no longer than OTHERS_S.
 
-    Waits at least ``at_least_s`` unless another client begins a transfer.
+    Unless another client begins a transfer, the wait takes at least ``at_least_s``.
     """
     begun_s = quiet_s = time.monotonic()
     request, response = od.sdo_request_cob_id(node_id), od.sdo_response_cob_id(node_id)

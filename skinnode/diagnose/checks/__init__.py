@@ -1,4 +1,4 @@
-"""The doctor's checks: pure functions that derive findings from facts, one file per area.
+"""Checks of the doctor: pure functions that derive findings from the facts about a bus.
 
-The checks do not access a bus. ``run`` calls all checks.
+Each module contains the checks of one area; ``run`` calls all of them.
 """

@@ -1,4 +1,4 @@
-"""Doctor checks of a bus: interface, controller, load, masters and unknown frames."""
+"""Doctor checks of a bus: interface, controller, load, masters and frames of unknown origin."""
 
 from __future__ import annotations
 
@@ -15,18 +15,19 @@ from skinnode.text.words import counted
 
 _SYNCS: Final = 10
 _ASTRAY: Final = 0.25
-"""Maximum fraction of SYNC counters that are not the successor of the previous counter.
+"""Fraction of SYNC counters out of sequence above which a second SYNC producer is reported.
 
-With two SYNC producers, the fraction is about one half; with lost SYNCs, it is much smaller.
+With two producers, about half of the counters do not follow the previous one. Lost SYNCs cause far fewer.
 """
 
 _BEATS: Final = 4
 _TOO_OFTEN: Final = 0.7
-"""Minimum heartbeat period as a fraction of the configured period; a second sender would halve the period."""
+"""Ratio of the measured to the configured heartbeat period below which a second sender is reported. A second
+sender halves the measured period."""
 
 
 def check_bus(bus: BusFacts) -> Iterator[Finding]:
-    """Check the interface, its controller, the load, unknown frames, and nodes without a node-ID."""
+    """Check the interface, its controller, the load, the origin of frames, and nodes without a node-ID."""
 
     def found(what: str, sure: Sure, evidence: str, advice: str) -> Finding:
         return Finding("bus", bus.name, what, sure, evidence, advice)
@@ -92,7 +93,7 @@ def check_bus(bus: BusFacts) -> Iterator[Finding]:
 
 
 def check_masters(bus: BusFacts) -> Iterator[Finding]:
-    """Check that each message reserved for a master has only one sender."""
+    """Check that only one master sends SYNC, the master's heartbeat and NMT commands."""
 
     def found(what: str, sure: Sure, evidence: str, advice: str) -> Finding:
         return Finding("bus", bus.name, what, sure, evidence, advice)

@@ -1,4 +1,4 @@
-"""Doctor checks of the nodes' configuration: sizes, layout, EDS, PDOs, inhibit time and heartbeat."""
+"""Doctor checks of the nodes' configuration: EDS, layout, PDOs, inhibit time and heartbeat."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from skinnode.protocol.profile import PatchProfile
 
 
 def check_configuration(bus: BusFacts) -> Iterator[Finding]:
-    """Check the sizes, layout, EDS, PDOs, inhibit time and heartbeat of each patch."""
+    """Check the EDS, layout, PDOs, inhibit time and heartbeat of each patch."""
     for patch in bus.patches:
         if patch.info is None or patch.info.patch is None:
             continue
@@ -57,7 +57,7 @@ def _check_layout(patch: PatchFacts) -> Iterator[Finding]:
 
 
 def _check_pdos(bus: BusFacts, patch: PatchFacts) -> Iterator[Finding]:
-    """Compare the PDOs with the host's settings. A value that the host will overwrite is not a fault."""
+    """Compare PDOs and heartbeat with the host's settings, except values that the host will overwrite."""
     info = patch.info
     assert info is not None
     if info.patch is None or patch.found is None:

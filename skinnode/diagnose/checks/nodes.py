@@ -13,7 +13,7 @@ from skinnode.text.words import counted, known
 
 
 def check_nodes(bus: BusFacts) -> Iterator[Finding]:
-    """Check that each node is present, is the expected device, is running and reports no error."""
+    """Check that every node answers, is the expected device, is running and reports no error."""
     if bus.failure:
         return
     if bus.patches and all(patch.found is None for patch in bus.patches):

@@ -1,4 +1,4 @@
-"""Runs all checks of the doctor on the facts about a bus."""
+"""Runs all doctor checks on the facts about a bus."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _SURENESS: Final = {sure: rank for rank, sure in enumerate(Sure)}
 
 
 def run_checks(facts: BusFacts) -> list[Finding]:
-    """Return all findings about a bus; each check's findings are sorted by certainty."""
+    """Return all findings about a bus, in the order of the checks and then by certainty."""
     checks: tuple[Callable[[BusFacts], Iterator[Finding]], ...] = (
         bus.check_bus,
         bus.check_masters,
@@ -36,9 +36,9 @@ def run_checks(facts: BusFacts) -> list[Finding]:
 
 
 def others(facts: BusFacts) -> list[str]:
-    """Return one line for each device that is neither a patch nor in the hand file.
+    """Describe each device that is neither a patch nor in the hand file in one line.
 
-    The lines identify the devices; they do not report faults.
+    Such a device is not a fault.
     """
     lines = []
     for node in facts.strangers:
@@ -58,7 +58,7 @@ def others(facts: BusFacts) -> list[str]:
 
 
 def not_judged(facts: BusFacts) -> list[str]:
-    """Return one line for each check that could not be performed, with the reason."""
+    """Return one line for each check that could not be made, with the reason."""
     if facts.failure:
         return [f"{facts.name}: all checks except the interface check"]
     lines = []

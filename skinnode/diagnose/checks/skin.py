@@ -1,6 +1,6 @@
-"""Doctor checks of the skin, based on captured scans: wires, noise, frozen values, jumps, baseline.
+"""Doctor checks of the skin: faulty wires, noise, jumps, frozen values and baseline.
 
-A finding is not reported if a touch can explain it.
+The checks evaluate captured scans. Anything that a touch can explain is not reported.
 """
 
 from __future__ import annotations
@@ -17,21 +17,22 @@ from skinnode.protocol.device_time import TIME_WRAP_US
 from skinnode.text.words import counted
 
 NOISY: Final = 5.0
-"""Minimum ratio of a noisy crossing's noise to the stated noise.
+"""Ratio of measured to stated noise above which a crossing is reported as noisy.
 
-Over 20 scans, a crossing with the stated noise practically never reaches this ratio.
+The noise measured over 20 scans practically never exceeds this ratio by chance.
 """
 
 _DRIFT: Final = 0.003
-"""Minimum deviation |R/R0 − 1| at rest that justifies a tare.
+"""Deviation |R/R0 − 1| at rest above which a tare is advised.
 
-A good converter's noise is a hundredth of this value; a press changes R/R0 a hundred times as much.
+The noise of a good converter is a hundredth of this value, and a press changes R/R0 by a hundred times this
+value.
 """
 
 _MANY: Final = 0.8
 _FEW: Final = 0.1
 _SHARE: Final = 0.7
-"""Minimum fraction of noisy crossings on a noisy wire; its other crossings may be quiet by chance."""
+"""Fraction of a wire's crossings that must be noisy for the wire to be reported as noisy."""
 
 
 def _judged(bus: BusFacts) -> Iterator[tuple[PatchFacts, ScanFacts, NoiseAnalysis]]:
@@ -41,7 +42,7 @@ def _judged(bus: BusFacts) -> Iterator[tuple[PatchFacts, ScanFacts, NoiseAnalysi
 
 
 def check_wires(bus: BusFacts) -> Iterator[Finding]:
-    """Check each node's fault masks and codes for open, shorted and out-of-range wires and crossings."""
+    """Check for wires and crossings that are open, shorted or out of range."""
     for patch in bus.patches:
         own = patch.info.patch if patch.info is not None else None
         upper: set[int] = set()
@@ -64,8 +65,8 @@ def check_wires(bus: BusFacts) -> Iterator[Finding]:
 def _check_crossings(
     patch: PatchFacts, scans: ScanFacts, upper: set[int], lower: set[int]
 ) -> Iterator[Finding]:
-    """Check the crossings that are not on an entirely faulty wire."""
-    whole = max(1, int(scans.complete.sum()))  # a torn scan lacks the values of some crossings
+    """Check all crossings except those on wires that the node reports as faulty."""
+    whole = max(1, int(scans.complete.sum()))  # in a torn scan, some crossings have no code
     rest = np.ones(scans.n_open.shape, dtype=np.bool_)
     rest[sorted(upper), :] = False
     rest[:, sorted(lower)] = False
@@ -115,7 +116,7 @@ def _check_crossings(
 
 
 def check_noise(bus: BusFacts) -> Iterator[Finding]:
-    """Check for noise above the stated level, for jumps, and for values that do not change."""
+    """Check for frozen values, for more noise than stated, and for jumps."""
     for patch, scans, analysis in _judged(bus):
         yield from _check_frozen(patch, scans)
         yield from _check_noise(patch, scans, analysis)
@@ -177,13 +178,13 @@ def _check_noise(patch: PatchFacts, scans: ScanFacts, analysis: NoiseAnalysis) -
 
 
 def _stands_out(levels: Float, wire: int) -> bool:
-    """Return whether a wire is noisier than its neighbours; a touch would affect adjacent wires equally."""
+    """Return whether a wire is much noisier than its neighbours, which a touch would also affect."""
     neighbours = [levels[i] for i in (wire - 1, wire + 1) if 0 <= i < len(levels)]
     return bool(neighbours) and bool(levels[wire] > NOISY * max(1.0, *neighbours))
 
 
 def _check_frozen(patch: PatchFacts, scans: ScanFacts) -> Iterator[Finding]:
-    device = scans.device_us[scans.device_us >= 0] % TIME_WRAP_US  # upper bits: host clock
+    device = scans.device_us[scans.device_us >= 0] % TIME_WRAP_US  # the host added the bits above
     if len(device) >= LEAST_SCANS and len(np.unique(device)) == 1:
         yield Finding(
             "wires",
@@ -216,9 +217,9 @@ def _check_frozen(patch: PatchFacts, scans: ScanFacts) -> Iterator[Finding]:
 
 
 def may_be_frozen(scans: ScanFacts) -> bool:
-    """Return whether all codes are constant but the stated noise is too small to prove a defect.
+    """Return whether no code changed, but the stated noise is too small for this to prove a fault.
 
-    Returns False for a patch that counts its conversions, because the count is conclusive.
+    False if the patch counts its conversions, because the count shows whether the converter is running.
     """
     if scans.conversions is not None:
         return False
@@ -227,18 +228,18 @@ def may_be_frozen(scans: ScanFacts) -> bool:
 
 
 def _shows(scans: ScanFacts) -> bool:
-    """Return whether the stated noise is large enough to change every code within a few scans."""
+    """Return whether the stated noise exceeds one code; every code should then change within a few scans."""
     return scans.stated_noise > scans.step
 
 
 def _still(scans: ScanFacts) -> tuple[Mask, Mask]:
-    """Return two masks: crossings measured in every scan, and the subset whose values never changed."""
+    """Return masks of the crossings with a value in every scan, and of those whose value never changed."""
     known = np.asarray(np.isfinite(scans.ratio).all(axis=0))
     return known, known & (np.ptp(np.where(known, scans.ratio, 0.0), axis=0) == 0.0)
 
 
 def check_baseline(bus: BusFacts) -> Iterator[Finding]:
-    """Check whether the baseline is missing or no longer matches the skin at rest."""
+    """Check that there is a baseline and that it matches the skin at rest."""
     for patch in bus.patches:
         own = patch.info.patch if patch.info is not None else None
         if own is not None and own.baseline_missing:
@@ -280,7 +281,7 @@ def check_baseline(bus: BusFacts) -> Iterator[Finding]:
 
 
 def is_touched(scans: ScanFacts) -> bool:
-    """Return whether something touched the skin, which makes some of the checks impossible."""
+    """Return whether something touched the skin during the scans; some checks are then skipped."""
     return scans.scans >= LEAST_SCANS and analyse_noise(scans).is_touched
 
 
@@ -297,6 +298,6 @@ def _listed(wires: tuple[int, ...]) -> str:
 
 
 def _places(mask: Mask) -> str:
-    """Return up to six crossings of a mask as text (upper/lower wire numbers)."""
+    """Return the first six crossings of a mask as text, such as ``3/12`` (upper/lower wire)."""
     places = [f"{row}/{column}" for row, column in np.argwhere(mask)[:6]]
     return ", ".join(places) + (" …" if mask.sum() > 6 else "")

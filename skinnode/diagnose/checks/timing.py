@@ -1,4 +1,4 @@
-"""Doctor checks of timing and losses: SYNC, delay of scans after SYNC, lost frames."""
+"""Doctor checks of SYNC, of the duration of scans, and of lost frames."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from skinnode.diagnose.facts import BusFacts, Finding, Sure
 from skinnode.text.words import counted
 
 _JITTER: Final = 0.1
-"""Maximum SYNC jitter as a fraction of the period."""
+"""SYNC jitter above which SYNC is reported as irregular, as a fraction of the period."""
 
 _PERIOD_ERROR: Final = 0.02
 _LATE: Final = 0.95
-"""Maximum time from SYNC to the end of a scan, as a fraction of the period."""
+"""Time from SYNC to the end of a scan above which scans are reported as late, as a fraction of the period."""
 
 
 def check_timing(bus: BusFacts) -> Iterator[Finding]:
-    """Check SYNC and the delay from SYNC to the end of each scan."""
+    """Check SYNC, and that scans end before the next SYNC."""
 
     def found(where: str, what: str, sure: Sure, evidence: str, advice: str) -> Finding:
         return Finding("timing", where, what, sure, evidence, advice)
@@ -53,7 +53,7 @@ def check_timing(bus: BusFacts) -> Iterator[Finding]:
 
 
 def _check_sync(bus: BusFacts) -> Iterator[Finding]:
-    """Check the period, losses and jitter of SYNC."""
+    """Check SYNC for a wrong period, missing frames and jitter."""
 
     def found(where: str, what: str, sure: Sure, evidence: str, advice: str) -> Finding:
         return Finding("timing", where, what, sure, evidence, advice)
@@ -92,7 +92,7 @@ def _check_sync(bus: BusFacts) -> Iterator[Finding]:
 
 
 def check_losses(bus: BusFacts) -> Iterator[Finding]:
-    """Check whether frames were lost in this machine, on the bus or at a node."""
+    """Check for frames lost by this machine, on the bus or by a node, and for frames of another sender."""
 
     def found(where: str, what: str, sure: Sure, evidence: str, advice: str) -> Finding:
         return Finding("losses", where, what, sure, evidence, advice)

@@ -1,21 +1,25 @@
-"""Estimate of the ratio of a stream's actual noise to its stated noise, computed from the readings alone.
+"""Estimate of the noise factor: the ratio of a stream's actual noise to its stated noise.
 
-The estimator groups frames into blocks of four. The four resistances of each crossing yield two contrasts,
-which are not affected by the mean or a linear trend of the resistance. If the noise of the four frames is
-independent, the contrasts are independent and have the same variance:
+The estimator uses only the readings, in blocks of four frames. The four resistances of a crossing yield two
+contrasts, in which a constant and a linear trend cancel. If the noise is independent from frame to frame, the
+contrasts are independent, and each has the variance of the noise:
 
 quadratic  (r₀ − r₁ − r₂ + r₃) / 2
 cubic      (r₀ − 3 r₁ + 3 r₂ − r₃) / √20
 
-A block is rejected if its contrasts show that the skin moved. Slow motion makes the quadratic contrast larger
-than the cubic contrast; a step or a lost scan also makes them unequal. In addition, motion shifts the
-readings of neighbouring crossings in the same direction, whereas noise does not. A robust mean over the
-readings (Huber, Robust Statistics, 1981, proposal 2) limits the effect of a few bad readings, or of a touch
-on a few wires, on the estimate of a block. The median over the last blocks limits the effect of a bad block.
+A block is rejected if the skin moved. Two tests detect motion:
 
-Readings that repeat exactly are not used, because they do not show whether the converter has little noise or
-is frozen. If the rounding error is known, the ratio applies only to the noise before the converter. If many
-codes repeat and the others change by only one code, the noise is at most half a code; the estimator then
+- Slow motion, a step or a lost scan makes the variances of the two contrasts unequal. Slow motion makes the
+  quadratic contrast the larger one.
+- Motion gives the contrasts of neighbouring crossings the same sign. The signs of noise are independent.
+
+The variance of a block is a robust mean over its readings (Huber, Robust Statistics, 1981, proposal 2), which
+limits the influence of bad readings and of a touch on a few wires. The estimate is the median over the last
+blocks, which limits the influence of a single block.
+
+Readings that repeat exactly are left out, because they do not tell a quiet converter from a frozen one. If
+the quantization error is known, the factor applies only to the noise before the converter. If many
+codes repeat and the others change by only one code, the noise is at most half a code, and the estimator
 assumes half a code.
 """
 
@@ -31,69 +35,78 @@ from skinnode.compiled.jit import njit, njit_part
 from skinnode.model.layout import Float
 
 BLOCK: Final = 4
-"""Number of frames in a block, the minimum for two contrasts."""
+"""Number of frames in a block; two contrasts require four frames."""
 WINDOW: Final = 11
 """Maximum number of blocks in the estimate (44 frames).
 
-The number of blocks is odd, so that the median is the noise of a single block. For an even number, the median
-would be the mean of two blocks.
+With an odd number, the median is the value of one block.
 """
 LEAST_BLOCKS: Final = 5
 """Minimum number of blocks in the estimate (20 frames)."""
 PAUSE: Final = 12
-"""Number of frames skipped after several rejected blocks, or after a block that agrees with a full window.
+"""Number of frames skipped after a block that agrees with a full window, and maximum number of frames skipped
+after rejected blocks.
 
-If no frames were skipped, the noise estimate would take 8 % of the computing time of a patch at rest.
+Without skipping, the noise estimate would take 8 % of the computing time of a patch at rest.
 """
 REPEATED: Final = 0.15
-"""Maximum fraction of readings that repeat exactly in a usable block.
+"""Fraction of exactly repeated readings above which the contrasts of a block do not measure the noise.
 
-With a noise of half a code, a tenth of the readings repeat in all four frames. With less noise, the variance
-of the codes is not the sum of the noise variance and the rounding variance.
+With a noise of half a code, a tenth of the readings are equal in all four frames. With less noise, the
+variance of the codes is no longer the sum of the noise variance and the quantization variance.
 """
 ALIVE: Final = 4
-"""Minimum number of changed readings in a usable block in which many readings repeat."""
+"""Minimum number of changed readings for a block in which many readings repeat; with fewer, the block is
+rejected."""
 SAME: Final = 1e-14
-"""Maximum contrast of a repeated reading, as a fraction of the reading; allows for float64 rounding."""
+"""Maximum contrast of a repeated reading, relative to the reading. The tolerance covers float64 rounding."""
 DEVIATIONS: Final = 4.0
-"""Margin added to each threshold, in standard deviations of the tested statistic.
+"""Margin of each test, in standard deviations of the tested statistic.
 
-A normal variable exceeds this margin once in 16,000 cases.
+The absolute value of a normal variable exceeds this margin with a probability of 1 in 16,000.
 """
 DEPARTED: Final = math.log(1.5)
-"""Logarithm of the noise ratio (estimated to stated) above which the estimate replaces the stated noise.
-If the ratio is smaller, the solver uses the stated noise unchanged."""
+"""Minimum |ln(estimated noise / stated noise)| for the estimate to replace the stated noise."""
 RETURNED: Final = math.log(1.25)
-"""Logarithm of the noise ratio (estimated to stated) below which the stated noise is used again."""
+"""Value of |ln(estimated noise / stated noise)| below which the stated noise is used again."""
 STEP: Final = math.log(1.05)
-"""Minimum change in the logarithm of the noise factor, in addition to the margin, for updating a factor other
-than 1. Each update requires another solve of the frame."""
+"""Minimum change in the logarithm of the noise factor, in addition to the margin, for the factor to be
+updated. Each update requires another solve of the frame."""
 UNEQUAL: Final = 0.3
-"""Maximum mean logarithm of the ratio of the quadratic to the cubic contrast's variance. At the limit, motion
-of the skin raises the noise estimate by 8 %."""
+"""Maximum mean logarithm of the ratio between the variances of the quadratic and the cubic contrast.
+
+At this limit, motion of the skin raises the noise estimate by 8 %.
+"""
 LEAST: Final = 1.0 / 30.0
-"""Lower limit of the ratio of estimated to stated noise."""
+"""Lower limit of the noise factor."""
 
 _CLIP: Final = 1.0
-"""Clipping limit for squared values in Huber's proposal 2, in units of the variance. At a limit of 1, noise
-on one upper and one lower wire (13 % of the readings) raises the noise estimate by 20 %."""
-_CLIPPED_MEAN: Final = 0.5160585
-"""Mean of min(z², 1) for a normal z: 1 − 2 φ(1)."""
-_STD: Final = 2.03
-"""Standard deviation of ln(variance) for the robust mean of n readings, times √n; 1.41 for an ordinary mean.
+"""Limit at which Huber's proposal 2 clips squared values, in units of the variance.
+
+With a limit of 1, excessive noise on one upper and one lower wire (13 % of the readings) raises the noise
+estimate by 20 %.
 """
+_CLIPPED_MEAN: Final = 0.5160585
+"""Mean of min(z², 1) for a standard normal z: 1 − 2 φ(1), with the normal density φ."""
+_STD: Final = 2.03
+"""Standard deviation of ln v times √n, for the robust mean v of n squared readings; 1.41 for the ordinary
+mean."""
 _ITERATIONS: Final = 30
-"""Maximum number of Newton steps; convergence takes 4 to 8 steps."""
+"""Maximum number of Newton steps for the robust mean, which converges in 4 to 8 steps."""
 _ONE_CODE: Final = 12.5
-"""Limit of the squared contrast of readings that change by one code, in units of the rounding variance."""
+"""Maximum squared contrast of a reading that changes by one code, in units of the quantization variance."""
 _HALF_A_CODE: Final = 4.0
-"""Variance of rounding and a noise of half a code together, in units of the rounding variance."""
+"""Variance of quantization plus noise of half a code, in units of the quantization variance."""
 _CUBIC: Final = 1.0 / math.sqrt(20.0)
 
 
 @njit_part
 def _variance(squares: Float, count: int) -> float:
-    """Return the robust mean v of ``count`` squared normal values, with mean(min(x, v)) = E[min(z², 1)] v."""
+    """Return the robust mean v of the first ``count`` values x in ``squares``.
+
+    For squared normal values x, v is their variance; it satisfies mean(min(x, v)) = E[min(z², 1)] v, where z
+    is a standard normal variable. Returns 0 if the iteration fails.
+    """
     total = 0.0
     for i in range(count):
         total += squares[i]
@@ -120,12 +133,15 @@ def _variance(squares: Float, count: int) -> float:
 def _contrasts(
     frames: Float, noise: Float, rounding_ohm: Float, quadratic: Float, cubic: Float
 ) -> tuple[int, int, int, float, float, float]:
-    """Write the squared contrasts of the readings that changed, divided by the stated variances.
+    """Write each changed reading's squared contrasts, divided by its stated variance.
 
-    The arguments have the same meaning as in :func:`assess_block`. Returns six values: the numbers of changed
-    and of repeated readings; the number of pairs of neighbouring contrasts, and the sum of the signs of their
-    products; the fraction of the stated variance that is not due to rounding; and the largest squared
-    contrast, in units of the rounding variance.
+    The arguments are those of :func:`assess_block`.
+
+    Returns:
+        The number of changed readings; the number of repeated readings; the number of pairs of contrasts of
+        neighbouring crossings; the sum of the signs of the products of these pairs; the mean fraction of the
+        stated variance that is not due to quantization; and the largest squared contrast, in units of the
+        quantization variance.
     """
     count, silent, pairs, signs, share, largest = 0, 0, 0, 0.0, 0.0, 0.0
     for u in range(frames.shape[1]):
@@ -158,16 +174,16 @@ def assess_block(
     """Return the noise variances of a block of four frames.
 
     Args:
-        frames: (4, U, K) resistances, ohm; NaN if not valid.
-        noise: (U, K) stated relative standard deviation, without rounding to codes.
-        rounding_ohm: (U, K) standard deviation of the rounding to codes, ohm; 0 if unknown.
+        frames: (4, U, K) resistances, ohm; NaN if invalid.
+        noise: (U, K) stated relative standard deviation of the resistances, excluding quantization.
+        rounding_ohm: (U, K) standard deviation of the quantization error, ohm; 0 if unknown.
         quadratic: (U K,) workspace.
         cubic: (U K,) workspace.
 
     Returns:
-        The number of changed readings, or 0 if the block is rejected; the variances of the quadratic and of
-        the cubic contrast, divided by the stated variance; and the fraction of the stated variance that is
-        not due to rounding.
+        The number of changed readings, or 0 if the block is rejected; the variance of the quadratic contrast
+        and the variance of the cubic contrast, both divided by the stated variance; and the mean fraction of
+        the stated variance that is not due to quantization.
     """
     none = 0, 0.0, 0.0, 0.0
     count, silent, pairs, signs, share, largest = _contrasts(frames, noise, rounding_ohm, quadratic, cubic)
@@ -192,12 +208,13 @@ class NoiseEstimate:
     """Estimator of the ratio of actual to stated noise; each stream needs its own instance.
 
     Args:
-        shape: (U, K) of the frames.
+        shape: Shape (U, K) of a frame.
 
     Attributes:
-        factor: Factor to apply to the stated noise; exactly 1 while the stream agrees with the stated noise.
-            If the rounding to codes is known, the factor applies to the noise before the converter.
-        relative_std: Relative standard deviation of the estimated ratio; inf before the first estimate.
+        factor: Factor by which to multiply the stated noise; exactly 1 while the stream agrees with the
+            stated noise. If the quantization error is known, the factor applies to the noise before the
+            converter.
+        relative_std: Relative standard error of the estimated noise; inf before the first estimate.
     """
 
     def __init__(self, shape: tuple[int, int]) -> None:
@@ -224,9 +241,10 @@ class NoiseEstimate:
 
         Args:
             ohm: (U, K) resistances, ohm.
-            noise: (U, K) stated relative standard deviation, without rounding if ``rounding_ohm`` is given.
-            rounding_ohm: (U, K) standard deviation of the rounding to codes, ohm.
-            valid: (U, K) bool, False if a reading is missing; default all True.
+            noise: (U, K) stated relative standard deviation of the resistances; excludes quantization if
+                ``rounding_ohm`` is given.
+            rounding_ohm: (U, K) standard deviation of the quantization error, ohm; default: 0.
+            valid: (U, K) bool, False for missing readings; default: all True.
         """
         if self._pause:
             self._pause -= 1
@@ -246,7 +264,7 @@ class NoiseEstimate:
         return self.factor != before
 
     def _assess(self) -> None:
-        """Add the current block to the window, then update :attr:`factor`."""
+        """Add the current block to the window and update :attr:`factor`; skip the block if it is rejected."""
         count, slow, fast, share = assess_block(
             self._frames, self._noise, self._rounding_ohm, self._work[0], self._work[1]
         )
@@ -269,7 +287,7 @@ class NoiseEstimate:
         level = 0.5 * (levels[(len(levels) - 1) // 2] + levels[len(levels) // 2])
         agrees = abs(blocks[-1][1] - level) < RETURNED + DEVIATIONS * _STD / math.sqrt(8.0 * blocks[-1][0])
         self._pause = PAUSE if agrees and len(blocks) == WINDOW else 0
-        # standard error of the median logarithm of the noise: 1.25 times that of the mean
+        # The standard error of a median is 1.25 times that of a mean.
         std = 1.25 * 0.5 * _STD / math.sqrt(2.0 * values)
         self.relative_std = std
         unequal = math.fsum(block[2] for block in blocks) / len(blocks)

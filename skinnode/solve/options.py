@@ -1,7 +1,7 @@
-"""Options of the trackers, with their defaults and checks.
+"""Options of the trackers: names, defaults and validation.
 
-A constructor accepts an options object, keyword arguments with the same names, or both; keyword arguments
-take precedence.
+The constructor of a tracker accepts an options object, keyword arguments with the same names, or both.
+Keyword arguments take precedence.
 """
 
 from __future__ import annotations
@@ -27,34 +27,33 @@ class EstimateOptions:
 
     Args:
         relative_noise: Relative standard deviation of R, a number or (U, K).
-        baseline_ohm: (U, K) resistances measured at rest, ohm; if given, resistivity and gain cancel.
-        rubber: Material of the skin. Forces are proportional to the rubber's modulus; the displacement does
-            not depend on the modulus.
-        estimate_noise: Whether to estimate, from the residuals, a factor that scales ``relative_noise``.
+        baseline_ohm: (U, K) resistances measured at rest, ohm. If given, errors of resistivity and gain
+            cancel.
+        rubber: Material of the skin. Forces are proportional to its modulus; displacements do not depend on
+            the modulus.
+        estimate_noise: Whether to scale ``relative_noise`` by a factor estimated from the residuals.
         follow_noise: Whether to scale ``relative_noise`` if the noise of the stream differs from it by a
             factor of more than 1.5 (:mod:`skinnode.solve.noise_estimate`). Ignored if ``estimate_noise`` is
             set.
         drift: Gain errors to estimate: ``patch`` for one gain common to all resistances, ``wire`` for one
             gain per upper wire, or ``none``.
-        drift_std: Expected (prior) standard deviation of a gain error; 0.02 is 2 %.
-        model_error: Standard error of the forward model (due to thickness, electrode size and conductivity
-            under strain), as a fraction of each resistance's change. An error common to all resistances has
-            this standard deviation; an additional, independent error of each resistance has 0.7 times this
-            standard deviation.
+        drift_std: Prior standard deviation of a gain error; 0.02 is 2 %.
+        model_error: Standard deviation of the forward model's error, as a fraction of the change in each
+            resistance. Typical causes are thickness, electrode size and conductivity under strain. The model
+            assumes an error with this standard deviation, common to all resistances, and independent errors
+            with 0.7 times this standard deviation.
         tolerances: Manufacturing tolerances of the patch, which increase the standard deviations; None
-            (default) means an exact patch. The solver assumes that the resistances at rest were measured on
-            the patch itself.
+            (default) for an exact patch. The resistances at rest must have been measured on the patch itself.
         contacts: Whether to estimate contacts and forces.
-        force_calibrated: Whether ``rubber`` reproduces known forces on this patch, for instance from presses
-            with a load cell. A modulus from a data sheet is not a calibration, because forces are computed
-            for a half-space. A thin layer on a support can carry fifty times as much force at the same
-            displacement. If ``force_calibrated`` is False, the standard deviation of each normal force covers
-            this difference.
-        normal_only: Whether only z is unknown, which reduces the number of unknowns to a third.
-        hold: Whether to keep the last solution of a wire if its resistances changed by no more than their
+        force_calibrated: Whether ``rubber`` reproduces known forces on this patch, for example presses with
+            a load cell. A modulus from a data sheet is not a calibration: forces are computed for a
+            half-space, and a thin layer on a support can carry fifty times as much force at the same
+            displacement. If False, the standard deviation of each normal force covers this difference.
+        normal_only: Whether to fix x and y at rest and solve for z only, with a third of the unknowns.
+        hold: Whether to keep the last solution of a wire while its resistances change by no more than their
             noise.
-        deadline_us: Time limit of an update, µs; an update can exceed the limit by the time for one solver
-            step. Wires still unsolved at the deadline have the status DEADLINE.
+        deadline_us: Time limit of an update, µs; an update can exceed it by the time of one solver step.
+            Wires that are unsolved at the deadline have the status DEADLINE.
 
     Raises:
         ValueError: If an option is out of range.
@@ -97,7 +96,7 @@ class PosteriorOptions(EstimateOptions):
     """Options of :class:`skinnode.Posterior`: ``scale_m``, and those of :class:`EstimateOptions`.
 
     Args:
-        scale_m: RMS normal displacement expected by the prior, metres; by default estimated from the data.
+        scale_m: RMS normal displacement in the prior, metres; by default, it is estimated from the data.
 
     Raises:
         ValueError: If an option is out of range.
@@ -115,21 +114,21 @@ class PosteriorOptions(EstimateOptions):
 class TrackerOptions(EstimateOptions):
     """Options of :class:`skinnode.Tracker`: the following, and those of :class:`EstimateOptions`.
 
-    The method ``auto`` chooses the posterior if ``drift``, ``model_error``, ``tolerances`` or
-    ``estimate_noise`` is set, since only the posterior supports these options.
+    Only the posterior supports ``drift``, ``model_error``, ``tolerances`` and ``estimate_noise``. If any of
+    them is set, ``auto`` selects the posterior.
 
     Args:
         method: ``exact``, ``posterior`` or ``auto``.
         operator: ``levenberg_marquardt``, ``dogleg`` or ``gauss_newton``; exact inverse only.
-        stiffness_n_per_m: Stiffness k in the paper's law F = k Δs, N/m; if given, the exact inverse computes
-            ``force_n`` by this law. All other forces, including contact forces, are computed from ``rubber``.
+        stiffness_n_per_m: Stiffness k of the paper's force law F = k Δs, N/m. If given, the exact inverse
+            computes ``force_n`` by this law. All other forces, including contact forces, are computed from
+            ``rubber``.
         active_only: Whether to fix electrodes at rest unless a contact moves them; exact inverse only.
-        codes: Mapping from the codes passed to :meth:`skinnode.Tracker.update_codes` to resistances.
-        max_std_m: A field is precise only if no coordinate has a larger standard deviation, metres; the
-            default depends on the layout and the noise (:mod:`skinnode.solve.precision`).
-        max_force_std_n: A field is precise only if no normal force of a contact has a larger standard
-            deviation, N. The default depends on the layout and the rubber, and applies only to calibrated
-            forces.
+        codes: Mapping of the codes passed to :meth:`skinnode.Tracker.update_codes` to resistances.
+        max_std_m: Maximum standard deviation of a coordinate in a precise field, metres. The default depends
+            on the layout and the noise (:mod:`skinnode.solve.precision`).
+        max_force_std_n: Maximum standard deviation of a contact's normal force in a precise field, N. The
+            default depends on the layout and the rubber, and applies only to calibrated forces.
 
     Raises:
         ValueError: If an option is out of range.
@@ -158,7 +157,7 @@ class TrackerOptions(EstimateOptions):
 
     @property
     def nuisances(self) -> list[str]:
-        """Names of the active options that only the posterior supports."""
+        """Names of the options that are set and that only the posterior supports."""
         asked = {
             "drift": self.drift != "none",
             "model_error": self.model_error > 0,
@@ -209,10 +208,10 @@ _Options = TypeVar("_Options", PosteriorOptions, TrackerOptions)
 
 
 def merged(kind: type[_Options], options: _Options | None, arguments: Any) -> _Options:
-    """Return ``options`` (by default, ``kind``'s defaults) with the keyword arguments applied.
+    """Return ``options``, or the defaults of ``kind`` if it is None, updated with the keyword arguments.
 
     Raises:
-        TypeError: If an argument is not an option, or ``options`` is not of type ``kind``.
+        TypeError: If an argument is not the name of an option, or ``options`` is not of type ``kind``.
         ValueError: If an option is out of range.
     """
     known = [field.name for field in dataclasses.fields(kind)]
@@ -227,10 +226,6 @@ def merged(kind: type[_Options], options: _Options | None, arguments: Any) -> _O
 
 
 def require_positive(name: str, value: float) -> None:
-    """Check that an option is positive and finite.
-
-    Raises:
-        ValueError: If the value is not positive and finite.
-    """
+    """Raise ValueError unless the value of an option is positive and finite."""
     if not (math.isfinite(value) and value > 0):
         raise ValueError(f"{name}: got {value}, must be positive and finite")

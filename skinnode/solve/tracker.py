@@ -1,14 +1,13 @@
 """Tracker that estimates the displacement field of a patch for each frame of a live stream.
 
-The method ``exact`` solves for each upper wire separately. The method ``posterior`` estimates the whole patch
-with an elastic prior. The default, ``auto``, selects ``exact`` if the converter's noise is low enough for
-this method, otherwise ``posterior``. Doubtful solutions of the exact method are checked with the posterior
+The method ``exact`` solves each upper wire separately. The method ``posterior`` estimates the whole patch,
+with an elastic prior. The default method, ``auto``, selects ``exact`` if the noise is low enough, and
+``posterior`` otherwise. The posterior also checks doubtful roots found by the exact method
 (:mod:`skinnode.solve.root_gate`).
 
-The tracker estimates the noise of the stream and scales the stated noise accordingly
-(:mod:`skinnode.solve.noise_estimate`). With ``auto``, the tracker switches between the methods if the
-estimated noise crosses the limit for the exact method. After a switch, the new method starts from the rest
-position.
+The tracker estimates the noise of the stream and corrects the stated noise
+(:mod:`skinnode.solve.noise_estimate`). With ``auto``, it changes the method when the estimated noise crosses
+the limit for ``exact``. The new method starts at the rest position.
 """
 
 from __future__ import annotations
@@ -36,28 +35,30 @@ from skinnode.solve.root_gate import RootGate
 from skinnode.solve.wires.problem import PatchProblem
 
 NO_CODE: Final = np.uint32(0xFFFF_FFFF)
-"""Invalid code that marks a reading to be ignored; no converter sends this code."""
+"""Invalid code that replaces the code of a reading to be ignored; no converter sends it."""
 EXACT_STD: Final = 0.0025
-"""Maximum standard deviation of an electrode position at rest, relative to the clearance between the layers,
-for which ``auto`` selects the exact method. With 16-bit codes, the standard deviation is 0.0005 on the
-staggered layout with h = 0.5, and 0.05 on the aligned layout."""
+"""RMS standard deviation of the exact inverse at rest, in clearances, up to which ``auto`` selects ``exact``.
+
+With 16-bit codes, the standard deviation is 0.0005 on the staggered layout with h = 0.5, and 0.05 on the
+aligned layout.
+"""
 
 
 class Tracker:
     """Estimates the displacement field of one patch for each frame of a stream.
 
-    Each patch needs its own tracker. The constructor compiles the kernels, which run without the GIL.
+    Each patch needs its own tracker. The constructor compiles the kernels, which release the GIL.
 
     Args:
         layout: The patch.
         options: Options of the tracker; default: ``TrackerOptions()``.
-        **arguments: Individual options, which override the same options in ``options``.
+        **arguments: Individual options, which take precedence over ``options``.
 
     Attributes:
         layout: The patch.
         options: Options in effect.
-        method: Method in use, ``exact`` or ``posterior``; ``auto`` may change it during a stream.
-        reason: Why this method is in use, as a short text.
+        method: Method in use, ``exact`` or ``posterior``. With ``auto``, it can change during a stream.
+        reason: Short explanation of why this method is in use.
 
     Raises:
         ValueError: If an option has the wrong shape or is out of range.
@@ -78,8 +79,8 @@ class Tracker:
         if self.method == "posterior":
             self._posterior = Posterior(layout, options.of_posterior())
             return
-        # This posterior checks roots in some of the frames only, so it uses the exact tracker's noise
-        # estimate.
+        # This posterior checks roots in only some of the frames, too few to estimate the noise; it uses the
+        # noise estimate of the exact tracker.
         self._posterior = Posterior(layout, dataclasses.replace(options.of_posterior(), follow_noise=False))
         self._noise = NoiseEstimate(layout.shape) if options.follow_noise else None
         self._factor = 1.0  # noise factor for which the method and the root check are configured
@@ -106,10 +107,10 @@ class Tracker:
         self.reset()
 
     def prepare(self) -> None:
-        """Compute tables in advance, so that they do not delay the first frames of a touch by up to 0.1 s.
+        """Compute the tables that would otherwise delay the first frames of a touch by up to 0.1 s.
 
-        The tables for the reference patch require 0.25 s and 85 MB. Trackers of the same layout share the
-        tables. The host calls this method before it starts the nodes.
+        For the reference patch, this takes 0.25 s and 85 MB. Trackers of the same layout share the tables.
+        The host calls this method before it starts the nodes.
         """
         self._posterior.check.prepare()
 
@@ -132,14 +133,15 @@ class Tracker:
     ) -> FieldFrame:
         """Compute the displacement field of one frame.
 
-        Invalid resistances do not raise an exception. If a wire cannot be solved, the field contains the
-        wire's last trusted position, an infinite standard deviation and a status other than CONVERGED.
+        No resistance raises an exception. A wire that cannot be solved keeps its last trusted position, with
+        an infinite standard deviation and a status other than CONVERGED.
 
         Args:
             frame_ohm: (U, K) resistances, ohm; values that are not positive and finite are ignored.
             valid: (U, K) bool, False for missing readings; default: all True.
-            relative_noise: Relative standard deviation of the resistances in this frame, a number or (U, K).
-                A resistance is ignored if its noise is not positive and finite.
+            relative_noise: Relative standard deviation of the resistances of this frame, a number or (U, K);
+                default: the option ``relative_noise``. A resistance is ignored if its standard deviation is
+                not positive and finite.
 
         Returns:
             The field, with one status per wire.
@@ -158,10 +160,12 @@ class Tracker:
         return self._judged(field)
 
     def update_codes(self, codes: NDArray[np.uint32]) -> tuple[FieldFrame, int]:
-        """Compute the displacement field of a scan from its codes; faster than decoding and :meth:`update`.
+        """Compute the displacement field of a scan from its codes.
+
+        This method is faster than decoding the codes and calling :meth:`update`.
 
         Args:
-            codes: (U, K) uint32 codes, which the option ``codes`` maps to resistances.
+            codes: (U, K) uint32 codes; the option ``codes`` maps them to resistances.
 
         Returns:
             The field, and the number of invalid codes.
@@ -194,7 +198,7 @@ class Tracker:
 
     @property
     def scan(self) -> int | None:
-        """Scan number of the next frame, used in ``DataFault.since``; if None, frames are counted instead."""
+        """Scan number of the next frame, for ``DataFault.since``; if None, frames are counted instead."""
         return self._posterior.check.scan
 
     @scan.setter
@@ -204,7 +208,7 @@ class Tracker:
             self._check.scan = number
 
     def _checked(self, field: FieldFrame, ohm: Float, start: float) -> FieldFrame:
-        """Test the data of an exact field; return the field with its data faults and trust added."""
+        """Check the readings behind an exact field; return the field with its faults and trust."""
         exact = self._exact
         assert exact is not None
         its = exact.arrays
@@ -220,7 +224,7 @@ class Tracker:
         return self._check.check(solved(field), solve_without, until)
 
     def _judged(self, field: FieldFrame) -> FieldFrame:
-        """Return the field with the attribute ``precise`` and, for the exact method, the contacts added."""
+        """Return the field with ``precise`` set and, for the exact method, with its contacts."""
         if field.method == "exact" and self._contacts is not None:
             field = self._contacts.add(field)
         return field if is_precise(field, self._limits) else amended(field, precise=False)
@@ -231,7 +235,7 @@ class Tracker:
             self._adapt(self._noise)
 
     def _adapt(self, noise: NoiseEstimate) -> None:
-        """Select the method and the limits of the root check for the estimated noise."""
+        """Set the method and the thresholds of the root check for the estimated noise."""
         assert self._exact is not None
         self._factor = noise.factor
         self._gate.set_noise(noise.factor)
@@ -255,10 +259,10 @@ class Tracker:
 
 
 def choose_method(layout: PatchLayout, options: TrackerOptions) -> tuple[str, str]:
-    """Select ``exact`` or ``posterior`` for a tracker; return the method and the reason for the choice.
+    """Return the method for a tracker, ``exact`` or ``posterior``, and the reason for this choice.
 
     Raises:
-        ValueError: If the requested method does not support one of the options.
+        ValueError: If the requested method does not support an option that is set.
     """
     nuisances, normal_only = options.nuisances, options.normal_only
     if options.method != "auto":

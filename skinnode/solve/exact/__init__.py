@@ -1,7 +1,6 @@
-"""Exact tracker for a live stream, which starts each solve at the wire's solution for the previous frame.
+"""Exact tracker: solves each upper wire of a live stream, starting at its solution for the previous frame.
 
-``tracker`` runs the stages of the solution. ``stream`` contains the arrays of a stream and decides whether a
-root is accepted.
-``recover`` retries failed wires, and ``leave_out`` reduces the number of unknowns. ``contacts`` finds loads
-and contacts in a solved field.
+``tracker`` runs the stages of a solve. ``stream`` contains the arrays of a stream and the acceptance test for
+roots. ``recover`` makes further attempts for wires that failed. ``leave_out`` reduces the number of unknowns.
+``contacts`` estimates loads and contacts from a solved field.
 """

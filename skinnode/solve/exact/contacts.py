@@ -1,18 +1,22 @@
-"""Estimates contacts and loads from exact fields.
+"""Estimate of the loads and contacts that explain a displacement field from the exact inverse.
 
-The displacement field u from the exact inverse is modelled as u = G q + slack + e. The loads q ~ N(0, s²) of
-the elastic prior move the electrodes by G q. The inverse's error is e ~ N(0, ν² Σ). Here Σ is the error
-covariance at rest, and the factor ν² is computed from the field's standard deviations. In the basis U of the
-singular value decomposition
+The field u is modelled as the sum of three terms:
+
+- G q: displacement due to the loads q ~ N(0, s²) of the elastic prior;
+- slack: displacement not explained by loads, with the standard deviation ε s;
+- e ~ N(0, ν² Σ): error of the exact inverse, with the error covariance Σ at rest. The factor ν² is computed
+  from the standard deviations of the field.
+
+With the singular value decomposition
 
     Σ^(−1/2) [G, ε I] = U S Vᵀ,   z = Uᵀ Σ^(−1/2) u,   B = Uᵀ Σ^(−1/2) G
 
 the covariance s² S² + ν² of z is diagonal for every s and ν. The matrices Uᵀ Σ^(−1/2) and B are computed once
-per patch. A frame then requires only two matrix-vector products, one for z and one for
+per patch. Each frame then requires two matrix-vector products, one for z and one for
 q = s² Bᵀ (s² S² + ν²)⁻¹ z. The scale s maximises the evidence.
 
-Wires without a position, or with a much larger standard deviation than the others, are left out: their rows
-are projected out of z and B. Projecting B takes a few milliseconds, so the result is cached.
+Wires without a position, or with a much larger standard deviation than the other wires, are left out: their
+rows are projected out of z and B. The projection of B takes a few milliseconds, so the result is cached.
 """
 
 from __future__ import annotations
@@ -40,24 +44,24 @@ from skinnode.solve.posterior.elastic_prior import SLACK, ElasticPrior
 from skinnode.solve.wires.problem import PatchProblem
 
 UNTOUCHED: Final = 4.0
-"""Displacement, in standard deviations, up to which a patch is considered untouched.
+"""Largest displacement, in standard deviations, up to which a patch counts as untouched.
 
-Noise alone exceeds this limit in 2 % of frames, which are then searched for contacts.
+Noise alone exceeds this limit in 2 % of the frames, which are then searched for contacts.
 """
 WILD: Final = 16.0
-"""Maximum ratio of a wire's variances to the other wires' variances; a wire with a larger ratio is left
-out."""
+"""Ratio of a wire's variance to the median variance of the wires above which the wire is left out. All
+variances are relative to their values at rest."""
 SCALE_STEPS: Final = 30
-"""Maximum number of iterations for the scale s²."""
+"""Maximum number of fixed-point iterations for s²."""
 SCALE_CLOSE: Final = 0.01
-"""Relative change in s² below which the iteration stops; the relative change in the loads is smaller."""
+"""Relative change in s² at which the iteration stops; the relative change in the loads is smaller."""
 SCALE_LEAST: Final = 1e-12
-"""Smallest s², pitch²."""
+"""Lower limit of s², pitch²."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LoadFactors:
-    """Matrices of one patch at one noise level, as defined in the module's docstring."""
+    """Matrices of one patch at one noise level; for the symbols, see the docstring of the module."""
 
     prior: ElasticPrior
     whitening: Float
@@ -69,11 +73,11 @@ class LoadFactors:
     rest_std: Float
     """(n,) standard deviations of the exact inverse at rest, pitches."""
     free: Index
-    """(n,) indices of the free coordinates, i.e. the unknowns."""
+    """(n,) indices of the free coordinates, which are the unknowns of the exact inverse."""
 
 
 class ExactContacts:
-    """Contact estimator for a stream of exact fields; each stream needs its own instance.
+    """Estimator of the contacts in a stream of exact fields; each stream needs its own instance.
 
     Args:
         layout: The patch.
@@ -112,13 +116,13 @@ class ExactContacts:
         self._ratio, self._sorted = np.empty((2, layout.upper_m.shape[0]))
         self._no_contacts: tuple[Contact, ...] = ()
         self.no_force_n = np.zeros(layout.upper_m.shape)
-        """(U, N, 3) forces on an untouched patch, all zero; read-only."""
+        """(U, N, 3) zero forces of an untouched patch, N; read-only."""
         self.no_force_n.setflags(write=False)
         self._wire = factors.free // (3 * layout.upper_m.shape[1])
         self.reset()
         solved = np.full(n, 1e-3)
         self._finder.warm_up(self._estimate(solved, 1.0))
-        # compiles the kernels before a stream starts
+        # The following two calls compile the kernels before a stream starts.
         self._find(np.zeros(layout.upper_m.shape), np.ones(layout.upper_m.shape))
         self._estimate_without(np.arange(len(layout.upper_m)) == 0, 1.0)
         self.reset()
@@ -133,11 +137,11 @@ class ExactContacts:
     def add(self, field: FieldFrame) -> FieldFrame:
         """Return the field with its contacts and, unless the option ``stiffness_n_per_m`` is set, its forces.
 
-        Wires with an infinite standard deviation are ignored. A field in which all standard deviations are
-        infinite has no contacts and zero forces.
+        Wires with an infinite standard deviation are ignored. If every wire is ignored, there are no contacts
+        and all forces are zero.
 
         Args:
-            field: Exact field, after the checks of its roots and data.
+            field: Field of the exact method, after its roots and readings have been checked.
         """
         start = perf_counter()
         held = field.held is not None and bool(field.held.all())
@@ -172,7 +176,7 @@ class ExactContacts:
         return self._finder.find(loads, displacement_m, std_m)
 
     def _estimate(self, moved: Float, level: float) -> LoadEstimate:
-        """Return the loads that explain a displacement (n,) in pitches, with ν² = ``level``."""
+        """Return the loads that explain the displacement ``moved`` (n,) in pitches, for ν² = ``level``."""
         factors = self._factors
         self._scale2 = _solve_loads(
             moved, factors.whitening, factors.gain, factors.rows, level, self._scale2,
@@ -181,9 +185,9 @@ class ExactContacts:
         return LoadEstimate(self._load.reshape(-1, 3), factors.rows, self._weight, self._share, self._scale2)
 
     def _estimate_without(self, left_out: NDArray[np.bool_], level: float) -> LoadEstimate:
-        """Return the loads that explain a displacement without the wires ``left_out`` (U,).
+        """Return the loads that explain the displacement of all wires except ``left_out`` (U,).
 
-        The scale s is computed with the left-out wires at their most probable positions.
+        For the scale s, the wires left out are assumed to be at their most probable positions.
         """
         factors, gone = self._factors, left_out[self._wire]
         moved = np.where(gone, 0.0, self._moved)
@@ -237,7 +241,7 @@ def _cached_factors(
 
 
 def _factors(layout: PatchLayout, rubber: Rubber | None, noise: Float, normal_only: bool) -> LoadFactors:
-    """Return a patch's matrices for a relative noise of ``noise`` (U, K)."""
+    """Return the matrices of a patch whose resistances have the relative noise ``noise`` (U, K)."""
     problem, prior, pitch = PatchProblem.of(layout), ElasticPrior.of(layout, rubber), layout.pitch_m
     wires, electrodes = layout.upper_m.shape[:2]
     slopes = jacobian(layout, layout.upper_m) * pitch**2 * problem.a_rest[..., None, None]
@@ -246,7 +250,7 @@ def _factors(layout: PatchLayout, rubber: Rubber | None, noise: Float, normal_on
     every = np.arange(3 * wires * electrodes)
     free = every[2::3] if normal_only else every
     n = weighted.shape[2]
-    # The standard deviations are limited to the clearance, because no electrode moves farther.
+    # No electrode moves farther than the clearance, which limits the standard deviations.
     least = 1.0 / float(problem.clearance.min())
     root, std = np.zeros((free.size, free.size)), np.empty((wires, n))
     for u in range(wires):
@@ -276,15 +280,21 @@ def _judge(  # noqa: PLR0913 - a kernel: field, factors and outputs by name
     ratio: Float,
     ordered: Float,
 ) -> tuple[float, float, bool]:
-    """Find the largest displacement in a field, and wires with unusually large standard deviations.
+    """Find the largest displacement in a field, and detect wires with unusually large standard deviations.
 
-    The argument ``field`` (2, 3UN) contains displacements and standard deviations, m. Writes the free
-    displacements (n,) in pitches to ``moved``. Writes the mean ratio of each wire's variances to its
-    variances at rest to ``ratio`` (U,); inf if a variance is infinite. ``ordered`` (U,) is scratch.
+    Args:
+        field: (2, 3UN) displacements and their standard deviations, m.
+        free: (n,) indices of the free coordinates.
+        rest_std: (n,) standard deviations of the free coordinates at rest, pitches.
+        pitch: Pitch, m.
+        moved: (n,) output: displacements of the free coordinates, pitches.
+        ratio: (U,) output: each wire's mean ratio of a variance to the variance at rest; inf if a variance is
+            infinite.
+        ordered: (U,) scratch.
 
     Returns:
-        The largest displacement in standard deviations, the median ratio of the wires with finite ratios,
-        and whether a wire's ratio exceeds the median by a factor of more than :data:`WILD`.
+        The largest displacement, in standard deviations; the median of the finite ratios; and whether any
+        wire's ratio exceeds :data:`WILD` times the median.
     """
     largest, each, known = 0.0, free.size // ratio.size, 0
     for u in range(ratio.size):
@@ -324,7 +334,7 @@ def _solve_loads(  # noqa: PLR0913, C901 - a kernel: field, matrices and outputs
 ) -> float:
     """Estimate s² and the loads that explain a displacement; return s².
 
-    Writes ``z`` (n,), the factors (s² S² + ν²)^(−1/2) to ``weight`` (n,), and the mean ``loads`` (3Q,).
+    Writes ``z`` (n,), (s² S² + ν²)^(−1/2) to ``weight`` (n,), and the posterior mean to ``loads`` (3Q,).
     """
     for j in range(z.size):
         z[j] = 0.0

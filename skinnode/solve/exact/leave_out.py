@@ -1,21 +1,24 @@
-"""Options ``normal_only`` and ``active_only`` of the exact tracker, which reduce the number of unknowns.
+"""Fixed coordinates of the exact tracker: the options ``normal_only`` and ``active_only``.
 
-If ``normal_only`` is set, the x and y coordinates of all electrodes are fixed at their rest values. If
-``active_only`` is set, electrodes that no contact moves are fixed at rest. Initially, all electrodes of a
-wire are fixed. While the χ² test rejects the fit, the electrode that explains most of the residual becomes an
-unknown, together with its neighbours. If more than half of the electrodes have become unknowns, all
-electrodes become unknowns. As soon as the rest position explains a frame, all electrodes are fixed at rest
-again. The standard deviation of an omitted coordinate is the smallest movement that the χ² test would detect
-if no other electrode moved. To first order at rest, this movement is √(quantile − degrees of freedom) σ /
-‖c‖. Here c is the component of the coordinate's column of J that is orthogonal to the columns of the unknowns
-and to the electrode's other columns.
+Both options reduce the number of unknowns. The coordinates that are not unknowns are fixed at rest.
 
-Each option rests on an assumption about the skin, and the standard deviations of the unknowns are valid only
-if the assumption holds. A χ² test reliably detects frames that violate the assumption of active_only. The
-test is less sensitive for normal_only, because smooth shear resembles a gradient of z. On the staggered
-layout (h = 0.5, noise 1e-5), the test rejected a strong Hertzian press whose shear was 30 % of its depth. A
-weaker press passed the test, although the errors in z reached 16 standard deviations (only 0.2 % of h).
-Increasing the standard deviations to cover these errors would cost more accuracy than solving for the shear.
+``normal_only`` fixes the x and y coordinates of all electrodes.
+
+``active_only`` fixes the electrodes that no contact moves. At first, all electrodes of a wire are fixed.
+While the χ² test rejects the fit, the fixed electrode that explains most of the residual becomes an unknown,
+together with its neighbours. Once more than half of the electrodes would be unknowns, all of them become
+unknowns. When the rest position explains a frame again, all electrodes are fixed again.
+
+The standard deviation of a fixed coordinate is the smallest movement that the χ² test would detect if no
+other electrode moved. To first order at rest, this is √(quantile − degrees of freedom) σ / ‖c‖, where c is
+the component of the coordinate's column of J that is orthogonal to the columns of the unknowns and to the
+other columns of the same electrode.
+
+Each option makes an assumption about the skin. If it is violated, the standard deviations of the unknowns are
+invalid. The χ² test reliably detects violations of active_only. It is less sensitive to violations of
+normal_only, because smooth shear resembles a gradient of z. For example, on the staggered layout (h = 0.5,
+noise 1e-5), the test rejected a strong Hertzian press whose shear was 30 % of its depth. It accepted a weaker
+press, in which the errors in z reached 16 standard deviations (0.2 % of h).
 """
 
 from __future__ import annotations
@@ -38,18 +41,23 @@ from skinnode.solve.wires.hold import Z_HOLD, chi2_quantile
 from skinnode.solve.wires.stages import DEADLINE, STALE
 
 Z_WIDEN: Final = 3.719
-"""Normal quantile for the probability 1 − 1e-4. If χ² exceeds the corresponding quantile,
-an electrode becomes an unknown.
+"""Quantile of the standard normal distribution for the probability 1 − 1e-4.
 
-At 100 frames/s, noise alone adds an electrode about once every 100 s during a long press.
+If χ² exceeds its quantile for the same probability, a fixed electrode becomes an unknown. During a long press
+at 100 frames/s, noise alone causes this about once every 100 s.
 """
 TINY: Final = 1e-200
-"""Minimum squared slope used as a divisor: smaller than any real slope, but large enough to prevent
-overflow."""
+"""Lower limit of squared slopes used as divisors. The limit is below any real squared slope, but large enough
+to prevent overflow."""
 
 
 class LeftOut:
-    """Electrodes omitted from the unknowns of a stream, and their smallest detectable movements."""
+    """Fixed coordinates of a stream, and the smallest movements of these coordinates that would be detected.
+
+    Args:
+        stream: State of the stream.
+        active_only: Whether to fix electrodes at rest unless a contact moves them.
+    """
 
     def __init__(self, stream: StreamState, active_only: bool) -> None:
         problem = stream.problem
@@ -59,30 +67,30 @@ class LeftOut:
         # ∂r/∂x at rest with respect to every coordinate, (U, 3N, K)
         slopes = jacobian(layout, layout.upper_m).reshape(*layout.shape, -1) * layout.pitch_m**2
         self._slopes = np.ascontiguousarray((slopes * problem.a_rest[:, :, None]).transpose(0, 2, 1))
-        # (U, 3N) smallest detectable movement of each coordinate, pitches per unit of σ, and the (U, K)
+        # (U, 3N) smallest detectable movement of each fixed coordinate, pitches per unit of σ, and (U, K)
         # weights of the readings for which it was computed
         self._unnoticed = np.zeros((layout.shape[0], layout.unknowns))
         self._unnoticed_weight = np.zeros(layout.shape)
-        # maximum χ², indexed by degrees of freedom
+        # limits of χ², indexed by degrees of freedom
         self._chi2_hold, self._chi2_widen, self._chi2_refuse = (
             np.array([chi2_quantile(max(dof, 1), z) for dof in range(layout.shape[1] + 1)])
             for z in (Z_HOLD, Z_WIDEN, Z_REFUSE)
         )
 
     def reset(self) -> None:
-        """Discard the state of the stream; with ``active_only``, start with all electrodes at rest."""
+        """Discard the state of the stream; with ``active_only``, fix all electrodes."""
         self._unnoticed_weight[:] = 0.0
         if self._active_only:
             for u in range(self._layout.shape[0]):
                 self._set_electrodes(u, np.arange(0))
 
     def take_in(self, wires_: NDArray[np.bool_]) -> None:
-        """Make all electrodes of the wires in the mask (U,) unknowns."""
+        """Make all electrodes of the given wires (mask of shape (U,)) unknowns."""
         for u in np.flatnonzero(wires_).tolist():
             self._set_electrodes(u, np.arange(self._layout.unknowns // 3))
 
     def leave_out(self, sigma: float) -> None:
-        """Fix wires whose rest position explains the frame; write the omitted coordinates' deviations."""
+        """Fix the wires that are at rest within noise; write the standard deviations of fixed coordinates."""
         solver, arrays = self._stream.solver, self._stream.arrays
         if self._active_only:
             a_rest = self._stream.problem.a_rest
@@ -101,9 +109,11 @@ class LeftOut:
             solver.still_std[:] = sigma * self._unnoticed
 
     def widen(self, frame: Frame, turns: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """Add unknowns to processed wires whose residual is unexplained; return a mask (U,) of these wires.
+        """Add unknowns to the processed wires whose residual exceeds noise; return a mask of them (U,).
 
-        Sets ``turns`` (U,) to False for wires not processed before the deadline.
+        Args:
+            frame: The current frame.
+            turns: (U,) mask of the processed wires; set to False for wires that the deadline interrupts.
         """
         unexplained = turns & ~self._explained()
         for u in [u for u in frame.order.tolist() if unexplained[u]]:
@@ -112,7 +122,7 @@ class LeftOut:
         return unexplained
 
     def _set_electrodes(self, u: int, electrodes: Index) -> None:
-        """Make the given electrodes of wire u its only unknowns."""
+        """Make the given electrodes of wire u its unknowns, and fix all its other electrodes."""
         solver, arrays, problem = self._stream.solver, self._stream.arrays, self._stream.problem
         solver.set_electrodes(u, electrodes)
         arrays.predictable[u] = len(electrodes) == 0
@@ -121,7 +131,7 @@ class LeftOut:
             solver.a_solved[u], solver.noise[u] = arrays.a_solved[u], 0.0
 
     def _measure_unnoticed(self, u: int, weight: Float) -> None:
-        """Write the smallest detectable movement of each omitted coordinate, pitches per unit of σ."""
+        """Compute the smallest detectable movement of each fixed coordinate of wire u."""
         solver, (_, lower) = self._stream.solver, self._layout.shape
         self._unnoticed_weight[u] = weight
         unnoticed = self._unnoticed[u].reshape(-1, 3)
@@ -140,11 +150,11 @@ class LeftOut:
             if most:
                 seen = _outside(slopes[group, :most].reshape(-1, lower), unknown).reshape(-1, most, lower)
                 power, direction = np.linalg.eigh(seen @ seen.transpose(0, 2, 1))
-                power = np.maximum(power, op.EPS * power[:, -1:] + TINY)  # smaller: rounding
+                power = np.maximum(power, op.EPS * power[:, -1:] + TINY)  # smaller values are rounding errors
                 unnoticed[group, :most] = least * np.sqrt((direction**2 / power[:, None]).sum(axis=2))
 
     def _explained(self) -> NDArray[np.bool_]:
-        """Return a mask (U,) of wires whose residual is within the noise, or that have no fixed electrode."""
+        """Return a mask (U,) of the wires that have a root within noise, or that have no fixed electrode."""
         solver = self._stream.solver
         spare = solver.report[:, wires.SPARE]
         limit = np.where(solver.free > 0, self._chi2_widen[spare], self._chi2_hold[spare])
@@ -153,7 +163,7 @@ class LeftOut:
         return np.asarray(whole | (self._stream.roots() & content))
 
     def _widen(self, u: int, frame: Frame) -> None:
-        """Add unknowns to wire u until the frame is explained; remove these unknowns if no root is found."""
+        """Add unknowns to wire u until its residual is within noise; remove them again if it has no root."""
         stream, solver, most = self._stream, self._stream.solver, self._layout.unknowns // 3
         before = solver.electrodes(u).copy()
         while stream.solvable()[u] and not self._explained()[u]:
@@ -162,7 +172,7 @@ class LeftOut:
                 break
             electrodes = np.arange(most)
             near = not stream.problem.out_of_reach(solver.x)[u]
-            # the solve found a minimum, but its χ² is too large
+            # The solve found a minimum, but its χ² is too large.
             if near and solver.measure[u, wires.CHI2] < np.inf:
                 joined = np.union1d(solver.electrodes(u), self._most_explaining(u))
                 electrodes = electrodes if 2 * len(joined) > most else joined
@@ -179,7 +189,7 @@ class LeftOut:
             solver.std[u, left_out] = frame.sigma * self._unnoticed[u, left_out]
 
     def _most_explaining(self, u: int) -> Index:
-        """Return the fixed electrode that explains most of wire u's residual, and its neighbours."""
+        """Return the fixed electrode that explains most of the residual of wire u, with its neighbours."""
         solver, arrays = self._stream.solver, self._stream.arrays
         each, (_, lower), most = solver.each, self._layout.shape, self._layout.unknowns // 3
         slopes = (self._slopes[u] * arrays.used[u]).reshape(most, 3, lower)[:, 3 - each :]
@@ -194,11 +204,11 @@ class LeftOut:
 
 
 def _changed(weight: Float, before: Float) -> NDArray[np.bool_]:
-    """Return a mask (U,) of wires with a reading whose weight changed by more than a factor of ``STALE``."""
+    """Return a mask (U,) of the wires with a weight that changed by more than a factor of ``STALE``."""
     return np.asarray(((weight > STALE * before) | (before > STALE * weight)).any(axis=1))
 
 
 def _outside(rows: Float, others: Float) -> Float:
-    """Return ``rows`` (n, K) minus their projection onto the rows ``others`` (m, K)."""
+    """Return ``rows`` (n, K) minus their projection onto the span of the rows ``others`` (m, K)."""
     q = np.linalg.qr(others.T)[0]
     return np.asarray(rows - (rows @ q) @ q.T)

@@ -1,11 +1,11 @@
-"""Recovers wires for which all solves in a frame failed to find an acceptable root.
+"""Recovery of wires for which the solver found no acceptable root in a frame.
 
-The recovery consists of three steps:
+A wire is recovered in three stages:
 
-- bridge: interpolate R from the last trusted frame to the new frame, and solve each substep;
-- restart: bridge again, starting from the rest position;
-- give up: keep the last trusted position of a wire that still fails, with an infinite standard deviation and
-  a status other than CONVERGED.
+- bridge: divide the change in R since the last trusted frame into substeps, and solve them in turn;
+- restart: bridge from the rest position instead;
+- give up: keep the last trusted position, with an infinite standard deviation and a status other than
+  CONVERGED.
 """
 
 from __future__ import annotations
@@ -23,18 +23,20 @@ from skinnode.solve.wires.arrays import solve_options
 from skinnode.solve.wires.stages import DEADLINE
 
 BRIDGES: Final = (3, 5, 10)
-"""Number of substeps in each successive bridge. If the skin is pressed by 50 % of h between two frames
-(staggered layout, h = 0.5), 3 substeps solved every wire in a test. For a press by 70 % of h, 5 substeps
-solved 23 of 24 wires. Adaptive steps restricted to the trusted branch solved fewer wires, because the
-straight line in R crosses singular points that the press avoids."""
-BRIDGE_TOLERANCE: Final = 1e-6
-"""Tolerance for all substeps of a bridge except the last: the intermediate tolerance in the paper."""
-BRIDGE_STEPS: Final = 20
-"""Maximum steps per substep."""
-RECOVERY_STEPS: Final = 300
-"""Maximum total number of solver steps (about 15 ms) in all bridges of a frame.
+"""Numbers of substeps of successive bridges.
 
-This limit prevents a corrupt frame from stalling the stream.
+On the staggered layout (h = 0.5), 3 substeps solved every wire after a press of 50 % of h within one frame; 5
+substeps solved 23 of 24 wires after a press of 70 %. Adaptive substeps that stay on the branch of the rest
+position solved fewer wires, because the straight line in R crosses folds that the press avoids.
+"""
+BRIDGE_TOLERANCE: Final = 1e-6
+"""Tolerance of all substeps of a bridge except the last; this is the paper's intermediate tolerance."""
+BRIDGE_STEPS: Final = 20
+"""Maximum number of solver steps per substep."""
+RECOVERY_STEPS: Final = 300
+"""Number of solver steps in a frame (about 15 ms) above which no further bridge is started.
+
+The limit prevents a corrupt frame from stalling the stream.
 """
 # Bridges use Levenberg-Marquardt, which converges most reliably from a distant starting point.
 _ACROSS: Final = solve_options(op.LEVENBERG_MARQUARDT, 0, BRIDGE_TOLERANCE, BRIDGE_TOLERANCE, BRIDGE_STEPS)
@@ -44,10 +46,13 @@ _LAST: Final = solve_options(op.LEVENBERG_MARQUARDT, TASKS, TOLERANCE, TOLERANCE
 def recover_lost(
     stream: StreamState, frame: Frame, turns: NDArray[np.bool_], exhausted: NDArray[np.bool_]
 ) -> None:
-    """Recover the wires that are not at a root; write ``good`` and ``status`` in the stream's arrays.
+    """Recover the wires without an acceptable root; write ``good`` and ``status`` of the stream's arrays.
 
-    Gives up on wires that fail again, and on the wires in the mask ``exhausted`` (U,), which have no attempts
-    left. Sets ``turns`` (U,) to False for wires not processed before the deadline.
+    Args:
+        stream: State of the stream.
+        frame: The current frame.
+        turns: (U,) mask of the processed wires; set to False for wires that the deadline interrupts.
+        exhausted: (U,) mask of the wires that have no attempts left and are given up.
     """
     solver, arrays = stream.solver, stream.arrays
     good, status = arrays.good, arrays.status
@@ -64,11 +69,11 @@ def recover_lost(
         ended = int(solver.report[u, wires.STATUS])
         status[u] = op.ILL_CONDITIONED if ended == op.CONVERGED and not good[u] else ended
     solver.std[~good] = np.inf
-    arrays.predictable &= ~(lost | exhausted)  # the inverses of all other wires remain valid
+    arrays.predictable &= ~(lost | exhausted)  # the inverses of the other wires remain valid
 
 
 def recover(stream: StreamState, u: int, frame: Frame) -> bool:
-    """Bridge wire u from its last trusted position, then from rest; return whether a root was found."""
+    """Bridge wire u from its last trusted position, then from rest; return whether it reached a root."""
     solver, arrays, problem = stream.solver, stream.arrays, stream.problem
     starts = [(arrays.x[u].copy(), arrays.a_solved[u].copy())]
     rest = problem.rest[u], problem.a_rest[u]
@@ -89,11 +94,11 @@ def recover(stream: StreamState, u: int, frame: Frame) -> bool:
 def _bridge(  # noqa: PLR0913 - both ends of the bridge
     stream: StreamState, u: int, x_from: Float, a_from: Float, frame: Frame, substeps: int
 ) -> bool:
-    """Solve wire u along a straight line from the resistances ``a_from`` (K,) to the frame's resistances.
+    """Solve wire u in ``substeps`` equal substeps from the resistances ``a_from`` (K,) to those of the frame.
 
-    Only the branch of the last point is checked: intermediate points do not correspond to deformations of the
-    rubber and may be on any branch. The outcome is written to the solver's report for the wire. Returns False
-    if the deadline interrupts the bridge.
+    The outcome of the last substep is in the solver's report. The interpolated resistances do not belong to a
+    deformation of the skin, so the solutions of the other substeps may be on any branch. Returns False if the
+    deadline interrupts the bridge.
     """
     todo, a_to = stream.only(u), stream.arrays.a[u]
     between = stream.arrays.a.copy()

@@ -1,8 +1,9 @@
-"""Solver, arrays and rest position of one patch, shared by the modules of the exact tracker.
+"""State of a stream that the modules of the exact tracker share: solver, arrays and acceptance of roots.
 
-A root of F = b is accepted only if the determinant of J has the same sign as at rest, and no electrode has
-moved farther than its clearance (its distance from the lower layer at rest). If a wire has more equations
-than unknowns, J has no determinant; instead, a χ² test compares the residual with the noise.
+A root of F = b is accepted only if it passes two tests. Each electrode must be within its clearance of its
+rest position; the clearance is its distance at rest from the nearest lower electrode. The determinant of J
+must have the same sign as at rest. If a wire has more equations than unknowns, J has no determinant, and a χ²
+test of the residual replaces the second test.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ from skinnode.solve.wires.patch_solver import PatchSolver
 from skinnode.solve.wires.problem import PatchProblem
 
 TOLERANCE: Final = 1e-9
-"""Tolerance of a solve for the residual r, and for the positions x in pitches.
+"""Tolerance of a solve, for the residual r and for the positions x in pitches.
 
 The tolerance is four orders of magnitude below the relative noise of a 24-bit converter. A single Newton step
 reduces an error of 1e-5 to less than 1e-9.
@@ -34,36 +35,36 @@ reduces an error of 1e-5 to less than 1e-9.
 FRAME_STEPS: Final = 12
 """Maximum number of steps per solve; Newton's method takes 3 to 6 steps within the trust region."""
 TASKS: Final = wires.COVARIANCE | wires.REUSE
-"""Tasks added to each solve: compute the covariance, and reuse the last J⁻¹ where possible."""
+"""Tasks of each solve: compute the covariance, and reuse the last J⁻¹ where possible."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Frame:
-    """Noise and deadline of the current frame, and the order in which its wires are solved."""
+    """Noise, deadline and order of the wires in the current frame."""
 
     sigma: float
-    """Smallest relative standard deviation of the resistances."""
+    """Minimum relative standard deviation of the resistances."""
     order: Index
-    """(U,) indices of the upper wires, in the order in which they are solved."""
+    """(U,) indices of the upper wires, in the order in which to solve them."""
     until: float
-    """Deadline on the ``perf_counter`` clock, s; inf if there is none."""
+    """Deadline on the ``perf_counter`` clock, s; inf for no deadline."""
 
     @property
     def expired(self) -> bool:
-        """True once the deadline has passed."""
+        """Whether the deadline has passed."""
         return self.until < math.inf and perf_counter() >= self.until
 
 
 class StreamState:
-    """Solver and arrays of one stream, modified in place by the parts of the tracker.
+    """Solver and arrays of one stream, which the modules of the exact tracker modify in place.
 
     Each stream needs its own instance.
 
     Args:
         problem: The patch in solver units.
         operator: Operator code.
-        normal_only: Whether only z is unknown.
-        first: HOLD or PREDICT: action for the wires whose J⁻¹ is known.
+        normal_only: Whether to solve for z only.
+        first: Action for wires with a valid J⁻¹: HOLD or PREDICT.
     """
 
     def __init__(self, problem: PatchProblem, operator: int, normal_only: bool, first: int) -> None:
@@ -104,10 +105,10 @@ class StreamState:
 
         Args:
             todo: (U,) action for each wire: LEAVE, SOLVE, PREDICT or HOLD.
-            frame: Frame with σ and the order of the wires.
-            a: (U, K) resistances; the frame's resistances by default.
-            options: Solver options; the stream's options by default.
-            units: As in :meth:`PatchSolver.solve`.
+            frame: Frame that provides σ and the order of the wires.
+            a: (U, K) scaled resistances; default: those of the frame.
+            options: Options of the solve; default: those of the stream.
+            units: Time limit, as in :meth:`PatchSolver.solve`.
         """
         self.solver.solve(
             todo,
@@ -120,13 +121,13 @@ class StreamState:
         )
 
     def only(self, u: int) -> NDArray[np.uint8]:
-        """Return the actions (U,) for a solve of wire u alone."""
+        """Return the actions (U,) that solve only wire u."""
         todo = np.full(len(self.solver.x), wires.LEAVE, np.uint8)
         todo[u] = wires.SOLVE
         return todo
 
     def roots(self) -> NDArray[np.bool_]:
-        """Return a mask (U,) of the wires at a root that the skin can reach from the rest position."""
+        """Return a mask (U,) of the wires with a plausible root on the branch of the rest position."""
         solver = self.solver
         report, out_of_reach = solver.report, self.problem.out_of_reach(solver.x)
         return on_rest_branch(
@@ -134,15 +135,15 @@ class StreamState:
         )
 
     def solvable(self) -> NDArray[np.bool_]:
-        """Return a mask (U,) of wires with at least as many usable resistances as unknowns."""
+        """Return a mask (U,) of the wires with at least as many usable resistances as unknowns."""
         count = np.count_nonzero(self.arrays.used, axis=1)
         return np.asarray((count > 0) & (count >= self.unknowns))
 
     def relative_residual(self, x: Float, a: Float) -> Float:
-        """Return the residuals a F(x) − 1 (K,) of a wire with its electrodes at ``x`` (3N,), pitches."""
+        """Return the residuals a F(x) − 1 (K,) of a wire with its electrodes at ``x`` (3N,) in pitches."""
         gaps = x.reshape(-1, 1, 3, 1) - self.problem.lower.transpose(1, 0, 2)[None]
         return np.asarray(relative_residual(a, (1.0 / np.sqrt((gaps**2).sum(axis=2))).sum(axis=(0, 1))))
 
     def a_at(self, x: Float) -> Float:
-        """Return the ``a`` (K,) for which a F(x) = 1 at the electrode positions ``x`` (3N,), pitches."""
+        """Return the ``a`` (K,) for which a F(x) = 1, with the electrodes at ``x`` (3N,) in pitches."""
         return np.asarray(1.0 / (1.0 + self.relative_residual(x, np.ones(self.problem.layout.shape[1]))))

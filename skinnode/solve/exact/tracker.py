@@ -1,15 +1,15 @@
-"""Exact tracker: solves each frame of a live stream from the solution of the previous frame.
+"""Exact tracker: solves each frame of a live stream, starting at the solution for the previous frame.
 
-The tracker applies these stages to each wire until one of them finds a root of F = b:
+Each wire passes through these stages until one of them finds a root of F = b:
 
-- hold: keep the last position if the wire's resistances changed by no more than their noise (see ``hold``);
-- predict: move the wire by (∂x/∂R) ΔR, using the J⁻¹ of an earlier frame;
-- follow: take simplified Newton steps with the same J⁻¹ while it is accurate enough;
-- correct: iterate the operator to a tolerance far below any noise;
-- widen: add an omitted electrode to the unknowns if it seems to move (see ``leave_out``);
-- recover: make further attempts if the solve of a wire fails (see ``recover``).
+- hold: keep the last position if the resistances changed by no more than their noise (module ``hold``);
+- predict: move the electrodes by (∂x/∂R) ΔR, with the J⁻¹ of an earlier frame;
+- follow: take simplified Newton steps with the same J⁻¹ while it is accurate enough (module ``follow``);
+- correct: iterate the operator to a tolerance far below any noise (module ``correct``);
+- widen: make a fixed electrode an unknown if it seems to move (module ``leave_out``);
+- recover: make further attempts if no root was found (module ``recover``).
 
-The rules for acceptable roots are in :mod:`skinnode.solve.roots`.
+:mod:`skinnode.solve.roots` defines which roots are acceptable.
 """
 
 from __future__ import annotations
@@ -39,39 +39,40 @@ from skinnode.solve.wires.solve_wires import COVARIANCE_UNITS
 from skinnode.solve.wires.stages import DEADLINE
 
 UNIT_S: Final = 10e-6
-"""Upper bound on the time for one solver step, including an evaluation of F and J, s.
+"""Upper bound on the time of one solver step, including one evaluation of F and J, s.
 
-Each call of the solver includes all wires that are certain to finish before the deadline. Splitting one
-solver call into ten would take as much additional time as solving ten more wires.
+Each call of the solver processes all wires that are certain to finish before the deadline. Ten calls instead
+of one would cost as much extra time as solving ten more wires.
 """
 WIRE_UNITS: Final = FRAME_STEPS + 1 + COVARIANCE_UNITS
-"""Maximum computing time for one wire in one frame, as a number of evaluations of F and J."""
+"""Maximum computing time of one wire in one frame, in units of one evaluation of F and J plus one step."""
 
 
 class ExactTracker:
-    """Tracker for one patch that solves each upper wire alone (exact inverse).
+    """Tracker of one patch that solves each upper wire separately (exact inverse).
 
-    Each patch needs its own tracker. The tracker's compiled code runs without the GIL.
+    Each patch needs its own tracker. The compiled code releases the GIL.
 
     Args:
         layout: The patch, with K ≥ 3N, or K ≥ N if ``normal_only``.
         operator: ``levenberg_marquardt``, ``dogleg`` or ``gauss_newton``.
         relative_noise: Relative standard deviation of R, a number or (U, K).
-        baseline_ohm: (U, K) resistances measured at rest, ohm; if given, resistivity and gain cancel.
-        stiffness_n_per_m: Stiffness k of the paper's law F = k Δs, N/m; if given, each field contains the
-            forces F.
-        hold: Whether to keep the last position of a wire if its resistances changed by no more than their
+        baseline_ohm: (U, K) resistances measured at rest, ohm. If given, errors of resistivity and gain
+            cancel.
+        stiffness_n_per_m: Stiffness k of the paper's force law F = k Δs, N/m. If given, each field contains
+            the forces F.
+        hold: Whether to keep the last position of a wire while its resistances change by no more than their
             noise.
-        deadline_us: Time limit of an update, µs; an update can exceed the limit by the time to solve one
-            wire. Wires not processed by the deadline have the status DEADLINE and an infinite standard
-            deviation; the next frame starts with these wires.
-        normal_only: Whether only z is unknown.
+        deadline_us: Time limit of an update, µs; an update can exceed it by the time of one wire's solve.
+            Wires not processed by the deadline have the status DEADLINE and an infinite standard deviation,
+            and are processed first in the next frame.
+        normal_only: Whether to fix x and y at rest and solve for z only.
         active_only: Whether to fix electrodes at rest unless a contact moves them.
-        codes: Mapping from the codes passed to :meth:`update_codes` to resistances.
-        noise_estimate: Estimate of the stream's noise, which scales the stated noise. :meth:`reset` does not
-            reset this estimate.
+        codes: Mapping of the codes passed to :meth:`update_codes` to resistances.
+        noise_estimate: Estimator of the stream's noise, which scales the stated noise. :meth:`reset` does not
+            reset it.
 
-    The constructor compiles the kernels. Raises ValueError if an argument has the wrong shape or is out of
+    The constructor compiles the kernels. It raises ValueError if an argument has the wrong shape or is out of
     range.
     """
 
@@ -103,7 +104,7 @@ class ExactTracker:
         problem = PatchProblem.of(layout, baseline_ohm)
         self.stiffness_n_per_m = stiffness_n_per_m
         self.untouched_force_n: Float | None = None
-        """(U, N, 3) forces to report if no stiffness is given, N: the forces on an untouched patch."""
+        """(U, N, 3) forces reported if no stiffness is given: those on an untouched patch, N."""
         self._noise = checked_noise(relative_noise, layout)
         self._sigma = float(self._noise.min())
         self._seconds = math.inf if deadline_us is None else deadline_us * 1e-6
@@ -116,7 +117,7 @@ class ExactTracker:
         )
         self._left_out = LeftOut(self._stream, active_only)
         self.arrays = self._stream.arrays
-        """Arrays of the stream and of the current frame."""
+        """Arrays of the current frame and of the last trusted solution."""
         self._code_noise = np.zeros(layout.shape)
         if codes is not None:
             self.arrays.set_codes(codes)
@@ -147,21 +148,21 @@ class ExactTracker:
 
         Args:
             frame_ohm: (U, K) resistances, ohm; values that are not positive and finite are ignored.
-            valid: (U, K) bool, False if a chunk or wire is missing; default all True.
-            relative_noise: As in the constructor, for this frame only; resistances whose noise is not
-                positive and finite are ignored.
-            left_out: (U, K) readings that the solve ignores although they are valid; the noise estimate uses
+            valid: (U, K) bool, False for missing readings; default: all True.
+            relative_noise: Relative standard deviation of the resistances of this frame, a number or (U, K);
+                default: as in the constructor. A resistance is ignored if its standard deviation is not
+                positive and finite.
+            left_out: (U, K) bool, True for valid readings that the solve ignores. The noise estimate uses
                 them.
 
-        No resistance value raises an exception. A wire with fewer usable resistances than unknowns is
-        ILL_CONDITIONED, or NON_FINITE if resistances not marked as missing were unusable. A wire that cannot
-        be solved keeps its last trusted position with an infinite standard deviation. The residual of an
-        unsolved wire is computed at its last trusted position; if the deadline has passed, the residual is
-        inf. Raises ValueError if a shape is wrong.
+        No resistance raises an exception. A wire that cannot be solved keeps its last trusted position, with
+        an infinite standard deviation and the residual at that position; after the deadline, the residual is
+        inf. A wire with fewer usable resistances than unknowns is NON_FINITE if any valid resistance is out
+        of range, otherwise ILL_CONDITIONED. Raises ValueError if a shape is wrong.
         """
         start = perf_counter()
         arrays = self.arrays
-        # the kernel stores the addresses of these arrays, so write into them
+        # The kernel stores the addresses of these arrays, so they must be modified in place.
         arrays.ohm[:] = require_array("frame_ohm", frame_ohm, self.layout.shape, finite=False)
         arrays.noise[:] = (
             self._noise if relative_noise is None else broadcast_noise(relative_noise, self.layout)
@@ -177,10 +178,10 @@ class ExactTracker:
         return self._advance(stage.SCALE, start)
 
     def update_codes(self, codes: NDArray[np.uint32]) -> FieldFrame:
-        """Return the field of a scan whose readings are given as codes (U, K); see :meth:`update`.
+        """Return the displacement field of a scan, given its codes (U, K); see :meth:`update`.
 
-        On return, :attr:`arrays` contains the resistances, and :attr:`invalid_codes` is the number of invalid
-        codes. Raises ValueError if ``codes`` has the wrong shape or is not uint32.
+        Writes the resistances to :attr:`arrays` and the number of invalid codes to :attr:`invalid_codes`.
+        Raises ValueError if ``codes`` has the wrong shape or is not uint32.
         """
         start = perf_counter()
         arrays, estimate = self.arrays, self._noise_estimate
@@ -191,18 +192,18 @@ class ExactTracker:
             self._code_factor = estimate.factor
             arrays.code_map[NOISE] = self._code_noise[0, 0] * estimate.factor
         field = self._advance(stage.DECODE | stage.SCALE, start)
-        estimate.see(arrays.ohm, self._code_noise, arrays.rounding_ohm)  # affects the next frame
+        estimate.see(arrays.ohm, self._code_noise, arrays.rounding_ohm)  # takes effect in the next frame
         return field
 
     def update_again(self, left_out: NDArray[np.bool_]) -> FieldFrame:
-        """Solve the last frame again without the readings ``left_out`` (U, K), and return its field."""
+        """Return the field of the last frame, solved again without the readings ``left_out`` (U, K)."""
         start = perf_counter()
         self.distrust(np.asarray(left_out.any(axis=1)))
         self.arrays.valid[left_out] = False
         return self._advance(stage.SCALE, start)
 
     def _advance(self, stages: int, start: float) -> FieldFrame:
-        """Run ``stages`` on the frame in :attr:`arrays`, solve it and return its field."""
+        """Run ``stages`` on the frame in :attr:`arrays`, solve the frame and return its field."""
         solver, arrays = self._stream.solver, self.arrays
         sigma, until, units = self._sigma, start + self._seconds, math.inf
         if self._leaves_out:
@@ -248,7 +249,7 @@ class ExactTracker:
         )
 
     def _call_stages(self, stages: int, sigma: float, units: float) -> tuple[float, int]:
-        """Run ``stages`` with :meth:`PatchSolver.advance`; return σ and the flags of the outcome."""
+        """Run ``stages`` with :meth:`PatchSolver.advance`; return σ and the flags that it returns."""
         sigma, invalid, found = self._stream.solver.advance(
             stages, self.arrays, self._stream.options, sigma, units
         )
@@ -257,9 +258,9 @@ class ExactTracker:
         return sigma, found
 
     def _rescue(self, frame: Frame) -> Float:
-        """Make further attempts to solve wires that are not at a root; return the residuals (U,).
+        """Make further attempts for wires without an acceptable root; return the residuals (U,).
 
-        Writes ``good`` and ``status`` of :attr:`arrays`.
+        Updates ``good`` and ``status`` in :attr:`arrays`.
         """
         solver, arrays = self._stream.solver, self.arrays
         turns = solver.report[:, wires.TURN] == 1
@@ -271,14 +272,14 @@ class ExactTracker:
         for u in np.flatnonzero(~arrays.good).tolist():
             known = arrays.status[u] != DEADLINE and not frame.expired
             residual[u] = self._held_residual(u) if known else math.inf
-        # the next frame starts with the unprocessed wires, in their previous order
+        # The next frame starts with the unprocessed wires, in the same order.
         self._waiting = not turns.all()
         order = arrays.order
         order[:] = order[np.argsort(turns[order], kind="stable")] if self._waiting else self._in_order
         return residual
 
     def _complete(self) -> None:
-        """For solved wires with missing readings, write the values of ``a`` that the solution predicts."""
+        """Write the missing ``a`` of each solved wire to ``a_solved``, as predicted by its solution."""
         stream, arrays = self._stream, self.arrays
         solved = arrays.good & (stream.solver.report[:, wires.HELD] == 0)
         for u in np.flatnonzero(solved & (arrays.used == 0).any(axis=1)).tolist():
@@ -286,7 +287,7 @@ class ExactTracker:
             arrays.a_solved[u, missing] = stream.a_at(arrays.x[u])[missing]
 
     def adopt(self, wires_: NDArray[np.bool_], displacement_m: Float) -> None:
-        """Use the given displacements (U, N, 3) as the last solutions of the given wires (U,)."""
+        """Replace the last solutions of the wires in the mask (U,) with displacements (U, N, 3), m."""
         stream, arrays = self._stream, self.arrays
         moved = (displacement_m / self.layout.pitch_m).reshape(arrays.x.shape)
         if self._active_only:  # solve for all electrodes of these wires again
@@ -297,13 +298,13 @@ class ExactTracker:
             arrays.predictable[u] = False
 
     def distrust(self, wires_: NDArray[np.bool_]) -> None:
-        """Solve the given wires (U,) from rest in the next frame, regardless of this frame's outcome."""
+        """Start the wires in the mask (U,) at rest in the next frame, whatever this frame's outcome."""
         problem, arrays = self._stream.problem, self.arrays
         arrays.x[wires_], arrays.a_solved[wires_] = problem.rest[wires_], problem.a_rest[wires_]
         arrays.predictable[wires_] = False
 
     def _solve(self, frame: Frame) -> None:
-        """Solve as many wires as time allows, but at least one."""
+        """Solve at least one wire, and further wires while time remains."""
         units = math.inf
         if frame.until < math.inf:
             units = max(WIRE_UNITS, (frame.until - perf_counter()) / UNIT_S)
@@ -322,7 +323,7 @@ class ExactTracker:
             self._stream.solve(todo, frame, units=units)
 
     def _held_residual(self, u: int) -> float:
-        """Return the RMS residual of wire u at its current position; inf if no resistance is usable."""
+        """Return the RMS residual of wire u at its last trusted position; inf if no resistance is usable."""
         arrays = self.arrays
         used = arrays.used[u] > 0
         if not used.any():

@@ -1,10 +1,10 @@
-"""Track how often each crossing's code has repeated, and how far the neighbours' codes changed in that time.
+"""Count each crossing's repeated codes, and measure how far its neighbours' codes move meanwhile.
 
-A crossing's *run* is the number of consecutive scans that have repeated its code. A crossing's *lead* is the
-amount by which its neighbours' codes have changed during the run. The lead along the upper wire is the
-smaller change of the two neighbours on the same upper wire, or 0 if the two codes have changed in opposite
-directions. The lead along the lower wire is defined in the same way. A crossing at the edge has only one
-neighbour on a wire; the next crossing on the wire is used as the second neighbour.
+The *run* of a crossing is the number of successive scans that have repeated its code. Its *lead* is the
+change of its neighbours' codes during the run. There are two leads: one along the upper wire and one along
+the lower wire. If both neighbours on the wire have changed in the same direction, the lead is the smaller of
+the two changes; otherwise, it is 0. For a crossing at the end of a wire, the two nearest crossings on the
+wire serve as neighbours.
 """
 
 from __future__ import annotations
@@ -18,35 +18,45 @@ from skinnode.compiled.jit import njit_brief, njit_part
 from skinnode.protocol.codes import MISSING as _MISSING
 
 LAST, BEFORE, RUN, NAMED, ALONG, ACROSS, _ANCHORS = range(7)
-"""Planes of the state array. ``LAST``: last code; -1 before the first code. ``BEFORE``: previous code.
-``RUN``: run. ``NAMED``: nonzero if the crossing or its wire has already been detected as frozen. ``ALONG``
-and ``ACROSS``: lead along the upper wire and along the lower wire. ``_ANCHORS``: first of four planes that
-store the neighbours' codes from the start of the run.
+"""Planes of the state array:
+
+- ``LAST``: newest code; -1 before the first code.
+- ``BEFORE``: code before the last change; -1 if there is none.
+- ``RUN``: run.
+- ``NAMED``: nonzero if the crossing, or its wire, has been reported as frozen.
+- ``ALONG``, ``ACROSS``: lead along the upper wire and along the lower wire.
+- ``_ANCHORS``: first of four planes with the neighbours' codes at the start of the run.
 """
 _PLANES: Final = 10
 
 UPPER, LOWER, CROSSING, WIRE_LEAD, CROSSING_LEAD, STEPS, FRESH = range(7)
-"""Indices of the limits. ``UPPER``, ``LOWER`` and ``CROSSING``: run at which an upper wire, a lower wire or a
-crossing is considered frozen. ``WIRE_LEAD`` and ``CROSSING_LEAD``: lead at which a wire or a crossing with
-repeated codes is considered frozen. ``STEPS``: highest code that represents a measurement. ``FRESH``: 1 if
-the node sent every code of the scan, 0 if the node omitted unchanged codes. Runs do not grow while ``FRESH``
-is 0.
+"""Indices of the limits:
+
+- ``UPPER``, ``LOWER``, ``CROSSING``: run at which an upper wire, a lower wire or a crossing may be frozen.
+- ``WIRE_LEAD``, ``CROSSING_LEAD``: lead at which a wire or crossing with repeated codes may be frozen.
+- ``STEPS``: highest code that is a measurement.
+- ``FRESH``: 1 if the node sent every code of the scan, 0 if it left out unchanged codes. Runs grow only if it
+  is 1.
 """
 MEASURED, CHANGED, RETURNED, LARGEST, RESERVED, LEAST, RELEASED, SUSPECT = range(8)
-"""Indices of the results. ``MEASURED``: number of crossings with a measurement. ``CHANGED``: number of
-crossings whose code changed. ``RETURNED``: number of crossings whose code returned to its previous value.
-``LARGEST``: largest change of a code. ``RESERVED``: number of crossings whose last code is reserved.
-``LEAST``: smallest code. ``RELEASED``: number of crossings detected as frozen whose code has changed since.
-``SUSPECT``: 1 if a wire or crossing not detected yet may be frozen, otherwise 0.
+"""Indices of the results:
+
+- ``MEASURED``: number of codes that are measurements.
+- ``CHANGED``: number of changed codes.
+- ``RETURNED``: number of codes that have changed back to the code before.
+- ``LARGEST``: largest change of a code.
+- ``RESERVED``: number of crossings whose newest code is reserved.
+- ``LEAST``: smallest code that is a measurement.
+- ``RELEASED``: number of crossings reported as frozen whose code has changed.
+- ``SUSPECT``: 1 if another wire or crossing may be frozen, 0 otherwise.
 """
 
 LEAST_RUN: Final = 5
-"""Minimum run (scans) at which a crossing, wire or patch is considered frozen. A wire is considered frozen at
-a run of 1 if the codes of its neighbours have changed.
+"""Minimum run (scans) of a frozen crossing, wire or patch. A run of 1 is enough for a wire whose neighbours'
+codes have moved.
 """
 LEADS: Final = 3
-"""Minimum number of crossings on a frozen wire whose neighbours' codes have changed during the run.
-"""
+"""Minimum number of crossings that must have a sufficient lead before a wire counts as frozen."""
 
 _Int = NDArray[np.int64]
 
@@ -60,7 +70,7 @@ def new_runs(shape: tuple[int, int]) -> _Int:
 
 @njit_brief
 def follow(codes: NDArray[np.uint32], state: _Int, limits: _Int, found: _Int) -> None:
-    """Update all runs and leads from the codes of a new scan.
+    """Update all runs and leads with the codes of a scan.
 
     Args:
         codes: (U, K) codes; missing codes are ignored.
@@ -101,7 +111,7 @@ def follow(codes: NDArray[np.uint32], state: _Int, limits: _Int, found: _Int) ->
 
 @njit_part
 def _update_leads(state: _Int, steps: int) -> None:
-    """Update the leads; at the start of a run, store the neighbours' codes."""
+    """Update the leads. At the start of a run, store the neighbours' codes."""
     rows, columns = state.shape[1], state.shape[2]
     for u in range(rows):
         for k in range(columns):
@@ -117,13 +127,13 @@ def _update_leads(state: _Int, steps: int) -> None:
 
 @njit_part
 def _one(here: int) -> int:
-    """Return the index of the first neighbour of wire number ``here``."""
+    """Return the number of the first neighbour of wire ``here``."""
     return 1 if here == 0 else here - 1
 
 
 @njit_part
 def _two(here: int, size: int) -> int:
-    """Return the index of the second neighbour of wire number ``here`` out of ``size`` parallel wires."""
+    """Return the number of the second neighbour of wire ``here``, of ``size`` parallel wires."""
     if here == 0:
         return 2
     return size - 3 if here == size - 1 else here + 1
@@ -131,7 +141,7 @@ def _two(here: int, size: int) -> int:
 
 @njit_part
 def _set_lead(state: _Int, u: int, k: int, axis: int, a: int, b: int, steps: int) -> None:  # noqa: PLR0913
-    """Set a crossing's lead along one axis, where its two neighbours have the codes ``a`` and ``b``."""
+    """Set the lead of a crossing along one axis, given its two neighbours' codes ``a`` and ``b``."""
     plane = _ANCHORS + 2 * axis
     lead = 0
     if state[RUN, u, k] == 0:
@@ -148,16 +158,16 @@ def _set_lead(state: _Int, u: int, k: int, axis: int, a: int, b: int, steps: int
 
 @njit_part
 def _counts(state: _Int, u: int, k: int, steps: int) -> bool:
-    """Return whether a crossing's last code is a measurement and the crossing is not marked as frozen."""
+    """Return whether a crossing's newest code is a measurement and the crossing is not reported as frozen."""
     return bool(0 <= state[LAST, u, k] <= steps and state[NAMED, u, k] == 0)
 
 
 @njit_part
 def _any_crossing(state: _Int, limits: _Int) -> bool:
-    """Return whether the code of any crossing is suspiciously constant.
+    """Return whether any crossing may be frozen.
 
-    A constant code is suspicious if the neighbours' codes have changed during the run, or if most other
-    crossings have shorter runs.
+    A repeated code is suspicious if the codes of all four neighbours have moved during the run, or if the run
+    is long and most other crossings have much shorter ones.
     """
     known = still = longest = 0
     lead = limits[CROSSING_LEAD]
@@ -176,10 +186,10 @@ def _any_crossing(state: _Int, limits: _Int) -> bool:
 
 @njit_part
 def _any_wire(state: _Int, limits: _Int) -> bool:
-    """Return whether the codes of any wire are suspiciously constant.
+    """Return whether any wire may be frozen.
 
-    Constant codes are suspicious if the neighbours' codes have changed during the run, or if most other
-    crossings have shorter runs.
+    A wire with repeated codes is suspicious if the codes of the adjacent wires have moved during the run, or
+    if the run is long and most other crossings have much shorter ones.
     """
     for side in range(2):
         wires, others = state.shape[1 + side], state.shape[2 - side]
@@ -205,7 +215,7 @@ def _any_wire(state: _Int, limits: _Int) -> bool:
 
 
 def compile_kernels() -> None:
-    """Compile :func:`follow` or load its compiled code from the cache, before the first scan arrives."""
+    """Compile :func:`follow`, or load it from the cache, so that the first scan is not delayed."""
     codes = np.zeros((1, 1), np.uint32)
     codes.setflags(write=False)
     follow(codes, new_runs((1, 1)), np.zeros(7, np.int64), np.zeros(8, np.int64))

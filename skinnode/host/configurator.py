@@ -1,10 +1,12 @@
 """Configure a node: check its identity and layout, write its parameters, and read its baseline.
 
-The host writes to a node only after checking its identity and layout against the hand file, because the node
-could be a different device, such as a motor drive. The host reads back every parameter that it writes. On a
-bus that another master runs, the host sends no NMT commands, does not change the SYNC parameters, and writes
-patch-specific parameters only if they differ from the hand file. If the host is not allowed to send any frame
-(``guest_sends = "nothing"``), all information about the node comes from files.
+The device that answers at a node-ID may be something else entirely, such as a motor drive. The host therefore
+compares the device's identity and layout with the hand file before it writes anything. Every parameter
+written is read back.
+
+On a bus that another master runs, the host sends no NMT commands and leaves the SYNC parameters unchanged. It
+writes a patch-specific parameter only if the node's value differs from the hand file. With
+``guest_sends = "nothing"``, the host sends no frames and takes all facts about the node from files.
 """
 
 from __future__ import annotations
@@ -32,21 +34,21 @@ from skinnode.protocol.profile import PatchProfile
 from skinnode.text.words import counted
 
 BOOT_DEADLINE_S: Final = 3.0
-"""Maximum time (s) to wait for a node's first response. A node takes less than a second to boot and tare
-itself.
+"""Time limit (s) for a node's first response. Booting and the initial tare take a node less than 1 s in
+total.
 """
 
 HEARTBEATS_WATCHED: Final = 3
-"""Number of consecutive host heartbeats that a node may miss before it stops sending scans."""
+"""Timeout for the host's heartbeat, in heartbeat periods. A node that times out stops sending scans."""
 
 _POLL_S: Final = 0.02
 
 
 @dataclass(frozen=True, slots=True)
 class Configurator:
-    """Configurator for the nodes on one bus.
+    """Configurator for the nodes of one bus.
 
-    Threads: several nodes may be configured in parallel, each on its own thread.
+    Threads: nodes may be configured in parallel, one thread per node.
     """
 
     send: Callable[[int, bytes], None]
@@ -54,28 +56,25 @@ class Configurator:
     bus: BusConfig
     boot_deadline_s: float
     abandoned: Callable[[], bool]
-    """Function called repeatedly during configuration; if it returns True, the configuration stops and raises
-    Abandoned.
-    """
+    """Function polled during configuration. If it returns True, :meth:`configure` raises Abandoned."""
     on_answer: Callable[[PatchConfig], None]
-    """Function called once per node, after the node's first response."""
+    """Function called when a node responds for the first time."""
     search: Callable[[PatchConfig], object]
-    """Function that searches for a silent node by its serial number."""
+    """Function that looks for a silent node by serial number."""
 
     def configure(self, patch: PatchConfig, profile: PatchProfile, remote: RemoteOd) -> NodeFacts:
         """Wait for the node, check its identity and configure it.
 
-        If the host is the NMT master of the bus, the node is pre-operational after the call.
+        If the host is the NMT master, it leaves the node in NMT state pre-operational.
 
         Args:
             patch: Configuration of the patch from the hand file.
-            profile: Wire format of the patch.
+            profile: PDO format of the patch.
             remote: Object dictionary of the patch's node.
 
         Raises:
-            NodeTimeout: if the node does not respond before the timeout.
-            NodeError: if the node does not match the hand file, or a parameter read back from the node
-                differs from the value written.
+            NodeTimeout: if the node does not respond in time.
+            NodeError: if the node does not match the hand file or does not keep a parameter value.
             SdoAbort: if the node aborts an SDO transfer.
             ConfigError: if the baseline file does not match the patch.
             Abandoned: if ``abandoned`` returned True.
@@ -125,7 +124,7 @@ class Configurator:
                 )
 
     def _identify(self, patch: PatchConfig, remote: RemoteOd) -> tuple[int, int]:
-        """Check the node's identity. Return the node's serial number and revision number."""
+        """Check the identity object (0x1018). Return the serial number and the revision number."""
         for subindex, what, expected in (
             (od.IDENTITY_VENDOR, "vendor-ID", od.VENDOR_ID),
             (od.IDENTITY_PRODUCT, "product code", od.PRODUCT_CODE),
@@ -134,7 +133,7 @@ class Configurator:
             if got != expected:
                 raise _mismatch(patch, what, f"0x{got:08X}", f"0x{expected:08X} (a skinnode patch)")
         revision = int(remote.read(od.IDENTITY, od.IDENTITY_REVISION, "u32"))
-        if revision >> 16 != od.REVISION_NUMBER >> 16:  # the major revision defines the CANopen behaviour
+        if revision >> 16 != od.REVISION_NUMBER >> 16:  # the major revision identifies the CANopen behaviour
             allowed = f"{od.REVISION_NUMBER >> 16}.x"
             raise _mismatch(patch, "revision", f"{revision >> 16}.{revision & 0xFFFF}", allowed)
         serial = int(remote.read(od.IDENTITY, od.IDENTITY_SERIAL, "u32"))
@@ -164,7 +163,7 @@ class Configurator:
         return layout
 
     def _read_layout(self, patch: PatchConfig, profile: PatchProfile, remote: RemoteOd) -> PatchLayout:
-        """Return the layout defined by the electrode coordinates that the node stores."""
+        """Build the layout from the electrode coordinates stored on the node."""
         self._go_on()
         data = remote.read_block(od.COORDINATES)
         resistivity = remote.read(od.DESCRIPTOR, od.RESISTIVITY, "f32")
@@ -174,11 +173,11 @@ class Configurator:
             raise _mismatch(patch, "electrode coordinates", counted(len(data), "byte"), str(error)) from None
 
     def _configure_communication(self, remote: RemoteOd) -> None:
-        """Write the node's SYNC and heartbeat consumer parameters, which only a master may set."""
+        """Write the SYNC and heartbeat consumer parameters, which belong to the NMT master of the bus."""
         self._go_on()
         sync = self.hand.sync
         remote.write_checked(od.COB_ID_SYNC, 0, "u32", od.SYNC_COB_ID)
-        # The overflow value may only change while the cycle period is 0 (CiA 301, 7.5.2.22).
+        # The overflow value is writable only while the cycle period is 0 (CiA 301, 7.5.2.22).
         remote.write_checked(od.CYCLE_PERIOD, 0, "u32", 0)
         remote.write_checked(od.SYNC_COUNTER_OVERFLOW, 0, "u8", sync.counter_overflow)
         remote.write_checked(od.CYCLE_PERIOD, 0, "u32", sync.period_ms * 1000)
@@ -190,7 +189,7 @@ class Configurator:
         _watch_master(remote, watched)
 
     def _configure_heartbeat(self, remote: RemoteOd, *, master: bool) -> float:
-        """Set the node's heartbeat period unless another master has set the period. Returns the period, s."""
+        """Set the heartbeat period, or keep the one set by another master. Return the period (s)."""
         heartbeat_ms = self.hand.bring_up.heartbeat_ms
         if not master:
             present_ms = int(remote.read(od.HEARTBEAT_PRODUCER, 0, "u16"))
@@ -202,7 +201,7 @@ class Configurator:
     def _configure_patch(
         self, patch: PatchConfig, profile: PatchProfile, remote: RemoteOd, *, master: bool
     ) -> None:
-        """Write the parameters that define when the patch scans and how it sends its scans."""
+        """Write the acquisition, send policy and TPDO parameters."""
         sync = self.hand.sync
         if not master:
             overflow = remote.read(od.SYNC_COUNTER_OVERFLOW, 0, "u8")
@@ -232,7 +231,7 @@ class Configurator:
                 remote.write_checked(index, sub, size, value)
 
     def _check_mapping(self, patch: PatchConfig, profile: PatchProfile, remote: RemoteOd) -> None:
-        """Check that the node has the PDO mapping that the decoder expects for the node's revision."""
+        """Check the node's PDO mapping against the mapping that the decoder expects for this revision."""
         expected = {item.index: item for item in profile.objects()}
         for index in (od.TPDO1_MAPPING, od.TPDO2_MAPPING):
             count = int(expected[index][0].default or 0)
@@ -246,17 +245,16 @@ class Configurator:
                     raise _mismatch(patch, what, f"0x{mapped:08X}", f"0x{entry:08X}")
 
     def settle_baseline(self, patch: PatchConfig, profile: PatchProfile, remote: RemoteOd) -> Float:
-        """Return the node's baseline.
+        """Return the node's baseline, after writing the baseline file to the node if the hand file names one.
 
-        If the hand file names a baseline file, the values of that file are first written to the node, unless
-        the node already has them. A node returns zeros while it tares itself; the tare must finish before the
-        boot deadline.
+        A baseline that the node already has is not written again. The baseline of a node reads as zeros
+        during a tare; the tare must finish before the boot deadline.
 
         Returns:
-            (U, K) ohm: resistances at rest.
+            Resistances at rest, (U, K), ohm.
 
         Raises:
-            NodeError: if the node does not store the baseline written to it, or a value is not positive.
+            NodeError: if the node does not keep the written baseline, or a resistance is not positive.
             SkinError: for the reasons listed under :meth:`configure`.
         """
         expected = None if patch.baseline is None else load_baseline(patch.baseline, profile)
@@ -283,11 +281,10 @@ class Configurator:
         return baseline
 
     def _read_baseline(self, patch: PatchConfig, profile: PatchProfile, remote: RemoteOd) -> Float:
-        """Read the baseline as one block, or value by value if the node does not support block transfer.
+        """Read the baseline by block transfer, or value by value from a node without block transfer.
 
-        A block transfer of 300 values requires 176 frames and takes 86 ms at 1 Mbit/s, because the node
-        limits the rate of its segments. Reading value by value requires 600 frames and takes 75 ms plus the
-        node's response times, but never saturates the bus.
+        At 1 Mbit/s, a block transfer of 300 values takes 176 frames and 86 ms, limited by the rate at which
+        the node sends segments. Single reads take 600 frames and 75 ms plus the response times of the node.
         """
         try:
             data = remote.read_block(od.BASELINE_DOMAIN, 4 * profile.n_codes)
@@ -311,13 +308,13 @@ class Configurator:
 
 
 def is_configured(patch: PatchConfig, hand: HandConfig, remote: RemoteOd) -> bool:
-    """Return whether a node still has the parameter values that it needs to send scans.
+    """Return whether a node still has the parameters that it needs to send scans.
 
-    The values may be wrong if the host did not notice a reset of the node during bring-up, or if another
-    master has configured the node.
+    The parameters are lost if the node resets during bring-up without the host noticing, or if another master
+    reconfigures the node.
 
     Returns:
-        True if the node has the values that the host would write to it.
+        True if the node's values are those that the host would write.
 
     Raises:
         NodeError: if reading fails; see :class:`RemoteOd`.
@@ -331,9 +328,9 @@ def is_configured(patch: PatchConfig, hand: HandConfig, remote: RemoteOd) -> boo
 
 
 def _open_window(remote: RemoteOd) -> None:
-    """Disable the synchronous window (0x1007), which might end before the node has sent the whole scan.
+    """Disable the synchronous window (0x1007), which may be too short for a whole scan.
 
-    A node without object 0x1007 has no synchronous window.
+    A node without this object has no synchronous window.
     """
     try:
         remote.write_checked(od.SYNC_WINDOW, 0, "u32", 0)
@@ -343,10 +340,10 @@ def _open_window(remote: RemoteOd) -> None:
 
 
 def _watch_master(remote: RemoteOd, watched: int) -> None:
-    """Make the node monitor the host's heartbeat, using entry 1 of object 0x1016.
+    """Make the node monitor the host's heartbeat through entry 1 of object 0x1016.
 
-    If another entry contains the host's node-ID, that entry is cleared, because two entries must
-    not contain the same node-ID. All other entries stay unchanged.
+    Two entries must not contain the same node-ID, so any other entry with the host's node-ID is cleared. The
+    remaining entries are left unchanged.
     """
     try:
         remote.write_checked(od.HEARTBEAT_CONSUMER, 1, "u32", watched)

@@ -1,32 +1,31 @@
-"""Detect whether a patch's converter is running, from the conversion phase and from repeated codes.
+"""Decide whether the converter of a patch is running, from the conversion phase and from repeated codes.
 
 **Phase.** Some patches count their conversions and send the conversion phase
-(:attr:`~skinnode.protocol.summary.SummaryFlag.CONVERSIONS`). If two successive scans of a patch have the same
-phase and the same codes, both scans contain the same conversion. If scans were missed or a summary was lost,
-an unchanged phase is inconclusive. A changed phase always proves that a conversion took place.
+(:attr:`~skinnode.protocol.summary.SummaryFlag.CONVERSIONS`). A new phase proves that a conversion has taken
+place. Two successive scans with the same phase and the same codes contain the same conversion. If a scan or
+summary was lost in between, an unchanged phase proves nothing.
 
-**Repeats.** If a patch sends no phase, only its codes show whether the converter is running. A run is a
-sequence of scans in which no code changes. A converter is considered stopped if all of
-these conditions are met:
+**Repeats.** Without a phase, only the codes show whether the converter is running. A run is a sequence of
+scans in which no code changes. A converter counts as stopped if all of these conditions hold:
 
-- At the noise stated in the hand file, the probability of such a long run is at most ``FALSE_ALARM`` for a
-  running converter.
-- At a lower noise, the probability is at most ``FALSE_ALARM_QUIET``. The lower noise is the larger of two
-  values: the stated noise divided by ``QUIETER``, and half of the noise measured by
-  :mod:`skinnode.host.wire_windows`.
-- In at least ``FLICKERS`` earlier scans, a code has returned to its previous value. Such a return proves that
-  the codes are noisy.
-- The run is at least ``LONGER`` times as long as any earlier run in which the converter was running. Runs at
-  rest and runs under a press are compared separately, because the same converter repeats its codes for
-  minutes at rest, but only for two or three scans under a press.
+- With the noise stated in the hand file, a running converter would produce such a run with a probability of
+  at most ``FALSE_ALARM``.
+- With a lower noise, the probability is at most ``FALSE_ALARM_QUIET``. The lower noise is the stated noise
+  divided by ``QUIETER``, or half of the noise measured by :mod:`skinnode.host.wire_windows` if that is
+  larger.
+- The codes are known to be noisy: in at least ``FLICKERS`` earlier scans, a code has returned to the value it
+  had before its last change.
+- The run is at least ``LONGER`` times as long as the longest run of the running converter so far. Runs at
+  rest and runs under a press are compared separately: a converter that repeats its codes for minutes at rest
+  may repeat them for only two or three scans under a press.
 
-**Doubt.** A few repeated scans do not prove that a converter has stopped, but the fields may already show a
-press that has ended. If the codes of a patch suddenly stop changing in mid-movement, the next ``DOUBT_RUN``
-fields are therefore not trusted. This rule applies only to patches that send no phase, have noisy codes and
-have never repeated all their codes before.
+**Doubt.** A few repeated scans do not prove that a converter has stopped, yet the fields may already show a
+press that is over. If all codes stop changing in mid-movement, the next ``DOUBT_RUN`` fields are therefore
+not trusted. This rule is limited to patches without a phase whose codes are noisy and have never all repeated
+before.
 
-If the phase and the codes are inconclusive and no code has changed for a second, the state of the converter
-is unknown (:attr:`Alive.CANNOT_TELL`).
+If neither phase nor codes decide and no code has changed for a second, the state is unknown
+(:attr:`Alive.CANNOT_TELL`).
 """
 
 from __future__ import annotations
@@ -48,44 +47,40 @@ from skinnode.text.words import counted
 _SOURCE_FAILED: Final = int(SummaryFlag.SOURCE_FAILED)
 
 FALSE_ALARM: Final = 1e-12
-"""Significance level of the tests for frozen crossings, wires and patches. A patch of 10 × 30 wires is tested
-341 times per scan: 300 crossings, 40 wires and the whole patch. Ten hours at 100 scans/s comprise 1.2e9
-tests, so about 0.001 false alarms are expected.
+"""False alarm probability of each test for a frozen crossing, wire or patch. A patch of 10 × 30 wires has 341
+tests per scan: 300 crossings, 40 wires and the patch. In ten hours at 100 scans/s, that makes 1.2e9 tests and
+about 0.001 false alarms.
 """
 FALSE_ALARM_QUIET: Final = 1e-8
-"""Significance level of the same test for a patch whose noise is only 1/``QUIETER`` of the stated noise. In
-ten hours (3.6e6 scans), about 0.04 false alarms are expected for such a patch.
+"""False alarm probability of the test for a frozen patch if its noise is only 1/``QUIETER`` of the stated
+noise. In ten hours (3.6e6 scans), such a patch has about 0.04 false alarms.
 """
 QUIETER: Final = 10.0
-"""Factor by which the noise stated in the hand file may exceed the actual noise of a converter."""
+"""Factor by which the noise stated in the hand file may exceed a converter's actual noise."""
 ABRUPT: Final = 16
-"""Minimum change (codes) of at least one code in the last scan before a run, for the run to be considered an
-abrupt end of a movement. The value has not been tuned.
+"""Threshold (codes) for the abrupt end of a movement. It applies to the largest code change in the last scan
+before the codes stop changing. The value has not been tuned.
 """
 DOUBT_RUN: Final = 64
-"""Number of scans for which fields are not trusted after a movement has ended abruptly. In simulations, most
-converters that stopped in mid-press were detected within 11 scans, and a few after more than 16 scans.
+"""Number of untrusted fields after the abrupt end of a movement. Most simulated converters that stopped in
+mid-press were detected within 11 scans, a few after more than 16.
 """
 FLICKERS: Final = 5
-"""Minimum number of scans in which a code must have returned to its previous value before a patch's codes are
-considered noisy.
-"""
+"""Minimum number of scans with a returning code before the codes of a patch count as noisy."""
 LONGER: Final = 4
-"""Minimum length of a frozen run, as a multiple of the live converter's longest run."""
+"""Minimum length of a run that counts as frozen, as a multiple of the running converter's longest run."""
 PROOF_NS: Final = 1_000_000_000
-"""Time (ns) for which a converter is considered running after a code or the phase has changed."""
+"""Time (ns) for which a change of a code or of the phase proves that the converter is running."""
 PHASES_REPEATED: Final = 3
-"""Number of scans without a new conversion after which a patch is reported as frozen. Even the field of the
-first such scan is not trusted. The value equals the number of missed scans after which a patch is reported as
-stale.
+"""Number of scans without a new conversion after which a patch is reported as frozen. The same number of
+missed scans makes a patch stale. Even the field of the first such scan is not trusted.
 """
 _MOVED: Final = 16
-"""Minimum difference (codes) between a code and the rest code for the resistance to be considered randomly
-distributed within its quantization step.
+"""Minimum distance (codes) from the rest code at which a resistance is assumed to be uniformly distributed
+within its quantization step.
 """
 _SPREAD: Final = 30
-"""Minimum number of distinct codes that differ from the rest code by at least ``_MOVED``, for a patch to be
-considered pressed.
+"""Minimum number of distinct codes of a pressed patch that differ from the rest code by at least ``_MOVED``.
 """
 
 
@@ -95,34 +90,34 @@ class Alive(enum.StrEnum):
     YES = "yes"
     NO = "no"
     CANNOT_TELL = "cannot tell"
-    """No scan has been received yet, or no code has changed for a second and the reason is unknown.
+    """No scan has arrived yet, or no code has changed for a second for an unknown reason.
 
-    The reason is unknown, for example, if the patch does not count its conversions and its converter has so
-    little noise that a running converter would also repeat its codes.
+    One such case is a patch that does not count its conversions and whose converter has so little noise that
+    it repeats its codes even while running.
     """
 
 
 class ConverterLiveness:
-    """Tracker of the state of one patch's converter. Used only by the mainline.
+    """Detector of a stopped converter for one patch. Used only by the mainline.
 
     Args:
         scale: Scale of the codes.
-        relative_noise: Converter noise stated in the hand file, as a fraction of the resistance.
+        relative_noise: Converter noise stated in the hand file, relative to the resistance.
     """
 
     def __init__(self, scale: CodeScale, relative_noise: float) -> None:
         self._scale, self._stated = scale, relative_noise / scale.step
         self._rest = round((1.0 - scale.lo) / scale.step)
         self.measured_noise = 0.0
-        """Noise (codes) measured over recent windows of scans; 0 if no noise could be measured."""
-        self._log_p = 0.0  # log probability of the current run if the run is improbable, else 0
-        self._abrupt = False  # whether the current run abruptly ended a movement
-        self._improbable = False  # whether a running converter would hardly repeat its codes for so long
-        self._largest = 0  # largest change (codes) in the last scan that changed
+        """Noise (codes) measured in the recent windows of scans; 0 if not measurable."""
+        self._log_p = 0.0  # log probability of an improbable run; 0 otherwise
+        self._abrupt = False  # whether a movement ended abruptly when this run began
+        self._improbable = False  # whether this run is improbable for a running converter
+        self._largest = 0  # largest code change in the last scan with a change
         self._run = self._codes = self._flickers = self._check_at = 0
         self._pressed = False
         self._longest = {False: 0, True: 0}
-        # noise measured before the current run; during the run, the constant codes show no noise
+        # noise measured before the current run, because constant codes show none
         self._noise_before = 0.0
         self._phase = self._phase_scan = self._same_phase = self._missing = 0
         self._t_ns = 0
@@ -130,17 +125,17 @@ class ConverterLiveness:
 
     @property
     def stopped(self) -> bool:
-        """Whether the converter had stopped at the newest scan, according to its phase or codes."""
+        """Whether the phase or the codes of the newest scan show that the converter has stopped."""
         return self._same_phase > 0 or self._improbable
 
     @property
     def doubtful(self) -> bool:
-        """Whether all codes stopped changing abruptly, at most ``DOUBT_RUN`` scans ago."""
+        """Whether a movement ended abruptly at most ``DOUBT_RUN`` scans ago."""
         return self._abrupt and self._run <= DOUBT_RUN
 
     @property
     def deviations(self) -> float:
-        """Significance of the current run as evidence of a stopped converter, in standard deviations."""
+        """Significance (standard deviations) of the evidence that the converter has stopped."""
         return math.inf if self._same_phase else deviations_of(self._log_p)
 
     @property
@@ -154,7 +149,7 @@ class ConverterLiveness:
 
     @property
     def words(self) -> str:
-        """Human-readable reason why the converter may not be running; empty if it is running."""
+        """Human-readable reason to doubt that the converter is running; empty if there is none."""
         if self._same_phase:
             return f"its converter has completed no conversion for {counted(self._same_phase, 'scan')}"
         if self.stopped:
@@ -178,17 +173,16 @@ class ConverterLiveness:
 
         Args:
             scan: Scan to evaluate.
-            counts: Results of :func:`~skinnode.host.code_runs.follow`: number of codes that are measurements,
-                number of changed codes, number of codes that returned to their previous value, largest change
-                of a code, smallest code.
-            last: (U, K) last code of each crossing.
-            run: (U, K) number of scans since each crossing's code last changed.
+            counts: Results of :func:`~skinnode.host.code_runs.follow`: ``MEASURED``, ``CHANGED``,
+                ``RETURNED``, ``LARGEST`` and ``LEAST``.
+            last: (U, K) newest code of each crossing.
+            run: (U, K) number of scans since the code last changed.
         """
         measured, changed, returned, largest, least = counts
         self._t_ns = scan.t_last_ns
         if changed:
             self._end_run(returned, largest)
-        # the changed codes may be those that the previous scan did not contain
+        # codes missing from the previous scan may count as changed
         self._compare_phase(scan, unchanged=measured > 0 and changed <= self._missing)
         self._missing = 0 if scan.flags & SummaryFlag.CHANGED_ONLY else scan.codes.size - measured
         if changed or not measured or scan.flags & SummaryFlag.CHANGED_ONLY:
@@ -199,7 +193,7 @@ class ConverterLiveness:
             unheard = not self._phase and not any(self._longest.values())
             self._abrupt = unheard and self._largest >= ABRUPT and self._flickers >= FLICKERS
         if self._run >= self._check_at and not self._improbable:
-            # the probability of a run decreases slowly, so evaluate at increasing intervals
+            # the probability changes little from scan to scan, so evaluate at growing intervals
             self._check_at = self._run + 1 + self._run // 4
             self._evaluate_run(last, run, least)
 
@@ -209,7 +203,7 @@ class ConverterLiveness:
     def _compare_phase(self, scan: Scan, *, unchanged: bool) -> None:
         phase = scan.phase
         if not phase:
-            # a summary without a phase shows that the patch does not count its conversions
+            # a summary without a phase: the patch does not count its conversions
             if scan.device_time_us is not None:
                 self._phase = self._same_phase = 0
             return

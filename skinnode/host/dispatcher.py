@@ -1,7 +1,6 @@
-"""Count the frames on a bus and dispatch them to handlers by COB-ID, without threads or a clock.
+"""Count the frames of a bus and dispatch them to handlers by COB-ID, without threads or a clock.
 
-In a host, a :class:`~skinnode.host.link.BusLink` passes the frames from a bus to the dispatcher; in a replay,
-the frames come from a recording.
+A host feeds the dispatcher through a :class:`~skinnode.host.link.BusLink`, a replay from a recording.
 """
 
 from __future__ import annotations
@@ -23,77 +22,76 @@ from skinnode.transport.bus_state import BusState, bus_state
 _log = logging.getLogger(__name__)
 
 Handler = Callable[[bytes, int], None]
-"""Function called with a frame's data and its monotonic arrival time in ns."""
+"""Function called with the data and the monotonic arrival time (ns) of a frame."""
 
 _MARK_NS: Final = 100_000_000
-"""Interval (ns) over which the frame bits are summed to compute the bus load."""
+"""Interval (ns) between updates of the bus load."""
 _MARKS: Final = 10
-"""Number of summing intervals in the moving average of the bus load."""
+"""Length of the moving average of the bus load, in units of ``_MARK_NS``."""
 
 _POLL_NS: Final = 2_000_000
-"""Minimum interval (ns) between calls to the pollers. Polling after every batch of frames, about once a
-millisecond, is unnecessary because the shortest timeout of a poller is 5 ms.
+"""Minimum interval (ns) between calls of the pollers. Their shortest timeout is 5 ms, so polling after each
+batch, about once a millisecond, is unnecessary.
 """
 
 
 @dataclass(frozen=True, slots=True)
 class BusStats:
-    """Counters of the frames on a bus since the host opened the bus."""
+    """Counters of the frames on a bus since it was opened."""
 
     received: int
-    """Number of data frames received, excluding the host's own frames."""
+    """Number of data frames received; the host's own frames are not included."""
     sent: int
     foreign: int
-    """Number of data frames with a COB-ID that the host does not expect on this bus."""
+    """Number of data frames with a COB-ID that has no handler."""
     ignored: int
-    """Number of frames ignored because of their type: remote frames, extended frames and, on a bus without
-    ``fd``, CAN FD frames.
+    """Number of remote and extended frames and, on a bus without ``fd``, CAN FD frames. All of these are
+    ignored.
     """
     error_frames: int
-    """Number of error frames, i.e. the interface's reports of bus errors and controller states."""
+    """Number of error frames, with which the interface reports bus errors and controller states."""
     bus_offs: int
-    """Number of times the CAN interface has reported that its controller went bus-off."""
+    """Number of times the CAN controller has gone bus-off."""
     controller: BusState | None
-    """Most recently reported state of the CAN controller; None if no state has been reported."""
+    """Last reported state of the CAN controller; None before the first report."""
     foreign_ids: Mapping[int, int]
-    """Number of data frames with each COB-ID that the host does not expect on this bus."""
+    """Number of foreign data frames by COB-ID."""
     read: int
-    """Number of frames of all types read from the interface."""
+    """Number of frames read from the interface, of all types."""
     waiting: int
-    """Number of frames that have been read from the interface but not yet dispatched."""
+    """Number of frames read from the interface but not dispatched yet."""
     kernel_dropped: int
-    """Number of frames dropped because the kernel's buffer was full; 0 if the interface does not report
-    drops."""
+    """Number of frames dropped by a full kernel buffer; 0 if the interface does not report drops."""
     dropped: int
-    """Number of frames dropped because the receive queue was full."""
+    """Number of frames dropped by a full receive queue."""
     malformed: int
     """Number of frames with an expected COB-ID but a wrong length or format."""
     outages: int
-    """Number of times the CAN interface has failed and been reopened."""
+    """Number of failures of the CAN interface."""
     bits: int
-    """Total length (bits, including stuff bits) of all data frames received and sent; updated every 0.1 s."""
+    """Total length (bits, including stuff bits) of the data frames received and sent, updated every 0.1 s."""
     load: float
     """Bus load over the last second, as a fraction of the capacity."""
 
 
 @dataclass(frozen=True, slots=True)
 class PortCounters:
-    """Counters of the interface or recording that supplies a dispatcher with frames."""
+    """Counters kept by the source of the frames, an interface or a recording."""
 
     sent: int = 0
     dropped: int = 0
     outages: int = 0
     read: int | None = None
-    """Number of frames read; None if every frame is dispatched as soon as it is read."""
+    """Number of frames read; None if frames are dispatched as soon as they are read."""
     waiting: int = 0
     kernel_dropped: int = 0
 
 
 class Dispatcher:
-    """Dispatcher that counts the frames on one bus of the hand and passes them to handlers.
+    """Dispatcher of the frames on one bus of the hand.
 
-    Threads: only the mainline may use a dispatcher, but :meth:`count` and :meth:`count_sent` may be called
-    from any thread.
+    Threads: :meth:`count` and :meth:`count_sent` may be called from any thread, the other methods only from
+    the mainline.
     """
 
     def __init__(self, config: BusConfig, handlers: Mapping[int, Handler], now_ns: int) -> None:
@@ -117,19 +115,19 @@ class Dispatcher:
         self._polled_ns = 0
 
     def handle(self, cob_id: int, handler: Handler, defects: Defects | None = None) -> None:
-        """Pass all further data frames with ``cob_id`` to ``handler``, on the mainline.
+        """Pass all data frames with ``cob_id`` to ``handler`` from now on.
 
         Args:
             cob_id: Identifier of the frames.
-            handler: Handler for the frames, which replaces the previous handler.
-            defects: Collector of the handler's exceptions; the bus's collector by default.
+            handler: Handler of the frames. It replaces any previous handler.
+            defects: Collector of the handler's exceptions; by default, that of the bus.
         """
         if defects is not None:
             self._owners[cob_id] = defects
         self._handlers[cob_id] = handler
 
     def listen(self, listener: Callable[[Sequence[Frame]], None]) -> None:
-        """Pass each batch of frames of all types to ``listener``, then to the handlers. Mainline only."""
+        """Pass each batch of frames, of all types, to ``listener`` before the handlers. Mainline only."""
         self._listeners = (*self._listeners, listener)
 
     def unlisten(self, listener: Callable[[Sequence[Frame]], None]) -> None:
@@ -137,33 +135,33 @@ class Dispatcher:
         self._listeners = tuple(each for each in self._listeners if each is not listener)
 
     def poll_with(self, poller: Callable[[int], None], defects: Defects | None = None) -> None:
-        """Call ``poller`` with the monotonic time (ns) after each batch of frames and while the bus is idle.
+        """Call ``poller`` regularly with the monotonic time (ns), after batches of frames and on an idle bus.
 
         Args:
-            poller: Function to call, at most every 2 ms.
-            defects: Collector of the poller's exceptions; the bus's collector by default.
+            poller: Function to call, at most once every 2 ms.
+            defects: Collector of the poller's exceptions; by default, that of the bus.
         """
         self._pollers = (*self._pollers, (poller, defects))
 
     def contain(self, owner: Defects | None, doing: str, error: Exception) -> None:
-        """Handle ``error``, which was raised by the operation ``doing``.
+        """Handle ``error``, raised during the operation ``doing``.
 
         Raises:
-            Exception: always ``error``, so that a replay stops. On a live bus, the method is overridden.
+            Exception: ``error`` itself, which stops a replay. On a live bus, the method is overridden.
         """
         raise error
 
     def expect(self, what: str, times_ns: tuple[int, ...]) -> None:
-        """Ignore the predicted arrival times of scans, which are used only on a live bus."""
+        """Ignore the predicted end times of scans. Only a live bus uses them."""
 
     def count_sent(self, can_id: int, data: bytes) -> None:
-        """Count a sent frame towards the bus load. Any thread."""
+        """Add a sent frame to the bus load. Any thread."""
         self._outgoing.append((can_id, data))
 
     def dispatch(self, batch: Sequence[Frame]) -> None:
         """Pass frames to their handlers, in order of arrival.
 
-        If a handler raises an exception, only the current frame is lost.
+        An exception in a handler costs only the current frame.
         """
         for listener in self._listeners:
             try:
@@ -188,7 +186,7 @@ class Dispatcher:
                         continue
                     handler(data, t_ns)
                 going_on = False
-            except Exception as defect:  # the iterator ``frames`` resumes after the failed frame
+            except Exception as defect:  # ``frames`` goes on with the next frame
                 self.contain(self._owners.get(can_id), f"frame 0x{can_id:03X}", defect)
         try:
             self._tally(batch, others)
@@ -196,7 +194,7 @@ class Dispatcher:
             self.contain(None, "counting frames", defect)
 
     def _tally(self, batch: Sequence[Frame], others: Sequence[Frame]) -> None:
-        """Count the frames in a batch, including ``others``: frames of types that no handler accepts."""
+        """Count the frames of a batch. ``others`` are those of types that no handler accepts."""
         takes_fd = self.config.fd
         if others:
             set_aside = {id(frame) for frame in others}
@@ -213,7 +211,7 @@ class Dispatcher:
         self._meter.add_all(batch)
 
     def poll(self, now_ns: int) -> None:
-        """Call the pollers with the monotonic time (ns) unless the last call was less than 2 ms ago."""
+        """Call the pollers, at most once every 2 ms."""
         if not 0 <= now_ns - self._polled_ns < _POLL_NS:
             self._polled_ns = now_ns
             for poll, owner in self._pollers:
@@ -223,16 +221,16 @@ class Dispatcher:
                     self.contain(owner, "polling", defect)
 
     def measure(self, now_ns: int) -> None:
-        """Compute the bus load if a summing interval has passed.
+        """Update the bus load if the update is due.
 
-        Because computing the bus load is slow, a mainline that serves several buses calls this method for
-        only one bus per iteration.
+        The update is slow. A mainline that serves several buses therefore calls this method for one bus per
+        iteration.
         """
         if now_ns >= self._marks[-1][0] + _MARK_NS:
             self._mark(now_ns)
 
     def reject(self, error: CodecError) -> None:
-        """Count a malformed frame, and log the first malformed frame with each COB-ID. Mainline only."""
+        """Count a malformed frame. Log the first one of each COB-ID. Mainline only."""
         self._malformed += 1
         if self.first_malformed is None:
             self.first_malformed = error
@@ -248,7 +246,7 @@ class Dispatcher:
         """Return all counters. Any thread.
 
         Args:
-            port: Counters of the interface that supplies the dispatcher with frames.
+            port: Counters of the source of the frames.
         """
         return BusStats(
             received=self._received,
@@ -271,17 +269,14 @@ class Dispatcher:
 
     def _on_error_frame(self, frame: Frame) -> None:
         self._error_frames += 1
-        if self.config.interface == "socketcan":  # only SocketCAN encodes the controller state in this way
+        if self.config.interface == "socketcan":  # this encoding of the controller state is SocketCAN's
             state, before = bus_state(frame), self._bus_state
             if state is not None:
                 self._bus_state = state
                 self._bus_offs += state is BusState.OFF and before is not BusState.OFF
 
     def _mark(self, now_ns: int) -> None:
-        """Sum the bits of all frames counted so far.
-
-        Call only from the mainline; the load meter is not thread-safe.
-        """
+        """Update the bus load. Mainline only: the load meter is not thread-safe."""
         while self._outgoing:
             self._meter.add(*self._outgoing.popleft())
         bits = self._meter.bits

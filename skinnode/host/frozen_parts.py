@@ -1,25 +1,24 @@
-"""Detect frozen wires and crossings on a patch whose converter is running, and leave them out of the solve.
+"""Detect frozen wires and crossings while the converter is running, and leave them out of the solve.
 
-**Movement.** A crossing is considered frozen if its code stays constant while the codes of its four
-neighbours all rise or all fall by at least ``CROSSING_LEAD``. A wire is considered frozen if all its codes
-stay constant while the codes of both adjacent wires rise or fall by at least ``WIRE_LEAD`` at ``LEADS`` or
-more crossings. These criteria do not depend on the converter's noise. :mod:`skinnode.host.code_runs` defines
-how far the neighbours' codes have changed (the *lead*).
+**Movement.** A crossing is frozen if its code stays constant while the codes of all four neighbours rise, or
+all fall, by at least ``CROSSING_LEAD``. A wire is frozen if all its codes stay constant while, at ``LEADS``
+or more crossings, the codes of both adjacent wires rise, or both fall, by at least ``WIRE_LEAD``. This change
+of the neighbours' codes is called the lead (:mod:`skinnode.host.code_runs`). The criteria do not depend on
+the converter's noise.
 
-The limits were verified by simulating presses on patches without faults:
+The limits rest on simulated presses of patches without faults:
 
-- In 696 presses, no crossing whose code was constant for five scans had a lead of more than 75 codes.
-- In 1,800 presses without converter noise, no wire whose codes were constant for one scan had a lead of more
-  than 25 codes.
+- In 696 presses, the largest lead of a crossing whose code was constant for five scans was 75 codes.
+- In 1,800 presses without converter noise, the largest lead of a wire whose codes were constant for one scan
+  was 25 codes.
 
-**Noise.** A wire or crossing is also considered frozen if its run would be very improbable for a running
-converter, that is, if the probability is at most :data:`~skinnode.host.converter_liveness.FALSE_ALARM`. The
-noise assumed for this probability is a tenth of the stated noise, or half of the recently measured noise if
-the latter is larger. In addition, at least three quarters of the other crossings must have runs shorter than
-a quarter of this run. If the converter has less noise than assumed, all crossings repeat their codes, and the
-second condition prevents a false alarm.
+**Noise.** A wire or crossing is also frozen if a running converter would produce its run with a probability
+of at most :data:`~skinnode.host.converter_liveness.FALSE_ALARM`. The noise assumed is a tenth of the stated
+noise, or half of the recently measured noise if that is larger. In addition, at least three quarters of the
+other crossings must have runs shorter than a quarter of this run. This second condition prevents false alarms
+if the converter has less noise than assumed, because then all crossings repeat their codes.
 
-A frozen wire or crossing is used in the solve again as soon as one of its codes changes.
+The solver uses a frozen wire or crossing again as soon as one of its codes changes.
 """
 
 from __future__ import annotations
@@ -52,28 +51,25 @@ from skinnode.model.data_fault import DataFault, FaultKind, FaultyPart
 from skinnode.protocol.codes import CodeScale
 
 CROSSING_LEAD: Final = 512
-"""Minimum lead (codes) of a frozen crossing. The value is seven times the largest lead in 696 simulated
-presses without a frozen crossing.
+"""Minimum lead (codes) of a frozen crossing: seven times the largest lead in 696 simulated presses without
+faults.
 """
 WIRE_LEAD: Final = 64
-"""Minimum lead (codes) at ``LEADS`` crossings of a frozen wire. The value is 2.5 times the largest lead in
-1,800 simulated presses without a frozen wire.
+"""Minimum lead (codes) at ``LEADS`` crossings of a frozen wire: 2.5 times the largest lead in 1,800 simulated
+presses without faults.
 """
 _NEVER: Final = 2**62
 _OTHERS: Final = 0.75
-"""Minimum fraction of the other crossings whose runs are shorter than a quarter of the run of a frozen wire
-or crossing.
-"""
+"""Minimum fraction of the other crossings that have a run shorter than a quarter of the frozen part's run."""
 
 
 class FrozenParts:
-    """Detector of the frozen wires and crossings of one patch. Owned by the mainline.
+    """Detector of frozen wires and crossings for one patch. Used only by the mainline.
 
     Args:
         scale: Scale of the codes.
-        relative_noise: Converter noise stated in the hand file, as a fraction of the resistance.
-        state: State of the runs (:mod:`skinnode.host.code_runs`). The detector flags the frozen crossings in
-            ``state``.
+        relative_noise: Converter noise stated in the hand file, relative to the resistance.
+        state: State array of :mod:`skinnode.host.code_runs`. The detector sets its plane ``NAMED``.
     """
 
     def __init__(self, scale: CodeScale, relative_noise: float, state: NDArray[np.int64]) -> None:
@@ -81,21 +77,19 @@ class FrozenParts:
         self._log_stay = 0.0
         self.faults: tuple[DataFault, ...] = ()
         self.left_out: NDArray[np.bool_] | None = None
-        """(U, K) bool: True for each frozen crossing, to be left out of the solve; None if no crossing is
-        frozen.
-        """
+        """(U, K) mask of the crossings to leave out of the solve; None if no crossing is frozen."""
         self.limits = np.zeros(7, np.int64)
         self.limits[STEPS] = scale.steps
         self.limits[_WIRE_LEAD], self.limits[_CROSSING_LEAD] = WIRE_LEAD, CROSSING_LEAD
         self.assume_noise(0.0, 0)
 
     def assume_noise(self, measured: float, least: int) -> None:
-        """Compute the run at which a wire or crossing is considered frozen, from the assumed noise.
+        """Set the runs at which a wire or crossing may be frozen, according to the assumed noise.
 
         Args:
-            measured: Noise (codes) measured over recent windows of scans; 0 if no noise could be measured.
-            least: Smallest code of a scan. This code has the lowest noise, because the noise is proportional
-                to the resistance.
+            measured: Noise (codes) measured in the recent windows of scans; 0 if not measurable.
+            least: Smallest code of a scan. It has the least noise, because the noise is proportional to the
+                resistance.
         """
         ratio = max(self._scale.lo + least * self._scale.step, self._scale.step)
         self._log_stay = log_stay(ratio * max(self._stated / QUIETER, 0.5 * measured))
@@ -106,15 +100,15 @@ class FrozenParts:
             self.limits[limit] = max(LEAST_RUN, math.ceil(needed)) if needed < _NEVER else _NEVER
 
     def release(self) -> None:
-        """Remove the faults of all wires and crossings whose codes have changed."""
+        """Remove the faults of wires and crossings whose codes have changed."""
         alive = (self._state[NAMED] != 0) & (self._state[RUN] == 0)
         self._set([fault for fault in self.faults if not alive[_place(fault)].any()])
 
     def name(self, scan: int) -> None:
-        """Add faults for wires and crossings that are now frozen.
+        """Add a fault for each wire and crossing found to be frozen.
 
         Args:
-            scan: Number of the newest scan, recorded as the first scan of the new faults.
+            scan: Number of the newest scan, recorded as the start of the new faults.
         """
         last, run, named = self._state[LAST], self._state[RUN], self._state[NAMED] != 0
         known = (last >= 0) & (last <= self._scale.steps) & ~named
@@ -135,7 +129,7 @@ class FrozenParts:
     def _wire(
         self, known: NDArray[np.bool_], run: NDArray[np.int64], lead: NDArray[np.int64], at: Any, limit: int
     ) -> float | None:
-        """Return the log probability of a frozen wire's run; None if the wire is not frozen."""
+        """Return the log probability of the run of a frozen wire; None if the wire is not frozen."""
         here = known[at]
         if not here.any() or (least := int(run[at][here].min())) < 1:
             return None
@@ -176,7 +170,7 @@ class FrozenParts:
 
 
 def _place(fault: DataFault) -> Any:
-    """Return an index that selects a fault's crossings in a (U, K) array."""
+    """Return the index of a fault's crossings in a (U, K) array."""
     return (
         slice(None) if fault.upper is None else fault.upper,
         slice(None) if fault.lower is None else fault.lower,
@@ -184,7 +178,7 @@ def _place(fault: DataFault) -> Any:
 
 
 def _lies_on(fault: DataFault, part: FaultyPart, number: int) -> bool:
-    """Return whether a fault concerns a single crossing of the given wire."""
+    """Return whether a fault is that of a single crossing on the given wire."""
     wire = fault.upper if part is FaultyPart.UPPER else fault.lower
     return fault.part is FaultyPart.CROSSING and wire == number
 

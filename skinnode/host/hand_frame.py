@@ -1,6 +1,6 @@
-"""Assemble hand frames, which contain the fields and contacts of all patches for one SYNC.
+"""Combine the fields of all patches for one SYNC into a hand frame.
 
-Hand frames are assembled on the thread that reads them; no other thread is started.
+The thread that reads the hand frames also assembles them.
 """
 
 from __future__ import annotations
@@ -22,32 +22,32 @@ from skinnode.model.pose import Pose
 from skinnode.process import clock
 
 LATE: Final = "late"
-"""Reason for a missing field: the patch is operational, but its field did not arrive before the deadline."""
+"""Reason for a missing field: the patch is operational, but its field missed the deadline."""
 OVERTAKEN: Final = "overtaken"
-"""Reason for a missing field: the field of a newer scan of the patch arrived first."""
+"""Reason for a missing field: the patch has already delivered the field of a newer scan."""
 
 
 @dataclass(frozen=True, eq=False)
 class HandFrame:
-    """Fields and contacts of all patches for one SYNC, in the coordinate frames of the links and hand.
+    """Fields and contacts of all patches for one SYNC.
 
-    Contacts and wrenches are computed on first use.
+    Contacts and wrenches are given in the coordinate frames of the links and of the hand. They are computed
+    on first access.
     """
 
     scan: int
-    """Number of the SYNC, counted from the start of the host. All fields have this scan number, which does
-    not wrap around.
+    """Scan number of all fields: number of the SYNC since the host started. The number does not wrap around.
     """
     t_sync_ns: int
-    """Monotonic time (ns) of the SYNC message that was sent or received last among all buses; 0 if unknown.
-    Because SYNC may be staggered between buses (``sync.stagger_ms``), each field records the SYNC time of its
-    own bus.
+    """Monotonic time (ns) of the SYNC; 0 if unknown. With staggered SYNC (``sync.stagger_ms``), the buses
+    have different SYNC times: this is the latest, and each field holds the time of its own bus.
     """
     fields: Mapping[str, FieldFrame]
     """Fields by patch name."""
     missing: Mapping[str, str]
-    """Reasons for missing fields by patch name: :data:`LATE`, :data:`OVERTAKEN`, or the patch's condition,
-    such as ``lost``."""
+    """Reasons for missing fields by patch name: :data:`LATE`, :data:`OVERTAKEN` or a condition such as
+    ``lost``.
+    """
     skeleton: Skeleton = field(default_factory=Skeleton)
     """Poses of the patches and links on the robot."""
 
@@ -58,30 +58,30 @@ class HandFrame:
 
     @property
     def trusted(self) -> bool:
-        """Whether all fields are present and trusted."""
+        """Whether the fields of all patches are present and trusted."""
         return not self.missing and all(each.trusted for each in self.fields.values())
 
     @property
     def precise(self) -> bool:
-        """Whether all fields are present and all their standard deviations are within the user's limits."""
+        """Whether the fields of all patches are present and precise."""
         return not self.missing and all(each.precise for each in self.fields.values())
 
     @property
     def distrust(self) -> Mapping[str, str]:
-        """Human-readable reasons by patch name; contains only the patches that are not trusted."""
+        """Human-readable reason for each patch that is not trusted, by patch name."""
         reasons = {patch: f"no field: {reason}" for patch, reason in self.missing.items()}
         return reasons | {name: why_not(each) for name, each in self.fields.items() if not each.trusted}
 
     @functools.cached_property
     def contacts(self) -> tuple[HandContact, ...]:
-        """Contacts on all patches in the hand's coordinate frame, in descending order of normal force."""
+        """Contacts on all patches in the frame of the hand, largest normal force first."""
         return tuple(each.moved(self.skeleton.link_pose(each.link)) for each in self._link_contacts)
 
     def contacts_on(self, link: str) -> tuple[HandContact, ...]:
-        """Return the contacts on a link's patches, in descending order of normal force.
+        """Return the contacts on a link in the frame of the link, largest normal force first.
 
         Args:
-            link: Name of the link; ``hand`` for patches without a link.
+            link: Name of the link; ``hand`` for the patches without a link.
 
         Raises:
             ValueError: if the link carries no patch.
@@ -92,10 +92,10 @@ class HandFrame:
 
     @functools.cached_property
     def wrenches(self) -> Mapping[str, Wrench]:
-        """Force and torque on each link's skin about the origin of the link's frame, by link name.
+        """Wrench on the skin of each link, by link name.
 
-        Each link that carries a patch has an entry, even if nothing touches the patch. The entry ``hand``
-        combines all patches without a link.
+        The torque is taken about the origin of the link's frame. Every link that carries a patch has an
+        entry, even without contact. The entry ``hand`` combines the patches without a link.
         """
         patches: dict[str, list[str]] = {}
         for patch in (*self.fields, *self.missing):
@@ -113,18 +113,18 @@ class HandFrame:
 
     @functools.cached_property
     def wrench(self) -> Wrench:
-        """Force on the skin of the whole hand, and torque about the origin of the hand's coordinate frame."""
+        """Wrench on the skin of the whole hand. The torque is taken about the origin of the hand's frame."""
         return wrench_of(self.contacts, HAND, trusted=self.trusted)
 
     def at(self, link_poses: Mapping[str, Pose]) -> HandFrame:
-        """Return a copy of the hand frame with new link poses, computed for example from joint angles.
+        """Return a copy with other link poses, for example from the current joint angles.
 
         Args:
-            link_poses: Poses in the coordinate frame of the hand, by link name. Links that are not listed
-                keep their poses; links without patches are ignored.
+            link_poses: Poses in the frame of the hand, by link name. Unlisted links keep their poses. Links
+                without patches are ignored.
 
         Raises:
-            ValueError: if ``hand`` is listed; the hand's frame is the reference frame and has no pose.
+            ValueError: if ``hand`` is listed. The frame of the hand is the reference and has no pose.
         """
         if HAND in link_poses:
             raise ValueError(f"link_poses: got {HAND!r}, must be names of links; the hand has no pose")
@@ -133,7 +133,7 @@ class HandFrame:
 
     @functools.cached_property
     def _link_contacts(self) -> tuple[HandContact, ...]:
-        """Contacts on all patches, each in its own link's frame, in descending order of normal force."""
+        """Contacts on all patches, each in the frame of its link, largest normal force first."""
         found = [
             HandContact.on_link(contact, patch, self.skeleton.mount(patch), trusted=each.trusted)
             for patch, each in self.fields.items()
@@ -143,18 +143,16 @@ class HandFrame:
 
 
 class HandGatherer:
-    """Assembler that combines fields into hand frames, in order of scan number.
+    """Assembler of hand frames, which it returns in order of scan number. Not thread-safe.
 
-    The assembler uses no clock and is not thread-safe.
-
-    A hand frame is ready as soon as every awaited patch has delivered its field for the frame or a newer
-    field. A patch whose fields were missing in :data:`~skinnode.host.health.SCANS_MISSED` consecutive hand
-    frames is not awaited again until its next field arrives. A hand frame is also ready
-    ``patience_ns`` after its first field, even if awaited fields are missing.
+    A hand frame is ready when each awaited patch has delivered the field of this or a later scan. After
+    :data:`~skinnode.host.health.SCANS_MISSED` consecutive hand frames without its field, a patch is not
+    awaited until its next field arrives. At the latest, a hand frame is ready ``patience_ns`` after its first
+    field.
 
     Args:
         patches: Names of the patches.
-        patience_ns: Maximum time (ns) to wait for further fields after the first field of a hand frame.
+        patience_ns: Time limit (ns) for the other fields of a hand frame, counted from its first field.
         condition: Function that returns the condition of a patch.
         skeleton: Poses of the patches and links on the robot.
     """
@@ -177,7 +175,7 @@ class HandGatherer:
         """Number of fields that arrived after their hand frame had been delivered."""
 
     def add(self, field: FieldFrame, now_ns: int) -> None:
-        """Add a field that was received at monotonic time ``now_ns``."""
+        """Add a field that arrived at monotonic time ``now_ns``."""
         stamp = field.stamp
         assert stamp is not None
         self._newest[stamp.patch] = stamp.scan
@@ -189,7 +187,7 @@ class HandGatherer:
         self._until_ns.setdefault(stamp.scan, now_ns + self._patience_ns)
 
     def next(self, now_ns: int) -> HandFrame | None:
-        """Return the oldest hand frame if that frame is ready at ``now_ns``, otherwise None."""
+        """Return the oldest hand frame if it is ready at ``now_ns``, else None."""
         if not self._open:
             return None
         scan = min(self._open)
@@ -207,7 +205,7 @@ class HandGatherer:
         return HandFrame(scan, t_sync_ns, fields, missing, self._skeleton)
 
     def next_deadline_ns(self) -> int | None:
-        """Return the oldest hand frame's deadline (ns); None if no hand frame is pending."""
+        """Return the deadline (ns) of the oldest hand frame; None if no hand frame is pending."""
         return self._until_ns[min(self._open)] if self._open else None
 
     def _awaited(self, patch: str, scan: int) -> bool:
@@ -221,10 +219,10 @@ class HandGatherer:
 
 
 class HandSubscription:
-    """Subscription to hand frames, which are read with ``for``, ``async for`` or :meth:`get`.
+    """Subscription to hand frames. Read it with ``for``, ``async for`` or :meth:`get`.
 
-    A slow reader loses the oldest fields, which are counted in ``dropped``, and receives hand frames with
-    missing fields. Only one thread may read the subscription.
+    A slow reader loses the oldest fields and gets hand frames with missing fields. ``dropped`` counts the
+    lost fields. Only one thread may read a subscription.
     """
 
     def __init__(self, fields: Subscription, gatherer: HandGatherer, timeout_s: float | None) -> None:
@@ -245,10 +243,10 @@ class HandSubscription:
         """Wait for the next hand frame and return it.
 
         Args:
-            timeout_s: Maximum time (s) to wait for a hand frame; None for no limit.
+            timeout_s: Time limit (s); None for no limit.
 
         Returns:
-            Next hand frame; None if no hand frame arrived before the timeout or the host has closed.
+            Next hand frame; None on timeout or once the host has closed.
 
         Raises:
             SkinError: the error that stopped the host, if any.
@@ -266,7 +264,7 @@ class HandSubscription:
         """Yield hand frames until the host closes.
 
         Raises:
-            TimeoutError: if no hand frame arrived within the subscription's timeout.
+            TimeoutError: if no hand frame arrives within the timeout of the subscription.
             SkinError: the error that stopped the host, if any.
         """
         while True:
@@ -303,7 +301,7 @@ class HandSubscription:
         self.close()
 
     def _next(self, timeout_s: float | None) -> HandFrame | None:
-        """Return the next hand frame; raise queue.Empty after ``timeout_s``."""
+        """Return the next hand frame; None once the host has closed. Raise queue.Empty on timeout."""
         check_timeout(timeout_s)
         end_ns = _end_ns(timeout_s)
         while (frame := self._gatherer.next(clock.monotonic_ns())) is None:
@@ -319,7 +317,7 @@ class HandSubscription:
         return frame
 
     def _wait_s(self, end_ns: int | None) -> float | None:
-        """Return the time (s) until the next deadline; None if there is no deadline."""
+        """Return the time (s) until ``end_ns`` or the next deadline; None if there is neither."""
         times = [t_ns for t_ns in (end_ns, self._gatherer.next_deadline_ns()) if t_ns is not None]
         return max(0, min(times) - clock.monotonic_ns()) * 1e-9 if times else None
 

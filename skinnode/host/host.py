@@ -1,4 +1,4 @@
-"""Provide the public interface of a hand's host: fields, health, events, statistics and taring."""
+"""Run a hand: the public interface to its fields, health, events, statistics and tare."""
 
 from __future__ import annotations
 
@@ -40,20 +40,20 @@ class HostStats:
     buses: Mapping[str, BusStats]
     patches: Mapping[str, StreamStats]
     nodes: Mapping[str, NodeStats]
-    """Bring-up statistics of each node, by patch name."""
+    """Bring-up counters by patch name."""
     other_masters: Mapping[str, OtherMasterStats]
-    """Counters of frames from other masters, by bus name."""
+    """Counters of other masters' frames, by bus name."""
     sync: SyncStats
     malformed: tuple[CodecError, ...]
-    """First malformed frame received on each bus; buses without malformed frames are omitted."""
+    """First malformed frame of each bus that has received one."""
     defects: Mapping[str, DefectStats]
-    """Statistics of contained exceptions by patch or bus name; the key ``host`` covers exceptions that
-    concern neither.
+    """Contained exceptions by patch or bus name. The key ``host`` holds those that concern no single patch or
+    bus.
     """
 
     @property
     def rivals(self) -> Mapping[str, OtherMasterStats]:
-        """Deprecated alias of :attr:`other_masters`; will be removed in version 0.2."""
+        """Deprecated alias of :attr:`other_masters`, to be removed in version 0.2."""
         warnings.warn(
             "HostStats.rivals is now HostStats.other_masters; the old name will be removed in version 0.2",
             DeprecationWarning,
@@ -63,7 +63,7 @@ class HostStats:
 
 
 class Host:
-    """Host of a running hand, created and shut down by :meth:`from_toml` or :meth:`from_config`.
+    """Host of a running hand; the context manager :meth:`from_toml` or :meth:`from_config` creates it.
 
     Example::
 
@@ -71,10 +71,10 @@ class Host:
             for field in host.fields():
                 ...
 
-    Inside the ``with`` block, all nodes are operational and the host sends SYNC. A node that restarts or
+    Inside the ``with`` block, the nodes are operational and the host sends SYNC. A node that restarts or
     reappears is brought up again. When the block exits or bring-up fails, the host sets the nodes to
-    pre-operational, ends its threads and closes its interfaces. On a bus that another master runs (``role =
-    "guest"``), the host sends neither NMT commands nor SYNC.
+    pre-operational, ends its threads and closes its interfaces. On a bus that another master runs
+    (``role = "guest"``), the host sends no NMT commands and no SYNC.
 
     Threads: any thread may call any method.
     """
@@ -98,7 +98,7 @@ class Host:
         cancelled: Callable[[], bool] = never,
         tap: HostTap | None = None,
     ) -> Iterator[Host]:
-        """Bring up the hand described in a hand file, and shut down the hand when the ``with`` block exits.
+        """Bring up the hand described by a hand file. Shut it down when the ``with`` block exits.
 
         Args:
             path: Path of the hand file.
@@ -137,30 +137,29 @@ class Host:
         tap: HostTap | None = None,
         open_port: Callable[[BusConfig], CanPort] = CanPort,
     ) -> Iterator[Host]:
-        """Bring up a hand, and shut it down when the ``with`` block exits.
+        """Bring up a hand. Shut it down when the ``with`` block exits.
 
-        After a successful bring-up, errors do not stop the host; they are reported by :meth:`health` and
-        :meth:`stats`.
+        Once bring-up has succeeded, errors no longer stop the host. :meth:`health` and :meth:`stats` report
+        them.
 
         Args:
             hand: Configuration of the hand.
-            interface: python-can interface to use instead of the interfaces in the hand file.
-            channel: Channel to use instead of the channel in the hand file; only for a hand with one bus.
-            boot_deadline_s: Maximum time (s) to wait for a node's first response.
-            cancelled: Function called repeatedly during bring-up; if it returns True, bring-up stops and
-                raises BringUpCancelled.
+            interface: python-can interface; overrides the interfaces in the hand file.
+            channel: Channel; overrides the channel in the hand file. Only for a hand with one bus.
+            boot_deadline_s: Time limit (s) for a node's first response.
+            cancelled: Function polled during bring-up. If it returns True, bring-up raises BringUpCancelled.
             tap: Recorder of the traffic, including bring-up; see :class:`skinnode.record.Recorder`.
-            open_port: Function that opens a bus, for interfaces that python-can does not provide.
+            open_port: Function that opens a bus. Needed only for an interface that python-can does not
+                support.
 
         Raises:
-            ConfigError: if an option, EDS file or baseline file does not match the hand, or the solver cannot
-                compute displacements for a layout.
+            ConfigError: if an option, EDS file or baseline file does not match the hand, or a layout has no
+                solution.
             BusLoadError: if the planned traffic exceeds the load limit of a bus.
             BusError: if an interface cannot be opened, or no node on a bus responds and ``bring_up.missing``
                 is not ``wait``.
             NodeTimeout: if a node does not respond and ``bring_up.missing`` is not ``wait``.
-            NodeError: if a node does not match ``hand``, or a parameter read back from the node differs from
-                the value written.
+            NodeError: if a node does not match ``hand`` or does not keep a parameter value.
             BringUpCancelled: if ``cancelled`` returned True.
             ValueError: if ``boot_deadline_s`` is negative, infinite or not a number.
         """
@@ -176,16 +175,16 @@ class Host:
     def fields(
         self, *, timeout_s: float | None = None, capacity: int | None = None, patch: str | None = None
     ) -> Subscription:
-        """Subscribe to the fields of all future scans.
+        """Subscribe to the fields of all scans from now on.
 
         Iterate over the subscription with ``for`` or ``async for``.
 
         Args:
             timeout_s: Maximum time (s) to wait for a field before the iteration raises TimeoutError; None for
                 no limit.
-            capacity: Capacity of the subscriber's queue, in fields; the hand file's capacity by default. When
-                the queue is full, the oldest field is dropped.
-            patch: Patch whose fields are delivered; all patches by default.
+            capacity: Queue length, in fields; by default, the capacity in the hand file. A full queue drops
+                its oldest field.
+            patch: Name of the patch; all patches by default.
 
         Raises:
             ValueError: if there is no such patch, or ``capacity`` or ``timeout_s`` is out of range.
@@ -194,19 +193,18 @@ class Host:
         return self._publisher.subscribe(kept, timeout_s, patch)
 
     def hands(self, *, timeout_s: float | None = None, capacity: int | None = None) -> HandSubscription:
-        """Subscribe to hand frames, each of which contains all patches' fields for one SYNC.
+        """Subscribe to hand frames. A hand frame combines the fields of all patches for one SYNC.
 
         Iterate over the subscription with ``for`` or ``async for``. A hand frame is delivered at most two
-        SYNC periods after its first field, without waiting for absent patches.
+        SYNC periods after its first field. It does not wait for absent patches.
 
         Args:
             timeout_s: Maximum time (s) to wait for a hand frame before the iteration raises TimeoutError;
                 None for no limit.
-            capacity: Capacity of the subscriber's queue, in hand frames; the hand file's capacity by default.
+            capacity: Queue length, in hand frames; by default, the capacity in the hand file.
 
         Raises:
-            ValueError: if the hand's patches do not all follow the same SYNC producer, or the SYNC has no
-                counter.
+            ValueError: if the buses of the hand have several SYNC producers, or SYNC has no counter.
         """
         self._require_one_sync()
         patches = [patch.name for patch in self.hand.patches]
@@ -226,13 +224,13 @@ class Host:
     ) -> FieldCallback:
         """Call ``function`` with each new field, on a separate thread.
 
-        The calls end when the host closes or the callback's ``close()`` is called. If the function blocks or
-        raises an exception, other subscribers are not affected; the callback counts the lost fields.
+        The calls end when the host closes or the callback's ``close()`` is called. A function that blocks or
+        raises an exception does not affect other subscribers. The callback counts the fields that it loses.
 
         Args:
             function: Function to call with each field.
-            patch: Patch whose fields are delivered; all patches by default.
-            capacity: Capacity of the callback's queue, in fields; the hand file's capacity by default.
+            patch: Name of the patch; all patches by default.
+            capacity: Queue length, in fields; by default, the capacity in the hand file.
 
         Raises:
             TypeError: if ``function`` is not callable, or is async.
@@ -241,7 +239,7 @@ class Host:
         return self._callbacks.add(function, self.fields(capacity=capacity, patch=patch))
 
     def latest(self, patch: str) -> FieldFrame | None:
-        """Return a patch's newest field, or None if no field has been published yet. Never waits.
+        """Return a patch's newest field without waiting; None before the first field.
 
         Raises:
             ValueError: if there is no such patch.
@@ -274,18 +272,17 @@ class Host:
         return served.health(no_sync=self._lacks_sync(served))
 
     def _lacks_sync(self, bus: ServedBus) -> bool:
-        """Return whether SYNC is missing on a bus whose patches need SYNC."""
+        """Return whether a bus whose patches need SYNC has none."""
         if not bus.sync_is_late(self._t_up_ns, self.hand.sync.period_ms * 1_000_000):
             return False
         streams = [node.stream for node in self._nodes.values() if node.link is bus.link]
         return bool(self.hand.sync.counter_overflow) or not any(each.stats().offered for each in streams)
 
     def events(self, *, capacity: int = CAPACITY_EVENTS) -> EventSubscription:
-        """Subscribe to all future changes in the health of patches, wires and buses.
+        """Subscribe to changes in the health of patches, wires and buses.
 
         Args:
-            capacity: Capacity of the subscriber's queue, in events; when the queue is full, the oldest event
-                is dropped.
+            capacity: Queue length, in events. A full queue drops its oldest event.
 
         Raises:
             ValueError: if ``capacity`` is below 1.
@@ -312,7 +309,7 @@ class Host:
         return {each.subject: each.stats() for each in (self._defects, *of_buses, *of_patches)}
 
     def tap(self, tap: HostTap) -> Callable[[], None]:
-        """Record all future traffic with ``tap``. Only one tap may be active at a time.
+        """Record all traffic from now on with ``tap``. Only one tap may be active at a time.
 
         Returns:
             Function that ends the recording.
@@ -329,21 +326,21 @@ class Host:
         return untap
 
     def tare(self, patch: str, *, deadline_s: float | None = None) -> None:
-        """Tare a patch: its current resistances become the baseline.
+        """Tare a patch: make its present resistances the baseline.
 
-        The call returns when the host has read the new baseline and uses it to solve scans. The event
-        ``baselines`` announces the new baseline to all subscribers. The host commands the tare with RPDO1.
-        The node loses the new baseline at power-off unless the baseline is stored (0x1010).
+        The host commands the tare with RPDO1. The call returns once the host has read the new baseline and
+        solves scans with it. Every event subscriber receives a ``baselines`` event. The node loses the new
+        baseline at power-off unless it is stored (0x1010).
 
         Args:
             patch: Name of the patch.
-            deadline_s: Maximum time (s) to wait for the new baseline; 5 s plus three SYNC periods by default.
+            deadline_s: Time limit (s) for the new baseline; 5 s plus three SYNC periods by default.
 
         Raises:
             KeyError: if there is no such patch.
             NodeError: if another master runs the bus, the baseline is kept in a file, or the node is not
                 operational.
-            NodeTimeout: if no new baseline arrived before the deadline.
+            NodeTimeout: if no new baseline arrives before the deadline.
             BusError: if the command cannot be sent.
         """
         node = self._nodes[patch]

@@ -1,9 +1,9 @@
 """Find nodes without a node-ID, and set node-IDs and bit rates, as an LSS master (CiA 305 v3.0).
 
-A slave that does not match a request stays silent, so every negative result takes a full timeout. LSS
-responses are not numbered, so a late response to an earlier request looks like a response to the current
-request. The master therefore considers a node found or selected only after receiving the node's own LSS
-address. After a timeout, the master waits until a late response can no longer arrive.
+A slave that does not match a request stays silent, so every negative result costs a full timeout. LSS
+responses carry no number, so a late response to an earlier request cannot be told from a response to the
+current one. The master therefore counts a node as found or selected only when the node has returned its own
+LSS address. After a timeout, the master waits until a late response can no longer arrive.
 """
 
 from __future__ import annotations
@@ -29,54 +29,50 @@ from skinnode.errors import BusError
 from skinnode.process import clock
 
 ANSWER_S: Final = 0.1
-"""Maximum time (s) to wait for an LSS response. The limit allows for the low priority of LSS frames on the
-bus.
-"""
+"""Time limit (s) for an LSS response. LSS frames have a low priority and may be delayed on a busy bus."""
 
 STORE_ANSWER_S: Final = 2.0
-"""Maximum time (s) to wait for the response to the store command. Before responding, the node writes to flash
-memory or syncs a file to disk. CANopenNode's LSS master waits 1 s for any response.
+"""Time limit (s) for the response to the store command. The node first writes to flash memory or syncs a file
+to disk. For comparison, CANopenNode's LSS master waits 1 s for any response.
 """
 
 _SCAN_ANSWERS_S: Final = (0.03, 0.15)
-"""Timeouts (s) for each request of the first and of the second fastscan. The second fastscan is slow, and is
-used only if the first fastscan has found no node.
+"""Time limits (s) for the response to a fastscan request, in the first and the second fastscan. The second,
+slower one runs only if the first has found no node.
 """
 
 _TRIES: Final = 2
-"""Number of unanswered requests after which a node is assumed to be absent. A busy computer may miss the
-response to a single request.
+"""Number of unanswered requests after which a node counts as absent. A busy computer may miss one response.
 """
 
 _SETTLE: Final = 0.2
-"""Pause after the first response to a fastscan request, as a fraction of the timeout. During the pause, other
-slaves may respond to the same request.
+"""Pause after the first response to a fastscan request, as a fraction of the timeout. It leaves time for the
+responses of other slaves.
 """
 
 _UNDER_WAY_S: Final = 0.4
-"""Pause (s) after a timeout, during which a late response may still arrive."""
+"""Pause (s) that follows a timeout, long enough for a late response to arrive."""
 
 _PARTS: Final = 4
 _REVISIONS: Final = od.REVISION_NUMBER, od.UNCHECKED_REVISION_NUMBER
 _LIKELY: Final = (od.VENDOR_ID,), (od.PRODUCT_CODE,), _REVISIONS
-"""First parts of the LSS address of a skinnode patch: vendor-ID, product code and revision number. A fastscan
-tries these values first. If they match, the fastscan finds the three parts with three or four requests; a
-search bit by bit needs 96 requests.
+"""Likely values of the first three parts of an LSS address: those of a skinnode patch. A fastscan tries them
+first. If they match, three or four requests replace the 96 of a search bit by bit.
 """
 
 
 class LssFailed(BusError):
-    """Failed LSS service: the slave refused the service or did not respond."""
+    """Raised when a slave refuses an LSS service or does not respond."""
 
 
 class LssMaster:
     """LSS master on one bus.
 
-    The master sends requests with ``send``; the caller must pass all responses (COB-ID 0x7E4) to
+    The master sends its requests through ``send``. The caller must pass every response (COB-ID 0x7E4) to
     :meth:`on_response`.
 
-    Threads: only :meth:`give_node_id` may be called from several threads at the same time. The mainline calls
-        :meth:`on_response`.
+    Threads: the mainline calls :meth:`on_response`. Of the other methods, only :meth:`give_node_id` may be
+    called from several threads at once.
     """
 
     def __init__(self, send: Callable[[int, bytes], None]) -> None:
@@ -85,15 +81,15 @@ class LssMaster:
         self._dialogue = clock.lock()
 
     def on_response(self, data: bytes, t_ns: int) -> None:
-        """Process a slave's response. Ignore responses that are not 8 bytes long, as CiA 305 requires."""
+        """Process a slave's response. A response that is not 8 bytes long is ignored (CiA 305)."""
         if len(data) == 8:
             self._answers.put(data)
 
     def give_node_id(self, serial: int, node_id: int) -> bool:
-        """Make the patch with this serial number boot with ``node_id``, without storing the node-ID.
+        """Make the patch with this serial number boot with ``node_id``.
 
-        Storing a node-ID permanently is left to a technician. A patch that already has the node-ID is not
-        changed.
+        The patch does not store the node-ID: that is left to a technician. A patch that already has the
+        node-ID is left alone.
 
         Returns:
             Whether the patch was found and accepted the node-ID.
@@ -110,7 +106,7 @@ class LssMaster:
                     self.set_node_id(node_id)
             except LssFailed:
                 return False
-            finally:  # release makes a slave boot if it has just received its first node-ID
+            finally:  # a slave that has received its first node-ID boots when released
                 self.release()
             if active not in (None, node_id):
                 self._send(od.NMT_COB_ID, nmt.encode(nmt.NmtCommand.RESET_COMMUNICATION, active))
@@ -121,8 +117,8 @@ class LssMaster:
     def any_unconfigured(self) -> bool:
         """Return whether any node on the bus lacks a node-ID.
 
-        The master sends both the service *identify non-configured remote slave* and the first request of a
-        fastscan, because some stacks, such as CANopenNode, support only fastscan.
+        The master uses the service *identify non-configured remote slave* and, if there is no response, the
+        first request of a fastscan. Some stacks, such as CANopenNode, support only fastscan.
         """
         expected = bytes((LssCommand.IDENTIFIED_NOT_CONFIGURED,))
         if any(self._ask(LssCommand.IDENTIFY_NOT_CONFIGURED, expected=expected) for _ in range(_TRIES)):
@@ -132,10 +128,10 @@ class LssMaster:
     def find_unconfigured(self) -> LssAddress | None:
         """Find a node without a node-ID by fastscan.
 
-        A node that is found stays in configuration state until :meth:`release` is called.
+        The node stays in configuration state until :meth:`release` is called.
 
         Returns:
-            LSS address of the node, or None if no node was found.
+            LSS address of the node; None if no node was found.
         """
         for answer_s in _SCAN_ANSWERS_S:
             if self._scan(0, RESET_SCAN, 0, 0, ANSWER_S) is None:
@@ -153,7 +149,7 @@ class LssMaster:
         return None
 
     def _scan_part(self, part: int, answer_s: float) -> int | None:
-        """Find one part of an LSS address by fastscan; return None if the node stops responding."""
+        """Return one part of an LSS address found by fastscan; None if the node stops responding."""
         following = (part + 1) % _PARTS
         for likely in _LIKELY[part] if part < len(_LIKELY) else ():
             if self._scan(likely, 0, part, following, answer_s) is not None:
@@ -167,7 +163,7 @@ class LssMaster:
     def _scan(self, value: int, bit: int, part: int, following: int, answer_s: float) -> bytes | None:
         data = value.to_bytes(4, "little") + bytes((bit, part, following))
         answer = self._ask(LssCommand.FASTSCAN, data, bytes((LssCommand.IDENTIFIED,)), answer_s)
-        # other slaves may respond slightly later: wait for them before the next request
+        # before the next request, wait for the responses of other slaves
         if answer is not None:
             clock.sleep(answer_s * _SETTLE)
         return answer
@@ -175,7 +171,7 @@ class LssMaster:
     # --- one node
 
     def select(self, address: LssAddress) -> bool:
-        """Switch the node with this address to configuration state. Return whether the node was found."""
+        """Switch the node with this address to configuration state. Return whether it was found."""
         self.release()
         for command, value in enumerate(address[:3], LssCommand.SELECT_VENDOR):
             self._request(command, value.to_bytes(4, "little"))
@@ -188,10 +184,12 @@ class LssMaster:
         return False
 
     def select_patch(self, serial: int) -> LssAddress | None:
-        """Switch the patch with this serial number and any known revision number to configuration state.
+        """Switch the patch with this serial number to configuration state.
+
+        All known revision numbers are tried.
 
         Returns:
-            LSS address of the patch, or None if the patch was not found.
+            LSS address of the patch; None if it was not found.
         """
         for revision in _REVISIONS:
             address = LssAddress(od.VENDOR_ID, od.PRODUCT_CODE, revision, serial)
@@ -207,7 +205,7 @@ class LssMaster:
         )
 
     def node_id(self) -> int | None:
-        """Return the node-ID of the node in configuration state, or None if the node has no node-ID.
+        """Return the node-ID of the node in configuration state; None if it has none.
 
         Raises:
             LssFailed: if the node does not respond.
@@ -216,7 +214,9 @@ class LssMaster:
         return None if answer[1] == NOT_CONFIGURED else answer[1]
 
     def set_node_id(self, node_id: int) -> None:
-        """Set the node-ID that the node uses after its next communication reset.
+        """Set the node-ID of the node in configuration state.
+
+        The node uses it from its next communication reset on.
 
         Raises:
             LssFailed: if the node refuses the node-ID or does not respond.
@@ -225,7 +225,9 @@ class LssMaster:
         _require_done(answer, f"node-ID {node_id}")
 
     def set_bit_rate(self, bitrate_bps: int) -> None:
-        """Set the bit rate that the node will use after its next power-on; takes effect only if stored.
+        """Set the bit rate of the node in configuration state.
+
+        The node uses the bit rate after its next power-on, if it has stored it by then.
 
         Raises:
             LssFailed: if the node refuses the bit rate or does not respond.
@@ -239,7 +241,7 @@ class LssMaster:
         _require_done(self._must(LssCommand.CONFIGURE_BIT_TIMING, request, what), what)
 
     def store(self) -> None:
-        """Make the node store its node-ID and bit rate, so that they survive a power cycle.
+        """Make the node in configuration state store its node-ID and bit rate permanently.
 
         Raises:
             LssFailed: if the node refuses the command or does not respond.
@@ -250,7 +252,7 @@ class LssMaster:
     def release(self) -> None:
         """Switch all nodes to waiting state.
 
-        A node that has just received its first node-ID boots on this command.
+        A node that has received its first node-ID then boots.
         """
         self._request(LssCommand.SWITCH_GLOBAL, bytes((LssState.WAITING,)))
 
@@ -266,10 +268,10 @@ class LssMaster:
     def _ask(
         self, command: int, data: bytes = b"", expected: bytes | None = None, answer_s: float = ANSWER_S
     ) -> bytes | None:
-        """Send a request and return the first response that starts with ``expected``.
+        """Send a request and return the first response that starts with ``expected``; None on timeout.
 
-        The default for ``expected`` is the command itself. All other responses are discarded, because they
-        belong to earlier requests. Return None if no matching response arrives before the timeout.
+        By default, ``expected`` is the command itself. Other responses belong to earlier requests and are
+        discarded.
         """
         expected = bytes((command,)) if expected is None else expected
         while not self._answers.empty():

@@ -1,4 +1,4 @@
-"""Run a state machine for each supervised node, and perform the actions of each phase."""
+"""Run the state machine of each supervised node."""
 
 from __future__ import annotations
 
@@ -20,30 +20,29 @@ from skinnode.text.words import known
 _log = logging.getLogger(__name__)
 
 START_DEADLINE_S: Final = 1.0
-"""Maximum time (s) from the start command to the first heartbeat with the NMT state operational: four
-heartbeat periods.
+"""Time limit (s) from the start command to the first heartbeat that reports operational: four heartbeat
+periods.
 """
 
 _PROBE_NS: Final = 250_000_000
-"""Interval (ns) between requests to an absent node. Without these requests, a node that sends no heartbeats
-would not be detected after its boot-up message was lost. The requests to four nodes take 0.1 % of a bus's
-capacity.
+"""Interval (ns) between requests to an absent node. They find a node that sends no heartbeats and whose
+boot-up message was lost. For four nodes, they take 0.1 % of a bus's capacity.
 """
 
 _SEARCH_NS: Final = 1_000_000_000
 """Interval (ns) between LSS searches for an absent node."""
 
 _FORGET_NS: Final = 2_000_000_000
-"""Time (ns) for which a node is still reported as refused or faulty after its last frame."""
+"""Time (ns) after a node's last frame until it is no longer reported as refused or faulty."""
 
 _MUTE_NS: Final = 1_000_000_000
-"""Minimum interval (ns) between two reads of a node's configuration while the node sends no scans."""
+"""Minimum interval (ns) between reads of the configuration of a node that sends no scans."""
 
 
 class NodeSupervision:
-    """State machine for all supervised nodes. Used only by the supervisor's thread.
+    """State machines of all supervised nodes. Used only by the supervisor's thread.
 
-    Jobs that wait for a node run on ``pool``, with at most one job per node at a time.
+    A job that has to wait for a node runs on ``pool``. A node has at most one job at a time.
     """
 
     def __init__(self, pool: Executor) -> None:
@@ -51,12 +50,12 @@ class NodeSupervision:
         self._baselines = BaselineWatch(pool)
 
     def look(self, node: Supervised, now_ns: int) -> None:
-        """Advance a node's state machine at monotonic time ``now_ns``."""
+        """Advance the state machine of a node to monotonic time ``now_ns``."""
         count = node.remote.defects.count
         if node.upset or (count != node.defects and node.phase in (Phase.STARTING, Phase.RUNNING)):
             self._make_faulty(node, now_ns)
             return
-        # in the other phases, bring-up continues in spite of exceptions in frame handlers
+        # in the other phases, exceptions in frame handlers do not interrupt bring-up
         if count != node.defects:
             node.defects = count
             node.complaint = node.remote.monitor.defect = node.remote.defects.newest
@@ -87,7 +86,7 @@ class NodeSupervision:
             return
         if now_ns >= node.probe_ns:
             node.probe_ns = now_ns + _PROBE_NS
-            # a request that cannot be sent is repeated after `_PROBE_NS`
+            # a request that cannot be sent is repeated after _PROBE_NS
             with contextlib.suppress(BusError):
                 remote.probe()
         search_is_over = node.searching is None or node.searching.done()
@@ -96,9 +95,9 @@ class NodeSupervision:
             node.searching = self._pool.submit(_search, remote)
 
     def _begin(self, node: Supervised, now_ns: int) -> None:
-        """Start configuring a node; if another job is using the node, abort that job first.
+        """Start configuring a node.
 
-        After a job has been aborted, configuration starts in a later iteration.
+        A job that is still running is aborted first, and the configuration starts in a later iteration.
         """
         if node.job is not None and not node.job.done():
             node.abandon.set()
@@ -117,7 +116,7 @@ class NodeSupervision:
         remote, job = node.remote, node.job
         assert job is not None  # a node in phase JOINING always has a job
         if remote.monitor.boot_ups != remote.boot_ups:
-            node.abandon.set()  # the node has booted again and lost its new configuration
+            node.abandon.set()  # the node has rebooted and lost its configuration
         if not job.done():
             return
         if node.abandon.is_set():
@@ -150,10 +149,10 @@ class NodeSupervision:
         elif remote.monitor.said_since(NmtState.OPERATIONAL, node.since_ns):
             self._running(node, now_ns)
         elif remote.link.t_dispatched_ns > node.since_ns + START_DEADLINE_S * 1e9:
-            # the state was reported before the start command, and no heartbeat has arrived since
+            # the reported state predates the start command, and no heartbeat has arrived since
             silent = remote.monitor.nmt_state == NmtState.OPERATIONAL
             self._fail(node, _not_started(remote, silent=silent), now_ns, refused=not silent)
-        elif now_ns >= node.probe_ns:  # NMT commands are unconfirmed, so the start command may have been lost
+        elif now_ns >= node.probe_ns:  # NMT commands are unconfirmed and may be lost
             node.probe_ns = now_ns + _PROBE_NS
             with contextlib.suppress(BusError):
                 nmt_master.start(remote.link.send, remote.patch.node_id)
@@ -183,7 +182,7 @@ class NodeSupervision:
     def _make_faulty(self, node: Supervised, now_ns: int) -> None:
         """Mark a patch as faulty after an unexpected exception.
 
-        If the method itself raises an exception, the method is called again in the next iteration.
+        If this method raises an exception itself, the next iteration calls it again.
         """
         remote = node.remote
         count = remote.defects.count
@@ -233,7 +232,7 @@ class NodeSupervision:
         if remote.link.t_dispatched_ns > max(said_ns, node.since_ns) + patience_ns and not remote.listen_only:
             _log.warning("node %d (%s) is lost: no heartbeat", remote.patch.node_id, remote.patch.name)
             node.phase, node.since_ns, node.not_before_ns = Phase.AWAITED, now_ns, 0
-            # withhold scans until the node is configured again
+            # until the node has been configured again
             remote.link.call(remote.stream.withhold, remote.defects)
             return
         if node.unconfigured:
@@ -249,14 +248,14 @@ class NodeSupervision:
 
 
 def _read_back(node: Supervised) -> None:
-    """Return whether a node that sends no scans has lost its configuration."""
-    # after a failed read, the configuration is read again later
+    """Check whether a node that sends no scans has lost its configuration."""
+    # a failed read is repeated later
     with contextlib.suppress(BusError, ConfigError):
         node.unconfigured = not node.remote.is_configured()
 
 
 def _search(remote: RemoteNode) -> bool:
-    """Search for a node by LSS. Return whether the node was found."""
+    """Search for a node by LSS. Return whether it was found."""
     try:
         return remote.search()
     except Exception as error:
@@ -265,7 +264,7 @@ def _search(remote: RemoteNode) -> bool:
 
 
 def _not_started(remote: RemoteNode, *, silent: bool) -> str:
-    """Return the error message for a node that did not start in time."""
+    """Return the message for a node that did not start in time."""
     node = f"node {remote.patch.node_id}"
     if silent:
         return f"{node}: got no heartbeat within {START_DEADLINE_S:g} s of the start command"

@@ -1,8 +1,8 @@
-"""Turn a patch's chunks into fields: assemble scans on the mainline, decode and solve them on workers.
+"""Turn the chunks of a patch into fields.
 
-The mainline assembles scans and stores the newest assembled scan in a one-element buffer (the *box*). A
-worker thread takes the scan from the box and solves it. If a newer scan replaces an unsolved scan in the box,
-the older scan is counted as skipped. A token ensures that at most one worker processes the stream at a time.
+The mainline assembles each scan and puts it into a one-element buffer, the *box*. A worker thread takes the
+scan from the box, decodes it and solves it. A scan that is replaced in the box by a newer one is counted as
+skipped. A token limits each stream to one worker at a time.
 """
 
 from __future__ import annotations
@@ -35,8 +35,8 @@ _BASELINE_CHANGED: Final = int(SummaryFlag.BASELINE_CHANGED)
 
 _EVER_NS: Final = 2**63
 WATCH_AFTER_NS: Final = 5_000_000
-"""Delay (ns) from a scan's last frame to the search for noisy and drifting wires. The delay gives priority to
-solving: all patches' fields for one SYNC are due at the same time, and applications are waiting for them.
+"""Delay (ns) between the last frame of a scan and the search for noisy and drifting wires. Solving comes
+first, because applications wait for the fields of all patches at the same time.
 """
 
 
@@ -44,68 +44,65 @@ solving: all patches' fields for one SYNC are due at the same time, and applicat
 class StreamStats:
     """Counters of a patch's scans.
 
-    The number of assembled scans is ``offered`` + ``withheld`` + ``partial``. The value of ``offered`` is
-    ``solved`` + ``failed`` + ``skipped``, plus up to two scans in progress.
+    Every assembled scan counts as ``offered``, ``withheld`` or ``partial``. Every offered scan ends as
+    ``solved``, ``failed`` or ``skipped``; up to two are still in progress.
     """
 
     frames: int
     """Number of chunks and summaries passed to the stream."""
     offered: int
     withheld: int
-    """Number of scans that could not be decoded because the patch was being brought up or its baseline was
-    being read."""
+    """Number of scans withheld because the patch was being brought up or its baseline was being read."""
     partial: int
-    """Number of incomplete scans withheld because of ``stream.partial`` in the hand file."""
+    """Number of incomplete scans withheld because ``stream.partial`` is ``withhold``."""
     solved: int
     skipped: int
-    """Number of scans that were replaced by newer scans before a worker was available."""
+    """Number of scans replaced by a newer scan before a worker was free."""
     untrusted: int
-    """Number of fields that are not trusted."""
+    """Number of untrusted fields."""
     invalid_codes: int
-    """Number of codes that are over range, short, open or missing, summed over all solved scans."""
+    """Number of codes in all solved scans that mark a crossing as over range, short, open or missing."""
     assembler: AssemblerStats
     failed: int = 0
     """Number of scans whose decoding or solving raised an exception."""
 
 
 class StreamTap(Protocol):
-    """Recorder of the events, other than received frames, that affect which scans are solved.
+    """Recorder of the events, apart from received frames, that decide which scans are solved.
 
-    Mainline only.
+    All methods are called on the mainline.
     """
 
     def resumed(self, patch: str, solver: ScanSolver, *, anew: bool) -> None:
-        """Record that :meth:`PatchStream.resume` started passing scans to a solver."""
+        """Record that :meth:`PatchStream.resume` has set a solver."""
 
     def withheld(self, patch: str) -> None:
         """Record that :meth:`PatchStream.withhold` was called."""
 
     def polled(self, patch: str, t_ns: int) -> None:
-        """Record that :meth:`PatchStream.poll` ended an incomplete scan."""
+        """Record that :meth:`PatchStream.poll` has ended an incomplete scan."""
 
     def overtaken(self, patch: str, scan: int, t_receive_ns: int) -> None:
-        """Record that a newer scan replaced ``scan``, whose last frame arrived at ``t_receive_ns``."""
+        """Record that a newer scan has replaced ``scan``, whose last frame arrived at ``t_receive_ns``."""
 
 
 def _ignore(scan: Scan) -> None:
-    """Ignore a scan; default for unused callbacks."""
+    """Do nothing; default of the callbacks in :class:`StreamOptions`."""
 
 
 def _find_nothing(scan: Scan, number: int) -> Verdict:
-    """Return a verdict without faults; default for :attr:`StreamOptions.judge`."""
+    """Return a verdict without faults; default of :attr:`StreamOptions.judge`."""
     return FAULTLESS
 
 
 @dataclass(frozen=True, slots=True)
 class StreamOutput:
-    """Destination of a stream's scans, fields and exceptions."""
+    """Destinations of a stream's scans, fields and exceptions."""
 
     workers: Workers | Inline
     publisher: Publisher
     defects: Defects | None = None
-    """Collector of exceptions raised by decoding and solving; if None, the first exception stops the
-    publisher.
-    """
+    """Collector of exceptions from decoding and solving. If None, the first exception stops the publisher."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,31 +110,29 @@ class StreamOptions:
     """Settings of a patch stream."""
 
     tick: Callable[[int], Tick | None]
-    """Function that returns the newest SYNC with the given counter value."""
+    """Function that returns the newest SYNC with a given counter value."""
     on_scan: Callable[[Scan], None] = _ignore
-    """Function called immediately with each assembled scan."""
+    """Function called with each assembled scan."""
     judge: Callable[[Scan, int], Verdict] = _find_nothing
-    """Function called with each assembled scan and its number before the scan is solved. All earlier scans
-    are passed to ``watch`` first, so that a replay produces the same verdicts as the host.
+    """Function called with each assembled scan and its number before the scan is solved. By then, ``watch``
+    has been called with all earlier scans, so a replay gives the same verdicts as the host.
     """
     watch: Callable[[Scan], None] = _ignore
-    """Function called with each assembled scan after a delay of :data:`WATCH_AFTER_NS`."""
+    """Function called with each assembled scan, delayed by :data:`WATCH_AFTER_NS` or until the next scan."""
     partial: Partial = "pass"
-    """Handling of incomplete scans: ``pass`` or ``withhold``."""
+    """Treatment of incomplete scans: ``pass`` or ``withhold``."""
     under_way: bool = False
-    """Whether another master starts the node. If so, the node may already be sending scans when the stream is
-    resumed.
-    """
+    """Whether another master starts the node. Scans may then be under way when the stream is resumed."""
 
 
 class PatchStream:
     """Stream of one patch's scans, from received frames to published fields.
 
-    Scans are withheld until :meth:`resume` is called with a solver. If decoding or solving a scan raises an
-    exception, that scan is lost.
+    Scans are withheld until :meth:`resume` sets a solver. An exception during decoding or solving costs only
+    the current scan.
 
-    Threads: :meth:`settled` and :meth:`stats` may be called from any thread, all other methods only from the
-        mainline.
+    Threads: any thread may call :meth:`settled` and :meth:`stats`. The other public methods are for the
+    mainline only.
     """
 
     def __init__(
@@ -156,18 +151,16 @@ class PatchStream:
         self._left_out: list[int] = []
         self._left_out_within_ns = 0
         self.withholdings = 0
-        """Number of times that :meth:`withhold` has been called."""
+        """Number of calls to :meth:`withhold`."""
         self.doubtful = False
-        """Whether the stream may have missed a new baseline, because a summary was lost or discarded."""
+        """Whether a lost or discarded summary may have announced a new baseline."""
         self._frames = self._withheld = self._partial = 0
         self._offered = self._taken = self._solved = self._failed = self._untrusted = self._invalid = 0
         self._newest = 0
         self._solving = 0
-        """Number of the scan that a worker is currently solving."""
+        """Number of the scan being solved."""
         self.t_passed_ns = 0
-        """Monotonic arrival time (ns) of the newest scan that was not withheld; 0 before the first such
-        scan.
-        """
+        """Monotonic arrival time (ns) of the newest scan that was not withheld; 0 if there is none."""
 
     # --- mainline
 
@@ -186,7 +179,7 @@ class PatchStream:
             self._offer(scan)
 
     def poll(self, t_ns: int) -> None:
-        """End the current scan if its deadline has passed, and check earlier scans for faulty wires."""
+        """End the current scan at its deadline, and check earlier scans for faulty wires."""
         self._watch_until(t_ns)
         deadline_ns = self._assembler.next_deadline_ns()
         if deadline_ns is None or t_ns < deadline_ns:
@@ -198,12 +191,12 @@ class PatchStream:
             self._offer(scan)
 
     def _watch_until(self, t_ns: int) -> None:
-        """Check the scans that are due at ``t_ns`` for faulty wires."""
+        """Check the scans due by ``t_ns`` for faulty wires."""
         while self._unwatched and t_ns >= self._unwatched[0][0]:
             self._options.watch(self._unwatched.popleft()[1])
 
     def withhold(self) -> int:
-        """Withhold all scans from now on, including the scan being assembled. Returns ``withholdings``."""
+        """Withhold all scans from now on, including the one being assembled. Return ``withholdings``."""
         self._solver = None
         self.withholdings += 1
         if self.tap is not None:
@@ -216,13 +209,13 @@ class PatchStream:
         return self._solver is None
 
     def resume(self, solver: ScanSolver, withholdings: int, *, anew: bool) -> None:
-        """Start passing scans to ``solver``, which decodes and solves them.
+        """Decode and solve the following scans with ``solver``.
 
         Args:
             solver: Solver for the scans.
-            withholdings: Newest value of ``withholdings`` known to the caller. If :meth:`withhold` has been
-                called again since, the call has no effect.
-            anew: Whether the node has been restarted, so that all earlier frames must be ignored.
+            withholdings: Value of ``withholdings`` that the caller has last seen. If :meth:`withhold` has
+                been called since, :meth:`resume` has no effect.
+            anew: Whether the node has restarted. If so, the frames received so far are discarded.
         """
         if withholdings != self.withholdings:
             return
@@ -237,16 +230,16 @@ class PatchStream:
             self.tap.resumed(self._patch, solver, anew=anew)
 
     def inform_tap(self) -> None:
-        """Report the current solver to a newly added tap, unless scans are being withheld."""
+        """Report the current solver, if any, to a newly added tap."""
         if self.tap is not None and self._solver is not None:
             self.tap.resumed(self._patch, self._solver, anew=False)
 
     def close(self) -> None:
-        """Discard the scan that is waiting for a worker. Call only after the mainline has ended."""
+        """Discard the scan in the box. Call only after the mainline has ended."""
         self._box.clear()
         while self._unwatched:
             scan = self._unwatched.popleft()[1]
-            with contextlib.suppress(Exception):  # no caller is left that could handle the exception
+            with contextlib.suppress(Exception):  # no caller is left to handle the exception
                 self._options.watch(scan)
 
     def _doubt(self) -> None:
@@ -292,14 +285,14 @@ class PatchStream:
         self._call_worker()
 
     def leave_out(self, times_ns: Sequence[int], within_ns: int) -> None:
-        """Skip the scans that were replaced by newer scans when the recording was made.
+        """Skip the scans that were skipped when the recording was made.
 
-        The replaced scans are identified by arrival time. Scan numbers are not unique: if reception
-        pauses in the middle of a scan, both parts may be assembled as scans with the same number.
+        Arrival times identify these scans, because scan numbers are not unique: a scan interrupted by a gap
+        in reception may be assembled as two scans with the same number.
 
         Args:
-            times_ns: Monotonic arrival times (ns) of the replaced scans' last frames.
-            within_ns: Tolerance (ns) for the arrival times.
+            times_ns: Monotonic arrival times (ns) of the last frames of the skipped scans.
+            within_ns: Tolerance (ns) of the comparison.
         """
         self._left_out, self._left_out_within_ns = sorted(times_ns), within_ns
 
@@ -310,9 +303,9 @@ class PatchStream:
         return i < len(self._left_out) and self._left_out[i] <= t_ns + self._left_out_within_ns
 
     def settled(self, scan: int) -> bool:
-        """Return whether ``scan`` has arrived and no scan is queued or being solved.
+        """Return whether ``scan`` has arrived and no scan is waiting or being solved.
 
-        While scans are being withheld, the method does not require ``scan`` to have arrived.
+        While scans are withheld, ``scan`` need not have arrived.
         """
         return (self._newest >= scan or self._solver is None) and not self._box and bool(self._token)
 
@@ -337,7 +330,7 @@ class PatchStream:
         self._leave()
 
     def _solve_next(self) -> None:
-        self._taken += 1  # count the scan before it leaves the box, so that the counters always include it
+        self._taken += 1  # before the scan leaves the box: the counters must always include it
         try:
             scan, stamp, solver, verdict = self._box.popleft()
         except IndexError:  # the stream was closed
@@ -361,9 +354,9 @@ class PatchStream:
         self._leave()
 
     def _leave(self) -> None:
-        """Put back the worker's token, and call another worker if a scan is waiting.
+        """Put back the token, and call a worker if a scan is waiting.
 
-        The method never raises an exception, because the token must be put back exactly once.
+        Never raises, because the token must be put back exactly once.
         """
         self._token.append(None)
         try:
@@ -384,7 +377,7 @@ class PatchStream:
     def stats(self) -> StreamStats:
         """Return all counters of the stream.
 
-        The counters are read in an order that prevents a scan in progress from being counted as skipped.
+        The counters are read in an order that never counts a scan in progress as skipped.
         """
         offered, waiting = self._offered, len(self._box)
         return StreamStats(

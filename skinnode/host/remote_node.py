@@ -1,4 +1,4 @@
-"""Represent a patch's node on the host, including its SDO client, parameters and scan stream."""
+"""Represent a patch's node on the host: its SDO client, its parameters and its scans."""
 
 from __future__ import annotations
 
@@ -22,27 +22,27 @@ from skinnode.protocol.command import pack_command
 from skinnode.protocol.profile import PatchProfile
 
 _MAINLINE_S: Final = 1.0
-"""Maximum time (s) to wait for a short job on the mainline. The mainline runs pending jobs at least fifty
-times a second unless the node's bus is unavailable.
+"""Time limit (s) for a short job on the mainline. The mainline runs pending jobs at least fifty times a
+second, unless the bus is unavailable.
 """
 
 _ANSWER_S: Final = 0.05
-"""Time (s) to wait for all responses to one SDO request when checking for a second node with the same
-node-ID. The check prolongs a failed bring-up by at least twice this time.
+"""Time (s) to collect the responses to one SDO request when looking for a second node with the same node-ID.
+The search prolongs a failed bring-up by at least twice this time.
 """
 
 _MUTE_S: Final = 0.4
 _MUTE_SCANS: Final = 5
-"""Time without a scan after which a node's configuration is read back: ``_MUTE_S`` seconds or ``_MUTE_SCANS``
-SYNC periods, whichever is longer. The time is short so that the stream recovers within a second.
+"""Time without a scan after which the configuration of a node is read back: ``_MUTE_S`` seconds or
+``_MUTE_SCANS`` SYNC periods, whichever is longer. It is short enough for scans to resume within a second.
 """
 
 
 class RemoteNode:
     """Patch of the hand and its CANopen node, as seen by the host.
 
-    Threads: only one thread at a time may bring up the node, and this thread must not be the mainline.
-        Methods not marked "Any thread" may be called only by the thread that brings up the node.
+    Threads: one thread at a time, other than the mainline, may bring up the node. Only that thread may call
+    the methods that are not marked "Any thread".
     """
 
     def __init__(
@@ -58,16 +58,16 @@ class RemoteNode:
         self.bus = hand.bus(patch.bus)
         self.has_other_master = self.bus.role == "guest"
         self.listen_only = self.has_other_master and self.bus.guest_sends == "nothing"
-        """Whether the hand file forbids sending any frame to the node."""
+        """Whether the hand file forbids sending frames to the node."""
         self.facts: NodeFacts | None = None
         self.boot_ups = 0
-        """Number of the node's boot-up messages at the start of bring-up. If the number increases, bring-up
-        must be repeated.
+        """Number of boot-up messages up to the start of bring-up. A later boot-up makes another bring-up
+        necessary.
         """
         self.t_answer_ns = 0
-        """Monotonic time (ns) of the node's newest SDO response."""
+        """Monotonic time (ns) of the newest SDO response."""
         self._answers = 0
-        """Number of SDO responses received from the node's node-ID."""
+        """Number of SDO responses received with this node-ID."""
         self._hand, self._lss = hand, bus.lss
         self._profile = PatchProfile.from_config(patch, self.bus)
         self._remote = self.link.remote_od(patch.node_id, self._on_answer, defects)
@@ -82,12 +82,12 @@ class RemoteNode:
 
     @property
     def heard(self) -> bool:
-        """Whether any frame from the node has been received since the host opened the bus."""
+        """Whether the node has sent a heartbeat or scan since the host opened the bus."""
         return self.monitor.t_heartbeat_ns is not None or self.stream.stats().withheld > 0
 
     @property
     def heartbeat_s(self) -> float:
-        """Node's heartbeat period, s."""
+        """Heartbeat period of the node, s."""
         return self._hand.bring_up.heartbeat_s if self.facts is None else self.facts.heartbeat_s
 
     def configure(
@@ -99,16 +99,15 @@ class RemoteNode:
         """Withhold the node's scans, and configure the node.
 
         Args:
-            deadline_s: Maximum time (s) to wait for the node's first response.
-            abandoned: Function called repeatedly during configuration; if it returns True, the configuration
-                stops and raises Abandoned.
-            on_answer: Function called once the node has responded.
+            deadline_s: Time limit (s) for the node's first response.
+            abandoned: Function polled during configuration. If it returns True, Abandoned is raised.
+            on_answer: Function called when the node has responded.
 
         Returns:
-            The solver for the node's scans.
+            Solver for the node's scans.
 
         Raises:
-            NodeError: if the node's electrode layout cannot be solved, or two nodes have the same node-ID.
+            NodeError: if the node's layout cannot be solved, or two nodes have the same node-ID.
             SkinError: for the reasons listed under :meth:`Configurator.configure`.
         """
         self.boot_ups = self.monitor.boot_ups
@@ -117,7 +116,7 @@ class RemoteNode:
             nmt_master.stand_by(self.link.send, self.patch.node_id)
 
         def answered(patch: PatchConfig) -> None:
-            self.boot_ups = self.monitor.boot_ups  # ignore the expected boot-ups
+            self.boot_ups = self.monitor.boot_ups  # boot-ups up to this point are expected
             if on_answer is not None:
                 on_answer(patch)
 
@@ -139,17 +138,17 @@ class RemoteNode:
             raise NodeError(self.patch.node_id, f"patch {self.patch.name!r}: {error}") from None
 
     def start(self, solver: ScanSolver, withholdings: int) -> None:
-        """Start passing scans to ``solver`` and, if the host is the master, start the node.
+        """Pass the following scans to ``solver``. If the host is the NMT master, start the node.
 
         Args:
-            solver: Solver that decodes and solves the scans.
+            solver: Solver for the node's scans.
             withholdings: Number returned by :meth:`withhold`.
 
         Raises:
             BusError: if the command cannot be sent.
         """
-        # If another master runs the node, the stream has been running since the bus was opened, unless the
-        # node has booted in the meantime.
+        # Scans of a node that another master runs have been arriving since the bus was opened, unless the
+        # node has booted since.
         anew = not self.has_other_master or self.monitor.boot_ups > 0
         self.link.call(lambda: self.stream.resume(solver, withholdings, anew=anew), self.defects)
         if not self.has_other_master:
@@ -157,17 +156,16 @@ class RemoteNode:
         self.monitor.running = True
 
     def renew_baseline(self, deadline_s: float, abandoned: Callable[[], bool]) -> ScanSolver | None:
-        """Read the node's current baseline, and create a new solver if needed.
+        """Read the node's current baseline. Create a new solver if needed.
 
         Returns:
-            Solver with the baseline that was read; None if the baseline is unchanged and no scans are
-            withheld.
+            Solver with the baseline read; None if the baseline is unchanged and no scans are withheld.
 
         Raises:
             SkinError: for the reasons listed under :meth:`Configurator.settle_baseline`.
         """
         facts = self.facts
-        assert facts is not None  # this method is called only for running nodes
+        assert facts is not None  # called for running nodes only
         configurator = self._configurator(deadline_s, abandoned, lambda patch: None)
         with self._remote.abort_if(abandoned):
             baseline_ohm = configurator.settle_baseline(self.patch, self._profile, self._remote)
@@ -175,11 +173,11 @@ class RemoteNode:
             return None
         facts = facts.with_baseline(baseline_ohm)
         solver = ScanSolver(facts, self._hand.solver)
-        self.facts = facts  # update only now: if creating the solver fails, the old baseline stays in use
+        self.facts = facts  # not earlier: if creating the solver fails, the old baseline stays in use
         return solver
 
     def renew_register(self) -> None:
-        """Read the node's error register, in case the emergency message that clears an error was lost.
+        """Read the node's error register. The EMCY message that clears an error may have been lost.
 
         Raises:
             NodeError: if reading fails; see :class:`RemoteOd`.
@@ -189,9 +187,9 @@ class RemoteNode:
         self.link.call(lambda: self.monitor.on_register_read(register, said), self.defects)
 
     def is_mute(self, since_ns: int) -> bool:
-        """Return whether an operational node sends no scans, possibly because it has lost its configuration.
+        """Return whether an operational node sends no scans and may therefore have lost its configuration.
 
-        On a bus that another master runs, the result is always False, because the host must not restore the
+        On a bus that another master runs, the result is False, because the host must not restore the
         configuration there.
 
         Args:
@@ -206,7 +204,7 @@ class RemoteNode:
         return is_configured(self.patch, self._hand, self._remote)
 
     def tare(self) -> None:
-        """Command the node to use its current resistances as its baseline. Any thread.
+        """Command the node to tare. Any thread.
 
         Raises:
             SkinError: for the reasons listed under :meth:`Host.tare`.
@@ -214,7 +212,7 @@ class RemoteNode:
         node_id, said = self.patch.node_id, f"patch {self.patch.name!r} on {self.patch.bus}: not tared"
         if self.has_other_master:
             raise NodeError(node_id, f"{said}: another master runs the bus")
-        if self.patch.baseline is not None:  # the host would immediately restore the baseline from the file
+        if self.patch.baseline is not None:  # the host would restore the baseline from the file at once
             raise NodeError(node_id, f"{said}: its baseline is kept in {self.patch.baseline}")
         if (
             not self.monitor.running or self.monitor.nmt_state != NmtState.OPERATIONAL
@@ -223,14 +221,13 @@ class RemoteNode:
         self.link.send(od.command_cob_id(node_id), pack_command(tare=True))
 
     def withhold(self) -> int:
-        """Withhold the node's scans; the mainline executes the request.
+        """Make the mainline withhold the node's scans.
 
         Returns:
             Number to pass to :meth:`start` as ``withholdings``.
 
         Raises:
-            NodeTimeout: if the mainline does not respond before the timeout, for example because the bus is
-                unavailable.
+            NodeTimeout: if the mainline does not respond in time, for example because the bus is unavailable.
         """
         answer: queue.SimpleQueue[int] = clock.simple_queue()
         self.link.call(lambda: answer.put(self.stream.withhold()), self.defects)
@@ -242,7 +239,7 @@ class RemoteNode:
             ) from None
 
     def probe(self) -> None:
-        """Request the node's device type, without waiting for the response.
+        """Request the node's device type (0x1000) without waiting for the response.
 
         Raises:
             BusError: if the request cannot be sent.
@@ -251,10 +248,10 @@ class RemoteNode:
         self.link.send(od.sdo_request_cob_id(self.patch.node_id), request)
 
     def _answers_to_one_question(self) -> int:
-        """Return the number of responses to one SDO request; two responses reveal a shared node-ID.
+        """Return the number of responses to one SDO request. Two responses reveal a shared node-ID.
 
-        A late response to an earlier request would inflate the count. The method therefore sends two requests
-        and returns the smaller number of responses.
+        A late response to an earlier request would be counted too. The method therefore sends two requests
+        and returns the smaller count.
         """
         clock.sleep(_ANSWER_S)
         counts = []
@@ -269,13 +266,13 @@ class RemoteNode:
 
     @property
     def searchable(self) -> bool:
-        """Whether the host can find the node by LSS: only a bus master that knows the serial number can."""
+        """Whether the host is the NMT master and knows the serial number, as a search by LSS requires."""
         return not self.has_other_master and self.patch.serial is not None
 
     def search(self) -> bool:
-        """Search for the node by LSS, using its serial number. Return whether the node was found.
+        """Search for the node by LSS with its serial number. Return whether it was found.
 
-        If the node is found, the node boots with the node-ID from the hand file.
+        A node that is found boots with the node-ID from the hand file.
         """
         if self.has_other_master or self.patch.serial is None:
             return False

@@ -1,10 +1,10 @@
-"""Read and write the object dictionary of a remote node as an SDO client.
+"""Read and write the object dictionary of a remote node by SDO.
 
-canopen's SDO client blocks the requesting thread until the mainline passes the response to the client through
-:meth:`SkinNetwork.notify`. This module limits the length and the duration of a transfer. canopen's client has
-no such limits, so a faulty node could fill the memory or block a thread forever.
+The SDO client of the canopen package blocks the calling thread until the mainline delivers the response
+through :meth:`SkinNetwork.notify`. It sets no limit to the length or the duration of a transfer, so a faulty
+node could exhaust the memory or block a thread forever. This module adds both limits.
 
-Threads: only one thread at a time may access a node. Different nodes may be accessed in parallel.
+Threads: one thread at a time per node. Different nodes may be accessed in parallel.
 """
 
 from __future__ import annotations
@@ -29,11 +29,10 @@ from skinnode.process import clock
 from skinnode.text.words import counted
 
 ATTEMPTS: Final = 3
-"""Maximum number of attempts if a transfer gets no response or a response to an earlier transfer."""
+"""Maximum number of attempts at a transfer that gets no response, or the response to an earlier transfer."""
 
 _SILENCES: Final = ("No SDO response", "could not be retransmitted")
-"""canopen's error messages for a missing response. canopen raises the second message after its own
-retransmission requests.
+"""Error messages of canopen for a missing response. The second follows canopen's own retransmission requests.
 """
 
 _OUT_OF_STEP: Final = (
@@ -44,41 +43,38 @@ _OUT_OF_STEP: Final = (
     AbortCode.INVALID_SEQUENCE,
     AbortCode.CRC,
 )
-"""SDO abort codes after which a transfer is retried, because they indicate that the node missed a frame:
-toggle bit, timeout, command specifier, block size, sequence number, CRC.
-"""
+"""SDO abort codes that indicate a lost frame. A transfer aborted with one of them is retried."""
 
 MAX_UPLOAD_BYTES: Final = 4 * 254 * 254
-"""Maximum length (bytes) of any value: the length of the largest patch's baseline."""
+"""Maximum length (bytes) of a value: the baseline of the largest possible patch."""
 
 MAX_TEXT_BYTES: Final = 4096
-"""Maximum length (bytes) of a number or text."""
+"""Maximum length (bytes) of a short value, such as a text."""
 
 _MAX_NUMBER_BYTES: Final = 8
 
 _TRANSFER_S: Final = 5.0
 _SEGMENT_S: Final = 0.02
-"""The maximum duration (s) of a transfer is ``_TRANSFER_S`` plus ``_SEGMENT_S`` for each segment of the
-longest permitted value.
+"""Time limit (s) of a transfer: ``_TRANSFER_S``, plus ``_SEGMENT_S`` for each segment of the longest value
+allowed.
 """
 
 _PLAIN: Final = {"u8": "<B", "u16": "<H", "u32": "<I", "f32": "<f"}
 
-# Without a handler, Python would print canopen's warnings to the terminal, in addition to the exceptions that
-# this module raises.
+# Keep canopen's warnings off the terminal: this module raises exceptions for the same errors.
 logging.getLogger("canopen").addHandler(logging.NullHandler())
 
 
 class Abandoned(Exception):
-    """Exception for a transfer that was aborted because the caller no longer needs the result."""
+    """Raised when a transfer is aborted because the caller no longer needs the result."""
 
 
 class _UploadTooLong(Exception):
-    """Exception for an upload that exceeds the maximum length or duration."""
+    """Raised when an upload exceeds the maximum length or duration."""
 
 
 class SkinNetwork(canopen.Network):
-    """canopen network that sends frames by calling ``send``."""
+    """Network of the canopen package that sends its frames through ``send``."""
 
     def __init__(self, send: Callable[[int, bytes], None]) -> None:
         super().__init__()
@@ -88,7 +84,7 @@ class SkinNetwork(canopen.Network):
         """Send a data frame.
 
         Raises:
-            ValueError: if ``remote`` is True, because the host sends data frames only.
+            ValueError: if ``remote`` is True. Remote frames are not supported.
         """
         if remote:
             raise ValueError("remote: got True, the host sends data frames only")
@@ -98,17 +94,16 @@ class SkinNetwork(canopen.Network):
 class RemoteOd:
     """Object dictionary of a remote node, read and written by SDO.
 
-    Values have one of the types ``u8 u16 u32 f32``. The function ``abandoned`` is called after each segment;
-    if it returns True, the transfer is aborted and Abandoned is raised. A transfer is retried if there is no
-    response or if an unexpected exception is raised.
+    A value has the type ``u8``, ``u16``, ``u32`` or ``f32``. ``abandoned`` is called after each segment. If
+    it returns True, the transfer is aborted and Abandoned is raised. A transfer that gets no response or
+    raises an unexpected exception is retried.
 
     Threads: only one thread at a time may use an instance.
 
     Args:
         network: Network that sends the requests.
         node_id: Node-ID of the SDO server.
-        on_defect: Function called with each unexpected exception, i.e. an exception not caused by the node's
-            response.
+        on_defect: Function called with each exception that the node's response does not explain.
 
     Raises:
         NodeTimeout: if the node does not respond; raised by all methods.
@@ -128,7 +123,7 @@ class RemoteOd:
 
     @contextmanager
     def abort_if(self, abandoned: Callable[[], bool]) -> Iterator[None]:
-        """Abort the transfers in the ``with`` block if ``abandoned`` returns True."""
+        """Abort a transfer in the ``with`` block as soon as ``abandoned`` returns True."""
         before, self.abandoned = self.abandoned, abandoned
         try:
             yield
@@ -136,7 +131,7 @@ class RemoteOd:
             self.abandoned = before
 
     def answers(self) -> bool:
-        """Return whether the node responds to a single SDO request, even if with an abort."""
+        """Return whether the node responds to one SDO request. An abort counts as a response."""
         try:
             self._upload(DEVICE_TYPE, 0, _MAX_NUMBER_BYTES)
         except SdoAbortedError:
@@ -157,11 +152,11 @@ class RemoteOd:
         return True
 
     def read_bytes(self, index: int, subindex: int, most: int = MAX_TEXT_BYTES) -> bytes:
-        """Return an object's undecoded value; the maximum length is ``most`` bytes."""
+        """Return the undecoded value of an object, of at most ``most`` bytes."""
         return bytes(self._transfer(index, subindex, "read", lambda: self._upload(index, subindex, most)))
 
     def read_block(self, index: int, most: int = MAX_UPLOAD_BYTES) -> bytes:
-        """Read a long value (at most ``most`` bytes) by block transfer with CRC."""
+        """Return a long value, of at most ``most`` bytes, by block transfer with CRC."""
 
         def ask() -> bytes:
             with BlockUpload(self._client, index) as stream:  # type: ignore[no-untyped-call]
@@ -170,7 +165,7 @@ class RemoteOd:
         return bytes(self._transfer(index, 0, "block read", ask))
 
     def read_large(self, index: int, most: int = MAX_UPLOAD_BYTES) -> bytes:
-        """Read a long value by block transfer; fall back to segmented transfer if the node refuses."""
+        """Return a long value by block transfer, or by segmented transfer if the node aborts the former."""
         try:
             return self.read_block(index, most)
         except SdoAbort:
@@ -187,7 +182,7 @@ class RemoteOd:
         self._transfer(index, 0, "block write", ask)
 
     def read(self, index: int, subindex: int, kind: str) -> Any:
-        """Return an object's value, decoded as type ``kind``."""
+        """Return the value of an object of type ``kind``."""
         layout = struct.Struct(_PLAIN[kind])
         data = self.read_bytes(index, subindex, _MAX_NUMBER_BYTES)
         if len(data) != layout.size:
@@ -203,7 +198,7 @@ class RemoteOd:
         self.write_bytes(index, subindex, struct.pack(_PLAIN[kind], value))
 
     def write_bytes(self, index: int, subindex: int, data: bytes) -> None:
-        """Write a value that is already encoded."""
+        """Write an encoded value."""
 
         def ask() -> None:
             with Download(self._client, index, subindex, len(data)) as stream:  # type: ignore[no-untyped-call]
@@ -212,7 +207,7 @@ class RemoteOd:
         self._transfer(index, subindex, "write", ask)
 
     def write_if_different(self, index: int, subindex: int, kind: str, value: float) -> None:
-        """Write a value and read it back, unless the node already has this value."""
+        """Write a value and read it back, unless the node already has the value."""
         if self.read(index, subindex, kind) != value:
             self.write_checked(index, subindex, kind, value)
 
@@ -262,9 +257,9 @@ class RemoteOd:
     def _whole(self, stream: Any, most: int) -> bytes:
         """Read a stream to its end.
 
-        Raises SdoCommunicationError if the length of the data differs from the announced length,
-        _UploadTooLong if the data exceed ``most`` bytes or the transfer takes too long, and Abandoned if
-        ``abandoned`` returns True.
+        Raises SdoCommunicationError if the data and the announced size differ in length, _UploadTooLong if
+        the data exceed ``most`` bytes or the transfer its time limit, and Abandoned if ``abandoned`` returns
+        True.
         """
         if stream.size is not None and stream.size > most:
             raise _UploadTooLong(f"a value of {counted(stream.size, 'byte')}, expected at most {most}")
@@ -309,7 +304,7 @@ class RemoteOd:
 
 
 def _send(stream: Any, data: bytes) -> None:
-    """Write ``data`` to a stream. If ``data`` is empty, send one empty segment."""
+    """Write ``data`` to a stream in segments. Empty data make one empty segment."""
     at = stream.write(data[:SEGMENT_BYTES])
     while at < len(data):
         at += stream.write(data[at : at + SEGMENT_BYTES])

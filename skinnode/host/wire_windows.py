@@ -1,18 +1,18 @@
-"""Detect noisy and drifting wires from successive scans, and measure the noise of the resistance codes.
+"""Detect noisy and drifting wires, and measure the noise of the codes.
 
-Noise and drift are evaluated over windows of ``WINDOW`` scans. A wire is reported if the criterion for noise
-or drift is met in ``WINDOWS`` consecutive windows.
+Both tests evaluate windows of ``WINDOW`` successive scans. A wire is reported once it has been noisy, or
+drifting, in ``WINDOWS`` consecutive windows.
 
-The noise power of a wire is estimated from the second differences of its codes over time, because a change
-at a constant rate has no second difference. A wire is noisy if its noise power exceeds both the median over
-the wires on its side and the expected noise power by a factor of ``NOISY``.
+**Noise.** The noise power of a wire is estimated from the second differences of its codes over time, which
+vanish for a steady change. A wire is noisy if its noise power exceeds ``NOISY`` times the expected noise
+power and ``NOISY`` times the median over the wires of its side.
 
-A wire drifts if the resistances of all its crossings have changed by the same fraction of R0, while the
-resistances of its neighbours have not. The drift, relative to both the median wire and the baseline, must
-exceed ``DRIFT``. A touch, in contrast, changes the crossings of a wire unevenly, and the rubber spreads the
-change to the adjacent wires. Touches changed a wire by more than ``DRIFT`` in 780,000 simulated cases, and
-none of these changes was mistaken for drift. Drift is not detected if adjacent wires drift equally, or if
-the wire is being touched.
+**Drift.** A wire drifts if the resistances of all its crossings have changed by the same fraction of R0 and
+those of the adjacent wires have not. The change must exceed ``DRIFT`` relative to R0 and relative to the
+median wire. A touch does not meet these conditions: it changes the crossings of a wire unevenly, and the
+rubber carries the change to the adjacent wires. None of 780,000 simulated touches that changed a wire by more
+than ``DRIFT`` was taken for drift. The test misses a drift that adjacent wires share and the drift of a wire
+that is being touched.
 """
 
 from __future__ import annotations
@@ -31,20 +31,18 @@ from skinnode.protocol.scan import Scan
 WINDOW: Final = 16
 """Number of scans in a window."""
 WINDOWS: Final = 3
-"""Number of consecutive windows in which a wire must be noisy or drifting before it is reported."""
+"""Number of consecutive windows in which a wire must be noisy, or drifting, to be reported."""
 NOISY: Final = 25.0
-"""Minimum ratio of a noisy wire's noise power to the median noise power of the wires on its side. This
-is equivalent to a ratio of 5 between the noise amplitudes.
+"""Minimum noise power of a noisy wire, relative to the median over the wires of its side. This corresponds to
+5 times the median noise amplitude.
 """
 DRIFT: Final = 1e-3
-"""Minimum drift of a drifting wire, as a fraction of R0. A light touch changes the resistance of a crossing
-by ten times this fraction.
+"""Minimum change of a drifting wire, as a fraction of R0. A light touch changes a crossing ten times as much.
 """
 UNEVEN: Final = 0.05
-"""Maximum deviation of a drifting wire's crossings from their median, as a fraction of the drift."""
+"""Maximum deviation of the crossings of a drifting wire from their median, as a fraction of the drift."""
 APART: Final = 0.3
-"""Minimum difference in R / R0 between a drifting wire and the more similar of its two neighbours, as a
-fraction of the drift."""
+"""Minimum difference in R/R0 between a drifting wire and each adjacent wire, as a fraction of the drift."""
 _SHOWN: Final = 8
 """Number of recent windows from which :attr:`WireWindows.shown_noise` is determined."""
 
@@ -54,28 +52,28 @@ class WireWindows:
 
     Args:
         scale: Mapping of R/R0 to codes.
-        relative_noise: Converter noise stated in the hand file, as a fraction of the resistance.
+        relative_noise: Converter noise stated in the hand file, relative to the resistance.
     """
 
     def __init__(self, scale: CodeScale, relative_noise: float) -> None:
         self._scale, self._relative_noise = scale, relative_noise
         self.wires: tuple[WireFault, ...] = ()
-        """Noisy and drifting wires, according to the latest windows."""
+        """Wires currently reported as noisy or drifting."""
         self.windows = 0
         """Number of windows evaluated so far."""
-        self._odd: dict[WireFault, int] = {}  # number of consecutive windows with each fault
+        self._odd: dict[WireFault, int] = {}  # number of consecutive windows, by fault
         self._window: list[Codes] = []
-        # mask of the crossings measured in every scan of the window; None if all crossings were measured
+        # crossings measured in every scan of the window, as a mask; None if that is all of them
         self._measured: NDArray[np.bool_] | None = None
         self._shown: deque[float] = deque(maxlen=_SHOWN)
 
     @property
     def shown_noise(self) -> float:
-        """Minimum noise (codes) of the recent windows; 0 if the noise of any window was not measurable."""
+        """Smallest noise (codes) of the recent windows; 0 if it was not measurable in one of them."""
         return min(self._shown) if len(self._shown) == _SHOWN else 0.0
 
     def on_scan(self, scan: Scan) -> None:
-        """Add the next scan, which must be complete and contain the codes of all crossings."""
+        """Add the next scan. It must contain the codes of all crossings."""
         if not scan.valid.all():
             self._measured = scan.valid if self._measured is None else self._measured & scan.valid
         self._window.append(scan.codes)
@@ -93,7 +91,7 @@ class WireWindows:
             return
         codes = np.array(self._window, dtype=np.float64)
         ratio = np.where(measured, scale.lo + codes.mean(axis=0) * scale.step, np.nan)
-        # The variance of a second difference is six times (1 + 4 + 1) the variance of a value.
+        # A second difference has 1 + 4 + 1 = 6 times the variance of a value.
         roughness = (np.diff(codes, 2, axis=0) ** 2).sum(axis=0)
         noise = np.where(measured, roughness / (6.0 * (WINDOW - 2)), np.nan)
         self._shown.append(_shown_noise(codes, noise))
@@ -106,8 +104,8 @@ class WireWindows:
             off = np.abs(ratio - (gain[:, None] if axis else gain))
             spread = _of_wires(off, axis, whole, np.max, np.nanmax)
             quiet = max(expected, _median_of_known(level))
-            # The deviation from the median is not enough: a touch may change the median wire, and the
-            # untouched wires then deviate from it without drifting.
+            # The deviation from the median alone is misleading: if a touch changes the median wire, the
+            # untouched wires deviate from it.
             away = np.minimum(np.abs(gain - _median_of_known(gain)), np.abs(gain - 1.0))
             step = np.concatenate(([np.inf], np.abs(np.diff(gain)), [np.inf]))
             apart = np.fmin(step[:-1], step[1:])
@@ -121,16 +119,16 @@ class WireWindows:
 
 
 def _shown_noise(codes: NDArray[np.float64], power: NDArray[np.float64]) -> float:
-    """Return the lower quartile of the crossings' noise (codes); 0 if the noise is not measurable.
+    """Return the lower quartile of the noise over the crossings (codes); 0 if it is not measurable.
 
-    The noise of a crossing counts as 0 if its codes span fewer than three values, or if their mean changed
-    significantly from the first to the second half of the window. A range of two values is not sufficient,
-    because a crossing without noise may alternate between two codes if its resistance is at the edge of a
-    quantization step.
+    A crossing counts as noiseless if its codes span fewer than three values. Two values are not enough,
+    because even without noise a resistance at the edge of a quantization step may alternate between two
+    codes. A crossing also counts as noiseless if its mean code changes significantly from the first to the
+    second half of the window.
 
     Args:
         codes: (WINDOW, U, K) codes of a window.
-        power: (U, K) codes²: mean square of the noise; NaN where a code is not a measurement.
+        power: (U, K) mean square of the noise, codes²; NaN where a code is not a measurement.
     """
     half = WINDOW // 2
     moved = np.abs(codes[half:].mean(axis=0) - codes[:half].mean(axis=0))
@@ -140,14 +138,14 @@ def _shown_noise(codes: NDArray[np.float64], power: NDArray[np.float64]) -> floa
 
 
 def _median(values: NDArray[np.float64], axis: int) -> NDArray[np.float64]:
-    """Return the median of values without NaN; three times as fast as ``np.median`` for small arrays."""
+    """Return the median of values without NaN, for small arrays in a third of the time of ``np.median``."""
     ordered, count = np.sort(values, axis=axis), values.shape[axis]
     middle: NDArray[np.float64] = ordered.take([(count - 1) // 2, count // 2], axis=axis).sum(axis=axis)
     return 0.5 * middle
 
 
 def _median_of_known(values: NDArray[np.float64]) -> float:
-    """Return the median of the values that are not NaN; NaN if all values are NaN."""
+    """Return the median of the values that are not NaN; NaN if there are none."""
     known = values[~np.isnan(values)]
     return float(_median(known, 0)) if known.size else math.nan
 
@@ -155,10 +153,10 @@ def _median_of_known(values: NDArray[np.float64]) -> float:
 def _of_wires(
     values: NDArray[np.float64], axis: int, whole: NDArray[np.bool_], plain: Any, without_nan: Any
 ) -> NDArray[np.float64]:
-    """Reduce the values of each wire's crossings to one number; NaN if none of the crossings was measured.
+    """Reduce the values of the crossings on each wire to one value; NaN if none was measured.
 
-    In ``values``, NaN denotes a crossing that was not measured. The reduction by ``plain`` is used if there
-    is no NaN, because it is ten times as fast as ``without_nan``.
+    NaN in ``values`` marks a crossing that was not measured. Without NaN, ``plain`` does the reduction, which
+    takes a tenth of the time of ``without_nan``.
     """
     if not np.isnan(values).any():
         return np.asarray(plain(values, axis=axis))

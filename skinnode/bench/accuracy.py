@@ -1,4 +1,4 @@
-"""Measures the accuracy and speed of the solvers and the calibration of their reported uncertainty."""
+"""Measures how accurate and how fast the solvers are, and how well their uncertainty is calibrated."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from skinnode.text.json_values import plain
 RATIO_LIMIT: Final = 1.15
 COVERAGE_LIMITS: Final = (0.90, 0.98)
 ERROR_LIMITS: Final = {"staggered": 0.03, "aligned": 0.10}
-"""Maximum permissible error of the posterior for each layout, as a fraction of the RMS displacement. The
-limits apply to a 10 % press at h = 0.5 with a relative noise of 1e-5."""
+"""Maximum error of the posterior for each layout, as a fraction of the RMS displacement, for a 10 % press at
+h = 0.5 with a relative noise of 1e-5."""
 SCENES_A_CELL: Final = 25
-"""Number of scenes in a row of the coverage table, relative to a cell of the noise and code tables. Three
-scenes per cell are enough, because each scene contributes 300 coordinates to the RMS error of a cell."""
+"""Number of scenes in a row of the coverage table for each scene in a cell of the noise and code tables. A
+cell needs at least three scenes; each contributes 300 coordinates to its RMS error."""
 
 
 def run(scenes: int, rounds: int) -> dict[str, Any]:
@@ -48,10 +48,10 @@ def run(scenes: int, rounds: int) -> dict[str, Any]:
 
 
 def requirements(figures: dict[str, Any]) -> list[dict[str, Any]]:
-    """Return a row for each requirement: name, measured value, limit as text, and whether the limit is met.
+    """Return one row per requirement: its name, the measured value, the limit as text, and whether it is met.
 
-    Requirements on execution times are marked ``absolute``. An unmet ``absolute`` requirement does not make
-    the benchmark fail, because execution times depend on the machine.
+    Limits on execution times are marked ``absolute``. They depend on the machine, so missing one does not
+    make the benchmark fail.
     """
     found = []
     for row in figures["noise"]:
@@ -121,7 +121,7 @@ def _print_front(panels: list[dict[str, Any]], echo: Callable[[str], object]) ->
 
 
 def best_of_each(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return the fastest row of each solver that meets ACCURACY, or its most accurate row if none does."""
+    """Return, for each solver, the fastest row that meets ACCURACY, or the most accurate row if none does."""
 
     def rank(row: dict[str, Any]) -> tuple[bool, float]:
         error = float("inf") if row["error"] is None else row["error"]

@@ -1,11 +1,11 @@
-"""Measures the time and error of our solvers and of other libraries on the same problems.
+"""Compares the time and error of our solvers with those of other libraries on the same problems.
 
-All solvers use the same compiled functions for the potential F and its Jacobian J. Only the patch's four
-middle wires, which are pressed most deeply, are solved. The simulated samples are noise-free. Every solver
-starts from rest. In some runs, a solver solves only the last sample. In the other runs, it solves a sequence
-of samples as in the paper, with the solution of each sample as the initial guess for the next. Each solver is
-run with several tolerances, and each run yields one data point. Only the time of ``solve_path`` includes
-setting up the patch, following the path, and estimating the error.
+All solvers call the same compiled functions for the potential F and its Jacobian J. The samples are
+noise-free, and every solver starts from rest. Only the four middle upper wires are solved, where the press is
+deepest. Some runs solve only the last sample. The others solve a sequence of samples, each from the solution
+of the previous one, as in the paper (:mod:`skinnode.bench.path`). Each solver is run with several tolerances,
+and each run yields one data point. Only the time of ``solve_path`` includes setting up the patch, following
+the path and estimating the error.
 """
 
 from __future__ import annotations
@@ -29,47 +29,46 @@ from skinnode.solve.paths.step_control import Adaptive, Periodic, Schedule, Unif
 from skinnode.solve.wires.problem import PatchProblem
 
 SCENES: Final = (("staggered", 0.5, 0.3), ("staggered", 1.0, 0.3), ("aligned", 0.5, 0.1))
-"""Scenes as (preset, layer height in pitches, press depth divided by the layer height). Every solver solves
-the first press from rest. The second press requires intermediate samples, and the third press uses the
-paper's layout."""
+"""Scenes as (preset, layer height in pitches, press depth divided by the layer height). Every solver can
+solve the first press from rest. The second requires intermediate samples. The third uses the paper's
+layout."""
 TOLERANCES: Final = (1e-4, 1e-7, 1e-10, 1e-13)
 SAMPLES: Final = (1, 5, 10, 20)
 SOLVED: Final = 0.01
-"""Maximum error of a solved sample, relative to the true displacement. Results with larger errors are not
-plotted."""
+"""Maximum error of a solved sample, as a fraction of the true displacement. Larger errors are not plotted."""
 ROUNDING: Final = 1e-11
-"""Lower limit for all errors; differences below this limit are rounding errors. The limit is the rounding
-error in F times the condition number of J."""
+"""Smallest error that is distinguishable from rounding: the rounding error in F times the condition number of
+J. Smaller errors are raised to this value."""
 LOOSE: Final = 1e-6
-"""Solver tolerance for all samples except the last, as in the paper."""
+"""Solver tolerance for every sample but the last, as in the paper."""
 REPEATS: Final = 7
 LONG_S: Final = 0.1
 
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """Four upper wires and the samples of a press on these wires."""
+    """Four upper wires and the samples of a press on them."""
 
     name: str
     layout: PatchLayout
     samples_ohm: Float
-    """(T, U, K), resistances in all samples except the sample at rest, ohm."""
+    """(T, U, K), resistances during the press, ohm; the sample at rest is excluded."""
     truth_m: Float
     """(U, N, 3), true displacement at the last sample, metres."""
 
     def thinned(self, samples: int) -> Float:
-        """Return ``samples`` evenly spaced samples of the press; the last sample is always included."""
+        """Return ``samples`` evenly spaced samples of the press, ending with the last."""
         step = len(self.samples_ohm) // samples
         return self.samples_ohm[step - 1 :: step]
 
     def error(self, displacement_m: Float) -> float:
-        """Return the error of a displacement (U, N, 3), relative to the size of the true displacement."""
+        """Return the norm of the error of a displacement (U, N, 3), divided by the norm of the true one."""
         with np.errstate(over="ignore", invalid="ignore"):
             return float(np.linalg.norm(displacement_m - self.truth_m) / np.linalg.norm(self.truth_m))
 
 
 def scene_of(name: str, height: float, depth: float) -> Scene:
-    """Create a scene in which a sphere presses on four wires; ``depth`` is relative to the layer height."""
+    """Create a scene in which a sphere presses on four wires to a depth of ``depth`` layer heights."""
     full = preset(name, height)
     layout = PatchLayout(full.upper_m[3:7], full.lower_m, full.resistivity_ohm_per_m)
     press = Press((18.3e-3, 17.1e-3), 10e-3, depth * full.height_m, (0.2, -0.1))
@@ -80,7 +79,7 @@ def scene_of(name: str, height: float, depth: float) -> Scene:
 
 
 def _timed_us(call: Callable[[], object]) -> float:
-    """Return the shortest of up to seven call times (µs), because other programs can only lengthen a call."""
+    """Return the shortest of up to seven call times (µs), which other programs have delayed least."""
     times: list[float] = []
     while len(times) < REPEATS and sum(times) < LONG_S:
         start = time.perf_counter()
@@ -99,7 +98,7 @@ def _path(scene: Scene, operator: str, schedule: Schedule, samples: int) -> tupl
 
 
 def _bare(scene: Scene, solve: Solve, samples: int, tolerance: float) -> tuple[float, float]:
-    """Time an operator or another library's solver; return the time per wire (µs) and the error."""
+    """Time a bare operator or another library's solver; return the time per wire (µs) and the error."""
     problem = PatchProblem.of(scene.layout)
     truth = problem.rest + scene.truth_m.reshape(len(problem.rest), -1) / scene.layout.pitch_m
     frames = scene.thinned(samples) * problem.gain
@@ -113,7 +112,7 @@ def _bare(scene: Scene, solve: Solve, samples: int, tolerance: float) -> tuple[f
                 x = solve(Case(problem, wire, frame, np.ascontiguousarray(x), truth[wire]), loose)
             found[wire] = x
 
-    with np.errstate(all="ignore"):  # an overflow is later noticed as a large error
+    with np.errstate(all="ignore"):  # an overflow shows up as a large error
         us = _timed_us(paths) / len(found)
         return us, scene.error(problem.displacement_m(found))
 
@@ -131,7 +130,7 @@ def pareto(rows: list[dict[str, Any]]) -> list[int]:
 
 
 def run() -> list[dict[str, Any]]:
-    """Measure all scenes; each returned row states its time, its error, and whether it is Pareto-optimal."""
+    """Measure all scenes; return one row per run with its time, its error and its Pareto optimality."""
     panels = []
     for setting in SCENES:
         scene = scene_of(*setting)

@@ -1,8 +1,8 @@
-"""Measures how the error depends on noise, code width and layout, and checks the standard deviations.
+"""Measures the error against noise, code width and layout, and checks the standard deviations.
 
-A tracker solves the four frames of each scene in sequence, starting at rest; only the last frame is scored.
-Errors and standard deviations are RMS values over the coordinates of all converged wires in all scenes,
-divided by the RMS displacement.
+Each scene consists of four frames, which a tracker solves in sequence from rest. Only the last frame is
+scored. Errors and standard deviations are RMS values over the coordinates of all converged wires in all
+scenes, divided by the RMS displacement.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ BITS: Final = (12, 14, 16, 24)
 LAYOUTS: Final = tuple((kind, height) for kind in ("staggered", "aligned") for height in (0.3, 0.5, 1.0))
 PRIOR_SHARES: Final = (0.0, 0.1, 0.2, 0.4, 0.6, 0.8, 1.0)
 FEWEST: Final = 1000
-"""Minimum number of coordinates for estimating a 99.9 % quantile."""
+"""Minimum number of coordinates from which a 99.9 % quantile is estimated."""
 SHARES: Final = np.array([0.0, 1 / 3, 2 / 3, 1.0])
 
 PROTOTYPE: Final = {
@@ -46,8 +46,8 @@ PROTOTYPE: Final = {
     ("aligned", 0.5): {"exact": {1e-5: 2.71}, "posterior": {4e-6: 0.05, 1e-5: 0.06, 1e-4: 0.20, 1e-3: 0.38}},
     ("aligned", 1.0): {"exact": {1e-5: 73.0}, "posterior": {4e-6: 0.14, 1e-5: 0.18, 1e-4: 0.24, 1e-3: 0.38}},
 }
-"""Relative RMS errors of the prototype for a 10 % press with shear by a single, approximately Hertzian
-indenter."""
+"""RMS errors of the prototype solver, as fractions of the RMS displacement, for a sheared 10 % press by one
+approximately Hertzian indenter."""
 
 
 @dataclass
@@ -91,7 +91,7 @@ class Pool:
 
 @dataclass
 class Parts:
-    """Compares the posterior's errors with its variance n + b (n due to the noise, b due to the prior)."""
+    """Compares the posterior's errors with its variance n + b, where n is due to noise and b to the prior."""
 
     _error: list[Float] = field(default_factory=list)
     _noise: list[Float] = field(default_factory=list)
@@ -109,11 +109,10 @@ class Parts:
         self._left.append(left.ravel())
 
     def rows(self) -> list[dict[str, Any]]:
-        """Return a row of statistics for each interval of b / (n + b).
+        """Return a row of statistics for each interval of b / (n + b), the prior's share of the variance.
 
-        The quotient b / (n + b) is the fraction of the variance that is due to the prior. Each row contains
-        the RMS, quantiles and kurtosis of error / √(n + b), the RMS expected for b = 0, and the ratio of the
-        observed to the predicted variance due to the prior.
+        A row contains the RMS, the quantiles and the kurtosis of error / √(n + b), the RMS that noise alone
+        would cause, and the ratio of observed to predicted prior variance.
         """
         if not self._error:
             return []
@@ -136,7 +135,7 @@ class Parts:
 
 @dataclass
 class Bound:
-    """Accumulates the wires' Cramér-Rao bounds, which are computed at the true positions without a prior."""
+    """Accumulates the Cramér-Rao bounds of wires at their true positions, computed without a prior."""
 
     _variance: float = 0.0
     _size: float = 0.0
@@ -158,8 +157,8 @@ class Bound:
 class Forces:
     """Compares each field's contacts, forces and centroids with the true loads.
 
-    Force errors are relative to the true normal force. Scenes in which the solver found no contact are
-    omitted. Centroid errors are in metres.
+    Force errors are relative to the true normal force. Centroid errors are in metres. Scenes in which the
+    solver found no contact are omitted.
     """
 
     found_right: int = 0
@@ -225,14 +224,14 @@ class Follower:
         self._solvers = {name: methods.solver_of(self.case, name) for name in METHODS}
 
     def last(self, taken: Stream) -> dict[str, FieldFrame]:
-        """Solve a stream with each method; return a mapping from method to the field of the last frame."""
+        """Solve a stream with each method; return the field of the last frame for each of them."""
         return {
             name: methods.fields(self.case, name, solver, taken)[-1] for name, solver in self._solvers.items()
         }
 
 
 def _streams(case: Case, converter: Converter, scenes: int) -> Iterable[Stream]:
-    """Yield streams of random 10 % presses; these depend only on the seed and the layout's dimensions."""
+    """Yield streams of random 10 % presses, which depend only on the seed and the size of the layout."""
     for seed in range(scenes):
         rng = np.random.default_rng([seed, 10])
         press = pad_press(rng, case.skin.layout, 0.1)
@@ -242,8 +241,8 @@ def _streams(case: Case, converter: Converter, scenes: int) -> Iterable[Stream]:
 def pad_press(rng: np.random.Generator, layout: PatchLayout, depth: float) -> Press:
     """Return a random press by a fingertip-sized body whose contact radius is 1.5 to 2.5 pitches.
 
-    The resulting errors can be compared with :data:`PROTOTYPE`, because the prototype's presses had the same
-    Cramér-Rao bounds.
+    The prototype's presses had the same Cramér-Rao bounds, so the errors are comparable with
+    :data:`PROTOTYPE`.
     """
     press = random_press(rng, layout, depth)
     contact = rng.uniform(1.5, 2.5) * layout.pitch_m
@@ -318,9 +317,9 @@ def _random_scene(rng: np.random.Generator, layout: PatchLayout) -> tuple[Press,
 def coverage(scenes: int) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
     """Solve random scenes with both methods.
 
-    Returns: Two lists. The first list has one row per layout, noise level and method. Rows for the method
-    ``posterior`` include force errors. The second list contains statistics of the posterior's errors in all
-    scenes, grouped by the fraction of the variance that is due to the prior.
+    Returns:
+        One row per layout, noise level and method, with force errors for the method ``posterior``; and the
+        rows of :class:`Parts` for the errors of the posterior in all scenes.
     """
     rows, parts = [], Parts()
     for kind, height, sigma in COVERAGE:

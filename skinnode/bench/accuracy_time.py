@@ -22,14 +22,13 @@ LIMITS_US: Final = {"exact": 500.0, "posterior, full frame": 5000.0, f"posterior
 
 
 class Cycle:
-    """Solves the frames of one press, followed by the frames of its release.
+    """Solves a press and its release, frame by frame.
 
-    Each call solves the whole cycle, because some frames take much longer to solve than others.
+    A call solves the whole cycle, because some frames take much longer than others.
 
     Args:
         solver: Solver to measure.
-        frames: Resistances (T, U, K), ohm, while the press deepens; the release repeats them in reverse
-            order.
+        frames: Resistances (T, U, K) of the press, ohm; the release repeats them in reverse order.
         valid: Mask (U, K) of the resistances to use; default: all.
     """
 
@@ -39,7 +38,7 @@ class Cycle:
         self._solver, self._valid = solver, valid
         self.frames = np.concatenate([frames, frames[-2:0:-1]])
         self.active: list[int] = []
-        """Number of wires that were solved rather than held, one entry per frame."""
+        """Number of wires in each frame that were solved rather than held."""
 
     def __call__(self) -> None:
         """Solve all frames."""
@@ -50,18 +49,18 @@ class Cycle:
 
 
 def _frames(skin: Skin, press: Press, sigma: float) -> Float:
-    """Return the resistances (T, U, K), ohm, while a press deepens from half to full depth."""
+    """Return the resistances (T, U, K) of a press from half to full depth, ohm."""
     shares = np.linspace(0.5, 1.0, FRAMES)
     return stream(skin, (press,), shares, Converter(sigma=sigma), np.random.default_rng(5)).frames_ohm
 
 
 def run(rounds: int) -> list[dict[str, Any]]:
-    """Time each solver; return its time per frame (µs), its time limit, and its mean number of solved wires.
+    """Time each solver; return the time per frame (µs), its limit and the mean number of wires solved.
 
-    The time per frame is averaged over a cycle; the median of all rounds is reported. A real press always
-    displaces more than three wires, because it deforms the whole half-space. To measure only three active
-    wires, the benchmark therefore masks the resistances of all other wires. The option ``hold`` of the
-    posterior is off, so wires with unchanged resistances are also solved.
+    The time per frame is the mean over a cycle; the result is the median of all rounds. A press deforms the
+    whole half-space and therefore moves every wire. To leave only three wires active, the benchmark masks the
+    readings of all others. The posterior runs with ``hold`` off, so it also solves wires whose readings have
+    not changed.
     """
     skin = Skin(preset("staggered", 0.5))
     layout, rest = skin.layout, skin.rest_ohm

@@ -18,16 +18,16 @@ PITCH_M: Final = 4e-3
 FINE: Final = Converter(sigma=1e-5)
 """Converter with a relative noise of 1e-5, which is typical of a 16-bit converter."""
 STRIDE: Final = 4
-"""Value of :attr:`Case.stride` for cases that are solved both by trackers and by path methods."""
+"""Value of :attr:`Case.stride` for cases that both trackers and path methods solve."""
 DRIFT: Final = 0.02
 MODEL_ERROR: Final = 0.05
-"""Model error assumed in case 13: relative error of the predicted resistance change ΔR. With the wrong models
-of case 13, the measured error of ‖ΔR‖ was 2.2 to 5 % (30 % press, ``staggered``, h = 0.5)."""
+"""Relative error of the predicted resistance change ΔR that the solver assumes in case 13. The wrong models
+of this case predicted ‖ΔR‖ with an error of 2.2 to 5 % (30 % press, ``staggered``, h = 0.5)."""
 
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """A hard case; ``make`` generates a stream from a random generator, which is seeded for each stream."""
+    """A hard case; ``make`` generates a stream from a seeded random generator."""
 
     number: int
     name: str
@@ -35,15 +35,15 @@ class Case:
     make: Callable[[np.random.Generator], Stream]
     methods: tuple[str, ...] = TRACKERS
     converter: Converter = FINE
-    """Converter that reads the resistances; the solver knows the converter's noise."""
+    """Converter that reads the resistances; the solver knows its noise."""
     drift: str = "none"
     stride: int = 1
     """A tracker solves only every ``stride``-th frame; path methods solve every frame."""
     known_wrong: tuple[str, ...] = ()
-    """Methods known to fail in this case (see ``docs/limits.md``). Wrong results of these methods are
-    reported, but do not make the benchmark fail."""
+    """Methods known to fail in this case (see ``docs/limits.md``). Their wrong results are reported but do
+    not make the benchmark fail."""
     model_error: float = 0.0
-    """Relative error of the predicted resistance change ΔR; passed to the solver as an option."""
+    """Relative error of the predicted resistance change ΔR, a solver option."""
     tolerances: Tolerances | None = None
     """Manufacturing tolerances passed to the solver; None for the solver's default."""
 
@@ -59,7 +59,7 @@ def narrowed(layout: PatchLayout) -> PatchLayout:
 
 
 def press_and_release(steps: int) -> Float:
-    """Return depth fractions that rise from 0 to 1 in equal steps and then drop to 0."""
+    """Return depth fractions that rise from 0 to 1 in equal steps and drop to 0 in the last frame."""
     return np.array([*np.linspace(0.0, 1.0, steps + 1), 0.0])
 
 
@@ -79,9 +79,8 @@ def pressing(  # noqa: PLR0913 - one argument per way to change a stream
         skin: The patch.
         depth: Depth of the press divided by the layer height.
         converter: Converter that reads the resistances.
-        shares: Depth (T,) in each frame, as a fraction of the full depth.
-        spoil: Function that inserts faulty data into a stream and returns the result; default: no faulty
-            data.
+        shares: Depth (T,) in each frame, as a fraction of ``depth``.
+        spoil: Function that returns a copy of a stream with faulty data; default: no faults.
         gain: Function that returns factors by which the resistances are multiplied; (T, U, K) or
             broadcastable to that shape; default: 1.
         presses: Function that returns the presses; default: one random press.

@@ -1,4 +1,4 @@
-"""Hard cases: streams on which solvers tend to fail. A case is added for each newly found failure.
+"""Hard cases: streams on which solvers tend to fail. Every newly found failure becomes a case.
 
  1 symmetric layout, J rank-deficient         8 baseline drift, gain error, contact resistance
  2 thick layers                               9 wrong roots with zero residual
@@ -9,8 +9,8 @@
  7 open, shorted, missing, saturated         14 wrong data not marked invalid
 15 patches made to ordinary tolerances       16 the whole patch pressed
 
-A case consists of a patch model for the solver, the options that an informed user would set, and a generator.
-For each seed, the generator returns a stream of frames and the true displacements.
+A case contains the patch model given to the solver, the options that an informed user would set, and a
+generator. For each seed, the generator returns a stream of frames with the true displacements.
 """
 
 from __future__ import annotations
@@ -165,14 +165,14 @@ def _spoilt(taken: Stream, frames: Float, valid: np.ndarray) -> Stream:
 
 
 def _open_lower(rng: np.random.Generator, taken: Stream, skin: Skin) -> Stream:
-    """Break a lower wire for three frames of the press, and mark its resistances invalid."""
+    """Open a lower wire for three frames of the press and mark its readings invalid."""
     frames, valid, k = taken.frames_ohm.copy(), taken.valid.copy(), rng.integers(skin.layout.shape[1])
     frames[2:5, :, k], valid[2:5, :, k] = np.nan, False
     return _spoilt(taken, frames, valid)
 
 
 def _shorted_lower(rng: np.random.Generator, taken: Stream, skin: Skin) -> Stream:
-    """Set the resistances of a lower wire to 0 ohm for three frames, but leave them marked valid."""
+    """Set the readings of a lower wire to 0 ohm for three frames without marking them invalid."""
     frames, k = taken.frames_ohm.copy(), rng.integers(skin.layout.shape[1])
     frames[2:5, :, k] = 0.0
     return _spoilt(taken, frames, taken.valid)
@@ -204,7 +204,7 @@ def _impossible(rng: np.random.Generator, taken: Stream, skin: Skin) -> Stream:
 
 
 def _garbage(rng: np.random.Generator, taken: Stream, skin: Skin) -> Stream:
-    """Replace one frame with random resistances, which no deformation can produce."""
+    """Replace one frame with random resistances that no deformation can produce."""
     frames = taken.frames_ohm.copy()
     frames[4] = skin.rest_ohm * rng.uniform(0.3, 1.2, skin.layout.shape)
     return _spoilt(taken, frames, taken.valid)
@@ -250,10 +250,10 @@ def _wrong_roots() -> Iterator[Case]:
 
 
 def _sheared() -> Iterator[Case]:
-    """Yield deep presses with a friction coefficient of 0.8; the wires pass through folds of the potential F.
+    """Yield deep presses with a friction coefficient of 0.8, in which wires cross folds of the potential F.
 
-    For some wires, the posterior and the live trackers then converge to a smooth but wrong root. Only path
-    methods also use the intermediate samples, which reveal a wrong root.
+    Beyond a fold, the posterior and the live trackers converge to a smooth but wrong root on some wires. Path
+    methods also use the intermediate samples, which reveal the wrong root.
     """
     for name, height in (("aligned", 0.5), ("aligned", 1.0), ("staggered", 1.0)):
         for contacts in (1, 2):
@@ -304,11 +304,10 @@ def _after_detour(
     detour: Callable[[np.random.Generator, PatchLayout, float], Float],
     converter: Converter,
 ) -> Callable[[np.random.Generator], Stream]:
-    """Return a generator of streams; each starts with a physically impossible motion and ends with a press.
+    """Return a generator of streams that consist of an impossible motion followed by a press.
 
-    After the impossible motion, every resistance has returned to its rest value. The true displacement is
-    undefined (NaN) during the motion, because swapping two electrodes of a wire or mirroring an electrode
-    leaves the potential unchanged.
+    The motion ends with every resistance back at its rest value: swapping two electrodes of a wire, or
+    mirroring one, leaves the potential unchanged. The true displacement during the motion is undefined (NaN).
     """
 
     def make(rng: np.random.Generator) -> Stream:
@@ -418,7 +417,7 @@ def _shapes() -> Iterator[Case]:
 
     yield Case(12, "fingertip, 30%", tip, pressing(tip, 0.3, FINE, shares, presses=on_tip))
     for lower, depth in ((3, 0.1), (6, 0.3)):
-        # With one electrode per upper wire, the electrodes of the patch form a single line.
+        # With one electrode per upper wire, all upper electrodes lie on one line.
         layout = PatchLayout.preset("staggered", upper_electrodes=1, lower_wires=lower)
         skin = Skin(layout)
 

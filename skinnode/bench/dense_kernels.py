@@ -1,8 +1,8 @@
-"""Compares our dense kernels with LAPACK in a child process that limits LAPACK to a single thread.
+"""Compares our dense kernels with single-threaded LAPACK in a child process.
 
-After each call, LAPACK's worker threads keep spinning for a while. If a worker thread shares a core with the
-next kernel to be timed, that kernel takes up to three times as long. On a busy machine, the worker threads
-also wait for each other.
+With several threads, LAPACK's workers keep spinning for a while after each call. A kernel that shares a core
+with a spinning worker takes up to three times as long. On a busy machine, the workers also wait for each
+other.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
 """Hard cases 14 to 16 of ``skinnode bench stability``: wrong data, imperfect patches and wide touches.
 
-In case 14, the data are wrong but not marked invalid. Only the results for wires that are CONVERGED and
-trusted have to be accurate. Case 14 uses only solvers with a tracker, because only a tracker checks its input
-data. The host detects frozen wires from repeated codes (:mod:`skinnode.host.frozen_parts`); a tracker cannot,
-because it receives only resistances.
+The data of case 14 are wrong but not marked invalid. Only wires that are CONVERGED and trusted must be
+accurate. The case is limited to trackers, the only solvers that test their input. A tracker receives
+resistances, not codes, so it cannot recognise a frozen wire by its repeated codes; the host does
+(:mod:`skinnode.host.frozen_parts`).
 """
 
 from __future__ import annotations
@@ -36,14 +36,14 @@ KNOWN: Final = {
     ("bits flipped", "1e-4"),
     ("lower wires crossed, tared", "1e-4"),
 }
-"""Combinations of fault and noise level for which the displacements of a few trusted wires are known to be
-wrong; ``docs/limits.md`` explains the reasons."""
+"""Pairs of fault and noise level for which a few trusted wires are known to be wrong; ``docs/limits.md``
+gives the reasons."""
 UPPER, LOWER = 1, 2
 """Axis indices of the upper and lower wires in an array (T, U, K)."""
 
 
 def fault_cases() -> Iterator[Case]:
-    """Yield the cases with wrong data, imprecisely made patches, and wide or sheared touches."""
+    """Yield the cases with wrong data, misplaced wires, and wide or sheared touches."""
     yield from _wrong_data()
     yield from _tolerances()
     yield from _touches()
@@ -71,7 +71,7 @@ def _wrong_data() -> Iterator[Case]:
 def _tolerances() -> Iterator[Case]:
     layout = preset("staggered", 0.5)
     for off in (0.01, 0.02, 0.05):
-        # The shifts are the same in all streams of a case, because a case has only one baseline.
+        # All streams of a case share one baseline and therefore the same shifts.
         rng = np.random.default_rng([15, round(1000 * off)])
         upper, lower = (off * PITCH_M * rng.standard_normal((count, 3)) for count in layout.shape)
         skin = Skin(layout, upper_shift_m=upper, lower_shift_m=lower)
@@ -108,7 +108,7 @@ def _spoilt(taken: Stream, frames: np.ndarray, valid: np.ndarray | None = None) 
 
 
 def _moved(taken: Stream, skin: Skin) -> np.ndarray:
-    """Return the magnitude of the relative change (U, K) of the resistances due to the press."""
+    """Return the magnitude (U, K) of the relative resistance change at full depth."""
     return np.asarray(np.abs(taken.frames_ohm[8] / skin.rest_ohm - 1.0))
 
 
@@ -150,7 +150,7 @@ def _flipped(rng: np.random.Generator, taken: Stream, skin: Skin) -> Stream:
 
 
 def _open(axis: int) -> Spoil:
-    """Return a function that breaks a wire: its readings then float near the top of the converter range."""
+    """Return a function that opens a wire; its readings then float near the top of the converter range."""
 
     def spoil(rng: np.random.Generator, taken: Stream, skin: Skin) -> Stream:
         frames, wire = taken.frames_ohm.copy(), int(rng.integers(taken.frames_ohm.shape[axis]))
@@ -164,7 +164,7 @@ def _open(axis: int) -> Spoil:
 
 
 def _shorted(axis: int) -> Spoil:
-    """Return a function that shorts two adjacent wires, so that both show their parallel resistance."""
+    """Return a function that shorts two adjacent wires; both then read their parallel resistance."""
 
     def spoil(rng: np.random.Generator, taken: Stream, skin: Skin) -> Stream:
         frames, wire = taken.frames_ohm.copy(), int(rng.integers(taken.frames_ohm.shape[axis] - 1))
@@ -176,7 +176,7 @@ def _shorted(axis: int) -> Spoil:
 
 
 def _crossed(axis: int) -> Spoil:
-    """Return a function that swaps R/R₀ of two adjacent wires, as if they were exchanged before taring."""
+    """Return a function that swaps R/R₀ of two adjacent wires, as if they had been swapped before taring."""
 
     def spoil(rng: np.random.Generator, taken: Stream, skin: Skin) -> Stream:
         frames, wire = taken.frames_ohm.copy(), _wire(rng, taken, skin, axis)

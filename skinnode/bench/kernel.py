@@ -1,8 +1,8 @@
 """Compares the compiled kernels with NumPy and LAPACK.
 
-For one wire of the reference patch, the benchmark times the evaluation of the potential F with its Jacobian
-J, and one step of each operator (Gauss-Newton, Levenberg-Marquardt and dogleg). The dense kernels are timed
-with the matrix sizes of the reference patch's posterior.
+The benchmark times one wire of the reference patch: the evaluation of the potential F with its Jacobian J,
+and one step of each operator (Gauss-Newton, Levenberg-Marquardt and dogleg). The dense kernels are timed at
+the matrix sizes of the reference patch's posterior.
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ from skinnode.solve.operators.work import LIMIT, Work, workspace
 from skinnode.solve.wires.problem import PatchProblem
 
 SHORT: Final = 1e-3
-"""Trust radius, pitches per coordinate. The radius is much smaller than a Newton step, so that the benchmark
-also times the shortening of steps."""
+"""Trust radius, pitches per coordinate. It is much smaller than a Newton step, so that every operator must
+shorten its step."""
 
 
 class NumpyWire:
-    """Computes F and Jᵀ of one wire with fast NumPy code (structure of arrays, preallocated buffers).
+    """Fast NumPy implementation of F and Jᵀ for one wire: structure of arrays, preallocated buffers.
 
-    The axis order and the summation method are the fastest of several that were compared.
+    The axis order and the summation method are the fastest of those compared.
     """
 
     def __init__(self, lower: Float, electrodes: int) -> None:
@@ -64,9 +64,9 @@ class NumpyWire:
 
 
 def numpy_step(operator: str, wire: NumpyWire, x: Float, a: Float) -> Float:
-    """Do the same work as :func:`compiled_steps` for one wire; return the relative residual after the step.
+    """Take the step of :func:`compiled_steps` for one wire, in NumPy; return the new relative residual.
 
-    The Levenberg-Marquardt parameter is fixed here, whereas the compiled step searches for it.
+    The Levenberg-Marquardt parameter is fixed; the compiled step searches for it.
     """
     f, jt = wire(x)
     r, j = relative_residual(a, f), (jt * a).T
@@ -91,7 +91,7 @@ def numpy_step(operator: str, wire: NumpyWire, x: Float, a: Float) -> Float:
                 )
         else:
             n = x.size
-            # With r as the last column of the matrix, qr also returns Qᵀr and need not compute Q.
+            # With r appended as the last column, qr returns Qᵀr without computing Q.
             augmented = np.zeros((r.size + n, n + 1))
             augmented[: r.size, :n] = j
             augmented[: r.size, n] = r
@@ -118,9 +118,9 @@ def _evaluate(x: Float, lower: Float, a: Float, r: Float, jt: Float) -> None:
 def compiled_steps(  # noqa: PLR0913 - a kernel takes its buffers
     operator: int, start: Float, lower: Float, a: Float, w: Work, jt_trial: Float
 ) -> None:
-    """Take one step for every wire from ``start`` (U, n), with the compiled functions of the solver loop.
+    """Take one step for every wire from ``start`` (U, n), with the functions that make up the solver loop.
 
-    The complete solver loop is not timed, because it computes a second step before it checks its step limit.
+    The loop itself would compute a second step before checking its step limit.
     """
     for u in range(start.shape[0]):
         for j in range(w.x.size):

@@ -1,4 +1,4 @@
-"""Sets up the solvers with the best options for a hard case, and solves the streams of the case."""
+"""Sets up solvers with the best options for a hard case, and solves the streams of the case."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ Method = Callable[[Stream], Solved]
 
 
 def set_up(case: Case, name: str) -> Method:
-    """Set up the method ``name`` for ``case``; the solver is reset before each stream."""
+    """Set up the method ``name`` for ``case``. It resets its solver before each stream."""
     if last_only(name):
         return functools.partial(_path, case, name.removeprefix("path "))
     solver = solver_of(case, name)
@@ -46,7 +46,7 @@ def _path(case: Case, how: str, stream: Stream) -> Solved:
         schedule=Adaptive() if adaptive else Uniform(),
         baseline_ohm=case.skin.rest_ohm,
     )
-    # The error estimate is an upper bound, and the verdict accepts errors of up to LIMIT times std.
+    # The verdict accepts errors up to LIMIT times std, but the error estimate is already an upper bound.
     std = np.broadcast_to(path.error_estimate_m[:, None, None] / LIMIT, path.displacement_m.shape)
     return Solved(path.displacement_m[None], std[None], _converged(path.status)[None])
 
@@ -61,7 +61,7 @@ def fields(case: Case, name: str, solver: Tracker | Posterior, stream: Stream) -
 
 def solver_of(case: Case, name: str) -> Tracker | Posterior:
     """Create a solver for the case; ``name`` is ``exact``, ``posterior`` or ``auto``."""
-    # Default noise; every call of ``update`` overrides it with the noise of the frame.
+    # Default noise, which every call of ``update`` overrides with the noise of the frame.
     common: dict[str, Any] = {
         "relative_noise": case.converter.relative_std,
         "baseline_ohm": case.skin.rest_ohm,
@@ -80,7 +80,7 @@ def solver_of(case: Case, name: str) -> Tracker | Posterior:
 
 
 def _noise_for_exact(case: Case, stream: Stream) -> Float:
-    """Add drift and model errors to the noise; the exact inverse has no options for these errors."""
+    """Add drift and model error to the noise, because the exact inverse has no options for them."""
     change = np.nan_to_num(np.abs(stream.frames_ohm / case.skin.rest_ohm - 1.0), posinf=0.0)
     drift = 0.0 if case.drift == "none" else DRIFT
     return np.asarray(np.sqrt(stream.noise**2 + drift**2 + (case.model_error * change) ** 2))
@@ -95,7 +95,7 @@ def _solved(frames: list[FieldFrame]) -> Solved:
 
 
 def _claimed(frame: FieldFrame) -> NDArray[np.bool_]:
-    """Return a mask (U,) of the wires that are both CONVERGED and trusted (if trust was assessed)."""
+    """Return a mask (U,) of the wires that are CONVERGED and, if trust was assessed, trusted."""
     converged = _converged(frame.status)
     return converged if frame.wires_trusted is None else converged & frame.wires_trusted
 

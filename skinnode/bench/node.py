@@ -1,9 +1,9 @@
 """Measures a node: chunk pacing, delay from SYNC to first chunk, heartbeat jitter, and CPU time per frame.
 
 A frame is timestamped when the node passes it to the CAN interface; SYNC is timestamped with the same
-monotonic clock. Another thread of the same process sends SYNC and background frames through a second
-endpoint, so contention for the interpreter lock affects the results. Other processes on the machine affect
-the results even more. To reduce their effect, run ``chrt -f 20 skinnode bench node``.
+monotonic clock. A second thread of the process sends SYNC and background frames through its own endpoint, so
+the results include contention for the interpreter lock. Other processes affect the results even more. To
+reduce their effect, run ``chrt -f 20 skinnode bench node``.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ from skinnode.transport import CanPort
 
 NODE_ID: Final = 4
 FULL_BUS_HZ: Final = 8_000
-"""Frame rate that fully loads a 1 Mbit/s bus with frames of eight data bytes, Hz."""
+"""Rate of frames with eight data bytes that fully loads a 1 Mbit/s bus, Hz."""
 SCAN_PERIOD_S: Final = 0.1
 BEAT_MS: Final = 10
-_BURST_S: Final = 1e-3  # time between bursts; a thread cannot wake up 8000 times per second
+_BURST_S: Final = 1e-3  # time between bursts, because a thread cannot wake up 8000 times per second
 _MOST_S: Final = (
-    5e-3  # maximum backlog; older frames are dropped, because a fully loaded bus cannot send a longer backlog
+    5e-3  # maximum backlog; older frames are dropped, because a fully loaded bus could not catch up
 )
 
 Row = dict[str, Any]
@@ -81,13 +81,13 @@ class _Rig:
         return self._port.received
 
     def take(self) -> None:
-        """Empty the manager's receive queue, because a full queue would block the node."""
+        """Empty the manager's receive queue; a full queue would block the node."""
         while self.manager.recv(0.0) is not None:
             pass
 
 
 def run(seconds: float, rounds: int, interface: str, channel: str | None) -> dict[str, Any]:
-    """Measure chunk pacing, heartbeats and the time to handle a frame; return all results.
+    """Measure chunk pacing, heartbeats and the CPU time per frame; return all results.
 
     Args:
         seconds: Duration of each measurement on the bus.
@@ -107,7 +107,7 @@ def run(seconds: float, rounds: int, interface: str, channel: str | None) -> dic
 
 
 def _row(what: str, late_ns: Float, goal_ms: float, load_hz: float = 0.0) -> Row:
-    """Summarise deviations from the nominal time (ns, signed) in a result row."""
+    """Return a row that summarises signed deviations from the nominal time, ns."""
     late_ms = np.abs(late_ns) / 1e6
     p50, p99, most = np.percentile(late_ms, [50, 99, 100]).tolist() if len(late_ms) else [None] * 3
     spread = {"p50_ms": p50, "p99_ms": p99, "max_ms": most}
@@ -168,9 +168,9 @@ def _load(rig: _Rig, rate_hz: int, stop: threading.Event) -> None:
 
 
 def handlers() -> dict[str, Callable[[], object]]:
-    """Return one function per kind of frame; the function passes a frame of that kind directly to a node.
+    """Return one function per kind of frame, which passes a frame of that kind directly to a node.
 
-    Each function also queries the node's next deadline, like the thread of a :class:`NodeRunner`.
+    Like the thread of a :class:`NodeRunner`, each function also queries the node's next deadline.
     """
     layout = PatchLayout.preset("staggered")
     node = PatchNode(NODE_ID, layout, _Still(layout), send=lambda _can_id, _data: None, pacing=EXACT)

@@ -1,24 +1,24 @@
-"""Repeats the path experiments of a paper by Xu and others, and compares the results (``paper.toml``).
+"""Repeats the path experiments of Xu et al. and compares the results with the paper (``paper.toml``).
 
-Each experiment uses one upper wire of 10 electrodes (30 unknowns), without the other wires of the patch. A
-sphere with a radius of 6 to 12 mm presses into the rubber at a random point near the middle of the patch. The
-displacement is computed from Hertz's closed-form solution with friction. Only the wire nearest to the centre
-of the press is solved. The press consists of 1000 samples; a path of n steps uses n evenly spaced samples.
+Each experiment solves one upper wire of 10 electrodes (30 unknowns), the wire nearest to the centre of a
+press. A sphere with a radius of 6 to 12 mm presses into the rubber at a random point near the middle of the
+patch. The displacement is Hertz's closed-form solution with friction. A press consists of 1000 samples; a
+path of n steps uses n of them, evenly spaced.
 
-The paper counts the calls of the potential function F. The paper's Jacobians are finite differences, so each
-Jacobian requires 30 additional calls. Our code evaluates F and an analytic Jacobian J together, at about
-twice the cost of F alone. One joint evaluation replaces 31 calls, so our counts are multiplied by 31 for
-comparison with the paper. As in the paper, the number of calls per step is averaged over all samples except
-the last. The accuracy is the relative error ‖X − X*‖ / ‖X* − X(0)‖, averaged over the experiments that
-converged. The first-order optimality ‖Jᵀr‖∞ is computed from the dimensionless residual r = a F − 1, with
-lengths in pitches. The paper's values, computed by MATLAB, are larger by a factor of F² and depend on the
-unit of length, which the paper does not state.
+The paper counts calls of the potential function F. It approximates each Jacobian by finite differences, which
+takes 30 additional calls. Our code evaluates F and an analytic Jacobian J together, at about twice the cost
+of F alone. One such evaluation replaces 31 calls, so our counts are multiplied by 31 for comparison. As in
+the paper, the number of calls per step is averaged over all samples except the last. The accuracy is the
+relative error ‖X − X*‖ / ‖X* − X(0)‖, averaged over the experiments that converged. The first-order
+optimality ‖Jᵀr‖∞ refers to the dimensionless residual r = a F − 1, with lengths in pitches. The paper's
+values come from MATLAB: they are larger by a factor of F² and depend on the unit of length, which the paper
+does not state.
 
-At the paper's press depth of 10 %, our Gauss-Newton solved all experiments on ``aligned``, with layer heights
-h of 0.3 to 1 pitches and any number of steps. For a depth of 10 %, the benchmark therefore uses the hardest
-``aligned`` setting, h = 1. The setting with h = 0.7 and a depth of 30 % was chosen because Gauss-Newton
-failed as often as in the paper. With this setting, Gauss-Newton failed in 6 of 10 experiments with 5 steps,
-in 2 of 10 with 10 steps, and in none with 20 or more steps.
+At the paper's press depth of 10 %, our Gauss-Newton solved every experiment on ``aligned``, for layer heights
+h from 0.3 to 1 pitch and any number of steps. At this depth, the benchmark therefore uses the hardest of
+these layouts, h = 1. The setting with h = 0.7 and a depth of 30 % was chosen because Gauss-Newton fails there
+as often as in the paper: in 6 of 10 experiments with 5 steps, in 2 with 10 steps, and in none with 20 or
+more.
 """
 
 from __future__ import annotations
@@ -57,13 +57,12 @@ LABELS: Final = {
     "gauss_newton": "Gauss-Newton",
     "dogleg": "dogleg",
 }
-"""Display names of the operators, in the row order of the paper's tables."""
+"""Display names of the operators, in the order of the paper's tables."""
 UNKNOWNS: Final = 30
 DIFFERENCES: Final = UNKNOWNS + 1
 """Number of calls of F per evaluation of F and its forward-difference Jacobian."""
 WRONG: Final = 1e-4
-"""Relative error above which a CONVERGED wire is classified as wrong; a correct solution has an error below
-1e-8."""
+"""Relative error above which a CONVERGED wire counts as wrong. Correct solutions have errors below 1e-8."""
 
 
 def printed() -> dict[str, Any]:
@@ -99,12 +98,12 @@ class Experiment:
 
 
 def preset(name: str, height: float) -> PatchLayout:
-    """Return a preset layout of the reference patch with a height of ``height`` pitches."""
+    """Return the reference patch with a preset layout and a layer height of ``height`` pitches."""
     return PatchLayout.preset(name, pitch_m=PITCH_M, height_m=height * PITCH_M)
 
 
 def experiments(layout: PatchLayout, depth: float, count: int) -> list[Experiment]:
-    """Generate ``count`` experiments, each with a random press to a depth of ``depth`` layer heights."""
+    """Generate ``count`` experiments with random presses, each ``depth`` layer heights deep."""
     rng = np.random.default_rng(SEED)
     span = layout.upper_m[..., :2].max(axis=(0, 1))
     made = []
@@ -148,7 +147,7 @@ def run(count: int) -> dict[str, Any]:
 
 def _setting(made: list[Experiment]) -> dict[str, Any]:
     first = made[0]
-    first.solve(Uniform())  # load the kernels, so that loading is not timed
+    first.solve(Uniform())  # load the kernels before timing
     operators, ours = (
         {operator: [_row(made, Uniform(plain=plain), operator, n) for n in STEPS] for operator in LABELS}
         for plain in (True, False)
@@ -172,7 +171,7 @@ def _setting(made: list[Experiment]) -> dict[str, Any]:
 
 
 def _row(made: list[Experiment], schedule: Schedule, operator: str, samples: int) -> dict[str, Any]:
-    """Solve all experiments with one step control; return the mean cost and the accuracy."""
+    """Solve all experiments with one step control; return their mean cost and accuracy."""
     paths, times = [], []
     for one in made:
         start = time.perf_counter()
@@ -212,7 +211,7 @@ def _mean(values: Sequence[float]) -> float | None:
 
 
 def _path_rows(path: PathResult) -> slice:
-    """Return the rows of the path itself, without the rows of cycle search, second attempts and checks."""
+    """Return the rows of the path itself, excluding those of cycle search, second attempts and checks."""
     at = path.position[path.searched :, 0]
     return slice(path.searched, path.searched + int(np.argmax(at == np.nanmax(at))) + 1)
 
@@ -245,7 +244,7 @@ def _cycle(made: list[Experiment], samples: int, tolerance: float) -> float | No
 
 
 def _iterations(made: list[Experiment], samples: int) -> dict[str, Any]:
-    """Return the data of figure 11: operator steps per path and, for the first experiment, per sample."""
+    """Return the data of figure 11: operator steps per path, and per sample of the first experiment."""
     uniform = [one.solve(Uniform(plain=True), samples=samples) for one in made]
     periodic = [one.solve(Periodic(plain=True), samples=samples) for one in made]
     return {
@@ -299,8 +298,8 @@ def _linear(layout: PatchLayout, upper_m: Float, frame_ohm: Float) -> tuple[Floa
 def _ten_steps() -> list[dict[str, Any]]:
     """Measure the time and error of a ten-step path on the layout ``staggered``.
 
-    A single wire is solved with each operator, and with our default step control. The last row contains the
-    time per wire when the whole patch of ten wires is solved.
+    The first rows solve one wire with each operator; the next row uses our default step control. The last row
+    is the time per wire of solving the whole patch of ten wires.
     """
     layout = preset(*SETTINGS[0][:2])
     one = experiments(layout, SETTINGS[0][2], 1)[0]
@@ -334,7 +333,7 @@ def _ten_steps() -> list[dict[str, Any]]:
 def _surface() -> dict[str, Any]:
     """Return the data of figure 13: z-displacement of the whole patch in the hardest setting, µm.
 
-    The patch is solved in 5 and in 20 steps as in the paper, and with our adaptive step control.
+    The patch is solved in 5 and in 20 steps, as in the paper, and with our adaptive step control.
     """
     name, height, depth = SETTINGS[-1]
     layout = preset(name, height)

@@ -1,8 +1,8 @@
 """Measures the throughput, latency and CPU time of a host, for hands with different numbers of buses.
 
-The host is configured as a guest, so it does not manage the buses. A child process replays the frames of the
-robot's master and nodes (:mod:`skinnode.bench.load`). The frames are transferred over a CAN interface or over
-UDP; UDP frames are received with the SocketCAN receiver (see :mod:`skinnode.transport.datagram`).
+The host is a guest on its buses. A child process replays the frames of the robot's master and of the nodes
+(:mod:`skinnode.bench.load`), over a CAN interface or over UDP. The SocketCAN receiver also receives the UDP
+frames (see :mod:`skinnode.transport.datagram`).
 """
 
 from __future__ import annotations
@@ -33,12 +33,11 @@ from skinnode.transport.datagram import DatagramPort, free_channel
 
 PATCHES_A_BUS: Final = 4
 CLASSIC_MS: Final = 50
-"""SYNC period with classic CAN, ms. In each period, four patches send 101 frames each, which is a total of
-8,080 frames/s."""
+"""SYNC period with classic CAN, ms. Four patches send 101 frames each per period, 8,080 frames/s in all."""
 FD_MS: Final = 25
 STAGGER_MS: Final = 3.0
-"""Offset between the SYNCs of successive buses in scenes with staggered SYNCs, ms. Within this time, the host
-solves the four patches of a bus before the scans of the next bus are complete."""
+"""Offset between the SYNCs of successive buses in staggered scenes, ms. It lets the host solve the four
+patches of one bus before the scans of the next bus are complete."""
 SCENES: Final = (
     (False, True, 0.0),
     (False, True, STAGGER_MS),
@@ -47,10 +46,10 @@ SCENES: Final = (
     (True, True, STAGGER_MS),
     (True, False, 0.0),
 )
-"""Scenes as (CAN FD or not, patches touched or not, offset between SYNCs in ms)."""
+"""Scenes as (whether CAN FD is used, whether patches are touched, offset between SYNCs in ms)."""
 DEADLINE_US: Final = 1000
-"""Deadline for solving a scan, µs. An exact inverse took 200 µs, and a verification by the posterior took 13
-ms."""
+"""Deadline for solving a scan, µs. For comparison, an exact inverse takes 200 µs, and its verification by the
+posterior 13 ms."""
 RECEIVE_US: Final = 5.0
 LATENCY_MS: Final = 5.0
 SETTLE_S: Final = 5.0
@@ -75,8 +74,8 @@ def run(  # noqa: PLR0913 - the options of the command
         short: Whether to measure only the rows that have a requirement.
         interface: ``udp`` or ``socketcan``.
         channel: Channel of the ``socketcan`` interface.
-        all_cores: Whether the host and the load generator may use all cores; if False, each is bound to a
-            core of its own.
+        all_cores: Whether the host and the load generator may use all cores; if False, each is bound to its
+            own core.
         report: Function that receives each row as soon as it is complete.
 
     Returns:
@@ -153,7 +152,7 @@ def _hand(  # noqa: PLR0913 - the properties in which hands differ
             "stream": {"capacity_fields": 100_000},
         }
     )
-    # Skip validation, which would reject this bus load because it assumes frames of maximum length.
+    # model_copy skips validation, which assumes frames of maximum length and would reject this bus load.
     full = tuple(bus.model_copy(update={"max_load": 2.0}) for bus in hand.buses)
     return hand.model_copy(update={"buses": full})
 
@@ -219,7 +218,7 @@ def _spread(late_ms: list[float]) -> dict[str, float | None]:
 
 
 def lost(row: Row) -> int:
-    """Return the total number of frames, chunks and scans lost between the generator and the solver."""
+    """Return the number of frames, chunks and scans lost on the way from the generator to the solver."""
     frames = row["sent"] - row["received"] + row["queue_dropped"]
     return int(frames + row["chunks_lost"] + row["scans_missed"] + row["scans"] - row["fields"])
 
@@ -257,7 +256,7 @@ class _Reader:
         self._thread = threading.Thread(target=self._run, name="subscriber", daemon=True)
 
     def since(self, begin_ns: int) -> tuple[list[float], list[float]]:
-        """Return the publication and delivery latencies (ms) of all scans that end after ``begin_ns``."""
+        """Return the publication and delivery latencies, ms, of all scans that end after ``begin_ns``."""
         stamps = [(stamp, read_ns) for stamp, read_ns in self._stamps if stamp.t_receive_ns >= begin_ns]
         published = [(stamp.t_solved_ns - stamp.t_receive_ns) * 1e-6 for stamp, _ in stamps]
         return published, [(read_ns - stamp.t_receive_ns) * 1e-6 for stamp, read_ns in stamps]

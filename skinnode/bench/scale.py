@@ -1,11 +1,10 @@
 """Measures how the CPU time of the simulator and the host grows with skin area and number of contacts.
 
-The simulated hands have four patches per bus, and spheres press on some of the patches. The hands run in
-virtual time, on buses that simulate the duration of each frame. The CPU time of each thread is read from the
-thread's CPU clock: node threads belong to the simulator, all other threads to the host. A bus has no thread
-of its own: when all threads are waiting, the last of them simulates the bus. The CPU time of each bus is
-measured separately and subtracted from the CPU time of the thread that simulated the bus. Because time is
-virtual, each patch sends every scan even on a slow machine.
+A simulated hand has four patches per bus, and spheres press on some of its patches. The hands run in virtual
+time, so that every patch sends every scan even on a slow machine. The simulated buses take account of the
+duration of each frame. CPU time is read from the CPU clock of each thread: node threads count as simulator,
+all other threads as host. A bus has no thread of its own. When all threads wait, the last one to wait
+simulates the bus. The CPU time of the bus is measured separately and subtracted from that of this thread.
 """
 
 from __future__ import annotations
@@ -32,30 +31,29 @@ from vcan_sim.timed_interface import Segment, segment
 from vcan_sim.virtual_time import VirtualClock
 
 PATCHES: Final = (1, 4, 16, 64)
-"""Numbers of patches to measure by default; in each hand, one patch is touched."""
+"""Default numbers of patches; in each hand, one patch is touched."""
 FIXED: Final = 16
-"""Number of patches in the hand in which the number of touched patches is varied."""
+"""Number of patches in the hand whose number of touched patches is varied."""
 TOUCHED: Final = (0, 1, 4, 16)
-"""Numbers of touched patches to measure, in a hand of :data:`FIXED` patches."""
+"""Numbers of touched patches in the hand of :data:`FIXED` patches."""
 PATCHES_PER_BUS: Final = 4
 PERIOD_MS: Final = 100
 _SETTLED_S: Final = 1.0
-"""Time from the end of the bring-up to the start of the measurement, s. All presses reach their full depth
-within this time."""
+"""Time from bring-up to measurement, s, within which all presses reach their full depth."""
 
 Row = dict[str, Any]
 
 
 def run(patches: Sequence[int] = PATCHES, scans: int = 20) -> dict[str, Any]:
-    """Measure the CPU time versus skin area and versus number of touched patches.
+    """Measure CPU time against skin area and against the number of touched patches.
 
     Args:
         patches: Numbers of patches to measure; in each hand, one patch is touched.
         scans: Number of scans per measurement.
 
     Returns:
-        Processor and library versions (``machine``), the lists of rows ``area``, ``contact`` and
-        ``changed``, and the result of :func:`physics`. In ``changed``, the patches send only changed chunks.
+        The processor and the library versions (``machine``); the lists of rows ``area``, ``contact`` and
+        ``changed``; and the result of :func:`physics`. In ``changed``, the patches send only changed chunks.
         A row contains the numbers of ``patches`` and ``touched`` patches, whether only changed chunks are
         sent (``changed_only``), the CPU times per patch and scan in ms (``nodes_ms``, ``bus_ms``,
         ``host_ms``), the number of solved ``fields``, the ratio of virtual to real time (``faster``), and the
@@ -99,7 +97,7 @@ def measure(patches: int, touched: int, scans: int, *, changed_only: bool = Fals
             clock.sleep(scans * PERIOD_MS * 1e-3)
             real_s = time.perf_counter() - start
             fields = _solved(host) - solved
-            for bus in segments:  # measuring the CPU time slows the bus, so this is done in a second run
+            for bus in segments:  # measuring its CPU time slows the bus, so this is left to a second run
                 bus.cpu_ns = Counter()
             before = _cpu_ns(segments)
             clock.sleep(scans * PERIOD_MS * 1e-3)
@@ -134,7 +132,7 @@ def physics() -> dict[str, float]:
 
 
 class _Skin:
-    """Simulates a patch at a new time in every call."""
+    """Simulates a patch, at a later time on each call."""
 
     def __init__(self, scene: PatchScene) -> None:
         self._patch, self._t_ns = SimulatedPatch(scene), 1_500_000_000
@@ -189,7 +187,7 @@ def scene_of(touched: int) -> SceneConfig:
 
 
 def _send_changed_only(hand: HandConfig) -> None:
-    """Command all patches to send only changed chunks, and wait until they do."""
+    """Configure all patches to send only changed chunks, and wait until they do."""
     command = pack_command(send_mode=SendMode.CHANGED)
     for bus in hand.buses:
         with CanPort(bus) as port:

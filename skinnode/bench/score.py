@@ -1,9 +1,9 @@
-"""Scores decoded fields: compares their errors with the reported uncertainty and the theoretical bound.
+"""Scores decoded fields: compares their errors with the reported uncertainty and the Cramér-Rao bound.
 
-The bound is the Cramér-Rao bound for a single scan. S denotes the diagonal matrix of the standard deviations
-of the relative residuals F/b − 1; J is the residuals' Jacobian at the true position. The covariance of an
-unbiased estimator of a wire's electrode positions is at least J⁻¹ S Sᵀ J⁻ᵀ. To be independent of the solver,
-this module computes the bound with the NumPy reference model.
+The bound applies to a single scan. Let J be the Jacobian of a wire's relative residuals F/b − 1 at the true
+position, and S the diagonal matrix of their standard deviations. Every unbiased estimator of the electrode
+positions then has a covariance of at least J⁻¹ S Sᵀ J⁻ᵀ. The bound is computed with the NumPy reference model
+and is thus independent of the solver.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from skinnode.model.layout import Float, PatchLayout
 
 OUTLIER_DEVIATIONS = 6.0
 """Maximum permissible error of a coordinate, in reported standard deviations. A run scores about 1e5
-coordinates. By chance, one in 5,000 runs has a coordinate whose error exceeds six standard deviations."""
+coordinates, so one run in 5,000 exceeds this limit by chance."""
 
 EXCESS_LIMIT = 1.15
 """Maximum permissible ratio of a run's RMS error to its RMS reported standard deviation."""
@@ -48,17 +48,17 @@ def bound_std_m(layout: PatchLayout, upper_m: Float, relative_std: Float) -> Flo
 
 @dataclass(frozen=True, slots=True)
 class Score:
-    """Results for one patch in a run. Lengths are in metres, and NaN if no scan was scored."""
+    """Results of one patch in a run. Lengths are in metres; they are NaN if no scan was scored."""
 
     scans: int
     untrusted: int
-    """Number of scans with an untrusted field; such scans are excluded from all other results."""
+    """Number of scans with an untrusted field; all other results exclude them."""
     deepest_m: float
     """Largest absolute component of any true electrode displacement."""
     error_rms_m: float
     reported_rms_m: float
     bound_rms_m: float
-    """RMS Cramér-Rao bound for quantisation noise only, without converter noise."""
+    """RMS Cramér-Rao bound due to quantisation alone, as if the converter were noise-free."""
     error_max_m: float
     relative_error: float
     """Relative error ‖X − X*‖ / ‖X* − X(0)‖ of the scan with the largest true displacement."""
@@ -80,7 +80,7 @@ class Score:
 
 @dataclass
 class Scorer:
-    """Scores one patch during a run; ``code_std`` is the quantisation noise of R/R0 (standard deviation)."""
+    """Scores one patch during a run; ``code_std`` is the standard deviation of R/R0 due to quantisation."""
 
     layout: PatchLayout
     code_std: float
@@ -97,7 +97,7 @@ class Scorer:
     _deepest: tuple[float, float] = (0.0, float("nan"))
 
     def add(self, frame: FieldFrame, true_upper_m: Float) -> float:
-        """Score a scan, given its true positions (U, N, 3), metres; return the scan's RMS error in metres."""
+        """Compare a scan with the true positions (U, N, 3), metres; return its RMS error, metres."""
         truth = true_upper_m - self.layout.upper_m
         error = frame.displacement_m - truth
         rms = float(np.sqrt(np.mean(error**2)))

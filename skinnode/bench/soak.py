@@ -1,13 +1,12 @@
-"""Soak test with random faults: checks that the host and the patches recover and the frame counters agree.
+"""Soak test: after random faults, host and patches must recover, and all frame counts must agree.
 
-The host and the simulated nodes run in the same process and communicate over two virtual buses. Each round of
-the test injects one to three kinds of fault, such as dropped frames, into one or all patches. Subscribers
-join and leave during each round. At the end of each round, the faults are removed, and the test waits until
-every patch is operational and publishes fields again. In some rounds, additional child processes keep all
-processors busy. Memory use is measured without faults, after a warm-up and at the end. The measurements are
-the resident memory and the number of blocks allocated by Python (:func:`sys.getallocatedblocks`). The number
-of blocks reveals even a leak of one object per scan. This module imports the simulator, which injects the
-faults.
+The host and the simulated nodes run in one process and communicate over two virtual buses. Each round injects
+one to three kinds of fault, such as dropped frames, into one or all patches, while subscribers join and
+leave. In some rounds, child processes also keep all processors busy. At the end of a round, the faults are
+removed. The next round starts when every patch is operational and publishes fields again. Memory use is
+measured twice, without faults: after a warm-up and at the end. It comprises the resident memory and the
+number of blocks allocated by Python (:func:`sys.getallocatedblocks`), which reveals even a leak of one object
+per scan. This module imports the simulator to inject the faults.
 """
 
 from __future__ import annotations
@@ -46,14 +45,14 @@ from vcan_sim.sensor import REMEMBERED_READINGS
 WARM_UP: Final = 0.25
 """Warm-up time before the first memory measurement, as a fraction of the test duration."""
 BLOCKS: Final = 2000
-"""Maximum permissible increase in the number of memory blocks. The number of blocks normally varies by a few
-hundred. A leak of one block per scan adds 10,000 blocks in three minutes."""
+"""Maximum increase in the number of memory blocks. The number normally varies by a few hundred; a leak of one
+block per scan adds 10,000 in three minutes."""
 RESIDENT_MB: Final = 8.0
-"""Maximum permissible increase of resident memory, MB; small increases are normal, because the C allocator
-does not return all freed memory at once."""
+"""Maximum increase in resident memory, MB. The C allocator does not return all freed memory at once, so small
+increases are normal."""
 BACK_S: Final = 15.0
 """Time limit for the recovery of all patches after a round, s. Recovery normally takes less than a second,
-but may take longer on a loaded machine."""
+but longer on a loaded machine."""
 SLOW_S: Final = 1.0
 """Recovery time above which a round is reported as slow, s."""
 STARVED: Final = 0.1
@@ -64,7 +63,7 @@ TARED: Final = 0.2
 CALM_S: Final = 1.5
 _PATCHES: Final = 4
 _MANY: Final = 8
-"""If a round injects at least this number of faults, its report states the number instead of the names."""
+"""Number of faults per round at and above which the report gives their number instead of their names."""
 
 _KINDS: Final[tuple[dict[str, Any], ...]] = (
     {"lost": 0.05},
@@ -305,7 +304,7 @@ def _soak(
 
 
 def _all_at_once(host: Host, fleet: Fleet, names: list[str]) -> None:
-    """Make all patches restart simultaneously, so that the number of threads reaches its maximum."""
+    """Restart all patches at once, so that the number of threads reaches its maximum."""
     fleet.inject(Faults(unplugged=True))
     time.sleep(CALM_S)
     _calm(fleet)
@@ -348,7 +347,7 @@ def _wait_for_patches(host: Host, names: list[str]) -> tuple[float, str]:
     """Wait until every patch is operational and has published a field whose SYNC was sent after the call.
 
     Returns:
-        The waiting time, s, and a text that names the last patch to recover and the reason for its delay.
+        The waiting time, s, and a text that gives the last patch to recover and what it was waiting for.
     """
     begin_ns, waited_for = time.monotonic_ns(), ""
 
@@ -368,7 +367,7 @@ def _wait_for_patches(host: Host, names: list[str]) -> tuple[float, str]:
 
 
 def _not_operational(host: Host) -> list[str]:
-    """Return a line of text with the reason for each patch that is not operational."""
+    """Return one line for each patch that is not operational, with the reason."""
     healths = (host.health(patch.name) for patch in host.hand.patches)
     return [f"{health.patch}, {health.condition}: {health.reason}" for health in healths if health.reason]
 

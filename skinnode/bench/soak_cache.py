@@ -12,8 +12,7 @@ from typing import Final
 
 CACHE_ENVIRONMENT: Final = "SKINNODE_CACHE_DIR"
 _DAMAGED: Final = 4
-"""Number of cache files to damage; it is small because each damaged kernel takes up to a few seconds to
-recompile."""
+"""Number of cache files to damage. It is small, because recompiling a kernel takes up to a few seconds."""
 _COMPILE_S: Final = 600.0
 """Time limit for compiling all kernels on a slow machine, s."""
 
@@ -44,10 +43,10 @@ def environment(folder: Path) -> dict[str, str]:
 
 
 def damage(folder: Path, seed: int) -> list[str]:
-    """Alternately truncate random cache files in ``folder`` and fill them with random bytes.
+    """Damage random cache files in ``folder``, alternately by truncation and with random bytes.
 
-    The choice of files depends only on the seed and the folder's contents. Returns one line of text per
-    damaged file.
+    The choice depends only on the seed and the contents of the folder. Returns one line of text per damaged
+    file.
     """
     chance = random.Random(seed)
     files = sorted(file for file in folder.rglob("*.nb[ci]") if file.stat().st_size > 1)

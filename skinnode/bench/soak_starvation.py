@@ -1,4 +1,4 @@
-"""Deprives a soak test of CPU time with child processes that run busy loops."""
+"""Starves a soak test of CPU time with child processes that run busy loops."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from collections.abc import Iterator
 from typing import Final
 
 _NICE: Final = -5
-"""Nice value of the child processes. If the user is not permitted to set this value, the child processes
-inherit the parent's nice value."""
+"""Nice value of the child processes. Without permission to set it, the child processes inherit the parent's
+nice value."""
 _CHILDREN_PER_PROCESSOR: Final = 3
 _LONGEST_S: Final = 30.0
-"""Maximum lifetime of a child process, s; a child also exits when its parent has exited."""
+"""Maximum lifetime of a child process, s. A child also exits when its parent has exited."""
 
 _BUSY: Final = """
 import os, sys, time

@@ -1,4 +1,4 @@
-"""Compares the frames sent and dropped in a soak test, by kind, with the host's counters."""
+"""Compares the numbers of frames sent and dropped in a soak test, by kind, with the host's counters."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ class KindSums:
 
     kind: str
     wanted: int
-    """Number of frames to be sent, including frames added by faults."""
+    """Number of frames to send, including those added by faults."""
     dropped: int
     """Number of frames dropped in transit by a fault."""
     held_back: int
@@ -100,14 +100,14 @@ def of_host(fleet: Fleet) -> list[KindSums]:
 
 
 def received_otherwise(fleet: Fleet, counter: FrameCounter, before: Mapping[str, Counter[Kind]]) -> list[str]:
-    """Compare the counters of frames from the nodes to the host; return a line of text for each mismatch.
+    """Compare the counts of frames from the nodes to the host; return one line of text per mismatch.
 
     All nodes must be silent during the call.
 
     Args:
         fleet: Simulated nodes.
         counter: Counter attached to the host.
-        before: Number of frames of each kind on each bus before the host opened the bus.
+        before: Number of frames of each kind that each bus had carried before the host opened it.
     """
     found = []
     for bus in fleet.hand.buses:
@@ -124,7 +124,7 @@ def received_otherwise(fleet: Fleet, counter: FrameCounter, before: Mapping[str,
 
 
 def sent_otherwise(fleet: Fleet, counter: FrameCounter) -> list[str]:
-    """Compare the counters of frames from the host to the nodes; return a line of text for each mismatch.
+    """Compare the counts of frames from the host to the nodes; return one line of text per mismatch.
 
     The host must be closed and the nodes stopped before the call.
     """
@@ -148,7 +148,7 @@ def sent_otherwise(fleet: Fleet, counter: FrameCounter) -> list[str]:
 
 
 def injected_otherwise(stats: HostStats, injected: Mapping[str, Injected]) -> list[str]:
-    """Compare the host's counters with the injected faults; return a line of text for each mismatch."""
+    """Compare the host's counters with the injected faults; return one line of text per mismatch."""
     found = [
         f"{name}: the host counted {stats.patches[name].frames} chunks and summaries, {each.pdos} were sent"
         for name, each in injected.items()

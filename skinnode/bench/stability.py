@@ -1,4 +1,4 @@
-"""Solves every hard case for many seeds; reports each method's error, uncertainty, status and verdict."""
+"""Solves every hard case for many seeds, and reports error, uncertainty and verdict of each method."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ from skinnode.process.child_processes import starting_children
 from skinnode.text.json_values import plain
 
 TWIN_SEEDS: Final = 2
-"""Number of streams on which ``auto`` must match another method exactly before the other method's results are
-reused for ``auto``."""
+"""Number of streams on which ``auto`` and another method must agree bit for bit before ``auto`` reuses the
+results of the other method."""
 
 
 @contextlib.contextmanager
@@ -57,7 +57,7 @@ def run(
         report: Function that receives each row as soon as it is complete.
 
     Returns:
-        The rows, and the number of wrong wires, excluding the known limitations (``Case.known_wrong``).
+        The rows, and the number of wrong wires other than known limitations (``Case.known_wrong``).
     """
     rows: list[dict[str, Any]] = []
     with contextlib.ExitStack() as stack:
@@ -82,7 +82,7 @@ def run(
 
 
 def _numbered(seeds: int, only: Sequence[str] | None, number: int) -> list[dict[str, Any]]:
-    """Return the rows of case ``number``; a case cannot be pickled, because it contains closures."""
+    """Return the rows of case ``number``, looked up by number because cases cannot be pickled."""
     return _rows(all_cases()[number], only, seeds)
 
 
@@ -92,7 +92,7 @@ def _rows(case: Case, only: Sequence[str] | None, seeds: int) -> list[dict[str, 
     solvers = {name: methods.set_up(case, name) for name in chosen}
     tallies = {name: Tally(case.converter.exact) for name in chosen}
     twins = [other for other in ("exact", "posterior") if "auto" in chosen and other in chosen]
-    name_code = zlib.crc32(case.name.encode())  # the seeds of a case do not depend on the other cases
+    name_code = zlib.crc32(case.name.encode())  # seeds are independent of the other cases
     for seed in range(seeds):
         stream = case.make(np.random.default_rng([seed, name_code]))
         tracked = stream.every(case.stride)

@@ -1,11 +1,11 @@
-"""Implements ``skinnode bench trust``: checks the errors of trusted values and the detection of faults.
+"""Implements ``skinnode bench trust``: tests whether trusted values are right and faults are detected.
 
 For each stream, data pass through the modules in this order::
 
     trust_loads, trust_faults -> trust_signal -> trust_solver -> trust_score -> trust_report
 
-Because a stream's random numbers depend only on the seed and the stream's name, a part of a run can be
-repeated separately.
+The random numbers of a stream depend only on the seed and the stream's name, so any part of a run can be
+repeated on its own.
 """
 
 from __future__ import annotations
@@ -38,8 +38,7 @@ from skinnode.text.json_values import plain
 PAIRS: Final = 500
 """Default number of streams with two randomly chosen faults."""
 PARTS: Final = ("table", "speed", "road")
-"""Names of the additional parts: table of earlier failures, speed versus error, and fault injection on a
-simulated bus."""
+"""Names of the additional parts: earlier failures, speed against error, and fault injection over a bus."""
 SHORT: Final[dict[str, Any]] = {
     "pairs": 20,
     "hours": 0.0,
@@ -47,12 +46,11 @@ SHORT: Final[dict[str, Any]] = {
 }
 """Options for a short run of :func:`run`."""
 WATCHED: Final = 4000
-"""Number of scans in each stream for counting false alarms; the stream contains ten touches."""
+"""Number of scans in a stream that counts false alarms; it contains ten touches."""
 QUIET: Final = Timeline(rest=200, press=10, hold=30, slide=40, release=10, after=110)
-"""Timeline of each touch in the streams for counting false alarms."""
+"""Timeline of a touch in a stream that counts false alarms."""
 PAIRED: Final = Timeline(rest=9, press=6, hold=7, slide=6, release=4, after=6)
-"""Timeline of a stream with two faults. The phases are short, because there are many streams with two
-faults."""
+"""Timeline of a stream with two faults. The phases are short, because there are many such streams."""
 
 
 @dataclass(frozen=True)
@@ -79,7 +77,7 @@ def items(seed: int, *, pairs: int = PAIRS, hours: float = 0.1, settings: Sequen
     Args:
         seed: Seed for choosing the fault pairs.
         pairs: Number of streams with two faults.
-        hours: Total duration of the streams for counting false alarms, in patch-hours.
+        hours: Total length of the streams that count false alarms, patch-hours.
         settings: Layouts and noise levels.
     """
     found = [Item("healthy", load, setting, load) for load in LOADS for setting in settings]
@@ -135,10 +133,10 @@ def _watch(item: Item, rng: np.random.Generator) -> Score:
 
 
 class Kept:
-    """File with the scores of the solved streams (one line per stream); used to resume a run.
+    """File of scores, one line per solved stream, from which an interrupted run is resumed.
 
     Args:
-        path: File to which scores are appended; None if scores are not stored.
+        path: File to which scores are appended; None to store nothing.
         seed: Seed of the run; lines with another seed are ignored.
     """
 
@@ -195,18 +193,17 @@ def run(  # noqa: PLR0913 - options of a command
     progress: Callable[[str], object] = lambda line: None,
     kept: Path | None = None,
 ) -> dict[str, Any]:
-    """Solve fault-free, faulty (one or two faults) and long streams, and check the targets.
+    """Solve streams with no, one or two faults and long fault-free streams; check the targets.
 
     Args:
         seed: Seed of all streams.
         pairs: Number of streams with two faults.
-        hours: Total duration of the streams for counting false alarms, in patch-hours.
+        hours: Total length of the streams that count false alarms, patch-hours.
         only: Substrings of the names of the sections and rows to run; default: all.
         settings: Layouts and noise levels; default: all.
         jobs: Number of processes that solve streams in parallel; the results do not depend on this number.
         progress: Function that receives a line of text after every 20 streams.
-        kept: File for the scores of solved streams; if the file exists, the streams that it lists are not
-            solved again.
+        kept: File for the scores of solved streams; streams that it already contains are not solved again.
 
     Returns:
         The report's rows and targets, as built-in types.

@@ -1,7 +1,7 @@
 """Faults for ``skinnode bench trust``, applied to arrays of readings and codes.
 
-The faults include every simulator fault that changes values. Each fault is applied at the stage at which it
-occurs in a real patch:
+The faults include every simulator fault that changes values. Each is applied at the stage at which it occurs
+in a real patch:
 
 made    deviation of the patch from its layout, present when the baseline is measured
 wired   wiring, before the converter adds noise
@@ -30,14 +30,14 @@ CHUNK: Final = 3
 NOISY: Final = 3e-3
 """Relative noise of a wire with a bad contact; the simulator uses the same value."""
 SETTLE: Final = 50
-"""Number of scans at rest within which the host must detect that the stated noise is wrong."""
+"""Number of scans at rest within which the host must detect a wrongly stated noise."""
 
 InPlace = Callable[[Signal], None]
 
 
 @dataclass(frozen=True, eq=False)
 class Fault:
-    """A fault; its location and time are chosen at random in each stream."""
+    """A fault, which each stream places at a random location and time."""
 
     name: str
     made: Callable[[Skin, np.random.Generator], Skin] | None = None
@@ -50,12 +50,11 @@ class Fault:
     ordinary: bool = False
     """Whether the hand file states ordinary tolerances instead of exact positions."""
     local: bool = False
-    """Whether the fault affects only single crossings or wires, so that the other wires can be trusted."""
+    """Whether the fault is confined to single crossings or wires, so that the others can be trusted."""
     scored_from: int = 0
     """Index of the first scored scan."""
     group: str = ""
-    """Name of the fault's group of mutually exclusive faults; empty if the fault may be combined with all
-    others."""
+    """Group of mutually exclusive faults to which the fault belongs; empty if it combines with any fault."""
 
 
 # --- places and times
@@ -127,7 +126,7 @@ def _leave_one(signal: Signal) -> None:
 
 
 def _freeze(start: Callable[[Signal], int], *, counted: bool = True) -> InPlace:
-    """Repeat a scan's codes in all later scans; ``counted`` states whether the patch counts conversions."""
+    """Return a function that repeats a scan's codes; ``counted``: whether the patch counts conversions."""
 
     def sent(signal: Signal) -> None:
         t = start(signal)
@@ -169,7 +168,7 @@ def _flip(signal: Signal, scans: slice, u: int, k: int, bit: int) -> None:
 
 
 def _flip_once(signal: Signal) -> None:
-    """Flip one bit of one code in one scan; the bit's value exceeds the noise."""
+    """Flip one bit of one code in one scan, by more than the noise."""
     t = int(signal.rng.integers(2, signal.shape[0] - 2))
     _flip(signal, slice(t, t + 1), *_crossing(signal), int(signal.rng.integers(6, 16)))
 
@@ -223,7 +222,7 @@ def _shorted_to_all(axis: int) -> InPlace:
 
 
 def _open_unmarked(axis: int) -> InPlace:
-    """Return a function that breaks a wire: its readings then float near the top of the converter range."""
+    """Return a function that opens a wire; its readings then float near the top of the converter range."""
 
     def wired(signal: Signal) -> None:
         at, t = _one(signal, axis), _pressing(signal)
@@ -236,7 +235,7 @@ def _open_unmarked(axis: int) -> InPlace:
 
 
 def _two_shorted(axis: int) -> InPlace:
-    """Return a function that shorts two adjacent wires, so that both show their parallel resistance."""
+    """Return a function that shorts two adjacent wires; both then read their parallel resistance."""
 
     def wired(signal: Signal) -> None:
         at, t = _one(signal, axis, 2), _pressing(signal)
@@ -266,7 +265,7 @@ def _crossed(axis: int, *, tared: bool) -> InPlace:
 
 
 def _gain(axis: int, by: float) -> InPlace:
-    """Return a function that changes the gain of a wire after the baseline has been measured."""
+    """Return a function that changes the gain of a wire after the baseline measurement."""
 
     def wired(signal: Signal) -> None:
         rows = _row(signal, axis, _pressed_wire(signal, axis), _at_rest(signal))

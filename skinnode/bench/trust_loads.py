@@ -1,9 +1,9 @@
-"""Loads for ``skinnode bench trust``, which violate the assumptions of the posterior's prior.
+"""Loads for ``skinnode bench trust`` that violate the assumptions of the posterior's prior.
 
-The prior assumes independent loads on the cells of a lattice. This module provides loads without a lattice:
-closed-form solutions for a sphere and for a flat punch, line loads at any angle, a dent that no load on a
-half-space can produce, and a rigid plate that covers the whole patch. The true force is known for bodies that
-press on a half-space or on a layer.
+The prior assumes independent loads on the cells of a lattice. The loads of this module have no lattice:
+spheres and flat punches in closed form, line loads at any angle, a dent that no load on a half-space can
+produce, and a rigid plate over the whole patch. The true force is known for bodies that press on a half-space
+or on a layer.
 
 The shear traction is proportional to the pressure. The rubber is incompressible (ν = ½). On a half-space,
 pressure therefore causes no tangential displacement, and shear causes no normal displacement.
@@ -22,7 +22,7 @@ from skinnode.model.layout import Float, PatchLayout
 
 LOADS: Final = ("sphere", "punch", "ridge", "dent", "edge", "whole patch")
 DEPTH: Final = (0.1, 0.3)
-"""Minimum and maximum depth of a load, divided by the layer height."""
+"""Minimum and maximum depth of a load, in layer heights."""
 SHEAR: Final = 0.3
 """Maximum coefficient of friction."""
 LINES: Final = 16
@@ -31,7 +31,7 @@ LINES: Final = 16
 WAVES: Final = 1500
 """Number of wave numbers at which Hankel transforms are sampled."""
 WAVE_MAX: Final = 60.0
-"""Maximum product of wave number and contact radius; larger wave numbers contribute only 1e-4 of Hertz's
+"""Maximum product of wave number and contact radius. Higher wave numbers contribute 1e-4 of Hertz's
 pressure."""
 
 _UNKNOWN: Final = np.full(3, np.nan)
@@ -129,7 +129,7 @@ class Ridge:
 
 @dataclass(frozen=True)
 class Dent:
-    """A Gaussian dent with displacements towards its centre, which no load on a half-space causes."""
+    """A Gaussian dent with displacements towards its centre, which no load on a half-space can cause."""
 
     center_m: tuple[float, float]
     spread_m: float
@@ -157,7 +157,7 @@ class Plate:
     center_m: tuple[float, float]
     depth_m: float
     tilt: tuple[float, float]
-    """Relative change of the plate's depth per metre along x and along y."""
+    """Relative change of the plate's depth along x and along y, 1/m."""
     traction_ratio: tuple[float, float] = (0.0, 0.0)
 
     def displacement_m(self, points_m: Float, share: float) -> Float:

@@ -14,7 +14,7 @@ from skinnode.bench.trust_signal import RATE_HZ, Setting
 
 SECTIONS: Final = ("healthy", "single", "pair", "hours")
 HEALTHY: Final = 0.99
-"""Minimum fraction of trusted fields among the fields without faults, at a relative noise of 1e-5 or 1e-4."""
+"""Minimum fraction of fault-free fields that are trusted, at a relative noise of 1e-5 or 1e-4."""
 FALSE_PER_HOUR: Final = 0.1
 """Maximum number of false alarms per patch-hour."""
 
@@ -24,7 +24,7 @@ def _sum(rows: Iterable[dict[str, Any]], key: str) -> float:
 
 
 def verdicts(rows: Sequence[dict[str, Any]], settings: Sequence[Setting]) -> list[dict[str, Any]]:
-    """Return the targets that apply to ``rows``, including the measured values and verdicts."""
+    """Return the targets that apply to ``rows``, with the measured values and the verdicts."""
     by_section = {name: [row for row in rows if row["section"] == name] for name in SECTIONS}
     found = []
     for section, what in (("healthy", "no fault"), ("single", "one fault"), ("pair", "two faults")):
@@ -76,7 +76,7 @@ def _must(what: str, got: float, asked: float, *, least: bool = False) -> dict[s
 
 
 def _false_namings(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """Compare the false-alarm rate with its target; the row's note states the rate's confidence bounds."""
+    """Compare the false-alarm rate with its target; the note of the row gives the confidence bounds."""
     hours, events = _sum(rows, "frames") / RATE_HZ / 3600.0, round(_sum(rows, "false_names"))
     low, high = rate_bounds(events, hours)
     verdict = _must("false alarms per patch-hour", events / hours, FALSE_PER_HOUR)

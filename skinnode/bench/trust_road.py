@@ -1,7 +1,7 @@
 """Runs a host and simulated nodes with faults on virtual buses, for ``skinnode bench trust``.
 
 Simulated spheres press on a hand of full-size patches. After a fault-free period, a different fault is
-injected into each patch. This module imports the simulator, which injects the faults.
+injected into each patch. This module imports the simulator to inject the faults.
 """
 
 from __future__ import annotations
@@ -46,17 +46,17 @@ ROAD: Final[tuple[dict[str, Any], ...]] = (
     {"crossed_lower": 13},
     {"flipped": 0.2},
 )
-"""Faults injected into each patch: changed, missing or repeated values. The first patch has no faults."""
+"""Fault of each patch: changed, missing or repeated values. The first patch has none."""
 AT_ONCE: Final = 4
 """Number of patches simulated simultaneously by this process."""
 CLEAN_S: Final = 1.2
-"""Fault-free time after bring-up, s. The first press begins within this fault-free time."""
+"""Time from bring-up to the injection of the faults, s. The first press begins within it."""
 FAULTY_S: Final = 4.0
 PERIOD_MS: Final = 80
 
 
 def rows(seed: int) -> list[dict[str, Any]]:
-    """Inject the faults and compare the resulting fields with the truth; return one row per patch."""
+    """Inject the faults and compare the fields with the truth; return one row per patch."""
     found = []
     kept = logging.getLogger("skinnode")
     level = kept.level

@@ -1,6 +1,6 @@
-"""Scores trusted fields by comparison with the true displacement, for ``skinnode bench trust``.
+"""Compares trusted fields with the true displacement, for ``skinnode bench trust``.
 
-A score consists of counts, so that the scores of several streams and processes can be added.
+A score consists of counts, so scores of several streams and processes can be added.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ LIMIT: Final = 5.0
 """Maximum error of a trusted coordinate, in reported standard deviations."""
 
 BEYOND: Final = 1e-3
-"""Maximum permissible fraction of trusted coordinates with an error above :data:`LIMIT`."""
+"""Maximum fraction of trusted coordinates with an error above :data:`LIMIT`."""
 
 Mask = NDArray[np.bool_]
 
@@ -48,8 +48,7 @@ class Score:
     nameable: int = 0
     """Number of streams in which a fault changed at least one reading."""
     scans_to_name: list[int] = dataclasses.field(default_factory=list)
-    """Number of scans from the first changed reading to the first correct fault report, one entry per
-    stream."""
+    """Number of scans from the first changed reading to the first correct fault report, for each stream."""
     after: int = 0
     """Number of fields from the first correct fault report onwards."""
     after_trusted: int = 0
@@ -90,7 +89,7 @@ class Score:
 
     @property
     def share_named(self) -> float:
-        """Fraction of the faulty streams in which the fault was identified correctly."""
+        """Fraction of the faulty streams in which the fault was reported correctly."""
         return self.named / self.nameable if self.nameable else math.nan
 
     @property
@@ -105,7 +104,7 @@ class Score:
 
     @property
     def median_scans(self) -> float:
-        """Median number of scans before a fault is identified."""
+        """Median number of scans until a fault is reported correctly."""
         return float(np.median(self.scans_to_name)) if self.scans_to_name else math.nan
 
 

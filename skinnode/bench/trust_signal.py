@@ -29,12 +29,12 @@ LAYOUTS: Final = (("staggered", 0.5), ("staggered", 1.0), ("aligned", 0.5))
 NOISES: Final = (1e-5, 1e-4, 1e-3)
 SCALE: Final = CodeScale(16)
 RATE_HZ: Final = 100.0
-"""Scan rate of a patch, Hz, for converting numbers of scans to hours."""
+"""Scan rate at which numbers of scans are converted to hours, Hz."""
 
 
 @dataclass(frozen=True)
 class Timeline:
-    """Number of scans in each phase of a stream; the default stream lasts about 5 s at 12.5 scans/s."""
+    """Number of scans in each phase of a stream; by default, about 5 s at 12.5 scans/s in all."""
 
     rest: int = 12
     press: int = 8
@@ -93,7 +93,7 @@ class Signal:
 
 @dataclass(frozen=True, eq=False)
 class CodeStream:
-    """A patch's scans as received by the host, and the true displacements and forces."""
+    """The scans of a patch as received by the host, with the true displacements and forces."""
 
     layout: PatchLayout
     baseline_ohm: Float

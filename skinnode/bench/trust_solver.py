@@ -1,8 +1,7 @@
 """Processes a code stream with the host's solver and fault detection, for ``skinnode bench trust``.
 
-As in the host, each scan is first checked for frozen parts and open wires. The scan is then solved without
-the readings that these checks exclude. Finally, the scan is added to the statistics for detecting slowly
-developing faults.
+As in the host, each scan is checked for frozen parts and open wires, solved without the readings that these
+checks exclude, and added to the statistics that reveal slow faults.
 """
 
 from __future__ import annotations

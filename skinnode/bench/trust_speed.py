@@ -1,4 +1,4 @@
-"""Compares the speed and error of the posterior and of the exact inverse, with and without its data tests."""
+"""Compares the speed and error of the posterior, the exact inverse, and the inverse without data tests."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ METHODS: Final = ("exact, no tests", "exact", "posterior")
 
 
 def rows(seed: int) -> list[dict[str, Any]]:
-    """Solve the same streams with each method; return one row per method with times and errors."""
+    """Solve the same streams with each method; return the times and errors of each in a row."""
     times: dict[str, list[float]] = {name: [] for name in METHODS}
     errors: dict[str, list[float]] = {name: [] for name in METHODS}
     worst = dict.fromkeys(METHODS, 0.0)

@@ -35,10 +35,10 @@ NAMED: Final = 0.95
 BRIEF: Final = Timeline(rest=4, press=5, hold=6, slide=0, release=0, after=0)
 """Timeline of a short stream, which ends while the load is held."""
 BLUNT_M: Final = 100e-6
-"""Maximum permissible error of a trusted, precise field when half of the readings are missing, metres. The
-limit is 5 % of the layer height."""
+"""Maximum error of a trusted, precise field that was computed from half of the readings, metres: 5 % of the
+layer height."""
 STEADY: Final = 0.95
-"""Minimum fraction of fields with the right number of contacts, and minimum fraction of correct forces."""
+"""Minimum fraction of fields with the right number of contacts, and of contacts with the right force."""
 
 Solved = tuple[CodeStream, list[FieldFrame]]
 
@@ -229,7 +229,7 @@ def _placed(off: float, *, stated: float | None = None) -> Callable[[int], tuple
 
 
 def _placed_beyond_ordinary(off: float) -> Callable[[int], tuple[str, bool]]:
-    """Return a function that checks the fields if the hand file states the true placement error."""
+    """Return a function that checks fields of patches whose hand file states the true placement error."""
 
     def measure(seed: int) -> tuple[str, bool]:
         ordinary, _ = _placed(off)(seed)

@@ -1,10 +1,10 @@
-"""Generates ground truth for benchmarks, without the assumptions of the solvers.
+"""Generates ground truth for benchmarks, independently of the assumptions of the solvers.
 
 Displacements are closed-form solutions for rigid spheres on rubber
-(:class:`skinnode.model.elastic.HertzContact`), which require no grid and no prior. Resistances are computed
-by :class:`Skin`. Unlike the solver's model, a skin may have electrodes of finite size, strain-dependent
-resistivity, a different thickness, or a series contact resistance. Like real converters, simulated converters
-add noise and quantise readings to codes.
+(:class:`skinnode.model.elastic.HertzContact`), which need neither grid nor prior. :class:`Skin` computes the
+resistances. Unlike the solver's model, it can have electrodes of finite size, strain-dependent resistivity, a
+different layer height, or a contact resistance in series. :class:`Converter` adds noise and quantises the
+readings to codes.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ from skinnode.protocol.codes import CodeScale, decode, encode
 
 RUBBER: Final = Rubber()
 EXACT_NOISE: Final = 1e-9
-"""Relative noise passed to a tracker for noise-free data; the solver's tolerance depends on this noise."""
+"""Relative noise passed to a tracker for noise-free data. It determines the tolerance of the solver."""
 RING: Final = 4
-"""Number of points on the rim of a finite electrode; the potential of an electrode pair is the mean over 16
-point pairs."""
+"""Number of points on the rim of a finite electrode. The potential between two electrodes is the mean over
+all 16 pairs of points."""
 
 
 class Load(Protocol):
@@ -47,7 +47,7 @@ class Load(Protocol):
         """Return the displacement (P, 3) of surface points (P, 2), metres."""
 
     def force_n(self, share: float) -> Float:
-        """Return the force (3,) on the rubber, newtons; NaN if the force is unknown for this kind of body."""
+        """Return the force (3,) on the rubber, newtons; NaN if it is unknown for this kind of body."""
 
 
 @dataclass(frozen=True)
@@ -59,11 +59,11 @@ class Press:
     depth_m: float
     traction_ratio: tuple[float, float] = (0.0, 0.0)
     shear_only: bool = False
-    """Whether only the tangential traction acts. The displacement is then that of a contact with friction
-    minus that of a frictionless contact."""
+    """Whether only the tangential traction acts. Its displacement is that of a contact with friction minus
+    that of a frictionless contact."""
 
     def contacts(self, share: float) -> tuple[tuple[int, HertzContact], ...]:
-        """Return closed-form solutions and their signs (+1 to add, −1 to subtract)."""
+        """Return the closed-form solutions to superpose, each with its sign (+1 or −1)."""
         depth = share * self.depth_m
         full = HertzContact(RUBBER, self.radius_m, depth, self.center_m, self.traction_ratio)
         if not self.shear_only:
@@ -87,7 +87,7 @@ class Press:
 
 @dataclass(frozen=True, eq=False)
 class Skin:
-    """A simulated patch; the solver is given only its nominal ``layout``.
+    """A simulated patch, of which the solver knows only the nominal ``layout``.
 
     Args:
         layout: Nominal layout, which is passed to the solver.
@@ -169,7 +169,7 @@ class Skin:
         return self._points(self.body.upper_m)
 
     def _points(self, upper: Float) -> Float:
-        """Do the same as :func:`skinnode.model.forward.resistance_ohm`, about five times as fast."""
+        """Compute :func:`skinnode.model.forward.resistance_ohm` about five times as fast."""
         lower = self.body.lower_m.reshape(-1, 3)
         square = np.zeros((upper.shape[0] * upper.shape[1], len(lower)))
         for axis in range(3):
@@ -228,7 +228,7 @@ class Converter:
 
     @property
     def relative_std(self) -> float:
-        """Relative standard deviation of a reading at rest; passed to the solver as the noise."""
+        """Relative standard deviation of a reading at rest, which the solver is given as the noise."""
         if self.exact:
             return EXACT_NOISE
         rounding = (self.hi - self.lo) / ((1 << self.bits) - 4) / math.sqrt(12.0) if self.bits else 0.0
@@ -294,7 +294,7 @@ def stream(  # noqa: PLR0913 - the parts of a stream
     rng: np.random.Generator,
     gain: Float | None = None,
 ) -> Stream:
-    """Generate a stream in which one or more superposed presses deform a patch.
+    """Generate the stream of a patch that one or more superposed presses deform.
 
     Args:
         skin: Patch to press.

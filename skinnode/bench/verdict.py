@@ -1,4 +1,4 @@
-"""Compares solved displacements with the true displacements and assigns a verdict to each wire.
+"""Compares solved displacements with the true ones, and assigns a verdict to each wire.
 
 Each wire of a frame receives one of three verdicts:
 
@@ -6,21 +6,21 @@ flagged    The status is not CONVERGED, or the data failed a test (``wires_trust
 accurate   The wire is not flagged, and every coordinate is within the reported uncertainty.
 wrong      The wire is not flagged, but an error is too large; or (with any status) a value is not finite.
 
-With noise, errors up to 5 reported standard deviations are accepted, but 6e-7 of all coordinates exceed this
-limit by chance. A long run should neither fail by chance nor miss a real defect. Each row of the report must
-therefore meet the two conditions below. If the errors are Gaussian with the reported standard deviation, the
-probability of violating each condition is 1e-4.
+With noise, errors up to 5 reported standard deviations are accepted, a limit that 6e-7 of all coordinates
+exceed by chance. A long run must neither fail by chance nor miss a real defect. Each row of the report is
+therefore tested against two conditions. If the errors are Gaussian with the reported standard deviation, a
+row violates each condition with a probability of 1e-4.
 
-- No error exceeds the larger of z(n) and 5 standard deviations. With a probability of 1e-4, at least one of n
-  independent coordinates exceeds z(n), which is 5.7 for 9,000 coordinates and 6.4 for 1e6. z(n) is
-  Bonferroni's bound, so the probability is lower if coordinates are correlated.
+- No error exceeds the larger of 5 and z(n) standard deviations, where n is the number of coordinates. The
+  largest of n independent errors exceeds z(n) with a probability of 1e-4; z(n) is 5.7 for 9,000 coordinates
+  and 6.4 for 1e6. This is Bonferroni's bound: correlated errors exceed it less often.
 - The number of seeds with an error above 5 standard deviations does not exceed a quantile of the binomial
-  distribution. The expected number of such errors per seed serves as the probability per seed, because it is
-  an upper bound. The test counts seeds instead of coordinates, because only seeds are independent.
+  distribution. The probability per seed is bounded by the expected number of such errors in a seed. The test
+  counts seeds, not coordinates, because only seeds are independent.
 
-If too many seeds have an error above 5 standard deviations, every wire with such an error is classified as
-wrong. With exact data, no error is attributed to chance: the limit is 5 reported standard deviations or 1e-6
-of the wire's largest displacement, whichever is larger.
+If too many seeds have an error above 5 standard deviations, every wire with such an error is wrong. With
+exact data, nothing is left to chance: the limit is 5 reported standard deviations or 1e-6 of the wire's
+largest displacement, whichever is larger.
 """
 
 from __future__ import annotations
@@ -36,16 +36,16 @@ from numpy.typing import NDArray
 from skinnode.model.layout import Float
 
 LIMIT: Final = 5.0
-"""Maximum permissible error of a coordinate, in reported standard deviations."""
+"""Maximum error of a coordinate, in reported standard deviations."""
 CHANCE: Final = 1e-4
-"""Probability of a false alarm per row. A run with 350 rows has a false alarm with a probability of 1/30."""
+"""Probability of a false alarm in a row of the report; about 1/30 in a run of 350 rows."""
 EXACT_SHARE: Final = 1e-6
-"""Maximum permissible error with exact data, relative to the wire's largest displacement."""
+"""Maximum error with exact data, relative to the wire's largest displacement."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Solved:
-    """Displacements and standard deviations that a method computed for the frames of a stream."""
+    """Displacements and standard deviations computed by a method for the frames of a stream."""
 
     displacement_m: Float
     """(F, U, N, 3)"""
@@ -65,7 +65,7 @@ class Solved:
 
 
 def beyond(deviations: float) -> float:
-    """Return the probability that the magnitude of a Gaussian error exceeds ``deviations`` sigma."""
+    """Return the probability that a Gaussian error exceeds ± ``deviations`` standard deviations."""
     return math.erfc(deviations / math.sqrt(2.0))
 
 
@@ -79,7 +79,7 @@ def limit_of(coordinates: int) -> float:
 
 
 def allowed_seeds(coordinates: int, seeds: int) -> int:
-    """Return the maximum number of seeds with errors above 5 standard deviations due to chance."""
+    """Return the number of seeds that may have an error above 5 standard deviations by chance."""
     from scipy.stats import binom
 
     if seeds == 0:
@@ -104,7 +104,7 @@ class Tally:
     """Wires with an error above :data:`LIMIT`: (error in standard deviations or inf, seed, frame, wire)."""
 
     def add(self, seed: int, solved: Solved, truth_m: Float) -> None:
-        """Add a seed's result; ignore frames in which the true displacement (F, U, N, 3) is NaN."""
+        """Add the result for a seed, ignoring frames whose true displacement (F, U, N, 3) is NaN."""
         self.seeds += 1
         kept = np.flatnonzero(np.isfinite(truth_m).all(axis=(1, 2, 3)))
         truth_m, moved, std = truth_m[kept], solved.displacement_m[kept], solved.std_m[kept]
@@ -127,8 +127,8 @@ class Tally:
     def _shares(self, error: Float, std: Float, truth: Float) -> None:
         """Add the error and standard deviation of the converged wires in the deepest frame.
 
-        Errors and standard deviations are divided by the displacement in the deepest frame. The worst error
-        is the largest error in any frame, divided by the same displacement.
+        Both are divided by the displacement in that frame. The worst error is the largest error in any frame,
+        divided by the same displacement.
         """
         deepest = int(np.argmax(np.linalg.norm(truth.reshape(len(truth), -1), axis=1)))
         used = np.isfinite(error[deepest])
@@ -172,7 +172,7 @@ class Tally:
 
 
 def named(row: Mapping[str, Any]) -> str:
-    """Describe a wrong row in one line: case, method, largest error, and where that error occurred."""
+    """Describe a wrong row in one line: case, method, largest error, and where it occurred."""
     worst = row["worst"]
     far = "not finite" if worst["deviations"] is None else f"{worst['deviations']:.3g} standard deviations"
     return (

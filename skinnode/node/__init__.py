@@ -1,8 +1,8 @@
-"""CANopen device (CiA 301) for a patch, and the thread that runs such devices on a bus.
+"""CANopen node (CiA 301) of a patch, and the thread that runs nodes on a bus.
 
-The module ``runner`` owns the thread and the CAN port, and passes received frames to ``device``. The device
-passes each frame to the service that handles it; each service has its own module. The sub-package ``patch``
-is the application that uses these services. It samples the skin and sends scans.
+``runner`` contains the thread, which passes received frames to ``device``. The device passes each frame to
+the service that handles it; every service has its own module. The sub-package ``patch`` is the application,
+which measures the skin and sends scans.
 """
 
 from skinnode.canopen.lss import NOT_CONFIGURED

@@ -1,4 +1,4 @@
-"""Interface between a CANopen device and its application, such as the patch application."""
+"""Interface between a CANopen device and its application."""
 
 from __future__ import annotations
 
@@ -13,33 +13,27 @@ from skinnode.node.storage import Storage
 
 
 class Application(Protocol):
-    """Application of a CANopen device, which shares the device's object dictionary."""
+    """Application of a CANopen device."""
 
     @property
     def deadline_ns(self) -> int:
-        """Time (ns) at which :meth:`on_timer` must be called next."""
+        """Time at which :meth:`on_timer` must be called next, ns."""
         ...
 
     def power_on(self, t_ns: int) -> None:
-        """Start the application at power-on, before the boot-up message.
-
-        The device does not call this method on a reset.
-        """
+        """Start the application at power-on, before the boot-up message. Not called at a reset."""
         ...
 
     def reset(self) -> None:
-        """Reset the application.
-
-        The device has already set the application's objects to their power-on values.
-        """
+        """Reset the application. Its objects already have their power-on values."""
         ...
 
     def enter(self, *, operational: bool) -> None:
-        """Handle a change of the NMT state; ``operational`` is true if the new state is OPERATIONAL."""
+        """Handle a change of the NMT state to OPERATIONAL or to another state."""
         ...
 
     def on_sync(self, counter: int | None, turns: frozenset[int], t_ns: int) -> None:
-        """Handle a SYNC in OPERATIONAL; ``turns`` contains the numbers of the synchronous TPDOs to send."""
+        """Handle a SYNC in OPERATIONAL. ``turns`` contains the numbers of the synchronous TPDOs now due."""
         ...
 
     def on_timer(self, t_ns: int) -> None:
@@ -49,15 +43,15 @@ class Application(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class ApplicationServices:
-    """Services that a device provides to its application."""
+    """Services of a device for its application."""
 
     store: ObjectStore
     """Object dictionary."""
     storage: Storage
-    """Storage of the values that survive a power cycle."""
+    """Storage of the non-volatile values."""
     tpdos: TpdoEngine
-    """Transmitter of all TPDOs."""
+    """TPDO engine."""
     emcy: EmcyProducer
-    """Emergency producer."""
+    """EMCY producer."""
     now: Clock
     """Function that returns the time (ns) of the event being handled."""

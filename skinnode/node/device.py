@@ -1,10 +1,10 @@
 """CANopen device: the CiA 301 communication services and an application that uses them.
 
-The device is synchronous and deterministic: it has no thread and reads no clock. The caller passes received
-frames to :meth:`CanopenDevice.on_frame` with their times of reception, and calls
-:meth:`CanopenDevice.on_timer` at the time that :meth:`CanopenDevice.next_deadline_ns` returns. On a bus, the
-caller is :class:`~skinnode.node.runner.NodeRunner`. No received frame causes an exception in the device
-itself, but exceptions from the application and from ``send`` propagate to the caller.
+The device has no thread and reads no clock, so its behaviour is deterministic. The caller passes received
+frames and their arrival times to :meth:`CanopenDevice.on_frame`, and calls :meth:`CanopenDevice.on_timer` at
+the time given by :meth:`CanopenDevice.next_deadline_ns`. On a bus, :class:`~skinnode.node.runner.NodeRunner`
+is the caller. The device handles every frame without an exception. Exceptions from the application and from
+``send`` propagate to the caller.
 """
 
 from __future__ import annotations
@@ -40,23 +40,23 @@ HARDWARE_VERSION: Final = "none"
 """Hardware version (0x1009) of a software node, which has no board."""
 
 Handler = Callable[[bytes, int], None]
-"""Callback with two arguments: a frame's payload, and its time of reception in ns."""
+"""Callback with two arguments: the payload of a frame, and its arrival time in ns."""
 
 
 class CanopenDevice:
-    """CANopen device with its communication services. The device sends nothing before :meth:`power_on`.
+    """CANopen device. It is silent until :meth:`power_on`.
 
     Args:
-        node_id: 1 to 127, or 255 to wait until LSS assigns a node-ID. A node-ID stored in the memory by LSS
-            takes precedence.
+        node_id: 1 to 127, or 255 to wait until LSS assigns a node-ID. A node-ID that LSS has stored in the
+            memory takes precedence.
         objects: declarations of the node's object dictionary.
-        application: called once, with the device's services, to create the application.
-        send: called with the COB-ID and payload of each frame that the node sends, in order.
+        application: function that creates the application, given the device's services.
+        send: function that sends a frame, given its COB-ID and payload.
         serial: serial number (0x1018:4), u32.
-        memory: memory for the values that survive a power cycle; None for a device without a memory.
-        kind: text that identifies the sizes and layout of the patch. The content of the memory is used only
-            if it was saved with the same text.
-        set_bit_rate: changes the bit rate (bit/s) for LSS; None if the node cannot change it.
+        memory: non-volatile memory of the device, or None.
+        kind: identifier of the sizes and layout of the patch. Memory content that was saved with another
+            identifier is not used.
+        set_bit_rate: function that changes the bit rate (bit/s), or None if LSS cannot change it.
 
     Raises:
         ValueError: if an argument is out of range.
@@ -110,7 +110,7 @@ class CanopenDevice:
     # --- events
 
     def power_on(self, t_ns: int) -> None:
-        """Start the application, then boot. A device without a node-ID waits until LSS assigns one.
+        """Start the application and boot. A device without a node-ID first waits until LSS assigns one.
 
         Args:
             t_ns: current time, ns.
@@ -125,7 +125,7 @@ class CanopenDevice:
         self._reset(EVERYTHING, t_ns)
 
     def power_off(self) -> None:
-        """Switch the device off: the device stops sending immediately."""
+        """Switch the device off. It stops sending immediately."""
         self._enter(NmtState.INITIALISING, self._now_ns)
         self._bit_rate_change.cancel()
         self._handlers = {}
@@ -136,13 +136,13 @@ class CanopenDevice:
         Args:
             can_id: identifier of the frame.
             data: payload of the frame; ignored for a remote frame.
-            t_ns: time of reception, ns.
+            t_ns: arrival time, ns.
             remote: whether the frame is a remote frame.
         """
         if self._bit_rate_change.silent(t_ns):
             return
         self._now_ns = t_ns
-        # Before boot-up, a node has no handlers, or only the LSS handler.
+        # Before boot-up, only the LSS handler exists, if any.
         if not remote and (handler := self._handlers.get(can_id)) is not None:
             handler(data, t_ns)
         elif self.nmt_state is NmtState.INITIALISING:
@@ -157,8 +157,8 @@ class CanopenDevice:
     def on_bus(self, state: BusState, t_ns: int) -> None:
         """Handle a change of the CAN controller's state.
 
-        The error behaviour (0x1029) applies immediately at bus-off. The emergency message about bus-off
-        follows after the bus has recovered.
+        At bus-off, the error behaviour (0x1029) takes effect immediately. The emergency message follows when
+        the bus has recovered.
 
         Args:
             state: new state of the CAN controller.
@@ -176,7 +176,7 @@ class CanopenDevice:
         self._report_passive(t_ns)
 
     def next_deadline_ns(self) -> int | None:
-        """Return the time (ns) of the next required :meth:`on_timer` call; None if nothing is scheduled."""
+        """Return the time (ns) at which :meth:`on_timer` must be called, or None if nothing is scheduled."""
         if self._bit_rate_change.deadline_ns != NO_DEADLINE_NS:
             return self._bit_rate_change.deadline_ns
         if self.nmt_state is NmtState.INITIALISING:
@@ -194,15 +194,15 @@ class CanopenDevice:
 
     @property
     def silent_from_ns(self) -> int:
-        """Time (ns) from which :meth:`on_timer` reports that the master or a monitored node has gone silent.
+        """Time (ns) from which :meth:`on_timer` reports a missed heartbeat or guarding request.
 
-        The caller must first pass all received frames to :meth:`on_frame`, in case one of them is a heartbeat
-        or guarding request.
+        Before that call, the caller must pass all received frames to :meth:`on_frame`, because the heartbeat
+        or guarding request may be among them.
         """
         return self._error_control.silent_from_ns
 
     def on_timer(self, t_ns: int) -> None:
-        """Perform all actions that are due at ``t_ns``. Calls before the next deadline have no effect.
+        """Perform all actions that are due at ``t_ns``. Before the next deadline, this has no effect.
 
         Args:
             t_ns: current time, ns.
@@ -243,7 +243,7 @@ class CanopenDevice:
                 self._nmt.obey(command, t_ns)
 
     def _reset(self, objects: tuple[int, int], t_ns: int) -> None:
-        """Reset objects and services, then boot. A node without a node-ID waits until LSS assigns one."""
+        """Reset the objects and services, and boot unless the node has no node-ID."""
         self._enter(NmtState.INITIALISING, t_ns)
         self._lss.reset_communication()
         self.node_id = self._lss.node_id
@@ -271,7 +271,7 @@ class CanopenDevice:
         self._nmt.enter(state, t_ns)
 
     def _entered(self, state: NmtState, before: NmtState, t_ns: int) -> None:
-        # The EMCY producer must be updated first, because the following calls may queue emergency messages.
+        # The EMCY producer comes first, because the calls below may report errors.
         self._emcy.allow(state.communicates, t_ns)
         if not state.communicates:
             self._sdo.reset()
@@ -308,7 +308,7 @@ class CanopenDevice:
             self._synchronise(data, t_ns)
 
     def _synchronise(self, sync: bytes, t_ns: int) -> None:
-        """Handle a SYNC in OPERATIONAL: apply received RPDOs, call the application, send TPDOs."""
+        """Handle a SYNC in OPERATIONAL: apply RPDOs, then call the application, then send TPDOs."""
         if self.nmt_state is not NmtState.OPERATIONAL:
             return
         counter = sync[0] if sync else None
@@ -347,7 +347,7 @@ class CanopenDevice:
     # --- object dictionary
 
     def _describe(self, serial: int) -> None:
-        """Set the objects that differ between devices: serial number and versions."""
+        """Set the serial number and the versions."""
         self._store.put(od.IDENTITY, od.IDENTITY_SERIAL, serial)
         self._store.put(od.HARDWARE_VERSION, 0, HARDWARE_VERSION)
         self._store.put(od.SOFTWARE_VERSION, 0, importlib.metadata.version("skinnode"))
@@ -363,12 +363,11 @@ class CanopenDevice:
         self._reload()
 
     def _reload(self) -> None:
-        """Register a handler for each received COB-ID, except the COB-IDs of RPDOs."""
+        """Rebuild the table of handlers for all received COB-IDs except those of RPDOs."""
         handlers: dict[int, Handler] = self._error_control.handlers()
         if self._time.cob_id is not None:
             handlers[self._time.cob_id] = self._on_time
-        # SYNC, SDO, NMT and LSS are registered last, so that other services with the same COB-ID cannot
-        # replace their handlers.
+        # SYNC, SDO, NMT and LSS come last, so that no other service can take over their COB-IDs.
         handlers[self._sync.cob_id] = self._on_sync
         handlers[od.sdo_request_cob_id(self.node_id)] = self._on_sdo
         handlers[od.NMT_COB_ID] = self._on_nmt
@@ -377,5 +376,5 @@ class CanopenDevice:
 
 
 def _count(objects: Sequence[Object], first: int) -> int:
-    """Return the number of RPDOs or TPDOs, where ``first`` is the index of the first communication record."""
+    """Return the number of RPDOs or TPDOs, given the index of the first communication record."""
     return sum(first <= item.index < first + od.MAX_PDOS for item in objects)

@@ -1,7 +1,6 @@
 """Error control services: boot-up message, heartbeat and node guarding (CiA 301 v4.2, 7.2.8.3).
 
-A node never uses heartbeat and guarding at the same time: a node whose producer heartbeat time (0x1017) is
-nonzero ignores guarding requests.
+A node ignores guarding requests while its producer heartbeat time (0x1017) is not 0.
 """
 
 from __future__ import annotations
@@ -24,11 +23,11 @@ from skinnode.node.services import NodeServices
 Handler = Callable[[bytes, int], None]
 
 _RIVAL_BEATS: Final = 3
-"""Number of heartbeat periods without a frame from a node with the same node-ID after which the conflict is
-considered resolved. The number allows for a lost heartbeat of the other node."""
+"""Duration of silence after which a node-ID conflict is considered resolved, in heartbeat periods. The other
+node may lose a heartbeat without ending the conflict."""
 _RIVAL_NS: Final = 750_000_000
-"""Time (ns) without a frame from a node with the same node-ID after which the conflict is considered
-resolved, if this node sends no heartbeats. This time equals three default heartbeat periods.
+"""Duration of silence after which a node-ID conflict is considered resolved if this node sends no heartbeats,
+ns; three default heartbeat periods.
 """
 
 
@@ -37,8 +36,8 @@ class ErrorControl:
 
     Args:
         services: resources that all services of the node share.
-        listen: called when the handlers returned by :meth:`handlers` have changed.
-        failed: called with the time (ns) of each heartbeat event or life guarding event.
+        listen: callback for a change of :meth:`handlers`.
+        failed: callback for a heartbeat event or life guarding event, given its time in ns.
     """
 
     def __init__(
@@ -47,14 +46,16 @@ class ErrorControl:
         listen: Callable[[], None],
         failed: Callable[[int], None],
     ) -> None:
-        self._cob_id = 0  # heartbeat COB-ID; 0 until the node has a node-ID
+        self._cob_id = 0  # COB-ID of heartbeats; 0 until the node has a node-ID
         store, emcy, now = services.store, services.emcy, services.now
         self._store, self._emcy, self._now = store, emcy, now
         self._rejected, self._send = services.rejected, services.send
         self._listen = listen
-        self._booted_ns: int | None = None  # time of boot-up; None after the boot-up message has been sent
+        self._booted_ns: int | None = None  # time of boot-up until the boot-up message is sent, then None
         self._producer = HeartbeatProducer()
-        self._rival_until_ns = NO_DEADLINE_NS  # end of a node-ID conflict if the other node stays silent
+        self._rival_until_ns = (
+            NO_DEADLINE_NS  # time at which a node-ID conflict ends unless the other node sends again
+        )
         self._guarding = Guarding(store, emcy, failed)
         self._consumer = HeartbeatConsumer(store, emcy, failed)
         store.watch(od.HEARTBEAT_PRODUCER, lambda _: self._on_period())
@@ -64,17 +65,17 @@ class ErrorControl:
 
     @property
     def deadline_ns(self) -> int:
-        """Time (ns) at which :meth:`on_timer` must be called next."""
+        """Time at which :meth:`on_timer` must be called next, ns."""
         boot_up_ns = NO_DEADLINE_NS if self._booted_ns is None else self._booted_ns
         return min(boot_up_ns, self._producer.deadline_ns, self.silent_from_ns, self._rival_until_ns)
 
     @property
     def silent_from_ns(self) -> int:
-        """Time (ns) from which a monitored node or the guarding master is reported as silent."""
+        """Time from which :meth:`on_timer` reports a missed heartbeat or guarding request, ns."""
         return min(self._guarding.deadline_ns, self._consumer.deadline_ns)
 
     def handlers(self) -> dict[int, Handler]:
-        """Return the handlers for received data frames, keyed by COB-ID."""
+        """Return the handlers for data frames, by COB-ID."""
         handlers: dict[int, Handler] = {
             od.heartbeat_cob_id(node_id): functools.partial(self._on_heartbeat, node_id)
             for node_id in self._consumer.node_ids
@@ -83,10 +84,10 @@ class ErrorControl:
         return handlers
 
     def reset(self, node_id: int) -> None:
-        """Reset all error control services, as if no guarding request or heartbeat had been received.
+        """Reset all error control services, and forget all received heartbeats and guarding requests.
 
         Args:
-            node_id: the new node-ID.
+            node_id: node-ID of this node.
         """
         self._cob_id = od.heartbeat_cob_id(node_id)
         self._rival_until_ns = NO_DEADLINE_NS
@@ -94,14 +95,14 @@ class ErrorControl:
         self._consumer.reset()
 
     def boot_up(self, t_ns: int) -> None:
-        """Send the boot-up message as soon as the bus accepts it, and schedule the heartbeats."""
+        """Schedule the heartbeats, and send the boot-up message as soon as the bus accepts it."""
         self._producer.boot_up(self._store.integer(od.HEARTBEAT_PRODUCER), t_ns)
         self._booted_ns = t_ns
         with contextlib.suppress(BusError):
             self._send_boot_up()
 
     def on_request(self, state: NmtState, t_ns: int) -> None:
-        """Answer a guarding request, which is a remote frame, unless the node sends heartbeats."""
+        """Answer a guarding request (a remote frame), unless the node sends heartbeats."""
         if not self._producer.period_ns:
             self._send(self._cob_id, self._guarding.answer(state, t_ns))
 
@@ -122,10 +123,10 @@ class ErrorControl:
             self._booted_ns = None
 
     def _on_own(self, _: bytes, t_ns: int) -> None:
-        """Report once that another node has this node-ID.
+        """Report that another node has the same node-ID.
 
-        The error ends after three heartbeat periods without frames from the other node. Every frame from the
-        other node increments a counter of rejected frames.
+        Every frame of the other node is counted as rejected. The error ends when the other node has been
+        silent for three heartbeat periods.
         """
         self._rival_until_ns = t_ns + (_RIVAL_BEATS * self._producer.period_ns or _RIVAL_NS)
         self._rejected.count(Rejected.OWN_ERROR_CONTROL)

@@ -1,4 +1,4 @@
-"""Node guarding and life guarding: CiA 301 v4.2, 7.2.8.3.2.1 (objects 0x100C and 0x100D)."""
+"""Node guarding and life guarding (CiA 301 v4.2, 7.2.8.3.2.1), with the objects 0x100C and 0x100D."""
 
 from __future__ import annotations
 
@@ -13,20 +13,20 @@ from skinnode.node.object_dictionary import ObjectStore
 
 
 class Guarding:
-    """Guarding slave, which answers the master's guarding requests and reports when the requests stop.
+    """Guarding slave: answers guarding requests, and reports a life guarding event when they stop.
 
     Args:
         store: object dictionary.
-        emcy: emergency producer, which reports life guarding events.
-        failed: called with the time (ns) of a life guarding event, after the emergency message.
+        emcy: EMCY producer of the node.
+        failed: callback for a life guarding event, given its time in ns.
     """
 
     def __init__(self, store: ObjectStore, emcy: EmcyProducer, failed: Callable[[int], None]) -> None:
         self._store, self._emcy, self._failed = store, emcy, failed
         self._toggle = 0
-        self._guarded = False  # true after the first guarding request
+        self._guarded = False  # whether a guarding request has been received
         self.deadline_ns = NO_DEADLINE_NS
-        """Time (ns) at which the node life time expires."""
+        """Time at which the node life time expires, ns."""
 
     def reset(self) -> None:
         """Reset the toggle bit and end guarding, as CiA 301 requires for *reset communication*."""
@@ -39,7 +39,7 @@ class Guarding:
 
         Args:
             state: NMT state of the node.
-            t_ns: time at which the request was received, ns.
+            t_ns: arrival time of the request, ns.
         """
         answer = bytes((state | self._toggle,))
         self._toggle ^= GUARD_TOGGLE
@@ -50,20 +50,19 @@ class Guarding:
     def on_written(self, t_ns: int) -> None:
         """Apply a new guard time or life time factor.
 
-        The node life time restarts if guarding is active. A new node life time of 0 ends a life guarding
-        error.
+        While guarding is active, the node life time restarts. A node life time of 0 ends the error.
         """
         if self._guarded or not self._life_ns:
             self._start(t_ns)
 
     def end(self, t_ns: int) -> None:
-        """End guarding, because heartbeats replace guarding. The next guarding request restarts guarding."""
+        """End guarding, because the node now sends heartbeats instead."""
         self._guarded = False
         self.deadline_ns = NO_DEADLINE_NS
         self._emcy.clear(EmcyCode.HEARTBEAT, t_ns)
 
     def on_timer(self, t_ns: int) -> None:
-        """Report a life guarding event if the node life time has expired and was not yet reported."""
+        """Report a life guarding event if the node life time has expired."""
         if t_ns >= self.deadline_ns:
             self._guarded = False
             self.deadline_ns = NO_DEADLINE_NS

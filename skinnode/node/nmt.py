@@ -1,4 +1,4 @@
-"""NMT slave, which controls a node's NMT state (CiA 301 v4.2, 7.2.8 and 7.3.2)."""
+"""NMT slave (CiA 301 v4.2, 7.2.8 and 7.3.2)."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ class NmtSlave:
     """NMT state machine of a node.
 
     Args:
-        store: object dictionary, which contains the error behaviour (0x1029).
+        store: object dictionary.
         rejected: counters of rejected frames.
-        entered: called after each change of state, with the new state, the previous state and the time in ns.
+        entered: callback for a change of state, given the new state, the previous state and the time in ns.
     """
 
     def __init__(
@@ -30,7 +30,7 @@ class NmtSlave:
         """Current NMT state."""
 
     def command(self, data: bytes, node_id: int) -> NmtCommand | None:
-        """Return the NMT command in a frame; None if the frame is malformed or addresses another node.
+        """Return the NMT command in a frame, or None if it is malformed or addresses another node.
 
         Args:
             data: payload of the frame.
@@ -43,20 +43,20 @@ class NmtSlave:
             return None
 
     def obey(self, command: NmtCommand, t_ns: int) -> None:
-        """Enter the NMT state requested by a command other than a reset."""
+        """Enter the state that a command requests. Resets are not handled here."""
         self.enter(AFTER_COMMAND[command], t_ns)
 
     def enter(self, state: NmtState, t_ns: int) -> None:
-        """Enter an NMT state, unless the node is already in that state."""
+        """Enter an NMT state, unless it is the current state."""
         if state is not self.state:
             before, self.state = self.state, state
             self._entered(state, before, t_ns)
 
     def on_communication_error(self, t_ns: int) -> None:
-        """Apply the error behaviour (0x1029) after a missed heartbeat, a life guarding event or bus-off.
+        """Apply the error behaviour (0x1029) after a heartbeat event, a life guarding event or bus-off.
 
-        If 0x1029:1 is 0, the state changes from OPERATIONAL to PRE-OPERATIONAL. If 0x1029:1 is 1, the state
-        does not change. If 0x1029:1 is 2, the node enters STOPPED.
+        Depending on 0x1029:1, the node leaves OPERATIONAL for PRE-OPERATIONAL (0), keeps its state (1) or
+        enters STOPPED (2).
         """
         behaviour = self._store.integer(od.ERROR_BEHAVIOUR, 1)
         if behaviour == 2:

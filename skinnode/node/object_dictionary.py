@@ -1,12 +1,14 @@
 """Object dictionary of a running node: declarations and current values of the objects.
 
-The declarations are in :mod:`skinnode.protocol.objects`; the EDS files are generated from the same
-declarations. Each value is stored as the little-endian bytes that SDO and PDO frames contain.
+The objects of a patch are declared in :mod:`skinnode.protocol.objects`, from which the EDS files are also
+generated. Values are stored as little-endian bytes, as they are sent in SDOs and PDOs.
 
-Services can register functions for an object. :meth:`ObjectStore.bind` registers a function that computes the
-value, :meth:`ObjectStore.guard` registers a check before each write, and :meth:`ObjectStore.watch` registers
-a callback after each write. With :meth:`ObjectStore.bind_domain`, the value of a DOMAIN is stored outside the
-object dictionary. A refused write does not change the object.
+The services of a node register callbacks for their objects:
+
+- :meth:`ObjectStore.bind`: computes the value when it is read
+- :meth:`ObjectStore.guard`: checks a value before it is written
+- :meth:`ObjectStore.watch`: reacts to a write
+- :meth:`ObjectStore.bind_domain`: reads and writes a DOMAIN that is stored elsewhere
 """
 
 from __future__ import annotations
@@ -19,23 +21,23 @@ from skinnode.canopen.abort import AbortCode, Refused
 from skinnode.canopen.dictionary import DataType, Entry, Object, Value
 
 MAX_BYTES: Final = 1 << 16
-"""Maximum length, in bytes, of a value with a variable-length data type."""
+"""Maximum length of a value with a variable-length data type, bytes."""
 
 Reader = Callable[[int], bytes]
-"""Callback that computes and returns the value of a sub-index as bytes, or raises Refused."""
+"""Callback that returns the bytes of a sub-index, or raises Refused."""
 Guard = Callable[[int, int], None]
-"""Callback that checks a new value and raises Refused to reject the value. Its arguments are the sub-index
-and the value; a REAL32 value is passed as its bit pattern."""
+"""Callback that checks a new value, and raises Refused to reject it. Its arguments are the sub-index and the
+value as an unsigned integer; a REAL32 is passed as its bit pattern."""
 Watcher = Callable[[int], None]
-"""Callback invoked after a client's write; the argument is the sub-index."""
+"""Callback for a write by a client. Its argument is the sub-index."""
 ChangeWatcher = Callable[[int, int], None]
-"""Callback invoked after a client has changed a parameter; the arguments are the index and sub-index."""
+"""Callback for a parameter that a client has changed. Its arguments are the index and sub-index."""
 DomainWriter = Callable[[bytes], None]
-"""Callback that stores a complete value, or raises Refused and stores nothing."""
+"""Callback that stores a complete value, or raises Refused without storing anything."""
 
 
 class Lengths(NamedTuple):
-    """Permitted length, in bytes, of the data written to an object by a client."""
+    """Range of lengths that a client may write to an object."""
 
     least: int
     """Minimum length, bytes."""
@@ -43,35 +45,35 @@ class Lengths(NamedTuple):
     """Maximum length, bytes."""
 
     def check(self, length: int) -> None:
-        """Check the length of a complete value written by a client.
+        """Check the length of a complete value.
 
         Raises:
-            Refused: if the object does not accept a value of that length.
+            Refused: if the length is out of range.
         """
         self.check_not_above(length)
         if length < self.least:
             raise Refused(AbortCode.TOO_SHORT)
 
     def check_not_above(self, length: int) -> None:
-        """Check that the part of a value received so far does not exceed the maximum length.
+        """Check the length of a value of which more may follow.
 
         Raises:
-            Refused: if the part of the value exceeds the maximum length.
+            Refused: if the length exceeds the maximum.
         """
         if length > self.most:
             raise Refused(AbortCode.TOO_LONG if self.most == self.least else AbortCode.OUT_OF_MEMORY)
 
 
 def to_bytes(entry: Entry, value: Value | bytes) -> bytes:
-    """Return the bytes of a value as sent on the bus.
+    """Convert a value to the bytes that are sent on the bus.
 
     Args:
         entry: declaration of the object.
-        value: value to convert; bytes are returned unchanged.
+        value: value; bytes are returned unchanged.
 
     Raises:
-        OverflowError: if the value is out of range for the integer type.
-        struct.error: if the value cannot be packed as REAL32.
+        OverflowError: if the value does not fit into the integer type.
+        struct.error: if the value is not a number but the data type is REAL32.
     """
     if isinstance(value, bytes):
         return value
@@ -83,11 +85,10 @@ def to_bytes(entry: Entry, value: Value | bytes) -> bytes:
 
 
 class ObjectStore:
-    """Object dictionary of one node: the declarations and current values of all objects.
+    """Object dictionary of one node.
 
-    The methods ``read`` and ``write`` provide access for clients and may raise
-    :class:`~skinnode.canopen.abort.Refused`. The methods ``raw``, ``integer`` and ``put`` provide access for
-    the node itself and require that the object exists.
+    Clients use :meth:`read` and :meth:`write`, which may raise :class:`~skinnode.canopen.abort.Refused`. The
+    node itself uses :meth:`raw`, :meth:`integer` and :meth:`put`, which require that the object exists.
 
     Args:
         objects: declarations of all objects.
@@ -111,12 +112,12 @@ class ObjectStore:
         return bytes(entry.data_type.bits // 8) if value is None else to_bytes(entry, value)
 
     def bind(self, index: int, reader: Reader, *, count: bool = False) -> None:
-        """Register a function that computes the values of an object when they are read.
+        """Register ``reader`` to compute the values of an object.
 
         Args:
             index: index of the object.
-            reader: returns the value of a sub-index.
-            count: whether the function also computes sub-index 0 of an array or record.
+            reader: returns the bytes of a sub-index.
+            count: whether ``reader`` also computes sub-index 0 of an array or record.
         """
         whole = count or (index, 1) not in self._entries
         for key in self._entries:
@@ -124,7 +125,7 @@ class ObjectStore:
                 self._readers[key] = reader
 
     def bind_domain(self, index: int, length: int, reader: Reader, writer: DomainWriter) -> None:
-        """Register functions that read and write a DOMAIN stored outside the object dictionary.
+        """Register functions that read and write a DOMAIN.
 
         Args:
             index: index of the object.
@@ -136,22 +137,22 @@ class ObjectStore:
         self._domains[index] = Lengths(length, length), writer
 
     def guard(self, index: int, guard: Guard) -> None:
-        """Register ``guard`` to check each new value of ``index`` before a client's write takes effect."""
+        """Register ``guard`` to check each value that a client writes to ``index``, before it is stored."""
         self._guards[index] = guard
 
     def watch(self, index: int, watcher: Watcher) -> None:
-        """Register ``watcher`` to be called after each write to ``index``."""
+        """Register ``watcher`` to be called after each write to ``index`` by a client."""
         self._watchers[index] = watcher
 
     def watch_changes(self, watcher: ChangeWatcher) -> None:
-        """Register ``watcher`` to be called after a client has changed an object that is not computed."""
+        """Register ``watcher`` to be called when a client has changed an object that is not computed."""
         self._change_watcher = watcher
 
     def find(self, index: int, subindex: int) -> Entry:
         """Return the declaration of an object.
 
         Raises:
-            Refused: if the object or sub-object does not exist.
+            Refused: if the index or sub-index does not exist.
         """
         entry = self._entries.get((index, subindex))
         if entry is None:
@@ -163,7 +164,7 @@ class ObjectStore:
         return (index, subindex) in self._entries
 
     def lengths(self, index: int, subindex: int) -> Lengths:
-        """Return the permitted length of a value written to an object by a client.
+        """Return the range of lengths that a client may write to an object.
 
         Raises:
             Refused: if the object does not exist or is read-only.
@@ -187,10 +188,10 @@ class ObjectStore:
         return self.raw(index, subindex)
 
     def write(self, index: int, subindex: int, data: bytes) -> None:
-        """Write an object for a client: check the value, store the value, call the object's watcher.
+        """Write an object for a client: check and store the value, then call the watcher.
 
         Raises:
-            Refused: if the value is not allowed; the old value is then preserved.
+            Refused: if the object cannot be written or does not accept the value.
         """
         self.lengths(index, subindex).check(len(data))
         if index in self._domains:
@@ -216,31 +217,31 @@ class ObjectStore:
             guard(subindex, value)
 
     def raw(self, index: int, subindex: int) -> bytes:
-        """Return the current bytes of a stored or computed object."""
+        """Return the current bytes of an object, stored or computed."""
         reader = self._readers.get((index, subindex))
         return self._values[index, subindex] if reader is None else reader(subindex)
 
     def written(self, index: int, subindex: int) -> bytes:
-        """Return the bytes last written by a client, even if a read would return a computed value."""
+        """Return the stored bytes of an object, even if reads return a computed value."""
         return self._values[index, subindex]
 
     def integer(self, index: int, subindex: int = 0) -> int:
-        """Return the value of an unsigned integer object that is not computed."""
+        """Return the stored value of an unsigned integer object."""
         return int.from_bytes(self._values[index, subindex], "little")
 
     def put(self, index: int, subindex: int, value: Value | bytes) -> None:
-        """Set an object for the node itself, without calling the object's guard or watcher."""
+        """Set an object without calling its guard or watcher."""
         self._values[index, subindex] = to_bytes(self._entries[index, subindex], value)
 
     def restore(self, first: int, last: int) -> None:
-        """Reset the writable objects from index ``first`` to index ``last`` to their defaults."""
+        """Reset the writable objects from ``first`` to ``last`` to their defaults."""
         for key in self._writable(first, last):
             self._values[key] = self._at_start(self._entries[key])
 
     def not_at_default(self, first: int, last: int) -> dict[tuple[int, int], bytes]:
-        """Return the parameters from index ``first`` to ``last`` that differ from their defaults.
+        """Return the values from ``first`` to ``last`` that differ from their defaults.
 
-        Computed objects are not parameters and are therefore excluded.
+        Only writable objects that are not computed are included.
         """
         return {
             key: self._values[key]
@@ -256,8 +257,7 @@ class ObjectStore:
     def renumber(self, node_id: int) -> None:
         """Change the node-ID.
 
-        The new node-ID changes read-only COB-IDs immediately, and writable COB-IDs at the next
-        :meth:`restore`.
+        Read-only COB-IDs change immediately. Writable COB-IDs change at the next :meth:`restore`.
         """
         self.node_id = node_id
         for key, entry in self._entries.items():

@@ -1,4 +1,4 @@
-"""Counters of rejected frames (0x2040), for which the standard defines no response."""
+"""Counters of rejected frames (0x2040). The standards define no response to these frames."""
 
 from __future__ import annotations
 
@@ -12,26 +12,26 @@ _MOST: Final = 0xFFFF_FFFF
 
 
 class Rejected(IntEnum):
-    """Reason for rejecting a frame; the value is the sub-index of object 0x2040."""
+    """Type of rejected frame. The value is the sub-index of its counter in 0x2040."""
 
     NMT = 1
-    """NMT frame whose length is not two bytes, or which addresses this node with an unknown command."""
+    """NMT frame that is not two bytes long, or that sends this node an unknown command."""
     SYNC = 2
-    """SYNC message with a length other than that required by 0x1019."""
+    """SYNC whose length does not match 0x1019."""
     TIME = 3
-    """TIME message whose length is not six bytes, or whose time of day is invalid."""
+    """TIME message that is not six bytes long or contains an invalid time of day."""
     HEARTBEAT = 4
-    """Heartbeat from a monitored node with a length other than one byte."""
+    """Heartbeat of a monitored node that is not one byte long."""
     SDO = 5
-    """SDO request with a length other than eight bytes."""
+    """SDO request that is not eight bytes long."""
     RPDO = 6
-    """RPDO that is shorter than the total length of its mapped objects."""
+    """RPDO that is shorter than its mapped objects."""
     OWN_ERROR_CONTROL = 7
-    """Boot-up message or heartbeat that another node sends with this node's node-ID."""
+    """Boot-up message or heartbeat of another node with the same node-ID."""
 
 
 class RejectedFrames:
-    """Counters of rejected frames (0x2040), which saturate at their maximum and are cleared by *reset node*.
+    """Counters of rejected frames (0x2040). They stop at their maximum; *reset node* clears them.
 
     Args:
         store: object dictionary.
@@ -42,11 +42,11 @@ class RejectedFrames:
         store.bind(od.REJECTED_FRAMES, lambda sub: self._counts[Rejected(sub)].to_bytes(4, "little"))
 
     def count(self, kind: Rejected) -> None:
-        """Count one rejected frame."""
+        """Count a rejected frame."""
         self._counts[kind] = min(self._counts[kind] + 1, _MOST)
 
     def counted(self, kind: Rejected) -> int:
-        """Return the number of frames rejected for a given reason."""
+        """Return the number of rejected frames of one type."""
         return self._counts[kind]
 
     def reset(self) -> None:

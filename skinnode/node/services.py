@@ -1,4 +1,4 @@
-"""Resources shared by a node's communication services."""
+"""Resources shared by the communication services of a node."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from skinnode.node.object_dictionary import ObjectStore
 from skinnode.node.rejected import RejectedFrames
 
 Send = Callable[[int, bytes], None]
-"""Callback that sends a frame; the arguments are the COB-ID and the payload."""
+"""Callback that sends a frame, given its COB-ID and payload."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -21,10 +21,10 @@ class NodeServices:
     store: ObjectStore
     """Object dictionary."""
     emcy: EmcyProducer
-    """Emergency producer."""
+    """EMCY producer."""
     rejected: RejectedFrames
     """Counters of rejected frames (0x2040)."""
     send: Send
     """Function that sends a frame."""
     now: Clock
-    """Function that returns the time (ns) of the event being handled."""
+    """Function that returns the time of the event being handled, ns."""

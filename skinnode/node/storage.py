@@ -1,8 +1,8 @@
-"""Saves and restores parameters: objects 0x1010 (store), 0x1011 (restore defaults) and 0x1020 (verify).
+"""Storage of the parameters, the baseline and the LSS configuration of a node.
 
-The objects are defined in CiA 301 v4.2. This module also saves the baseline and the LSS configuration of a
-node. A *parameter* is an object that a client can write and read back; commands and computed objects are not
-parameters.
+This module implements the objects 0x1010 (store parameters), 0x1011 (restore default parameters) and 0x1020
+(verify configuration) of CiA 301 v4.2. A *parameter* is an object that a client can write and read back.
+Commands and computed objects are not parameters.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ APPLICATION: Final = 0x2000, 0x9FFF
 EVERYTHING: Final = 0x1000, 0x9FFF
 """First and last index of all parameters."""
 _ALL, _COMMUNICATION_ONLY, _APPLICATION_ONLY = 1, 2, 3
-"""Sub-indices of 0x1010 and 0x1011: all, communication or application parameters."""
+"""Sub-indices of 0x1010 and 0x1011, which select all, communication or application parameters."""
 
 _CAN_ID_MASK: Final = 0x7FF
 
@@ -34,15 +34,15 @@ Rows = tuple[tuple[float, ...], ...]
 
 
 class Storage:
-    """Saves and restores a node's non-volatile values, and implements the store and restore objects.
+    """Saves and restores the non-volatile values of a node.
 
-    If a value cannot be saved or restored, the node sends EMCY 0x6300. The first manufacturer-specific byte
-    of this message is a :class:`~skinnode.node.memory.Fault`.
+    If this fails, the node sends EMCY 0x6300, whose first manufacturer-specific byte is a
+    :class:`~skinnode.node.memory.Fault`.
 
     Args:
         services: resources that all services of the node share.
-        memory: memory of the node; None for a node without a memory. Without a memory, 0x1010 and 0x1011 read
-            as 0 and refuse writes (CiA 301).
+        memory: memory of the node, or None. Without a memory, 0x1010 and 0x1011 read as 0 and refuse writes
+            (CiA 301).
         patch: sizes and layout of the patch; see :class:`~skinnode.node.memory.Kept`.
     """
 
@@ -53,10 +53,10 @@ class Storage:
         self._lasting: dict[Fault, bytes] = {}
         self._kept = Kept(patch)
         self.problem = ""
-        """One-line description of the latest memory problem; empty if no problem has occurred."""
+        """One-line description of the latest memory problem; empty if there has been none."""
         self.baseline_ohm: Callable[[], Rows] = tuple
-        """Function that returns the current baseline R0 in ohms; set by the application."""
-        # The value 1 indicates that the node saves and restores parameters on command.
+        """Function that returns the baseline R0, ohm. Set by the application."""
+        # 1 means that the node saves or restores parameters on command.
         able = int(memory is not None).to_bytes(4, "little")
         for index, signature, command in (
             (od.STORE, od.STORE_SIGNATURE, self._save),
@@ -68,7 +68,7 @@ class Storage:
 
     @property
     def kept(self) -> Kept:
-        """Usable content of the memory."""
+        """Content of the memory, without any content that is unusable."""
         return self._kept
 
     @property
@@ -77,7 +77,7 @@ class Storage:
         return self._memory is not None
 
     def load(self) -> None:
-        """Load the memory's content at power-on. A memory without usable content is treated as empty."""
+        """Load the content of the memory at power-on. Unusable content is treated as empty."""
         patch = self._kept.patch
         self._kept, self._unreported, self._lasting, self.problem = Kept(patch), [], {}, ""
         try:
@@ -94,13 +94,13 @@ class Storage:
             self._kept = kept
 
     def note(self, fault: Fault, index: int = 0, subindex: int = 0, why: str = "") -> None:
-        """Record a fault, which :meth:`report` will report.
+        """Record a fault for :meth:`report`.
 
         Args:
             fault: type of the fault.
-            index: index of a refused parameter.
-            subindex: sub-index of a refused parameter.
-            why: one-line description of the fault; if empty, the refused parameter is reported.
+            index: index of the refused parameter, if any.
+            subindex: sub-index of the refused parameter, if any.
+            why: one-line description; by default, a description of the refused parameter.
         """
         self.problem = why or f"the stored value of 0x{index:04X}:{subindex} is not allowed"
         detail = struct.pack("<BHB", fault, index, subindex)
@@ -110,10 +110,10 @@ class Storage:
             self._lasting[fault] = detail
 
     def report(self, t_ns: int) -> None:
-        """Send emergency messages for the faults recorded since the last call.
+        """Report the recorded faults in emergency messages.
 
-        A fault that affects the whole memory remains active, even across resets, until the memory is reliable
-        again.
+        A refused parameter is reported once. Any other fault stays active, even across resets, until it has
+        been resolved.
         """
         for fault, detail in self._lasting.items():
             self._emcy.report(EmcyCode.DATA_SET, detail, t_ns, fault)
@@ -122,10 +122,10 @@ class Storage:
             self._emcy.report_once(EmcyCode.DATA_SET, detail, t_ns)
 
     def restore(self, first: int, last: int) -> None:
-        """Set the objects from index ``first`` to index ``last`` to their power-on values.
+        """Set the objects from ``first`` to ``last`` to their power-on values.
 
-        A saved value must pass the same checks as a value written by a client. An object without a
-        saved value, or with a saved value that is not allowed, is set to its default.
+        The power-on value is the saved value, or the default if nothing was saved. Saved values pass the same
+        checks as values written by a client; a refused value is replaced by the default.
         """
         self._store.restore(first, last)
         values: dict[Key, bytes] = {}
@@ -138,10 +138,10 @@ class Storage:
         for index, subindex in write_configuration(self._store, values):
             self.note(Fault.REFUSED, index, subindex)
         if self._present(*APPLICATION) != self._kept.application.values:
-            self._clear_verification()  # the restored configuration differs from the verified one
+            self._clear_verification()  # this is not the configuration that was verified
 
     def keep_baseline(self) -> None:
-        """Save only the baseline, if the node has a memory."""
+        """Save the baseline, if the node has a memory."""
         if self._memory is None:
             return
         try:
@@ -150,11 +150,11 @@ class Storage:
             self.note(Fault.NOT_SAVED, why=f"baseline not saved: {error}")
 
     def keep_lss(self, node_id: int, bit_rate_bps: int | None) -> None:
-        """Save the node-ID and bit rate configured by LSS.
+        """Save the LSS configuration.
 
         Args:
             node_id: 1 to 127, or 255 for no node-ID.
-            bit_rate_bps: bit rate, bit/s; None to keep the current bit rate.
+            bit_rate_bps: bit rate, bit/s; None if LSS has not configured one.
 
         Raises:
             OSError: if saving fails.
@@ -168,7 +168,7 @@ class Storage:
         self._settle(Fault.NOT_SAVED)
 
     def _settle(self, *faults: Fault) -> None:
-        """Clear the given memory faults and report that they have ended."""
+        """End the given faults, and report their end."""
         for fault in faults:
             if self._lasting.pop(fault, None) is not None:
                 self._emcy.clear(EmcyCode.DATA_SET, self._now(), fault)
@@ -183,8 +183,8 @@ class Storage:
                 self._keep(command(subindex))
             except OSError:
                 raise Refused(AbortCode.HARDWARE) from None
-            # By giving the command, the user accepts the current parameters, so memory faults are cleared.
-            # Automatic saving of the baseline does not clear memory faults.
+            # With this command, the user accepts the current parameters, so faults of the memory's content
+            # end. Saving the baseline automatically does not end them.
             self._settle(Fault.UNREADABLE, Fault.DAMAGED, Fault.FOREIGN)
 
         return guard
@@ -197,13 +197,12 @@ class Storage:
         if subindex in (_ALL, _APPLICATION_ONLY):
             application_kept = Parameters(node_id, application)
             kept = replace(kept, application=application_kept, baseline_ohm=self.baseline_ohm())
-        # Object 0x1020 identifies a whole configuration, so 0x1020 is saved only if the memory contains the
-        # whole configuration.
+        # 0x1020 identifies a whole configuration, so it is saved only together with one.
         whole = kept.communication.values == communication and kept.application.values == application
         return kept if whole else _unverified(kept)
 
     def _forget(self, subindex: int) -> Kept:
-        """Return the memory's content without the saved parameters; a reset then restores the defaults."""
+        """Return the content of the memory without its saved parameters."""
         kept = _unverified(self._kept)
         if subindex in (_ALL, _COMMUNICATION_ONLY):
             kept = replace(kept, communication=Parameters())
@@ -216,7 +215,7 @@ class Storage:
             self._clear_verification()
 
     def _clear_verification(self) -> None:
-        """Mark the current configuration as not verified."""
+        """Mark the configuration as unverified."""
         for subindex in (od.VERIFY_DATE, od.VERIFY_TIME):
             self._store.put(od.VERIFY_CONFIGURATION, subindex, 0)
 
@@ -225,7 +224,7 @@ class Storage:
         return {key: value for key, value in changed.items() if key not in od.COMMANDS}
 
     def _for_this_node(self, key: Key, value: bytes, node_id: int) -> bytes:
-        """Return the value; change a COB-ID that is the default of ``node_id`` to this node's default."""
+        """Return a saved value; if it is the default COB-ID for ``node_id``, the default for this node."""
         if not self._store.has(*key):
             return value
         entry = self._store.find(*key)

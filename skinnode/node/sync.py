@@ -1,7 +1,4 @@
-"""SYNC consumer and producer: objects 0x1005, 0x1006, 0x1007 and 0x1019.
-
-CiA 301 v4.2, 7.2.5, 7.5.2.5 to 7.5.2.7 and 7.5.2.22.
-"""
+"""SYNC consumer and producer (CiA 301 v4.2, 7.2.5), with the objects 0x1005, 0x1006, 0x1007 and 0x1019."""
 
 from __future__ import annotations
 
@@ -21,14 +18,14 @@ PRODUCER_BIT: Final = 1 << 30
 """Bit in 0x1005 that enables SYNC production."""
 
 SHORTEST_PERIOD_US: Final = 100
-"""Minimum cycle period (0x1006) in µs: twice the duration of a SYNC message at 1 Mbit/s."""
+"""Minimum communication cycle period (0x1006), µs; twice the duration of a SYNC at 1 Mbit/s."""
 
 _DO_NOT_CARE_BIT: Final = 1 << 31
-"""Bit in 0x1005 that clients may set but that has no effect (CiA 301 v4.2, table 44)."""
+"""Bit in 0x1005 that may be set but has no effect (CiA 301 v4.2, table 44)."""
 
 
 class SyncWindow:
-    """Synchronous window (0x1007): time after a SYNC during which synchronous PDOs are valid."""
+    """Synchronous window (0x1007): the time after a SYNC within which synchronous PDOs are valid."""
 
     def __init__(self, store: ObjectStore, emcy: EmcyProducer) -> None:
         self._store, self._emcy = store, emcy
@@ -36,25 +33,25 @@ class SyncWindow:
         self._missed: set[int] = set()
 
     def start(self, t_ns: int) -> None:
-        """Open the synchronous window at ``t_ns``, the time of a SYNC."""
+        """Open the window at a SYNC."""
         self._sync_ns = t_ns
 
     def forget(self, t_ns: int) -> None:
-        """Reset the synchronous window and clear its errors when the NMT state changes."""
+        """Forget the last SYNC and end all errors, because the NMT state has changed."""
         self._sync_ns = None
         for number in tuple(self._missed):
             self._clear(number, t_ns)
 
     def is_open(self, t_ns: int) -> bool:
-        """Return whether synchronous PDOs are valid at ``t_ns``; always true before the first SYNC."""
+        """Return whether synchronous PDOs are valid at ``t_ns``. Before the first SYNC, they always are."""
         length_us = self._store.integer(od.SYNC_WINDOW)
         return not length_us or self._sync_ns is None or t_ns - self._sync_ns <= length_us * 1000
 
     def lets_out(self, number: int, t_ns: int) -> bool:
-        """Return whether a synchronous TPDO may be sent; if not, the caller must discard the TPDO.
+        """Return whether a synchronous TPDO may be sent. If not, the caller must discard it.
 
-        The first time a TPDO is discarded, the node sends an emergency message. The error ends when this TPDO
-        is next sent within the window.
+        A discarded TPDO is reported in an emergency message. The error ends when the same TPDO is sent within
+        the window again.
 
         Args:
             number: number of the TPDO, counted from 0.
@@ -74,10 +71,10 @@ class SyncWindow:
 
 
 class Sync:
-    """Consumer of SYNC messages and, if 0x1005 enables production, also their producer.
+    """SYNC consumer and, if 0x1005 enables it, SYNC producer.
 
-    A SYNC producer also consumes its own SYNC messages: the caller must treat a SYNC returned by
-    :meth:`on_timer` like a SYNC accepted by :meth:`accept`.
+    A SYNC producer also consumes its own SYNCs. The caller must handle a SYNC returned by :meth:`on_timer`
+    like one accepted by :meth:`accept`.
 
     Args:
         services: resources that all services of the node share.
@@ -88,15 +85,15 @@ class Sync:
         self._store, self._emcy, self._rejected = store, services.emcy, services.rejected
         self._send, self._now = services.send, services.now
         self.window = SyncWindow(store, services.emcy)
-        """The synchronous window."""
+        """Synchronous window."""
         self._communicates = False
         self._counter = 0  # counter of the last SYNC sent
         self._period_ns = 0
-        self._wrong_length: int | None = None  # incorrect length of the last SYNC received; None if correct
+        self._wrong_length: int | None = None  # length of the last SYNC received; None if correct
         self.cob_id = od.SYNC_COB_ID
-        """COB-ID of SYNC messages."""
+        """COB-ID of the SYNC."""
         self.deadline_ns = NO_DEADLINE_NS
-        """Time (ns) at which the next SYNC must be sent."""
+        """Time at which the next SYNC must be sent, ns."""
         store.guard(od.COB_ID_SYNC, self._guard_cob_id)
         store.guard(od.CYCLE_PERIOD, _guard_period)
         store.guard(od.SYNC_COUNTER_OVERFLOW, self._guard_overflow)
@@ -112,7 +109,8 @@ class Sync:
     def reload(self) -> None:
         """Apply 0x1005 and 0x1006 after a write or a reset.
 
-        A SYNC producer sends its next SYNC one period later. The SYNC counter starts at 1.
+        A SYNC producer sends its next SYNC one period later. When production starts, the SYNC counter starts
+        at 1.
         """
         self.cob_id = self._store.integer(od.COB_ID_SYNC) & COB_ID_MASK
         self._start()
@@ -120,8 +118,8 @@ class Sync:
     def enter(self, *, communicates: bool) -> None:
         """Handle a change of the NMT state.
 
-        SYNC is produced and consumed in PRE-OPERATIONAL and OPERATIONAL. The SYNC counter restarts at 1 when
-        the node enters these states from another NMT state.
+        SYNCs are produced and consumed in PRE-OPERATIONAL and OPERATIONAL. When the node enters one of these
+        states from any other state, the SYNC counter restarts at 1.
         """
         if communicates != self._communicates:
             self._communicates, self._wrong_length, self._period_ns = communicates, None, 0
@@ -135,9 +133,9 @@ class Sync:
         self.deadline_ns = self._now() + self._period_ns if runs else NO_DEADLINE_NS
 
     def on_timer(self, t_ns: int) -> bytes | None:
-        """If a SYNC is due, send the SYNC and return its payload; otherwise, return None.
+        """Send a SYNC and return its payload, or return None if no SYNC is due.
 
-        After a delay of several periods, the missed SYNCs are skipped and the schedule stays the same.
+        SYNCs that are overdue by a whole period are skipped. The phase of the schedule does not change.
         """
         if t_ns < self.deadline_ns:
             return None
@@ -150,13 +148,13 @@ class Sync:
         return message
 
     def accept(self, message: bytes, t_ns: int) -> bool:
-        """Return whether a SYNC message has the length that 0x1019 requires.
+        """Return whether the length of a received SYNC matches 0x1019.
 
-        Successive SYNC messages with the same incorrect length cause only one emergency message.
+        A wrong length is reported in an emergency message, and again only if the length changes.
 
         Args:
-            message: payload of the SYNC message.
-            t_ns: time of reception, ns.
+            message: payload of the SYNC.
+            t_ns: arrival time, ns.
         """
         counted = self._overflow > 0
         if len(message) == counted:

@@ -1,8 +1,8 @@
-"""TIME consumer, which receives the time of day (CiA 301 v4.2, 7.2.6 and object 0x1012).
+"""TIME consumer (CiA 301 v4.2, 7.2.6), with the object 0x1012.
 
-A node has no real-time clock. Instead, the node stores the last time of day received, together with the time
-of reception on its own clock. From these two times, the node computes the current time of day (0x2022), and a
-host can convert the device time of a scan to a date.
+A node has no real-time clock. It stores the last time of day received and the time at which it arrived on the
+node's own clock, and computes the current time of day (0x2022) from both. A host can use 0x2022 to convert
+the device times of scans to dates.
 """
 
 from __future__ import annotations
@@ -26,16 +26,16 @@ _MS_MASK: Final = (1 << 28) - 1
 
 
 class TimeConsumer:
-    """Receives TIME messages and provides the time of day in object 0x2022.
+    """TIME consumer of a node. The object 0x2022 contains the current time of day.
 
     Args:
         store: object dictionary.
-        now: returns the time of the event being handled, ns.
+        now: function that returns the time of the event being handled, ns.
     """
 
     def __init__(self, store: ObjectStore, now: Clock) -> None:
         self._store, self._now = store, now
-        # Last time of day received, in ms since 1984-01-01, and its time of reception on the node's clock.
+        # last time of day received, in ms since 1984-01-01, and its arrival time on the node's clock
         self._received_ms = 0
         self._received_ns = 0
         self._messages = 0
@@ -44,7 +44,7 @@ class TimeConsumer:
 
     @property
     def cob_id(self) -> int | None:
-        """COB-ID of TIME messages; None if the node ignores TIME messages."""
+        """COB-ID of TIME, or None if the node does not consume TIME."""
         word = self._store.integer(od.COB_ID_TIME)
         return word & COB_ID_MASK if word & _CONSUMES else None
 
@@ -53,10 +53,10 @@ class TimeConsumer:
 
         Args:
             data: payload of the frame.
-            t_ns: time of reception, ns.
+            t_ns: arrival time, ns.
 
         Returns:
-            Whether the payload is a valid time of day. An invalid payload does not change the stored time.
+            Whether the payload is a valid time of day. An invalid payload is ignored.
         """
         if len(data) != _FORMAT.size:
             return False
@@ -69,11 +69,11 @@ class TimeConsumer:
         return True
 
     def reset(self) -> None:
-        """Discard the received time of day, as required after power-on and *reset node*."""
+        """Discard the time of day after power-on and *reset node*."""
         self._received_ms = self._received_ns = self._messages = 0
 
     def _read(self, subindex: int) -> bytes:
-        """Return a sub-object of 0x2022; 0 before the first TIME message."""
+        """Return the value of a sub-index of 0x2022; 0 before the first TIME message."""
         passed_ms = (self._now() - self._received_ns) // 1_000_000 if self._messages else 0
         days, ms = divmod(self._received_ms + passed_ms, _DAY_MS)
         match subindex:
@@ -87,11 +87,11 @@ class TimeConsumer:
                 return (self._received_ns // 1000 & 0xFFFF_FFFF).to_bytes(4, "little")
 
     def _guard(self, _: int, value: int) -> None:
-        """Refuse a COB-ID that enables TIME production, or a change while the node consumes TIME."""
+        """Refuse to produce TIME, or to change the CAN-ID while the node consumes TIME."""
         current = self._store.integer(od.COB_ID_TIME)
         if value & _PRODUCES:
             raise Refused(AbortCode.INVALID_VALUE)
-        # In 0x1012, bit 31 means "in use"; in other COB-IDs, bit 31 means "invalid". Restricted CAN-IDs are
-        # never allowed.
+        # Bit 31 means "in use" in 0x1012 but "invalid" in other COB-IDs. Restricted CAN-IDs are refused even
+        # if TIME is not in use.
         check_cob_id(value ^ _CONSUMES, current ^ _CONSUMES)
         check_cob_id(value & ~_CONSUMES, INVALID_BIT)

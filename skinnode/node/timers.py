@@ -1,4 +1,4 @@
-"""Collection of timers with one timer per key."""
+"""Timers of a service, one per key."""
 
 from __future__ import annotations
 
@@ -9,26 +9,26 @@ from skinnode.node.clock import NO_DEADLINE_NS
 
 
 class Timers:
-    """Heap of timers with one timer per key. Operations take amortised O(log n) time."""
+    """Set of timers, one per key. Operations take amortised O(log n) time."""
 
     def __init__(self) -> None:
         self._due: dict[int, int] = {}
-        self._heap: list[tuple[int, int]] = []  # may contain stale entries of changed or cancelled timers
+        self._heap: list[tuple[int, int]] = []  # may contain entries of timers that were changed or cancelled
 
     @property
     def deadline_ns(self) -> int:
-        """Time (ns) of the earliest timer; NO_DEADLINE_NS if no timer is set."""
+        """Time at which the earliest timer is due, ns; NO_DEADLINE_NS if no timer is set."""
         heap, due = self._heap, self._due
         while heap and due.get(heap[0][1]) != heap[0][0]:
             heapq.heappop(heap)
         return heap[0][0] if heap else NO_DEADLINE_NS
 
     def set(self, key: int, t_ns: int) -> None:
-        """Set or replace the timer of a key.
+        """Set, change or cancel a timer.
 
         Args:
-            key: number that identifies the timer.
-            t_ns: time at which the timer is due, ns; NO_DEADLINE_NS cancels the timer.
+            key: number of the timer.
+            t_ns: time at which the timer is due, ns; NO_DEADLINE_NS to cancel it.
         """
         if t_ns == NO_DEADLINE_NS:
             self._due.pop(key, None)
@@ -47,8 +47,8 @@ class Timers:
     def take(self, t_ns: int) -> Iterator[int]:
         """Yield the keys of the timers that are due at ``t_ns``, earliest first.
 
-        A timer is removed when its key is yielded, so an exception in the caller's loop does not affect the
-        other timers. If the caller sets a timer to a time no later than ``t_ns``, the key is yielded again.
+        Each timer is removed just before its key is yielded, so the remaining timers survive an exception in
+        the caller's loop. If the caller sets a timer to ``t_ns`` or earlier, its key is yielded again.
         """
         while self.deadline_ns <= t_ns:
             _, key = heapq.heappop(self._heap)

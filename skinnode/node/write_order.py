@@ -1,4 +1,4 @@
-"""Restores a saved configuration by writing its values in an order that CiA 301 permits."""
+"""Restores a saved configuration in an order that CiA 301 permits."""
 
 from __future__ import annotations
 
@@ -14,33 +14,31 @@ Key = tuple[int, int]
 
 _PDO_END: Final = 0x1C00
 _LATE: Final = (od.CYCLE_PERIOD, od.COB_ID_SYNC, od.VERIFY_CONFIGURATION)
-"""Indices of the objects that must be written last, in writing order.
+"""Objects that must be written last, in this order.
 
-The cycle period is written after the SYNC counter overflow, which cannot be changed while a cycle period is
-set. The COB-ID of SYNC is written after the cycle period, because this write starts the SYNC producer. Object
-0x1020 is written last, because any other write clears 0x1020.
+A cycle period locks the SYNC counter overflow. The COB-ID of SYNC starts the SYNC producer, which needs the
+cycle period. Any write clears 0x1020.
 """
 
 
 def write_configuration(store: ObjectStore, values: Mapping[Key, bytes]) -> list[Key]:
-    """Write the values of a saved configuration to an object dictionary that contains the defaults.
+    """Write a saved configuration to an object dictionary that contains the defaults.
 
-    Each PDO is disabled while its mapping and communication parameters are written. EMCY is disabled before
-    its COB-ID changes.
+    PDOs are disabled while their parameters are written, and EMCY is disabled before its COB-ID is written.
 
     Args:
-        store: object dictionary whose objects have their defaults.
+        store: object dictionary.
         values: saved bytes, by index and sub-index.
 
     Returns:
-        Index and sub-index of each refused value. An object with a refused value keeps its default. If a
-        mapping entry is refused, the whole mapping keeps its default.
+        Objects that refused their values and keep their defaults. A mapping with a refused entry keeps its
+        default as a whole.
     """
     known = {key: value for key, value in values.items() if store.has(*key)}
     refused = [key for key in values if key not in known]
     pdos = {index & ~od.PDO_MAPPING_OFFSET for index, _ in known if od.RPDO1_PARAMETER <= index < _PDO_END}
     defaults = {pdo: store.raw(pdo, od.PDO_COB_ID) for pdo in sorted(pdos)}
-    # All PDOs are disabled first, because a saved COB-ID may equal another PDO's default COB-ID.
+    # Disable all PDOs first, because a saved COB-ID may be the default COB-ID of another PDO.
     for pdo, default in defaults.items():
         _accepted(store, [((pdo, od.PDO_COB_ID), _switched_off(default))])
     for pdo, default in defaults.items():
@@ -57,10 +55,9 @@ def write_configuration(store: ObjectStore, values: Mapping[Key, bytes]) -> list
 
 
 def _write_pdo(store: ObjectStore, values: Mapping[Key, bytes], pdo: int, default: bytes) -> Iterator[Key]:
-    """Write both records of a PDO, and yield the index and sub-index of each refused value.
+    """Write both records of a PDO, and yield the objects that refused their values.
 
-    The argument ``pdo`` is the index of the communication record. The argument ``default`` is the
-    COB-ID of the PDO if ``values`` does not contain one.
+    ``pdo`` is the index of the communication record. ``default`` is the COB-ID if ``values`` contains none.
     """
     cob_id, count = (pdo, od.PDO_COB_ID), (pdo + od.PDO_MAPPING_OFFSET, 0)
     own = sorted(item for item in values.items() if item[0][0] == pdo and item[0] != cob_id)

@@ -1,9 +1,6 @@
-"""Object dictionary and PDO payloads of a patch, as pure functions without bus or clock access.
+"""Object dictionary and PDO payloads of a patch. Nothing in this package accesses a bus or a clock.
 
-A node uses ``codes`` to convert resistances to codes, and ``chunk`` and ``summary`` to pack these codes into
-PDO payloads. A host uses ``chunk`` and ``summary`` to unpack the payloads, ``assembler`` to collect them into
-scans, and ``codes`` to convert the codes back to resistances. The module ``profile`` contains the sizes of
-the patch.
-
-The module ``codec`` only re-exports the public names of these modules.
+A node encodes resistances (``codes``) and packs the codes into PDOs (``chunk``, ``summary``). A host
+assembles the PDOs into scans (``assembler``) and decodes the codes. ``profile`` defines the sizes of a patch,
+on which the wire format depends. ``codec`` re-exports the public names of the other modules.
 """

@@ -1,37 +1,34 @@
-"""Assembles one patch's chunks and summaries into scans. The assembler is not thread-safe.
+"""Assembles the frames of one patch into scans. Not thread-safe.
 
-**Scans are never mixed.** A scan contains only frames that have the scan's counter and arrived within the
-*timeout* after its first frame. The scan is closed permanently as soon as a frame of a newer scan arrives.
-Frames of two scans can therefore be mixed only if both scans have the same counter and the frames arrive
-within the timeout. The age of a frame is the time from its scan's SYNC to its arrival. Mixing is impossible
-if counter range × period is longer than the timeout plus the maximum age. The timeout is three periods, or
-less if the counter range is short. With the usual counter range of 240 scans, mixing is impossible if all
-frames are less than 237 periods old.
+**Grouping.** A frame belongs to the open scan if it carries the scan's counter and arrives within the
+*timeout* after the scan's first frame. The timeout is three periods, or less if the counter range is short.
+The first frame of a newer scan closes the open scan for good. Because counters repeat, a frame that is a
+whole counter cycle late could be mistaken for a frame of a later scan. This is impossible if every frame
+arrives within counter range × period − timeout after its SYNC. With the usual counter range of 240, this
+limit is 237 periods.
 
-**Two scans with the same counter.** Two scans have the same counter if a node did not increment the counter,
-or if two nodes have the same node-ID. The assembler detects the conflict if two frames with the same index
-and different content arrive. The remaining frames then cannot be assigned to one of the two scans, so the
-assembler discards the whole scan. The assembler also discards an incomplete scan whose chunks arrived more
-than two periods apart, because they may belong to two scans. If the frames of two mixed scans have no chunk
-index in common, only the scan check detects the mixing.
+**Two scans with the same counter.** Two scans have the same counter if a node fails to increment it, or if
+two nodes share a node-ID. The assembler notices if two different frames arrive for the same chunk or summary.
+It cannot tell which scan the other frames belong to, so it discards all of them. It also discards an
+incomplete scan whose chunks arrived more than two periods apart, because they may belong to two scans. If no
+chunk arrived from both scans, only the scan check can detect the mix.
 
-**The check.** A summary with :attr:`~skinnode.protocol.summary.SummaryFlag.CHECKED` carries a CRC over all
+**Scan check.** A summary with :attr:`~skinnode.protocol.summary.SummaryFlag.CHECKED` carries a CRC over all
 codes of the patch, including those of unsent chunks (:mod:`skinnode.protocol.scan_check`). A failed check
-does not show which chunk is wrong. The assembler therefore discards the whole scan, and the stored codes of
-unsent chunks. A stream becomes *checked* when a check passes for the first time, or when
-:meth:`ScanAssembler.reset` is called with ``checked=True``. In a checked stream, a scan is complete only if
-its check passed, and a summary without a check is rejected. A scan is published as *unchecked* if its summary
-was lost, or if the codes of chunks that were not sent are unknown. Patches of revision 1.0 send no checks, so
-their scans are complete as soon as all chunks have been received.
+does not reveal which chunk is wrong, so the assembler discards the scan and all codes stored for unsent
+chunks. A stream is *checked* once a check has passed, or after :meth:`ScanAssembler.reset` with
+``checked=True``. In a checked stream, a scan is complete only if its check passed, and a summary without a
+check is rejected. If all chunks of a scan arrived, but the check is impossible, the scan is published as
+*unchecked*. The check is impossible if the summary was lost, or if the codes of unsent chunks are unknown.
+Patches of revision 1.0 send no checks, so their scans are complete once all chunks have arrived.
 
-**Order of counters.** If a frame's counter is ahead of the last scan's counter by at most half the counter
-range, the frame belongs to a newer scan. Frames with other counters are late and are dropped. If no frame
-has arrived for as long as the timeout, a frame with any counter is accepted, because the node or the SYNC
-producer may have restarted.
+**Order.** A frame starts a newer scan if its counter is ahead of the last scan's counter by at most half the
+counter range. Frames with other counters are late and are dropped. After a silence of one timeout, a frame
+with any counter is accepted, because the node or the SYNC producer may have restarted.
 
-**Chunks that were not sent.** If the summary indicates that only changed chunks were sent, the other chunks
-keep their last codes (:mod:`skinnode.protocol.partial_scan`). After a lost or incomplete scan, or a pause
-longer than the timeout, the codes of unsent chunks are unknown until these chunks are sent again.
+**Unsent chunks.** If the node sends only changed chunks, the other chunks keep their last codes
+(:mod:`skinnode.protocol.partial_scan`). After a lost or incomplete scan, or a pause longer than the timeout,
+the codes of unsent chunks are unknown until the node sends these chunks again.
 """
 
 from __future__ import annotations
@@ -53,35 +50,36 @@ from skinnode.text.words import counted
 
 _CHUNK_INDICES: Final = 256
 _NOT_EXPECTED: Final = b""
-"""Placeholder payload for chunk numbers beyond the patch's last chunk. With this placeholder, the range of
-each received chunk number need not be checked."""
+"""Placeholder payload for chunk indices beyond the patch's last chunk. Such an index looks like a repeated
+chunk, so the code that receives chunks need not check the range of each index."""
 _NONE_OPEN: Final = -1  # scan counters are never negative
 _NEVER: Final = -1
-# Testing an enum flag takes as long as processing a whole chunk; testing an int is ten times as fast.
+# Plain ints, because testing an enum flag takes as long as processing a chunk.
 _CHANGED_ONLY, _OVERRUN = int(SummaryFlag.CHANGED_ONLY), int(SummaryFlag.OVERRUN)
 _BASELINE_CHANGED: Final = int(SummaryFlag.BASELINE_CHANGED)
 
 
 class ScanAssembler:
-    """Assembler of one patch's scans. Each method call returns at most one scan; scans are returned in order.
+    """Assembles the scans of one patch. Each call returns at most one scan, in order of the scans.
 
-    Call :meth:`poll` after each batch of frames and at :meth:`next_deadline_ns`. The method ``poll`` returns
-    a scan whose missing frames have timed out. If a single frame closed two scans, ``poll`` returns the
-    second scan.
+    Call :meth:`poll` after each batch of frames, and at the time given by :meth:`next_deadline_ns`. It
+    returns scans whose missing frames have timed out. If a frame closes two scans, the call that processes
+    the frame returns the first scan, and ``poll`` returns the second.
 
     Args:
         profile: sizes of the patch.
-        counter_overflow: SYNC counter overflow value (0x1019) if the scan counter is the SYNC counter; 0 if
-            the patch itself counts its scans from 0 to 255.
-        period_ns: scan period (ns), which determines the timeout.
-        grace_ns: maximum wait (ns) for late frames after the summary or the last missing chunk has arrived.
-        node_id: node-ID shown in the errors passed to ``on_reject``.
-        on_reject: called with a CodecError for each frame with a wrong length, and for each summary that
-            lacks a check.
+        counter_overflow: synchronous counter overflow value (0x1019) if scans carry the SYNC counter; 0 if
+            the patch counts its own scans from 0 to 255.
+        period_ns: scan period, ns. The timeout is a multiple of this period.
+        grace_ns: maximum time (ns) to wait for the remaining frames after the summary, or after all chunks of
+            a full scan, have arrived.
+        node_id: node-ID for the COB-IDs in the errors passed to ``on_reject``.
+        on_reject: callback that receives a CodecError for each frame with a wrong length, and for each
+            summary that lacks a required check.
         under_way: whether the node may already be sending scans; see :meth:`reset`.
 
     Raises:
-        ConfigError: if the counter overflow is not 0 or 2 to 240, or if a time is not positive.
+        ConfigError: if ``counter_overflow`` is neither 0 nor 2 to 240, or if a time is not positive.
     """
 
     def __init__(  # noqa: PLR0913 - keywords with defaults, each given alone by some caller
@@ -112,9 +110,9 @@ class ScanAssembler:
         self._node_id = node_id
         self._on_reject = on_reject
         self.on_discarded: Callable[[], None] | None = None
-        """Callback invoked if a discarded scan may have announced a new baseline; None for no callback."""
+        """Callback for a discarded scan that may have announced a new baseline; None for no callback."""
 
-        # The following attributes describe the open scan or, if no scan is open, the last scan.
+        # State of the open scan; if no scan is open, of the last scan.
         self._counter = _NONE_OPEN
         self._last_counter = _NEVER
         self._scan = _NEVER
@@ -146,11 +144,11 @@ class ScanAssembler:
         """Process a chunk.
 
         Args:
-            data: payload of TPDO1; the assembler keeps a reference to this object.
-            t_ns: time of reception, ns.
+            data: payload of TPDO1. The assembler keeps a reference to this object.
+            t_ns: arrival time, ns.
 
         Returns:
-            The scan that the chunk closed; None if the chunk did not close a scan.
+            The scan that this chunk closed, or None.
         """
         if len(data) != self._chunk_bytes:
             self._reject_length(chunk_cob_id(self._node_id), data, self._chunk_bytes, "chunk")
@@ -173,10 +171,10 @@ class ScanAssembler:
 
         Args:
             data: payload of TPDO2.
-            t_ns: time of reception, ns.
+            t_ns: arrival time, ns.
 
         Returns:
-            The scan that the summary closed; None if the summary did not close a scan.
+            The scan that this summary closed, or None.
         """
         if len(data) != PDO_BYTES:
             self._reject_length(summary_cob_id(self._node_id), data, PDO_BYTES, "scan summary")
@@ -207,7 +205,7 @@ class ScanAssembler:
         return closed
 
     def poll(self, t_ns: int) -> Scan | None:
-        """Close and return the open scan if its missing frames have timed out.
+        """Close the open scan if its missing frames have timed out, and return it.
 
         Args:
             t_ns: current time, ns.
@@ -216,9 +214,9 @@ class ScanAssembler:
         return self._close() if deadline is not None and t_ns >= deadline else None
 
     def next_deadline_ns(self) -> int | None:
-        """Return the time (ns) at which :meth:`poll` will close the open scan; None if no scan is open.
+        """Return the time (ns) from which :meth:`poll` closes the open scan, or None if no scan is open.
 
-        Each received frame may change the closing time.
+        Each frame that arrives may change this time.
         """
         if self._counter == _NONE_OPEN:
             return None
@@ -229,13 +227,13 @@ class ScanAssembler:
         return self._expires_ns
 
     def reset(self, *, under_way: bool = False, checked: bool = False) -> None:
-        """Discard the open scan, the last codes and the scan counter, as after a boot-up of the node.
+        """Discard the open scan, the stored codes and the scan counter, for example after a boot-up.
 
         Args:
-            under_way: whether the node may already be sending scans. If the node may be sending, chunks
-                missing at the start of the first scan are not counted as lost.
-            checked: whether the node is known to send a check in every summary; if false, a passed check
-                makes all subsequent checks mandatory.
+            under_way: whether the node may already be sending scans. If so, the first scan is discarded if
+                its beginning was missed, and its missing chunks are not counted as lost.
+            checked: whether every summary must contain a check. If false, checks become mandatory as soon as
+                one has passed.
         """
         if self._counter != _NONE_OPEN:
             self._discarded += 1
@@ -277,7 +275,7 @@ class ScanAssembler:
             resyncs=self._resyncs,
         )
 
-    # --- frames that start a new scan, repeat an earlier frame, or are rejected
+    # --- frames that start a scan, repeat an earlier frame, or are rejected
 
     def _on_chunk_of_another_scan(self, data: bytes, t_ns: int) -> Scan | None:
         index = self._index_of(data)
@@ -314,9 +312,9 @@ class ScanAssembler:
             self._on_reject(CodecError(cob_id, data, allowed))
 
     def _is_news(self, counter: int, t_ns: int, *, known: bool) -> bool:
-        """Return whether a frame starts a new scan; if not, count the frame as late, duplicate or invalid.
+        """Return whether a frame starts a new scan. If not, count it as late, duplicate or invalid.
 
-        The argument ``known`` indicates whether the last scan contains an identical frame.
+        ``known`` is true if the last scan contains an identical frame.
         """
         if not self._lowest <= counter < self._lowest + self._range:
             self._bad_counter += 1
@@ -364,7 +362,7 @@ class ScanAssembler:
         self._expires_ns = t_ns + self._timeout_ns
 
     def _steps_to(self, counter: int, last: int) -> int:
-        """Return the number of scans (at least 1) between the scan counters ``last`` and ``counter``."""
+        """Return by how many scans ``counter`` is ahead of ``last``, from 1 to the counter range."""
         return (counter - last) % self._range or self._range
 
     def _book(self) -> None:
@@ -373,7 +371,7 @@ class ScanAssembler:
         self._summaries += self._summary is not None
 
     def _close(self) -> Scan | None:
-        """Close the open scan; return the scan, or None if the scan must be discarded."""
+        """Close the open scan and return it, or None if it has to be discarded."""
         self._book()
         self._counter = _NONE_OPEN
         summary = self._summary
@@ -430,9 +428,9 @@ class ScanAssembler:
         )
 
     def _discard(self, *, doubt: bool = True) -> None:
-        """Discard a scan, and all codes stored for later scans.
+        """Discard all stored codes after a scan was discarded.
 
-        The argument ``doubt`` indicates whether the scan may have announced a new baseline.
+        ``doubt`` is true if that scan may have announced a new baseline.
         """
         self._held.forget()
         if doubt and self.on_discarded is not None:

@@ -1,4 +1,4 @@
-"""Packs and unpacks chunks, the parts of a scan that a patch sends in TPDO1."""
+"""Packs and unpacks chunks. A chunk carries some of the codes of a scan and is sent in TPDO1."""
 
 from __future__ import annotations
 
@@ -24,8 +24,7 @@ class Chunk(NamedTuple):
     """Contents of a chunk, as sent on a classic CAN bus."""
 
     chunk: int
-    """Chunk index. The first code in the chunk is code number ``chunk · codes_per_chunk`` of the scan,
-    counted from 0."""
+    """Chunk index. The first code of the chunk is code ``chunk · codes_per_chunk`` of the scan."""
     scan: int
     """Scan counter, u8."""
     codes: tuple[int, ...]
@@ -37,11 +36,11 @@ def pack_chunk(chunk: int, scan: int, codes: Sequence[int], bits: int = 16) -> b
     Args:
         chunk: chunk index, 0 to 255.
         scan: scan counter, 0 to 255.
-        codes: up to 3 codes of 16 bits or 2 codes of 24 bits; unused bytes are set to 0.
+        codes: up to 3 codes of 16 bits, or 2 of 24 bits; unused bytes are set to 0.
         bits: width of a code, 16 or 24.
 
     Raises:
-        ValueError: if a number exceeds the range of its field, or if there are too many codes.
+        ValueError: if a value does not fit into its field, or if there are too many codes.
     """
     width = bits // 8
     if not (0 <= chunk <= 255 and 0 <= scan <= 255):
@@ -61,7 +60,7 @@ def unpack_chunk(data: bytes, bits: int = 16, *, cob_id: int = _COB_ID) -> Chunk
     Args:
         data: payload of the frame.
         bits: width of a code, 16 or 24.
-        cob_id: COB-ID to be shown in the error.
+        cob_id: COB-ID for the error message.
 
     Raises:
         CodecError: if the payload is not 8 bytes long.
@@ -81,10 +80,10 @@ def pack_scan(
         codes: (U, K) codes.
         scan: scan counter, 0 to 255.
         profile: sizes of the patch.
-        only: indices of the chunks to pack, in order; None for all chunks.
+        only: chunks to pack, numbered as in :func:`chunk_of_code`, in sending order; None for all chunks.
 
     Raises:
-        ValueError: if the codes have the wrong shape, or if a code is wider than ``profile`` allows.
+        ValueError: if the shape is wrong, or if a code has more bits than ``profile`` allows.
     """
     array = np.asarray(codes, dtype=np.uint32)
     if array.shape != (profile.rows, profile.columns):
@@ -112,7 +111,7 @@ def pack_scan(
 
 @functools.cache
 def _empty_chunks(profile: PatchProfile) -> NDArray[np.uint8]:
-    """Return the payloads of all chunks, (chunks, bytes), without the scan counter and the codes."""
+    """Return (chunks, bytes) payloads whose scan counter and codes are still zero."""
     n = profile.n_chunks
     chunks = np.zeros((n, profile.chunk_bytes), dtype=np.uint8)
     if profile.bus == "classic":
@@ -135,14 +134,14 @@ def unpack_scan(frames: bytes, profile: PatchProfile) -> Codes:
 
 
 def unpack_scan_with_check(frames: bytes, profile: PatchProfile) -> tuple[Codes, int]:
-    """Unpack the codes of a scan as :func:`unpack_scan` does, and compute their CRC.
+    """Unpack the codes of a scan and compute their CRC.
 
     Args:
         frames: payloads of all chunks in ascending order, concatenated.
         profile: sizes of the patch.
 
     Returns:
-        (U, K) codes, and their CRC as :func:`~skinnode.protocol.scan_check.check_of_codes` computes it.
+        (U, K) codes, and the CRC over them (:func:`~skinnode.protocol.scan_check.check_of_codes`).
     """
     places = _places_of_codes(profile)
     if profile.code_bits == 16:
@@ -157,9 +156,8 @@ def unpack_scan_with_check(frames: bytes, profile: PatchProfile) -> tuple[Codes,
 def _places_of_codes(profile: PatchProfile) -> NDArray[np.intp]:
     """Return the position of each code in the concatenated payloads of a scan.
 
-    For 16-bit codes, the result has the shape (U, K) and contains positions in units of 16 bits. For 24-bit
-    codes, the result has the shape (U, K, 4) and contains the position of each byte. The fourth byte of each
-    code is a zero byte appended to the payloads.
+    16-bit codes: (U, K) positions in 16-bit words. 24-bit codes: (U, K, 4) positions in bytes; the fourth
+    byte is the zero byte that :func:`unpack_scan_with_check` appends to the payloads.
     """
     width, per, head = profile.code_bits // 8, profile.codes_per_chunk, profile.chunk_head_bytes
     lines, shape = profile.lines, (profile.rows, profile.columns)
@@ -173,7 +171,7 @@ def _places_of_codes(profile: PatchProfile) -> NDArray[np.intp]:
 
 @functools.lru_cache(maxsize=64)
 def chunk_of_code(profile: PatchProfile) -> NDArray[np.intp]:
-    """Return a (U, K) array of each code's chunk number; chunks are numbered from 0 in sending order."""
+    """Return the (U, K) numbers of the chunks that carry each code, counted from 0 in sending order."""
     lines, per_line = profile.lines, profile.n_codes // profile.lines
     within = np.arange(per_line) // profile.codes_per_chunk
     chunks = np.arange(lines)[:, None] * profile.chunks_per_line + within
@@ -183,10 +181,10 @@ def chunk_of_code(profile: PatchProfile) -> NDArray[np.intp]:
 
 
 def chunk_indexer(profile: PatchProfile) -> Callable[[bytes], int]:
-    """Return a function that maps a chunk's payload to the chunk's number (:func:`chunk_of_code`).
+    """Return a function that reads the number of a chunk (:func:`chunk_of_code`) from its payload.
 
-    If the payload does not identify a chunk of the patch, the returned function returns ``n_chunks`` or more.
-    The function does not check the payload length.
+    The function returns ``n_chunks`` or more if the patch has no such chunk. The length of the payload must
+    already have been checked.
     """
     if profile.bus == "classic":
         return operator.itemgetter(0)
@@ -195,7 +193,7 @@ def chunk_indexer(profile: PatchProfile) -> Callable[[bytes], int]:
 
     def index(data: bytes) -> int:
         column = data[2]
-        # The upper byte of the first column must be 0, because a patch has fewer than 256 columns.
+        # A patch has fewer than 256 columns, so the upper byte of the first column must be 0.
         if data[0] >= rows or data[3] or column >= columns or column % per:
             return n
         return data[0] * per_line + column // per

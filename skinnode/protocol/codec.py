@@ -1,9 +1,9 @@
-"""Public names of the modules that define a patch's wire format.
+"""Public names of the modules that implement the wire format of a patch.
 
-The module ``codes`` converts resistances to codes. The modules ``chunk`` and ``summary`` pack and unpack PDO
-payloads, and ``command`` packs and unpacks the host's commands. The modules ``scan_check`` and
-``device_time`` compute the summary's scan check and device time, and ``self_test`` packs the record 0x2023.
-None of the functions accesses a bus or a clock.
+- ``codes``: conversion between resistances and codes
+- ``chunk``, ``summary``, ``command``: payloads of the PDOs
+- ``scan_check``, ``device_time``: scan check and device time of a summary
+- ``self_test``: record 0x2023
 """
 
 from skinnode.protocol.chunk import (

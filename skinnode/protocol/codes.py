@@ -1,8 +1,8 @@
 """Conversion between resistances and the codes sent on the bus.
 
-A resistance R has the n-bit code round((R/R0 − lo) / (hi − lo) · (2ⁿ − 4)). Codes from 0 to 2ⁿ − 4 are
-measurements. The three highest codes are reserved: in ascending order, over-range, short and open. Live
-streams are decoded by a compiled function, ``skinnode.solve.wires.decode``.
+A resistance R is encoded as the n-bit code round((R/R0 − lo) / (hi − lo) · (2ⁿ − 4)). Codes from 0 to 2ⁿ − 4
+are measurements. The three codes above are reserved for over-range, short and open, in this order. A host
+decodes live streams with the compiled function ``skinnode.solve.wires.decode``.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from skinnode.protocol.objects import DEFAULT_CODE_HI, DEFAULT_CODE_LO
 Codes = NDArray[np.uint32]
 
 MISSING: Final = 0xFFFF_FFFF
-"""Value that represents a code that was not received; greater than any valid code."""
+"""Placeholder for a code that was not received. It is greater than every code."""
 
 CODE_BITS: Final = (16, 24)
 """Allowed code widths, bits."""
@@ -30,18 +30,18 @@ CODE_BITS: Final = (16, 24)
 
 @dataclass(frozen=True)
 class CodeScale:
-    """Mapping of R/R0 to codes. The limits ``lo`` and ``hi`` have REAL32 precision, as on the bus.
+    """Mapping of R/R0 to codes. ``lo`` and ``hi`` are rounded to REAL32, as in the object dictionary.
 
     Raises:
-        ConfigError: if the code width is not 16 or 24 bits, or if the limits do not satisfy 0 ≤ lo < hi < ∞.
+        ConfigError: if the code width is neither 16 nor 24 bits, or unless 0 ≤ lo < hi < ∞.
     """
 
     bits: int = 16
     """Width of a code, bits."""
     lo: float = DEFAULT_CODE_LO
-    """R/R0 at code 0."""
+    """R/R0 of code 0."""
     hi: float = DEFAULT_CODE_HI
-    """R/R0 value of the highest measurement code."""
+    """R/R0 of the highest measurement code."""
 
     def __post_init__(self) -> None:
         if self.bits not in CODE_BITS:
@@ -54,12 +54,12 @@ class CodeScale:
 
     @functools.cached_property
     def steps(self) -> int:
-        """Highest measurement code, which represents R/R0 = ``hi``."""
+        """Highest measurement code, 2ⁿ − 4, which represents R/R0 = ``hi``."""
         return (1 << self.bits) - 4
 
     @property
     def over_range(self) -> int:
-        """Reserved code for R/R0 below ``lo`` or above ``hi``, and for a measurement without a baseline."""
+        """Reserved code for an R/R0 outside the code range, and for a crossing without a baseline."""
         return self.steps + 1
 
     @property
@@ -74,23 +74,23 @@ class CodeScale:
 
     @functools.cached_property
     def step(self) -> float:
-        """Resistance step between successive codes, relative to R0."""
+        """Difference in R/R0 between adjacent codes."""
         return (self.hi - self.lo) / self.steps
 
     @property
     def relative_std(self) -> float:
-        """Standard deviation of the rounding error, relative to R0: step / √12 for a uniform distribution."""
+        """Standard deviation of the quantisation error of R/R0: step / √12."""
         return self.step / math.sqrt(12.0)
 
 
 def as_baseline(baseline_ohm: ArrayLike) -> Float:
-    """Round R0 to REAL32, the precision used by the node and the host.
+    """Round R0 to REAL32, its precision in the object dictionary.
 
     Args:
         baseline_ohm: R0, ohm; any shape.
 
     Returns:
-        Rounded R0, ohm; float64 of the same shape.
+        Rounded R0, ohm, as float64 of the same shape.
     """
     return np.asarray(baseline_ohm, dtype=np.float32).astype(np.float64)
 
@@ -98,14 +98,13 @@ def as_baseline(baseline_ohm: ArrayLike) -> Float:
 def encode(resistance_ohm: ArrayLike, baseline_ohm: ArrayLike, scale: CodeScale) -> Codes:
     """Encode resistances.
 
-    Resistances of +inf and NaN become the code for open; zero and negative resistances become the code for
-    short. R/R0 values outside the range from ``lo`` to ``hi`` are rounded to the nearest limit if they are at
-    most half a step outside; otherwise, they become the over-range code. A measurement without a valid
-    baseline (R0 must be positive and finite) also becomes the over-range code.
+    Infinite and NaN resistances are encoded as open, and zero and negative resistances as short. All others
+    are encoded as over-range if R/R0 is more than half a step outside the code range, or if R0 is not
+    positive and finite.
 
     Args:
         resistance_ohm: resistances, ohm; any shape.
-        baseline_ohm: R0 in ohm, with the same shape or broadcastable to it.
+        baseline_ohm: R0, ohm; broadcastable to the shape of the resistances.
         scale: mapping of R/R0 to codes.
 
     Returns:
@@ -126,23 +125,23 @@ def decode(codes: ArrayLike, baseline_ohm: ArrayLike, scale: CodeScale) -> tuple
     """Decode codes into resistances.
 
     Args:
-        codes: codes of any shape; :data:`MISSING` is allowed.
-        baseline_ohm: R0 in ohm, with the same shape or broadcastable to it.
+        codes: codes of any shape, which may include :data:`MISSING`.
+        baseline_ohm: R0, ohm; broadcastable to the shape of the codes.
         scale: mapping of R/R0 to codes.
 
     Returns:
-        Resistances in ohm and a mask of the measurements, both with the same shape as ``codes``. The
-        resistance is NaN and the mask is False for reserved codes, for :data:`MISSING`, and where R0 is not
-        positive and finite.
+        Resistances in ohms, and a mask of the valid resistances, both with the shape of ``codes``. Where the
+        code is reserved or :data:`MISSING`, or R0 is not positive and finite, the resistance is NaN and the
+        mask is False.
     """
     return Decoder(baseline_ohm, scale).decode(codes)
 
 
 class Decoder:
-    """Decoder for many scans with the same baseline; equivalent to :func:`decode`.
+    """Decodes many scans with the same baseline; equivalent to :func:`decode`.
 
     Args:
-        baseline_ohm: R0 in ohm, with the shape of the codes or broadcastable to it.
+        baseline_ohm: R0, ohm; broadcastable to the shape of the codes.
         scale: mapping of R/R0 to codes.
     """
 
@@ -152,13 +151,13 @@ class Decoder:
         self._known: NDArray[np.bool_] | None = None if known.all() else known
 
     def decode(self, codes: ArrayLike) -> tuple[Float, NDArray[np.bool_]]:
-        """Decode codes as :func:`decode` does.
+        """Decode codes into resistances.
 
         Args:
-            codes: codes of any shape that broadcasts with the baseline.
+            codes: codes, which may include :data:`MISSING`.
 
         Returns:
-            Resistances in ohm, and a mask of the measurements.
+            Resistances in ohms, and a mask of the valid resistances.
         """
         code, scale = np.asarray(codes), self._scale
         valid: NDArray[np.bool_] = code <= scale.steps

@@ -1,4 +1,4 @@
-"""Packs and unpacks the commands that a host sends to a patch in RPDO1."""
+"""Packs and unpacks RPDO1, in which a host sends commands to a patch."""
 
 from __future__ import annotations
 
@@ -23,12 +23,11 @@ class Command(NamedTuple):
     """Contents of a command, as sent on the bus."""
 
     tare: int
-    """Tare command: :data:`~skinnode.canopen.indices.TARE_SIGNATURE` to tare; any other number has no
-    effect."""
+    """Tare command: :data:`~skinnode.canopen.indices.TARE_SIGNATURE` to tare; other values have no effect."""
     single_scan: int
-    """Single-scan command: 1 to take one scan immediately; 0 for no scan."""
+    """Single-scan command: 1 to take one scan immediately, 0 for none."""
     send_mode: int
-    """Send mode, a value of :class:`SendMode`."""
+    """Value of :class:`SendMode`."""
 
 
 _COMMAND: Final = struct.Struct("<IBB")
@@ -42,7 +41,7 @@ def pack_command(
     Args:
         tare: whether to make the current resistances the baseline.
         single_scan: whether to take one scan immediately.
-        send_mode: send mode of the patch, which remains in effect until the next command.
+        send_mode: send mode of the patch from now on.
     """
     return _COMMAND.pack(od.TARE_SIGNATURE if tare else 0, single_scan, send_mode)
 
@@ -52,7 +51,7 @@ def unpack_command(data: bytes, *, cob_id: int = _COB_ID) -> Command:
 
     Args:
         data: payload of the frame.
-        cob_id: COB-ID to be shown in the error.
+        cob_id: COB-ID for the error message.
 
     Raises:
         CodecError: if the payload is shorter than six bytes.

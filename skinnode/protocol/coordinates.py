@@ -1,8 +1,8 @@
 """Packs and unpacks a patch's electrode coordinates (object 0x2300).
 
-Coordinates are signed 32-bit integers in nanometres, little-endian: x, y, z of every upper electrode, wire by
-wire, then x, y, z of every lower electrode. The layout hash is also computed from coordinates rounded to
-nanometres, so packing and unpacking does not change a layout's hash.
+Each coordinate is a little-endian signed 32-bit integer in nanometres. The object contains x, y and z of each
+upper electrode, wire by wire, and then of each lower electrode. The layout hash is also computed from whole
+nanometres, so packing and unpacking a layout preserves its hash.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ _BYTES = 12  # per electrode
 
 
 def pack_coordinates(layout: PatchLayout) -> bytes:
-    """Pack a layout into the bytes of 0x2300. Raises ConfigError if a coordinate exceeds 2.1 m."""
+    """Return the content of 0x2300 for a layout. Raises ConfigError if a coordinate exceeds 2.1 m."""
     nanometres = np.rint(np.concatenate([a.ravel() for a in (layout.upper_m, layout.lower_m)]) / _NANOMETRE_M)
     farthest = float(np.abs(nanometres).max())
     if farthest >= 2**31:
@@ -30,10 +30,10 @@ def pack_coordinates(layout: PatchLayout) -> bytes:
 def unpack_coordinates(
     data: bytes, profile: PatchProfile, resistivity_ohm_per_m: float, name: str = "custom"
 ) -> PatchLayout:
-    """Unpack the layout of a patch with the sizes in ``profile`` from the bytes of 0x2300.
+    """Return the layout in the content of 0x2300.
 
-    Raises ConfigError if the number of bytes is wrong, and ValueError if the coordinates do not form a valid
-    layout.
+    Raises ConfigError if the length does not match the sizes in ``profile``, and ValueError if the
+    coordinates do not form a valid layout.
     """
     upper, lower = profile.rows * profile.upper_electrodes, profile.columns * profile.lower_electrodes
     if len(data) != (upper + lower) * _BYTES:

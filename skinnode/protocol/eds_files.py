@@ -1,4 +1,4 @@
-"""Generates EDS and DCF files (CiA 306) for patches, and the reference files in ``eds/``."""
+"""EDS and DCF files (CiA 306) for patches, including the reference files in ``eds/``."""
 
 from __future__ import annotations
 
@@ -12,20 +12,18 @@ from skinnode.protocol.profile import PatchProfile
 
 
 def eds_name(profile: PatchProfile) -> str:
-    """Return the file name of the EDS for a patch with this wire format."""
+    """Return the file name of the EDS of a patch."""
     variant = "-fd" if profile.bus == "fd" else ""
     return f"skinnode-{profile.rows}x{profile.columns}-u{profile.code_bits}{variant}.eds"
 
 
 def eds_text(profile: PatchProfile) -> str:
-    """Return the text of a patch's electronic data sheet (EDS, CiA 306). Equal profiles yield equal texts."""
+    """Return the content of a patch's EDS, which depends only on the profile."""
     return render_eds(_device_info(profile, eds_name(profile)), profile.objects())
 
 
 def dcf_text(profile: PatchProfile, node_id: int, bitrate_bps: int) -> str:
-    """Return the text of a patch's device configuration file (DCF, CiA 306).
-
-    Equal arguments yield equal texts.
+    """Return the content of a patch's DCF, which depends only on the arguments.
 
     Args:
         profile: sizes of the patch.
@@ -33,7 +31,7 @@ def dcf_text(profile: PatchProfile, node_id: int, bitrate_bps: int) -> str:
         bitrate_bps: bit rate of the bus, bit/s.
 
     Raises:
-        ConfigError: if the node-ID is not 1 to 127, or if patches do not support the bit rate.
+        ConfigError: if the node-ID is not 1 to 127, or if the bit rate is not supported.
     """
     if not 1 <= node_id <= od.MAX_NODE_ID:
         raise ConfigError("node_id", node_id, "1 to 127")
@@ -67,14 +65,14 @@ REFERENCE_PROFILES: Final = (
     PatchProfile(10, 30, 10, 10, 16, bus="fd"),
     PatchProfile(10, 30, 10, 10, 24, bus="fd"),
 )
-"""Profiles whose EDS files are in ``eds/``: a 10 × 30 patch, one profile per wire format."""
+"""Profiles of the EDS files in ``eds/``: a 10 × 30 patch in each wire format."""
 
 
 def write_reference_files(folder: Path) -> None:
-    """Write the EDS file of every reference profile into a folder.
+    """Write the EDS file of every reference profile.
 
     Args:
-        folder: an existing folder.
+        folder: existing folder for the files.
     """
     for profile in REFERENCE_PROFILES:
         (folder / eds_name(profile)).write_text(eds_text(profile), encoding="ascii", newline="\n")

@@ -1,7 +1,7 @@
 """Object dictionary of a patch.
 
-This module declares the manufacturer objects (0x2000 to 0x2301) and the default PDO mappings. Settings and
-constants have default values; measured, counted or transmitted values have none.
+This module declares the manufacturer objects (0x2000 to 0x2301) and the default PDO mappings. Only settings
+and constants have default values.
 """
 
 from __future__ import annotations
@@ -18,14 +18,13 @@ if TYPE_CHECKING:
 _U8, _U16, _U32, _REAL32 = DataType.UNSIGNED8, DataType.UNSIGNED16, DataType.UNSIGNED32, DataType.REAL32
 
 DEFAULT_CODE_LO: Final = 0.25
-"""Default R/R0 value of code 0."""
+"""Default R/R0 of code 0."""
 DEFAULT_CODE_HI: Final = 1.25
-"""Default R/R0 value of the highest measurement code. The range extends above 1, because sliding moves some
-electrodes apart and increases R, whereas a press reduces R."""
+"""Default R/R0 of the highest measurement code. A press reduces R, but sliding moves some electrodes apart
+and increases R above R0."""
 DEFAULT_REFRESH_SCANS: Final = 10
-"""Default number of scans from one full scan to the next in the send mode for changed chunks. Lost codes are
-thus sent again within 0.8 s at a scan period of 80 ms. Full scans at this interval cause a tenth of the
-traffic of continuous full scans."""
+"""Default interval between full scans in send mode 1 (changed chunks only), scans. At a scan period of 80 ms,
+a lost chunk is sent again within 0.8 s. The full scans add a tenth of the traffic of send mode 0."""
 
 
 def patch_objects(profile: PatchProfile) -> tuple[Object, ...]:

@@ -1,4 +1,4 @@
-"""Decodes partial scans, in which unsent chunks keep their last codes."""
+"""Decodes scans from which chunks are missing. Unsent chunks keep their last codes."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from skinnode.protocol.profile import PatchProfile
 
 
 class HeldChunks:
-    """Stores the last known payload of each of a patch's chunks.
+    """Last known payloads of all chunks of a patch.
 
     Args:
         profile: sizes of the patch.
@@ -26,15 +26,15 @@ class HeldChunks:
         self.forget()
 
     def forget(self) -> None:
-        """Discard all payloads, as required after a missed scan, which may have changed the codes."""
+        """Discard all payloads, because a scan that may have changed them was lost."""
         self._payloads = [None] * self._profile.n_chunks
 
     def update(self, received: Sequence[bytes | None], *, carry: bool) -> None:
-        """Store the payloads of a scan after its last frame.
+        """Store the payloads of a closed scan.
 
         Args:
             received: payload of each chunk; None for a chunk that did not arrive.
-            carry: whether chunks that did not arrive are unchanged and keep their last payloads.
+            carry: whether these chunks are unchanged and keep their last payloads.
         """
         if carry and None in received:
             held = self._payloads
@@ -45,8 +45,9 @@ class HeldChunks:
         """Decode all stored payloads.
 
         Returns:
-            (U, K) codes, a (U, K) mask of the measurements, and the CRC over the codes
-            (:func:`~skinnode.protocol.scan_check.check_of_codes`). The CRC is None if any payload is unknown.
+            (U, K) codes, with :data:`~skinnode.protocol.codes.MISSING` where unknown; a (U, K) mask of the
+            measurements; and the CRC over the codes
+            (:func:`~skinnode.protocol.scan_check.check_of_codes`), or None if any code is unknown.
         """
         profile = self._profile
         known = [payload for payload in self._payloads if payload is not None]

@@ -1,4 +1,4 @@
-"""Payload length of PDOs, and a function that checks payload lengths. All payloads are little-endian."""
+"""Lengths of PDO payloads. All numbers in payloads are little-endian."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from skinnode.errors import CodecError
 from skinnode.text.words import counted
 
 PDO_BYTES: Final = 8
-"""Length, in bytes, of a summary, and of a chunk on a classic CAN bus."""
+"""Length of a summary, and of a chunk on classic CAN, bytes."""
 
 
 def require_length(data: bytes, length: int, cob_id: int, what: str) -> None:
@@ -17,8 +17,8 @@ def require_length(data: bytes, length: int, cob_id: int, what: str) -> None:
     Args:
         data: payload of the frame.
         length: required length, bytes.
-        cob_id: COB-ID to be shown in the error.
-        what: name of the message, shown in the error.
+        cob_id: COB-ID for the error message.
+        what: name of the payload for the error message.
 
     Raises:
         CodecError: if the payload does not have the required length.

@@ -1,14 +1,14 @@
-"""Patch sizes that determine the wire format.
+"""Sizes of a patch and its wire format.
 
-A patch sends its U×K codes in *chunks*: TPDO1 carries a u8 chunk index, a u8 scan counter and 3 codes of 16
-bits (or 2 codes of 24 bits). The codes are in row-major order: all codes of upper wire 0 first, then those of
-upper wire 1, and so on. TPDO2 carries the *summary*, which ends each scan and contains a checksum of all
-codes (:mod:`skinnode.protocol.scan_check`).
+**Classic CAN.** A patch sends the U×K codes of a scan in *chunks* (TPDO1). A chunk consists of a u8 chunk
+index, a u8 scan counter, and 3 codes of 16 bits or 2 codes of 24 bits. Codes are sent in row-major order,
+starting with all codes of upper wire 0. The *summary* (TPDO2) ends the scan and contains a CRC over all codes
+(:mod:`skinnode.protocol.scan_check`).
 
-Over CAN FD, a chunk carries codes of a single upper wire: u8 wire, u8 scan counter, u16 first column and up
-to 30 codes of 16 bits (or 20 codes of 24 bits). All chunks of a patch have the same length: the total length
-of the mapped objects, padded to the next valid CAN FD length. If a patch has more columns than fit into a
-chunk, the codes of each upper wire are split evenly into several chunks.
+**CAN FD.** A chunk carries codes of one upper wire. It consists of a u8 wire number, a u8 scan counter, the
+u16 number of the first column, and up to 30 codes of 16 bits or 20 codes of 24 bits. If an upper wire has
+more codes than fit into a chunk, they are split evenly among several chunks. All chunks of a patch have the
+same length, padded to a valid CAN FD length.
 
 The command ``python -m skinnode.protocol.profile eds/`` regenerates the reference EDS files
 (:mod:`skinnode.protocol.eds_files`).
@@ -32,23 +32,22 @@ if TYPE_CHECKING:
     from skinnode.config import BusConfig, PatchConfig
 
 DEFAULT_PERIOD_MS: Final = 80
-"""SYNC period (ms) for which the default settings are chosen. With this period, four 10×30 patches cause
-a load of about 2/3 on a 1 Mbit/s bus."""
+"""SYNC period for which the default settings are chosen, ms. At this period, four 10×30 patches use about
+two thirds of the capacity of a 1 Mbit/s bus."""
 
 BusType = Literal["classic", "fd"]
-"""Type of the frames that carry PDOs: classic CAN with up to 8 bytes, or CAN FD with up to 64 bytes."""
+"""Frame format of PDOs: classic CAN (up to 8 bytes) or CAN FD (up to 64 bytes)."""
 
 _MOST_SUBINDICES: Final = 254  # sub-index 255 is reserved by CiA 301
 
 
 @dataclass(frozen=True, slots=True)
 class PatchProfile:
-    """Patch sizes that determine the wire format.
+    """Sizes of a patch and its wire format.
 
     Raises:
-        ConfigError: if a number of wires exceeds 254, the size of an array in the object dictionary; if a
-            scan has more than 256 chunks (classic CAN); if the code width is not 16 or 24 bits; or if a
-            number of electrodes or PDOs is out of range.
+        ConfigError: if a number of wires, electrodes or PDOs is out of range; if the code width is neither 16
+            nor 24 bits; or if a scan on classic CAN has more than 256 chunks.
     """
 
     rows: int
@@ -62,14 +61,14 @@ class PatchProfile:
     code_bits: int = 16
     """Width of a code, bits: 16 or 24."""
     rpdos: int = 4
-    """Number of RPDOs; RPDO1 carries commands, and all others are spare."""
+    """Number of RPDOs. RPDO1 carries commands; the others are spare."""
     tpdos: int = 4
-    """Number of TPDOs; TPDO1 carries chunks, TPDO2 carries summaries, and all others are spare."""
+    """Number of TPDOs. TPDO1 carries chunks and TPDO2 carries summaries; the others are spare."""
     bus: BusType = "classic"
-    """Type of the frames that carry PDOs: classic CAN or CAN FD."""
+    """Frame format of PDOs."""
     checked: bool = True
-    """Whether summaries contain a scan check; false for patches of revision 1.0, which send the 32-bit device
-    time instead."""
+    """Whether summaries contain a 16-bit device time and a scan check. If false, as for patches of revision
+    1.0, they contain a 32-bit device time instead."""
 
     def __post_init__(self) -> None:
         for name, least, most in (
@@ -101,7 +100,7 @@ class PatchProfile:
         Args:
             layout: electrodes of the patch.
             code_bits: width of a code in bits, 16 or 24.
-            bus: type of the frames that carry PDOs.
+            bus: frame format of PDOs.
         """
         rows, upper_electrodes = layout.upper_m.shape[:2]
         columns, lower_electrodes = layout.lower_m.shape[:2]
@@ -109,7 +108,7 @@ class PatchProfile:
 
     @classmethod
     def from_config(cls, patch: PatchConfig, bus: BusConfig) -> PatchProfile:
-        """Return the profile of a patch from the configurations of the patch and its bus in the hand file."""
+        """Return the profile of a patch, given its entry and its bus's entry in hand.toml."""
         return cls.from_layout(patch.layout.build(), patch.code_bits, "fd" if bus.fd else "classic")
 
     @property
@@ -119,12 +118,12 @@ class PatchProfile:
 
     @property
     def pdo_bytes(self) -> int:
-        """Maximum PDO length in bytes, which is also the maximum number of objects in a PDO mapping."""
+        """Maximum length of a PDO, bytes; also the maximum number of objects mapped into a PDO."""
         return 8 if self.bus == "classic" else 64
 
     @property
     def chunk_head_bytes(self) -> int:
-        """Number of bytes before the first code in a chunk."""
+        """Length of a chunk's header, which precedes the codes, bytes."""
         return 2 if self.bus == "classic" else 4
 
     @property
@@ -133,25 +132,25 @@ class PatchProfile:
 
     @property
     def lines(self) -> int:
-        """Number of code sequences per scan: 1 on classic CAN, one per upper wire on CAN FD."""
+        """Number of sequences into which the codes of a scan are divided before they are split into chunks.
+
+        A scan is one sequence on classic CAN, and one sequence per upper wire on CAN FD.
+        """
         return 1 if self.bus == "classic" else self.rows
 
     @property
     def chunks_per_line(self) -> int:
-        """Number of chunks per code sequence. Unused codes in its last chunk are sent as 0 and ignored."""
+        """Number of chunks per sequence of codes. Unused codes in the last chunk are 0."""
         return -(-self.n_codes // self.lines // self._most_codes)
 
     @property
     def codes_per_chunk(self) -> int:
-        """Number of codes per chunk.
-
-        A chunk carries 3 codes (16-bit) or 2 codes (24-bit) on classic CAN, and up to 30 or 20 on CAN FD.
-        """
+        """Number of codes per chunk."""
         return self._most_codes if self.bus == "classic" else -(-self.columns // self.chunks_per_line)
 
     @property
     def n_chunks(self) -> int:
-        """Number of chunks in a full scan."""
+        """Number of chunks in a scan if all chunks are sent."""
         return self.lines * self.chunks_per_line
 
     @property
@@ -173,10 +172,10 @@ class PatchProfile:
 
     @property
     def default_inhibit_100us(self) -> int:
-        """Default inhibit time of TPDO1 (0x1800:3), in units of 100 µs.
+        """Default inhibit time of TPDO1 (0x1800:3), in units of 100 µs, at most 1 ms.
 
-        With this inhibit time, a full scan of up to 720 chunks takes at most nine tenths of the default
-        period. The inhibit time is at most 1 ms.
+        With this inhibit time, sending all chunks of a scan takes at most nine tenths of the default period,
+        for up to 720 chunks.
         """
         return max(1, min(10, 9 * DEFAULT_PERIOD_MS // self.n_chunks))
 

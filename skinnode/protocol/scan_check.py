@@ -1,4 +1,4 @@
-"""Scan check: a CRC over all codes of a scan and the first bytes of the scan's summary."""
+"""Scan check: a CRC over all codes of a scan and the first bytes of its summary."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ CRC_INITIAL: Final = 0xFFFF
 
 
 def check_of_codes(codes: Codes, profile: PatchProfile) -> int:
-    """Return the CRC over the codes only; :func:`scan_check` adds the summary.
+    """Return the CRC over the codes of a scan; :func:`scan_check` extends it over the summary.
 
     Args:
-        codes: (U, K) codes after the scan, including those of unsent chunks.
+        codes: (U, K) codes of all chunks, including those not sent in this scan.
         profile: sizes of the patch.
     """
     if profile.code_bits == 16:
@@ -28,22 +28,21 @@ def check_of_codes(codes: Codes, profile: PatchProfile) -> int:
 
 
 def scan_check(check_of_codes: int, head: bytes) -> int:
-    """Return the scan check: a CRC over all codes of a scan and the first bytes of the scan's summary.
+    """Return the scan check: a CRC over all codes of a scan and the first bytes of its summary.
 
     The algorithm is CRC-16/IBM-3740: polynomial x¹⁶ + x¹² + x⁵ + 1 (0x1021), initial value 0xFFFF, most
     significant bit first, not inverted. The CRC of the ASCII digits ``123456789`` is 0x29B1. The CRC covers,
     in this order:
 
-    1. All U·K codes, ordered by upper wire. Each code is little-endian and has 2 bytes (16-bit codes) or 3
-       bytes (24-bit codes). For a chunk that is not sent in this scan, the CRC covers the codes that were
-       last sent, which may differ from the newest codes by up to the delta threshold.
-    2. The argument ``head``, the first 6 bytes of the summary: scan counter, flags, number of chunks sent,
-       device time. Because the CRC covers the scan counter and the device time, codes of a different scan
-       fail the check.
+    1. All U·K codes, ordered by upper wire. Each code is little-endian, with 2 bytes for 16-bit codes and 3
+       bytes for 24-bit codes. For an unsent chunk, these are the codes that were last sent, which may differ
+       from the measured codes by up to the delta threshold.
+    2. The first 6 bytes of the summary: scan counter, flags, number of chunks sent, and device time. Codes of
+       another scan fail the check, because their scan counter or device time differs.
 
-    The check detects every burst error of up to 16 bits, such as one wrong 16-bit code, and every odd number
-    of wrong bits. In up to 4,087 bytes of codes, the check also detects any two wrong bits. One in 65,536 of
-    all other errors remains undetected.
+    The check detects every error burst of up to 16 bits, such as one wrong 16-bit code, and every odd number
+    of bit errors. With up to 4,087 bytes of codes, it also detects every double bit error. Of all other
+    errors, one in 65,536 goes undetected.
 
     Args:
         check_of_codes: result of :func:`check_of_codes`.

@@ -8,7 +8,7 @@ from typing import Final, NamedTuple
 
 
 class SelfTestStatus(enum.IntEnum):
-    """Verdict of a self-test (0x2023:1)."""
+    """Result of a self-test (0x2023:1)."""
 
     NEVER_RUN = 0
     PASSED = 1
@@ -19,23 +19,22 @@ class SelfTestFault(enum.IntFlag):
     """Faults found by a self-test (0x2023:2), as flags."""
 
     SOURCE = 0x01
-    """The converter failed to return a valid reading at least once."""
+    """The converter returned no valid reading at least once."""
     NOISE = 0x02
     OPEN_WIRE = 0x04
     SHORTED_WIRE = 0x08
     OUT_OF_RANGE = 0x10
-    """At least one crossing with a baseline is open, shorted or out of range and therefore yielded no
-    measurement."""
+    """At least one crossing with a baseline is open, shorted or over-range."""
     NO_BASELINE = 0x20
 
 
 class SelfTest(NamedTuple):
-    """Findings of a self-test, in the order of sub-indices 2 and above of 0x2023."""
+    """Findings of a self-test, in the order of the sub-indices of 0x2023 from 2."""
 
     faults: SelfTestFault
     readings: int
     noise: float
-    """Relative noise of the readings: RMS of the relative standard deviations of all crossings."""
+    """Relative noise: RMS over all crossings of the standard deviation divided by the mean."""
     open_wires: int
     shorted_wires: int
     out_of_range: int
@@ -48,9 +47,9 @@ SELF_TEST_NEVER_RUN: Final = bytes(_SELF_TEST.size)
 
 
 def pack_self_test(test: SelfTest) -> bytes:
-    """Pack the findings of a self-test into the content of record 0x2023.
+    """Return the content of record 0x2023 after a self-test.
 
     Args:
-        test: findings of the self-test. The self-test has passed if the findings contain no faults.
+        test: findings of the self-test, which has passed if there are no faults.
     """
     return _SELF_TEST.pack(SelfTestStatus.FAILED if test.faults else SelfTestStatus.PASSED, *test)

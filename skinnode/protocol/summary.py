@@ -16,32 +16,29 @@ _SUMMARY: Final = struct.Struct("<BBHI")
 _HEAD: Final = struct.Struct("<BBHH")
 
 HEAD_BYTES: Final = _HEAD.size
-"""Number of bytes of a summary that the scan check covers, counted from the first byte."""
+"""Number of leading bytes of a summary that the scan check covers."""
 
 
 class SummaryFlag(enum.IntFlag):
     """Flags of a scan summary. Undefined bits are sent as 0 and ignored on reception."""
 
     CHANGED_ONLY = 0x01
-    """Only changed chunks were sent; all other chunks are the same as in the previous scan."""
+    """Only changed chunks were sent. All other chunks are the same as in the previous scan."""
     OVERRUN = 0x02
     """Some chunks of the scan were not sent, so their codes are unknown."""
     WIRE_FAULT = 0x04
     """At least one wire is open or shorted; see 0x2030 and 0x2031."""
     BASELINE_CHANGED = 0x08
-    """This scan is the first scan with a new baseline. The host must re-read the baseline (0x2200 and
-    above)."""
+    """This scan is the first with a new baseline. The host must read 0x2200 and above again."""
     SOURCE_FAILED = 0x10
-    """The converter returned no valid reading, so no chunks were sent and the codes of this scan are
-    unknown."""
+    """The converter returned no valid reading. No chunks were sent, and the codes are unknown."""
     CHECKED = 0x20
     """Bytes 4 to 7 of the summary contain the u16 device time in steps of 64 µs and the u16 scan check.
     Without this flag, as in patches of revision 1.0, bytes 4 to 7 contain the u32 device time in µs."""
     CONVERSIONS = 0xC0
-    """Conversion phase, a two-bit number. The phase is 0 if the patch does not supply a phase. Otherwise, the
-    phase cycles from 1 to 3. The phase advances if the converter has completed a new conversion of all
-    crossings since the previous scan. Two successive scans with the same phase therefore contain the same
-    conversion."""
+    """Two-bit conversion phase. The phase cycles through 1, 2 and 3, and advances if the converter has
+    completed a conversion of all crossings since the previous scan. Two successive scans with the same phase
+    therefore contain the same conversion. The phase is 0 if the patch does not count its conversions."""
 
 
 class Summary(NamedTuple):
@@ -54,22 +51,22 @@ class Summary(NamedTuple):
     chunks: int
     """Number of chunks sent in this scan."""
     device_time_us: int
-    """Device time in µs, from 0 to 2³² − 1. In a summary with a ``check``, the device time is a multiple of
-    64 from 0 to 2²² − 64; see :mod:`skinnode.protocol.device_time`."""
+    """Time on the node's clock, µs, 0 to 2³² − 1. In a summary with a ``check``, only bits 6 to 21 are known
+    and all others are 0; see :mod:`skinnode.protocol.device_time`."""
     check: int | None = None
     """Scan check (:mod:`skinnode.protocol.scan_check`); None if :attr:`SummaryFlag.CHECKED` is not set."""
 
 
 PHASES: Final = 3
-"""Number of conversion phases. After missed scans, the phase of the next scan does not show how many
-conversions took place, because the phase may have advanced by any number of steps."""
+"""Number of conversion phases, not counting 0. A phase can be compared only with the phase of the previous
+scan: after missed scans, it may have wrapped."""
 _PHASE_SHIFT: Final = 6
 
-_CHECKED: Final = int(SummaryFlag.CHECKED)  # testing an int is ten times as fast as testing an enum flag
+_CHECKED: Final = int(SummaryFlag.CHECKED)  # ten times as fast to test as an enum flag
 
 
 def conversion_phase(flags: int) -> int:
-    """Return the conversion phase from a summary's flags; 0 if the patch does not supply the phase."""
+    """Return the conversion phase from a summary's flags; 0 if the patch does not count its conversions."""
     return flags >> _PHASE_SHIFT & 3
 
 
@@ -88,7 +85,7 @@ def pack_summary(scan: int, flags: int, chunks: int, device_time_us: int) -> byt
         device_time_us: time on the node's clock, µs; wraps at 2³².
 
     Raises:
-        ValueError: if the scan counter, the flags or the number of chunks do not fit their fields.
+        ValueError: if the scan counter, the flags or the number of chunks does not fit into its field.
     """
     try:
         return _SUMMARY.pack(scan, flags, chunks, device_time_us & 0xFFFF_FFFF)
@@ -110,7 +107,7 @@ def pack_checked_summary(
             this scan, including those of unsent chunks.
 
     Raises:
-        ValueError: if the scan counter, the flags or the number of chunks do not fit their fields.
+        ValueError: if the scan counter, the flags or the number of chunks does not fit into its field.
     """
     steps = device_time_us >> TIME_SHIFT & 0xFFFF
     try:
@@ -121,7 +118,9 @@ def pack_checked_summary(
 
 
 def pack_summary_record(payload: bytes, device_time_us: int) -> bytes:
-    """Return the content of record 0x2011 for a given summary.
+    """Return the content of record 0x2011 for a summary.
+
+    In a summary with a check, the full device time is inserted before the 16-bit device time.
 
     Args:
         payload: the payload of TPDO2.
@@ -137,7 +136,7 @@ def unpack_summary(data: bytes, *, cob_id: int = _COB_ID) -> Summary:
 
     Args:
         data: payload of the frame.
-        cob_id: COB-ID to be shown in the error.
+        cob_id: COB-ID for the error message.
 
     Raises:
         CodecError: if the payload is not 8 bytes long.

@@ -1,4 +1,4 @@
-"""Read the resistances of a patch from its analogue port, encode them as codes, and measure the baseline."""
+"""Reads the resistances of a patch from its analogue port, encodes them, and measures the baseline."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from skinnode.protocol.profile import PatchProfile
 from skinnode.protocol.summary import PHASES
 
 TARE_READS: Final = 16
-"""Number of readings averaged to measure a baseline. Averaging reduces the noise of the baseline to a quarter
-of the noise of one reading. The relative noise of R/R0 is then only 3 % higher than that of R."""
+"""Number of readings averaged for a baseline. The noise of the baseline is then a quarter of the noise of a
+reading, and the relative noise of R/R0 is only 3 % higher than that of R."""
 
 
 class Acquisition:
-    """Acquisition of codes from a source. Stores the baseline and the codes of the last scan.
+    """Baseline of a patch, and the codes of its last scan.
 
     Args:
         profile: sizes of the patch.
@@ -46,21 +46,20 @@ class Acquisition:
         if (given < 0).any():
             raise ValueError(f"baseline_ohm: got {given.min()}, must not be negative")
         self.baseline_ohm: NDArray[np.float32] = given.astype(np.float32)
-        """(U, K) baseline R0 in ohms, with REAL32 precision as in the object dictionary; 0 where R0 is
-        unknown."""
+        """(U, K) baseline R0 with REAL32 precision, as in the object dictionary, ohm; 0 where unknown."""
         self.codes: Codes = np.full(shape, scale.open, dtype=np.uint32)
-        """(U, K) codes of the last scan; before the first scan, all elements are the code for open."""
+        """(U, K) codes of the last scan; all open before the first scan."""
         self.faults = WireFaults.none(profile)
         """Wire faults of the last scan."""
         self.phase = 0
         """Conversion phase of the last scan; 0 if the source does not count its conversions."""
-        # Conversion count of the source at the last scan.
+        # conversion count of the source at the last scan
         self._conversions: int | None = None
         self.selection = ChunkSelection(profile, scale)
-        """Selector of the chunks to send when only changed chunks are sent (send mode 0x2020:1)."""
+        """Selects the chunks to send in send mode 1 (changed chunks only)."""
 
     def read(self, t_ns: int) -> Float:
-        """Read the source at ``t_ns`` and return (U, K) resistances in ohms.
+        """Read the source once and return (U, K) resistances, ohm.
 
         Raises:
             SourceFailed: if the source returns no valid reading.
@@ -68,7 +67,7 @@ class Acquisition:
         return read_source(self._source, (self.profile.rows, self.profile.columns), t_ns)
 
     def sample(self, t_ns: int, readings: int = 1) -> None:
-        """Take a scan: read the source once or several times, and encode the mean.
+        """Take a scan: read the source, and encode the mean of the readings.
 
         Args:
             t_ns: current time, ns.
@@ -88,7 +87,7 @@ class Acquisition:
         self.faults = find_faults(self.codes, self.scale)
 
     def _total(self, t_ns: int, readings: int) -> Float:
-        """Return the (U, K) sum of several readings in ohms; ∞ − ∞ gives NaN, which is encoded as open."""
+        """Return the (U, K) sum of several readings, ohm. ∞ − ∞ gives NaN, which is encoded as open."""
         total = self.read(t_ns)
         with np.errstate(over="ignore", invalid="ignore"):
             for _ in range(readings - 1):
@@ -96,18 +95,18 @@ class Acquisition:
         return total
 
     def tare(self, t_ns: int, readings: int = TARE_READS) -> None:
-        """Measure the current resistances and make them the baseline.
+        """Make the current resistances the baseline.
 
-        R0 remains unchanged at crossings without a valid resistance.
+        Crossings without a valid resistance keep their R0.
 
         Args:
             t_ns: current time, ns.
-            readings: number of readings averaged.
+            readings: number of readings to average.
 
         Raises:
             SourceFailed: if the source returns no valid reading.
         """
-        with np.errstate(over="ignore", under="ignore"):  # resistances above the REAL32 range are invalid
+        with np.errstate(over="ignore", under="ignore"):  # a resistance beyond REAL32 is invalid
             mean = (self._total(t_ns, readings) / readings).astype(np.float32)
         measured = np.isfinite(mean) & (mean > 0)
         self.baseline_ohm = np.where(measured, mean, self.baseline_ohm)
@@ -115,13 +114,13 @@ class Acquisition:
         self.selection.forget()
 
     def set_baseline(self, row: int, column: int, value_ohm: float) -> None:
-        """Set R0 (ohm) of one crossing. The node then no longer tares automatically, but only on command."""
+        """Set the R0 of one crossing, ohm. From then on, the node tares only on command."""
         self.baseline_ohm[row, column] = value_ohm
         self.tared = True
         self.selection.forget()
 
     def set_baselines(self, values_ohm: NDArray[np.float32]) -> None:
-        """Set the baseline R0 of all crossings: (U, K) values in ohms."""
+        """Set the (U, K) baseline R0, ohm."""
         self.baseline_ohm = values_ohm
         self.tared = True
         self.selection.forget()

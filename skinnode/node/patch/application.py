@@ -1,7 +1,7 @@
-"""Patch application, which takes scans, measures the baseline and performs self-tests.
+"""Application of a patch: takes scans, measures the baseline and runs self-tests.
 
-The module :mod:`skinnode.node.patch.objects` connects the manufacturer objects (0x2000 to 0x2301) to the
-application. The CANopen communication services are in :mod:`skinnode.node.device`.
+Most manufacturer objects (0x2000 to 0x2301) are connected to the application in
+:mod:`skinnode.node.patch.objects`.
 """
 
 from __future__ import annotations
@@ -35,14 +35,14 @@ from skinnode.protocol.summary import SummaryFlag, conversion_flags
 
 
 class PatchApplication:
-    """Application of one patch, which implements :class:`~skinnode.node.application.Application`.
+    """Application of one patch; implements :class:`~skinnode.node.application.Application`.
 
     Args:
         layout: electrodes of the patch.
         serial: serial number (0x2000:11), u32.
         acquisition: source of the codes and the baseline.
-        services: services that the device provides.
-        pacing: timer precision of the node, also used to pace the chunks.
+        services: services of the device.
+        pacing: timer precision of the node, which determines how chunks are paced.
     """
 
     def __init__(
@@ -75,9 +75,9 @@ class PatchApplication:
         self.overruns = 0
         """Number of scans skipped because one scan was still being sent and another was waiting."""
         self.slow_overruns = 0
-        """Number of scans skipped because the computer or the bus is too slow, rather than because the scan
+        """Number of scans skipped because the computer or the bus was too slow, rather than because the scan
         period is too short."""
-        self._scan_ns = NO_DEADLINE_NS  # time of the next scan triggered by the node's timer
+        self._scan_ns = NO_DEADLINE_NS  # time of the next timer-driven scan
         describe(services.store, layout, acquisition.scale, serial)
         self._connect()
 
@@ -85,16 +85,16 @@ class PatchApplication:
 
     @property
     def deadline_ns(self) -> int:
-        """Time (ns) at which :meth:`on_timer` must be called next, to take or send a scan."""
+        """Time at which :meth:`on_timer` must be called next, ns."""
         return min(self._scan_ns, self.stream.deadline_ns)
 
     @property
     def baseline_ohm(self) -> Float:
-        """(U, K) current baseline R0 in ohms; 0 where R0 is unknown."""
+        """(U, K) baseline R0, ohm; 0 where unknown."""
         return self._acquisition.baseline_ohm.astype(np.float64)
 
     def power_on(self, t_ns: int) -> None:
-        """Load the baseline from the memory; tare if neither the memory nor the caller has supplied one.
+        """Load the baseline from the memory, or tare if there is no baseline at all.
 
         Args:
             t_ns: current time, ns.
@@ -108,7 +108,7 @@ class PatchApplication:
                 self._storage.keep_baseline()
 
     def reset(self) -> None:
-        """Restart the scan counter, and report all persisting faults again."""
+        """Restart the scan counter. Faults that persist are reported again."""
         self._counter, self._late = -1, False
         self._wire_faults.reset()
         self._test = SELF_TEST_NEVER_RUN
@@ -125,21 +125,21 @@ class PatchApplication:
         self._plan()
 
     def on_sync(self, counter: int | None, turns: frozenset[int], t_ns: int) -> None:
-        """Take a scan at a SYNC in OPERATIONAL, unless the node's timer triggers scans.
+        """Take a scan at a SYNC in OPERATIONAL, unless scans are timer-driven.
 
         Args:
-            counter: SYNC counter; None if the SYNC message contains no counter.
+            counter: SYNC counter; None if the SYNC contains no counter.
             turns: numbers of the synchronous TPDOs that are due.
-            t_ns: time at which the SYNC was received, ns.
+            t_ns: arrival time of the SYNC, ns.
         """
         scans = not self._period_ns
-        if not scans or self.stream.full:  # otherwise, this SYNC starts a new scan
+        if not scans or self.stream.full:  # this SYNC does not start a scan
             self.stream.on_sync(turns, t_ns)
         if scans:
             self._scan(self._following() if counter is None else counter, turns, t_ns)
 
     def on_timer(self, t_ns: int) -> None:
-        """Send the chunks and summaries due at ``t_ns``, and take a scan if the scan period has elapsed."""
+        """Send the chunks and summaries due at ``t_ns``, and take a timer-driven scan if it is due."""
         self.stream.on_timer(t_ns)
         if t_ns >= self._scan_ns:
             self._scan_ns = max(self._scan_ns + self._period_ns, t_ns)
@@ -162,13 +162,13 @@ class PatchApplication:
         return None
 
     def _new_baseline(self) -> None:
-        """Announce a complete new baseline, and save it without waiting for a save command."""
+        """Announce a new baseline and save it."""
         self._mark_baseline()
         self._storage.keep_baseline()
         self._storage.report(self._now())
 
     def _mark_baseline(self) -> None:
-        """Announce a new baseline with a flag in the next summary."""
+        """Announce a new baseline in the next summary."""
         self._baseline_changed = True
 
     # --- scans
@@ -177,7 +177,7 @@ class PatchApplication:
         return self._counter + 1 & 0xFF
 
     def _scan(self, counter: int, turns: frozenset[int], t_ns: int) -> None:
-        """Take a scan now and queue it, or skip the scan if another scan is already waiting."""
+        """Take a scan and queue it, or skip it if another scan is already waiting."""
         self._counter = counter
         if self.stream.full:
             self.overruns += 1
@@ -202,18 +202,18 @@ class PatchApplication:
             self._end_overrun(t_ns)
 
     def _end_overrun(self, t_ns: int) -> None:
-        """Report the end of an overrun: a new scan can be queued again, or scanning has stopped."""
+        """Report the end of an overrun, because scans are no longer skipped."""
         self._late = False
         self._emcy.clear(EmcyCode.CAN_OVERRUN, t_ns)
 
     def _sample(self, counter: int, t_ns: int) -> tuple[list[bytes], SummaryFlag, Codes]:
         """Take a scan.
 
-        Returns the chunks to send, the summary flags, and the (U, K) codes that a receiver has after this
-        scan. Raises SourceFailed if the source returns no valid reading.
+        Returns the chunks to send, the summary flags, and the (U, K) codes that the receiver will have after
+        this scan. Raises SourceFailed if the source returns no valid reading.
         """
         store, acquisition = self._store, self._acquisition
-        if not acquisition.tared:  # no baseline yet, because taring at power-on failed
+        if not acquisition.tared:  # taring failed at power-on
             self._tare(t_ns)
             self._new_baseline()
         with self.source.watch(t_ns):
@@ -259,8 +259,7 @@ class PatchApplication:
             case od.SELF_TEST if value not in (0, od.SELF_TEST_SIGNATURE):
                 raise Refused(AbortCode.CANNOT_STORE)
             case od.SINGLE_SCAN if value:
-                # If scans are numbered by the SYNC counter, a scan on command would have the same number as
-                # the scan at the next SYNC.
+                # With SYNC counters, a single scan would have the same counter as the scan at the next SYNC.
                 numbered_by_sync = not self._period_ns and self._store.integer(od.SYNC_COUNTER_OVERFLOW)
                 if numbered_by_sync or not self._operational:
                     raise Refused(AbortCode.DEVICE_STATE)

@@ -1,4 +1,4 @@
-"""Selection of the chunks to send when only changed chunks are sent (send mode 0x2020:1)."""
+"""Selection of the chunks to send in send mode 1, in which only changed chunks are sent (0x2020:1)."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from skinnode.protocol.profile import PatchProfile
 
 
 class ChunkSelection:
-    """Selector of the chunks whose codes have changed since they were last sent.
+    """Selects the chunks whose codes have changed since they were last sent.
 
     Args:
         profile: sizes of the patch.
@@ -23,25 +23,25 @@ class ChunkSelection:
         self._since_full = 0  # number of scans since the last full scan
         self._full_scan_due = True
         self.sent: Codes = np.full((profile.rows, profile.columns), scale.open, dtype=np.uint32)
-        """(U, K) codes in the chunks last sent; before the first scan, all elements are the code for open."""
+        """(U, K) codes that were last sent; all open before the first scan."""
 
     def forget(self) -> None:
-        """Make the next scan a full scan, because the receiver may lack the codes sent earlier."""
+        """Make the next scan a full scan, because the receiver may not have the codes that were last sent."""
         self._full_scan_due = True
 
     def changed_chunks(self, codes: Codes, threshold: int, full_every: int) -> list[int] | None:
-        """Return the indices of the chunks to send, and record them as sent.
+        """Select the chunks to send, and record their codes as sent.
 
-        A chunk is selected if one of its codes differs from the code last sent by more than the threshold, or
-        by any amount if either of the two codes is reserved.
+        A chunk is selected if one of its codes differs from the last code sent by more than the threshold, or
+        if it differs at all and either code is reserved.
 
         Args:
             codes: (U, K) codes of the scan.
-            threshold: maximum code change for which a chunk is not sent.
-            full_every: interval between full scans, as a number of scans; 0 for no further full scans.
+            threshold: largest change of a code that is not sent.
+            full_every: interval between full scans, scans; 0 for no regular full scans.
 
         Returns:
-            Indices of the chunks in ascending order; None if a full scan is due.
+            Numbers of the chunks in ascending order, or None if a full scan is due.
         """
         self._since_full += 1
         if self._full_scan_due or (full_every and self._since_full >= full_every):

@@ -1,4 +1,4 @@
-"""Find resistance sources by name. Other packages can register sources as entry points."""
+"""Creates resistance sources by name. Installed packages can register sources as entry points."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def load(reference: str, option: str) -> Any:
 
     Args:
         reference: ``MODULE:NAME``.
-        option: name of the option, to be shown in the error.
+        option: name of the option for the error message.
 
     Raises:
         ConfigError: if the module cannot be imported or does not contain the name.
@@ -41,13 +41,13 @@ def load(reference: str, option: str) -> Any:
 
 
 def make_source(name: str, layout: PatchLayout, option: str = "source") -> ResistanceSource:
-    """Create a source for a patch, and read the source once to detect faults before the node starts.
+    """Create the source of a patch, and read it once to detect faults before the node starts.
 
     Args:
-        name: name of an entry point, or ``MODULE:NAME``, for a class or function that takes the layout and
-            returns a :class:`~skinnode.node.patch.source.ResistanceSource`.
-        layout: the electrodes of the patch.
-        option: name of the option, to be shown in the error.
+        name: entry point or ``MODULE:NAME`` of a class or function that takes the layout and returns a
+            :class:`~skinnode.node.patch.source.ResistanceSource`.
+        layout: electrodes of the patch.
+        option: name of the option for the error message.
 
     Raises:
         ConfigError: if the source is not found, cannot be created or returns no valid reading.

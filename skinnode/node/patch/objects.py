@@ -1,4 +1,4 @@
-"""Functions that connect the manufacturer objects (0x2000 to 0x2301) to the values of a running patch."""
+"""Connects the manufacturer objects (0x2000 to 0x2301) to the values of a running patch."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from skinnode.protocol.coordinates import pack_coordinates
 
 
 def describe(store: ObjectStore, layout: PatchLayout, scale: CodeScale, serial: int) -> None:
-    """Set the objects that describe the patch: descriptor (0x2000) and electrode coordinates (0x2300).
+    """Set the patch descriptor (0x2000) and the electrode coordinates (0x2300).
 
     Args:
         store: object dictionary.
@@ -39,12 +39,12 @@ def describe(store: ObjectStore, layout: PatchLayout, scale: CodeScale, serial: 
 
 
 def bind_scan(store: ObjectStore, acquisition: Acquisition, stream: ScanStream) -> None:
-    """Bind the objects that contain the last scan: chunk, summary, wire faults and codes.
+    """Bind the objects of the last scan: chunk, summary, wire faults and codes.
 
     Args:
         store: object dictionary.
-        acquisition: source of the codes and wire faults.
-        stream: source of the last chunk and summary.
+        acquisition: provides the codes and wire faults.
+        stream: provides the last chunk and summary.
     """
     chunk, summary = fields_of(store, od.CHUNK), fields_of(store, od.SUMMARY)
     store.bind(od.CHUNK, lambda sub: stream.chunk[chunk[sub]])
@@ -58,13 +58,13 @@ def bind_scan(store: ObjectStore, acquisition: Acquisition, stream: ScanStream) 
 def bind_baseline(
     store: ObjectStore, acquisition: Acquisition, changed: Callable[[], None], replaced: Callable[[], None]
 ) -> None:
-    """Bind the objects that contain the baseline (0x2200 and above, 0x2301).
+    """Bind the objects of the baseline (0x2200 and above, 0x2301).
 
     Args:
         store: object dictionary.
-        acquisition: owner of the baseline.
-        changed: called after a client has written one crossing's R0.
-        replaced: called after a client has written the whole baseline.
+        acquisition: contains the baseline.
+        changed: callback for a write of the R0 of one crossing.
+        replaced: callback for a write of the whole baseline.
     """
     profile = acquisition.profile
     for row in range(profile.rows):
@@ -84,7 +84,7 @@ def bind_baseline(
 
 
 def fields_of(store: ObjectStore, index: int) -> dict[int, slice]:
-    """Return the slice of each sub-object within the concatenated bytes of a record.
+    """Return the slice of each sub-index within the concatenated bytes of a record.
 
     Args:
         store: object dictionary.
@@ -120,7 +120,7 @@ def _bind_baseline_row(
 
 
 def _fault_word(masks: tuple[Mask, ...], subindex: int) -> bytes:
-    """Return a mask of 32 wires: open wires for odd sub-indices, shorted wires for even sub-indices."""
+    """Return the bit mask of 32 wires at a sub-index: open wires if odd, shorted wires if even."""
     first = (subindex - 1) // 2 * 32
     bits = masks[(subindex - 1) % 2][first : first + 32]
     return np.packbits(bits, bitorder="little").tobytes().ljust(4, b"\0")

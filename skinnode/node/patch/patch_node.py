@@ -1,8 +1,4 @@
-"""CANopen node of a patch.
-
-A patch node combines the device in :mod:`skinnode.node.device` with the application in
-:mod:`skinnode.node.patch.application`.
-"""
+"""CANopen node of a patch: the device of :mod:`skinnode.node.device` with the application of a patch."""
 
 from __future__ import annotations
 
@@ -24,22 +20,22 @@ from skinnode.protocol.profile import PatchProfile
 
 
 class PatchNode(CanopenDevice):
-    """CANopen node of one patch. The node sends nothing before :meth:`power_on`.
+    """CANopen node of one patch. It is silent until :meth:`power_on`.
 
     Args:
-        node_id: 1 to 127, or 255 to wait until LSS assigns a node-ID. A node-ID stored in the memory by LSS
-            takes precedence.
+        node_id: 1 to 127, or 255 to wait until LSS assigns a node-ID. A node-ID that LSS has stored in the
+            memory takes precedence.
         layout: electrodes of the patch, which determine the sizes of the object dictionary.
-        source: analogue port of the patch, read once per scan.
-        send: called with the COB-ID and payload of each frame that the node sends, in order.
-        profile: wire format of the patch; by default the layout's format with 16-bit codes.
+        source: analogue port of the patch.
+        send: function that sends a frame, given its COB-ID and payload.
+        profile: wire format of the patch; by default, 16-bit codes on classic CAN.
         serial: serial number (0x1018:4 and 0x2000:11), u32.
         baseline_ohm: (U, K) initial R0, ohm; None to tare at the first power-on. A baseline in the memory
             takes precedence.
         pacing: :data:`~skinnode.node.clock.EXACT` for a node on its own board,
             :data:`~skinnode.node.clock.THRIFTY` for many nodes on one computer.
-        memory: memory for the configuration, baseline and node-ID; None for a node without a memory.
-        set_bit_rate: changes the bit rate (bit/s) for LSS; None if the node cannot change it.
+        memory: non-volatile memory for the parameters, baseline and LSS configuration, or None.
+        set_bit_rate: function that changes the bit rate (bit/s), or None if LSS cannot change it.
 
     Raises:
         ValueError: if an argument is out of range.
@@ -82,32 +78,32 @@ class PatchNode(CanopenDevice):
 
     @property
     def scans_sent(self) -> int:
-        """Number of scans sent completely since the node was created."""
+        """Number of scans sent since the node was created."""
         return self._patch.stream.scans_sent
 
     @property
     def baseline_ohm(self) -> Float:
-        """(U, K) current baseline R0 in ohms; 0 where R0 is unknown."""
+        """(U, K) baseline R0, ohm; 0 where unknown."""
         return self._patch.baseline_ohm
 
     @property
     def source_failures(self) -> int:
-        """Number of scans, tares and self-test readings that failed because the source failed."""
+        """Number of scans, tares and self-test readings for which the source returned no valid reading."""
         return self._patch.source.failures
 
     @property
     def source_error(self) -> str:
-        """One-line description of the source's last failure; empty before the first failure."""
+        """One-line description of the latest source failure; empty if there has been none."""
         return self._patch.source.error
 
     @property
     def rival_frames(self) -> int:
-        """Number of boot-up messages and heartbeats from another node with this node-ID."""
+        """Number of boot-ups and heartbeats received from another node with the same node-ID."""
         return self._rejected.counted(Rejected.OWN_ERROR_CONTROL)
 
     @property
     def memory_problem(self) -> str:
-        """One-line description of the latest memory problem; empty if no problem has occurred."""
+        """One-line description of the latest memory problem; empty if there has been none."""
         return self._storage.problem
 
     @property
@@ -117,5 +113,5 @@ class PatchNode(CanopenDevice):
 
     @property
     def slow_overruns(self) -> int:
-        """Number of scans skipped because the computer or the bus is too slow."""
+        """Number of scans skipped because the computer or the bus was too slow."""
         return self._patch.slow_overruns

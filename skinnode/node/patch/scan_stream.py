@@ -1,27 +1,26 @@
-"""Send the chunks of each scan at intervals of at least the inhibit time, followed by the summary.
+"""Sends scans through the TPDOs of a node: first the chunks, then the summary.
 
-Chunks are sent in a TPDO whose first mapped object is 0x2010. This TPDO must be event-driven, or it must be
-due at the SYNC that starts the scan. After the chunks, the summary is sent in all TPDOs whose first mapped
-object is 0x2011. A summary TPDO is sent immediately if it is event-driven, or if it was due at the SYNC that
-started the scan. Any other summary TPDO is sent at the next SYNC at which it is due. Event-driven TPDOs with
-other objects are also sent after the chunks.
+Chunks are sent in the first TPDO whose first mapped object is 0x2010 and which is event-driven or due at the
+SYNC that starts the scan. The summary is sent in every TPDO whose first mapped object is 0x2011. If such
+a TPDO is event-driven, or was due at the SYNC that started the scan, it follows directly after the chunks.
+Otherwise, it is sent at the next SYNC at which it is due. The end of a scan also triggers all event-driven
+TPDOs that contain other objects.
 
-**Pacing.** The standard defines the inhibit time as a minimum interval between frames. On a general-purpose
-operating system, however, threads wake up late. A scan could then take longer than the SYNC period if the
-minimum interval were strict. The stream therefore compensates for delays of up to ``catch_up_ns``, if
-necessary by sending several frames at once. The mean frame rate never exceeds the rate that the inhibit time
-allows (generic cell rate algorithm, ITU-T I.371). If ``catch_up_ns`` is 0, the minimum interval is strict.
+**Pacing.** CiA 301 defines the inhibit time as a minimum interval between frames. Under a general-purpose
+operating system, threads wake up late, and with a strict minimum interval, a scan could take longer than the
+SYNC period. The stream therefore makes up for delays of up to ``catch_up_ns``, if necessary by sending
+several frames at once. The mean frame rate stays within the limit set by the inhibit time (generic cell rate
+algorithm, ITU-T I.371). With ``catch_up_ns`` 0, the minimum interval is strict.
 
-The node receives the time of a SYNC from its caller, but cannot measure how long it then takes to read the
-resistances. The stream therefore requests a timer event immediately after a scan's first chunk. The interval
-to the second chunk is then measured from the time of this timer event.
+The node has no clock to measure how long it takes to read the resistances after a SYNC. The stream therefore
+requests a timer event directly after the first chunk, and paces the second chunk from the time of this event.
 
-**Synchronous window (0x1007).** Chunks and summaries in synchronous TPDOs that are still unsent when the
-window closes are discarded. The synchronous window does not apply to event-driven TPDOs.
+**Synchronous window (0x1007).** Chunks and summaries in synchronous TPDOs are discarded if they are still
+unsent when the window closes. Event-driven TPDOs are not affected.
 
-**Queue.** A scan waits while another scan is being sent; only one scan can wait. Chunks of two scans are
-never interleaved. If the node leaves OPERATIONAL, the scan being sent ends without a summary. If the chunk
-TPDO is disabled, the summary indicates that chunks are missing.
+**Queue.** While a scan is being sent, one other scan can wait. Chunks of two scans are never interleaved. If
+the node leaves OPERATIONAL, all scans are dropped without a summary. If the chunk TPDO is disabled, the
+summary states that chunks are missing.
 """
 
 from __future__ import annotations
@@ -38,8 +37,8 @@ from skinnode.node.pdo.tpdo import Tpdo, TpdoEngine
 from skinnode.protocol.summary import SummaryFlag, pack_checked_summary, pack_summary, pack_summary_record
 
 _HELD_UP: Final = 0.1
-"""A skipped scan is attributed to a slow computer or bus if delays make up more than this fraction of the
-sending time. Normal thread jitter causes shorter delays."""
+"""Fraction of the sending time that delays must exceed before a slow computer or bus is blamed for a skipped
+scan. Delays due to normal scheduling jitter are shorter."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,21 +52,21 @@ class OutgoingScan:
     flags: int
     """Bits of :class:`~skinnode.protocol.summary.SummaryFlag`."""
     device_time_us: int
-    """Time of the scan on the node's clock in µs, modulo 2³²."""
+    """Time of the scan on the node's clock, µs, modulo 2³²."""
     check_of_codes: int | None = None
-    """CRC over the codes that a receiver has after this scan; None if the summary contains no CRC."""
+    """CRC over the codes that the receiver will have after this scan; None for a summary without a check."""
     turns: frozenset[int] = frozenset()
     """Numbers of the synchronous TPDOs that were due at the SYNC that started the scan."""
 
 
 class ScanStream:
-    """Sender of a patch's scans through its TPDOs.
+    """Sends the scans of a patch.
 
     Args:
         store: object dictionary.
-        tpdos: the TPDOs of the node.
-        chunk: content of the chunk record (0x2010) before the first chunk is sent.
-        catch_up_ns: maximum delay (ns) for which the stream compensates by sending the next chunks earlier.
+        tpdos: TPDO engine of the node.
+        chunk: initial content of the chunk record (0x2010).
+        catch_up_ns: maximum delay that is made up by sending the following chunks sooner, ns.
     """
 
     def __init__(self, store: ObjectStore, tpdos: TpdoEngine, chunk: bytes, catch_up_ns: int) -> None:
@@ -75,13 +74,13 @@ class ScanStream:
         self._whole_record = [(od.CHUNK, sub) for sub in range(1, store.integer(od.CHUNK, 0) + 1)]
         self._scan: OutgoingScan | None = None
         self._next_scan: OutgoingScan | None = None
-        self._carrier: Tpdo | None = None  # TPDO used for the chunks of the current scan
+        self._carrier: Tpdo | None = None  # TPDO of the current scan's chunks
         self._unsent: deque[bytes] = deque()
         self._verbatim = False  # whether the carrier maps exactly the chunk record
         self._chunks_sent = 0
-        self._busy_ns = 0  # time since which the stream has been sending without a pause
+        self._busy_ns = 0  # time at which the stream last started to send after being idle
         self._just_begun = False
-        self._paced_ns = 0  # sum of the inhibit times since ``_busy_ns``
+        self._paced_ns = 0  # sum of all inhibit times since _busy_ns
         self.chunk = chunk
         """Content of the chunk record (0x2010): the last chunk sent."""
         self.summary = bytes(12)
@@ -97,9 +96,9 @@ class ScanStream:
         return self._next_scan is not None
 
     def is_held_up(self, t_ns: int) -> bool:
-        """Return whether the stream is sending the current scans more slowly than the inhibit time permits.
+        """Return whether the stream is sending more slowly than the inhibit time allows.
 
-        Slow sending means that the thread receives too little processor time, or that the bus refuses frames.
+        This happens if the thread gets too little processor time or the bus refuses frames.
         """
         busy_ns = t_ns - self._busy_ns
         lost_ns = busy_ns - self._paced_ns
@@ -107,7 +106,7 @@ class ScanStream:
 
     @property
     def deadline_ns(self) -> int:
-        """Time (ns) at which :meth:`on_timer` must be called next."""
+        """Time at which :meth:`on_timer` must be called next, ns."""
         if self._scan is None:
             return NO_DEADLINE_NS
         return 0 if self._carrier is None or self._just_begun else self._carrier.ready_ns
@@ -115,11 +114,11 @@ class ScanStream:
     # --- methods called by the TPDO engine
 
     def sends(self, tpdo: Tpdo) -> bool:
-        """Return whether a TPDO is used to send the chunks of the current scan."""
+        """Return whether ``tpdo`` carries the chunks of the current scan."""
         return tpdo is self._carrier
 
     def on_reload(self, tpdo: Tpdo) -> None:
-        """Drop the current scan's remaining chunks if their TPDO was disabled or mapped differently."""
+        """Drop the remaining chunks of the current scan if their TPDO was disabled or remapped."""
         if tpdo is not self._carrier:
             return
         if tpdo.parameters.enabled and tpdo.first_index == od.CHUNK:
@@ -131,7 +130,7 @@ class ScanStream:
     # --- events
 
     def stop(self) -> None:
-        """Drop all scans without sending a summary, because the node has left OPERATIONAL."""
+        """Drop all scans without a summary, because the node leaves OPERATIONAL."""
         self._unsent.clear()
         self._scan = self._next_scan = self._carrier = None
 
@@ -142,12 +141,10 @@ class ScanStream:
                 self._tpdos.transmit(tpdo, t_ns)
 
     def offer(self, scan: OutgoingScan, t_ns: int) -> None:
-        """Send a scan, immediately or after the current scan.
-
-        The caller must first check that :attr:`full` is false.
+        """Send a scan, immediately or after the current scan. :attr:`full` must be false.
 
         Args:
-            scan: the scan.
+            scan: scan to send.
             t_ns: current time, ns.
         """
         if self._scan is None:
@@ -184,14 +181,14 @@ class ScanStream:
                 self._carrier, self._verbatim = tpdo, self._carries_record(tpdo)
                 tpdo.waiting = False
                 self._unsent.extend(scan.chunks)
-                tpdo.ready_ns = max(tpdo.ready_ns, t_ns)  # prevents a burst of chunks after a pause
+                tpdo.ready_ns = max(tpdo.ready_ns, t_ns)  # no burst of chunks after a pause
                 return
 
     def _carries_record(self, tpdo: Tpdo) -> bool:
         return [(each.index, each.subindex) for each in tpdo.parameters.mapping] == self._whole_record
 
     def _stream(self, t_ns: int) -> bool:
-        """Send the due chunks; return whether all chunks of the scan have been sent or discarded."""
+        """Send the chunks that are due. Return whether all chunks have been sent or discarded."""
         unsent, carrier = self._unsent, self._carrier
         if carrier is None:
             return True
@@ -205,7 +202,7 @@ class ScanStream:
             carrier.ready_ns = max(carrier.ready_ns, earliest_ns) + inhibit_ns
             self._paced_ns += inhibit_ns
             tpdos.emit(carrier, self.chunk if self._verbatim else tpdos.payload(carrier))
-            self._chunks_sent += 1  # not before sending, because the bus may refuse the chunk
+            self._chunks_sent += 1  # only now: the bus may have refused the chunk
         return not unsent
 
     def _end(self, scan: OutgoingScan, t_ns: int) -> None:

@@ -1,7 +1,7 @@
-"""Self-test of a patch (0x2021:3), which reads the source several times and checks the readings.
+"""Self-test of a patch (0x2021:3).
 
-A software node has no board to test, so the self-test checks only the source. The skin must not be touched
-during the self-test, because a touch would be measured as noise.
+The self-test checks several readings of the source. It does not check the board, because a software node has
+none. A touch during the self-test is measured as noise.
 """
 
 from __future__ import annotations
@@ -18,23 +18,23 @@ from skinnode.protocol.codes import CodeScale, encode
 from skinnode.protocol.self_test import SelfTest, SelfTestFault
 
 READINGS: Final = 16
-"""Number of readings in a self-test, as in a tare.
+"""Number of readings in a self-test.
 
-From 16 readings, the noise of one crossing is estimated with a relative standard error of 18 % (1/√30). For a
-patch with 300 crossings, the relative standard error of the RMS noise is 1 %.
+The relative standard error of the noise estimate is 1/√30 = 18 % for one crossing, and 1 % for the RMS over
+300 crossings.
 """
 
 NOISE_LIMIT: Final = 1e-3
-"""Maximum relative noise of a reading for which the self-test passes. The accuracy of the solver is specified
+"""Maximum relative noise of a reading; above it, the self-test fails. The accuracy of the solver is specified
 for a hundredth of this noise."""
 
 
-@np.errstate(over="ignore", invalid="ignore")  # only unrealistically large resistances overflow
+@np.errstate(over="ignore", invalid="ignore")  # only absurdly large resistances overflow
 def self_test(read: Callable[[], Float], baseline_ohm: Float, scale: CodeScale) -> SelfTest:
-    """Perform a self-test of a patch.
+    """Run a self-test.
 
     Args:
-        read: returns (U, K) resistances in ohm, or raises SourceFailed.
+        read: function that returns (U, K) resistances, ohm, or raises SourceFailed.
         baseline_ohm: (U, K) R0, ohm.
         scale: mapping of R/R0 to codes.
 
@@ -75,7 +75,7 @@ def self_test(read: Callable[[], Float], baseline_ohm: Float, scale: CodeScale) 
 
 
 def _noise(readings: Float) -> float:
-    """Return the relative noise of the readings: the RMS of all crossings' relative standard deviations."""
+    """Return the RMS, over all crossings, of the standard deviation divided by the mean."""
     if len(readings) < 2 or not readings.shape[1]:
         return 0.0
     relative = readings.std(axis=0, ddof=1) / readings.mean(axis=0)

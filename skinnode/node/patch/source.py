@@ -1,4 +1,4 @@
-"""Analogue port of a patch: the interface of a resistance source, such as a converter or the simulator."""
+"""Analogue port of a patch: interface of a resistance source, such as a converter or the simulator."""
 
 from __future__ import annotations
 
@@ -10,22 +10,22 @@ from skinnode.model.layout import Float, require_array
 
 
 class ResistanceSource(Protocol):
-    """Source of the resistances between a patch's upper and lower wires.
+    """Source of the resistances between the upper and the lower wires of a patch.
 
-    A source may also have an integer attribute ``conversions``, which counts how often the converter has
-    measured all crossings. The node reads ``conversions`` after :meth:`read`. Each summary indicates whether
-    the number has changed, so the host detects a stopped converter immediately. If the attribute
-    ``conversions`` is missing or None, the host must detect a stopped converter from the codes.
+    A source may also have an integer attribute ``conversions``: the number of times that the converter has
+    measured all crossings. The node reads it after :meth:`read`, and states in the summary whether it has
+    changed. The host can then detect a stopped converter immediately. If the attribute is missing or None,
+    the host must rely on the codes to detect a stopped converter.
 
-    The conversions must be counted in the converter itself, not in :meth:`read`. A source may have the
-    attribute ``conversions`` only if its converter measures all crossings at least once per scan.
+    The converter itself must count the conversions, not :meth:`read`, and it must measure all crossings at
+    least once per scan. Otherwise, the source must not have this attribute.
     """
 
     def read(self, t_ns: int) -> Float:
-        """Return (U, K) resistances in ohms: infinite for an open crossing, 0 for a shorted crossing.
+        """Return (U, K) resistances, ohm; infinite for an open crossing, 0 for a shorted crossing.
 
-        The node copies the returned array. If this method raises an exception, the node reports a failure of
-        the source, and reads the source again at the next scan.
+        The node copies the array. If this method raises an exception, the node reports a source failure and
+        tries again at the next scan.
 
         Args:
             t_ns: current time on the monotonic clock, ns.
@@ -34,7 +34,7 @@ class ResistanceSource(Protocol):
 
 
 def conversions_of(source: ResistanceSource) -> int | None:
-    """Return a source's number of completed conversions; None if the source does not count conversions.
+    """Return the number of conversions of a source, or None if the source does not count them.
 
     Raises:
         SourceFailed: if the attribute raises an exception or is not an integer.
@@ -49,16 +49,16 @@ def conversions_of(source: ResistanceSource) -> int | None:
 
 
 class SourceFault(IntEnum):
-    """Type of source failure, which is the first detail byte of the emergency message."""
+    """Type of source failure; sent as the first manufacturer-specific byte of the emergency message."""
 
     RAISED = 1
     """The source raised an exception."""
     WRONG_ARRAY = 2
-    """The source returned something other than an array of numbers with shape (U, K)."""
+    """The source did not return a (U, K) array of numbers."""
 
 
 class SourceFailed(Exception):
-    """Error raised if a source cannot be read."""
+    """A source returned no valid reading."""
 
     def __init__(self, fault: SourceFault, message: str) -> None:
         self.fault = fault
@@ -66,19 +66,19 @@ class SourceFailed(Exception):
 
 
 def read_source(source: ResistanceSource, shape: tuple[int, int], t_ns: int) -> Float:
-    """Read a source and check the shape of the reading.
+    """Read a source and check the reading.
 
     Args:
-        source: the source.
-        shape: (U, K).
+        source: source to read.
+        shape: shape of the reading, (U, K).
         t_ns: current time, ns.
 
     Returns:
-        (U, K) float64, ohm; a copy.
+        Copy of the (U, K) resistances, ohm, as float64.
 
     Raises:
-        SourceFailed: if the source raises an exception, or returns something other than an array of numbers
-            with the required shape. The error message is a single line.
+        SourceFailed: if the source raises an exception, or does not return an array of numbers with the
+            required shape. The message is a single line.
     """
     try:
         reading = source.read(t_ns)
@@ -88,6 +88,8 @@ def read_source(source: ResistanceSource, shape: tuple[int, int], t_ns: int) -> 
             SourceFault.RAISED, f"source.read(): {type(error).__name__}: {what}".rstrip(": ")
         ) from error
     try:
-        return require_array("source.read()", reading, shape, finite=False).copy()  # may be reused
+        return require_array(
+            "source.read()", reading, shape, finite=False
+        ).copy()  # the source may reuse its array
     except ValueError as error:
         raise SourceFailed(SourceFault.WRONG_ARRAY, str(error)) from None

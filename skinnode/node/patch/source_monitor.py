@@ -1,4 +1,4 @@
-"""Count failures of a patch's source, and report them in EMCY messages (0xFF00)."""
+"""Monitoring of the source of a patch; failures are reported with EMCY 0xFF00."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from skinnode.node.patch.source import SourceFailed, SourceFault
 
 
 class SourceMonitor:
-    """Monitor that counts and reports failures of a source.
+    """Counts and reports failures of a source.
 
     Args:
-        emcy: emergency producer.
-        on_failure: called after each failure of the source.
+        emcy: EMCY producer of the node.
+        on_failure: callback for each failure.
     """
 
     def __init__(self, emcy: EmcyProducer, on_failure: Callable[[], None]) -> None:
@@ -25,18 +25,19 @@ class SourceMonitor:
         self.failures = 0
         """Number of failed scans, tares and self-test readings."""
         self.error = ""
-        """One-line description of the source's last failure; empty before the first failure."""
+        """One-line description of the latest failure; empty if there has been none."""
 
     def reset(self, t_ns: int) -> None:
-        """Report the failure again after a reset if the source is still failing."""
+        """Report the current failure again after a reset, if any."""
         if self._fault is not None:
             self._report(self._fault, t_ns)
 
     @contextlib.contextmanager
     def watch(self, t_ns: int) -> Iterator[None]:
-        """Monitor the source while it is read in the ``with`` block.
+        """Return a context manager for a block of code that reads the source.
 
-        A failure is reported and raised again. If an earlier failure has ended, its end is reported.
+        If the block raises SourceFailed, the failure is reported. If it succeeds, the end of an earlier
+        failure is reported.
 
         Args:
             t_ns: current time, ns.
@@ -46,7 +47,7 @@ class SourceMonitor:
         except SourceFailed as failure:
             self.failures += 1
             self.error = str(failure)
-            if failure.fault is not self._fault:  # report a continuing failure only once
+            if failure.fault is not self._fault:  # a lasting failure is reported once
                 self._report(failure.fault, t_ns)
             self._on_failure()
             raise

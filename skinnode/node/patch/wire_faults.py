@@ -1,4 +1,4 @@
-"""Detect open and shorted wires in the codes of a scan, and report them in EMCY messages (0x5000)."""
+"""Detection of open and shorted wires from the codes of a scan, reported with EMCY 0x5000."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ Mask = NDArray[np.bool_]
 
 @dataclass(frozen=True, slots=True)
 class WireFaults:
-    """Wire faults of a patch: wires whose crossings are all open or all shorted."""
+    """Open and shorted wires of a patch."""
 
     upper_open: Mask
     """(U,) mask of the open upper wires."""
@@ -31,13 +31,13 @@ class WireFaults:
 
     @classmethod
     def none(cls, profile: PatchProfile) -> WireFaults:
-        """Return masks without any wire fault."""
+        """Return the value for a patch without wire faults."""
         rows, columns = np.zeros(profile.rows, dtype=np.bool_), np.zeros(profile.columns, dtype=np.bool_)
         return cls(rows, rows, columns, columns)
 
     @property
     def masks(self) -> tuple[Mask, Mask, Mask, Mask]:
-        """Masks by fault type: upper open, upper shorted, lower open, lower shorted."""
+        """All masks: upper open, upper shorted, lower open, lower shorted."""
         return self.upper_open, self.upper_short, self.lower_open, self.lower_short
 
     @property
@@ -47,7 +47,7 @@ class WireFaults:
 
 
 def find_faults(codes: Codes, scale: CodeScale) -> WireFaults:
-    """Return the open wires (all crossings open) and the shorted wires (all crossings shorted).
+    """Return the wires whose crossings are all open or all shorted.
 
     Args:
         codes: (U, K) codes.
@@ -58,11 +58,11 @@ def find_faults(codes: Codes, scale: CodeScale) -> WireFaults:
 
 
 class WireFaultReporter:
-    """Reporter of wire faults, which sends emergency messages when faults begin and end.
+    """Sends emergency messages when wire faults begin and end.
 
     Args:
         profile: sizes of the patch.
-        emcy: emergency producer.
+        emcy: EMCY producer of the node.
     """
 
     def __init__(self, profile: PatchProfile, emcy: EmcyProducer) -> None:
@@ -70,15 +70,14 @@ class WireFaultReporter:
         self._reported = WireFaults.none(profile)
 
     def reset(self) -> None:
-        """Clear the list of reported faults after a reset, so that persisting faults are reported again."""
+        """Forget the reported faults after a reset, so that persisting faults are reported again."""
         self._reported = WireFaults.none(self._profile)
 
     def report(self, faults: WireFaults, t_ns: int) -> None:
-        """Report new wire faults, or the end of all wire faults, in a single emergency message.
+        """Report new wire faults, or the end of all wire faults.
 
-        The message contains the type and wire number of the first new fault, and the number of faulty wires.
-        Several faults that begin in the same scan, for example when a connector is unplugged, cause a single
-        message.
+        Faults that begin in the same scan, as when a connector is unplugged, are reported in one message. It
+        contains the type and wire number of the first new fault, and the number of faulty wires.
 
         Args:
             faults: current wire faults.

@@ -1,7 +1,6 @@
-"""Faults that can be injected into a simulated node, and counts of the injected faults.
+"""Faults of a simulated node, and counts of injected faults.
 
-A chunk has at most one fault, so that the counts of injected faults can be compared with a receiver's
-counters.
+At most one fault applies to each chunk, so a receiver's counters can be checked against these counts.
 """
 
 from __future__ import annotations
@@ -22,7 +21,7 @@ LOST_OUT: Final = {
     Kind.BOOT_UP: "boot_up_lost",
     Kind.EMCY: "emcy_lost",
 }
-"""Fault that drops frames sent by the node, for each kind of frame."""
+"""Name of the fault that drops outgoing frames, by kind of frame."""
 LOST_IN: Final = {
     Kind.NMT: "nmt_lost",
     Kind.SDO_REQUEST: "sdo_request_lost",
@@ -30,7 +29,7 @@ LOST_IN: Final = {
     Kind.COMMAND: "command_lost",
     Kind.HEARTBEAT: "heartbeat_lost",
 }
-"""Fault that drops frames addressed to the node, for each kind of frame except SYNC (see ``sync_lost``)."""
+"""Name of the fault that drops incoming frames, by kind of frame. SYNC has its own fault, ``sync_lost``."""
 _SHARES: Final = (
     *OF_CHUNKS,
     *OF_SCANS,
@@ -53,153 +52,148 @@ OF_WIRES: Final = (
     "crossed_upper",
     "crossed_lower",
 )
-"""Faults that specify a wire number, alternately of an upper wire and a lower wire."""
+"""Faults whose value is a wire number, with upper and lower wires alternating."""
 _RATES: Final = ("emcy_per_s", "babble_per_s", "restart_every_s")
 _MOST: Final = {"drift_per_s": 1.0, "warmer_k": 100.0}
-"""Maximum absolute value of each fault that can have a negative value."""
+"""Maximum absolute value of each fault that can be negative."""
 
 
 @dataclass(frozen=True, slots=True)
 class Faults:
-    """Faults of one simulated node. By default, there are no faults.
+    """Faults of one simulated node. The default is no faults.
 
     Raises:
-        ConfigError: If a value is out of range, or if the fractions of chunks or of scans add up to more than
-            1.
+        ConfigError: If a value is out of range, or the fractions of chunks or of scans add up to more than 1.
     """
 
     seed: int = 1
-    """Seed of the random numbers. The same seed and the same frames result in the same faults."""
+    """Random seed. With the same seed, the same frames suffer the same faults."""
 
     # --- fractions of the chunks
     lost: float = 0.0
     duplicated: float = 0.0
-    """Fraction of the chunks that are sent twice."""
+    """Fraction of chunks sent twice."""
     reordered: float = 0.0
-    """Fraction of the chunks that are sent after the next frame."""
+    """Fraction of chunks that trade places with the next frame."""
     late: float = 0.0
-    """Fraction of the chunks that are sent after the first frame of the next scan."""
+    """Fraction of chunks held back until the first frame of the next scan has been sent."""
     short: float = 0.0
-    """Fraction of the chunks that are one byte too short."""
+    """Fraction of chunks sent without their last byte."""
     remote: float = 0.0
-    """Fraction of the chunks that are replaced by a remote frame."""
+    """Fraction of chunks replaced by a remote frame."""
     miscounted: float = 0.0
-    """Fraction of the chunks with a wrong scan counter."""
+    """Fraction of chunks with a wrong scan counter."""
     miscounted_by: int | None = None
-    """Value added to the scan counter of a ``miscounted`` chunk, modulo 256; None for a random value."""
+    """Error of the scan counter in ``miscounted`` chunks, modulo 256; None for a random error."""
     corrupted: float = 0.0
-    """Fraction of the chunks in which one code is falsified. The length and the counters of the falsified
-    chunks are correct."""
+    """Fraction of chunks in which one code is wrong. The length and the counters are correct."""
 
     # --- fractions of the scans
     torn: float = 0.0
-    """Fraction of the scans whose second half and summary are not sent. The scan after a torn scan has the
-    same scan counter."""
+    """Fraction of scans that break off: the second half of the chunks and the summary are not sent. The next
+    scan has the same scan counter."""
     summary_lost: float = 0.0
     reset: float = 0.0
-    """Fraction of the scans during which the node is reset, as if by a watchdog, after half of the chunks."""
+    """Fraction of scans in which the node is reset after half of the chunks, as if by a watchdog."""
     displaced: float = 0.0
-    """Fraction of the scans in which a chunk has the scan counter of the next scan. In the next scan, the
-    chunk with the same index is lost."""
+    """Fraction of scans in which one chunk carries the scan counter of the next scan. The next scan then
+    lacks the chunk with the same index."""
     understated: float = 0.0
-    """Fraction of the scans in which a chunk is lost and the summary conceals this loss. In the falsified
-    summary, the number of chunks is reduced by one, the flag for changed chunks only is set, and the check,
-    if any, is valid. If the node itself sends only changed chunks, the summary is not falsified."""
+    """Fraction of scans in which one chunk is lost and the summary hides the loss. The summary states one
+    chunk fewer, sets the flag for changed chunks only, and has a valid check if the node sends checks. If the
+    node itself sent only changed chunks, the summary is left unaltered."""
     unchecked: float = 0.0
-    """Fraction of the scans whose summary contains no check, as in protocol revision 1.0."""
+    """Fraction of scans whose summary contains no check, as in protocol revision 1.0."""
     struck: int | None = None
-    """Index of the chunk to which ``displaced`` or ``understated`` applies; None for a random chunk."""
+    """Index of the chunk affected by ``displaced`` or ``understated``; None for a random chunk."""
 
     # --- fractions of other frames
     sync_lost: float = 0.0
-    """Fraction of the SYNC messages that the node does not receive."""
+    """Fraction of SYNC messages that never reach the node."""
     long: float = 0.0
-    """Fraction of the heartbeats that are one byte too long. Chunks and summaries already have the maximum
-    length."""
+    """Fraction of heartbeats with one extra byte. Chunks and summaries already have the maximum length."""
     nmt_lost: float = 0.0
-    """Fraction of the NMT commands that the node does not receive."""
+    """Fraction of NMT commands that never reach the node."""
     sdo_request_lost: float = 0.0
-    """Fraction of the SDO requests that the node does not receive."""
+    """Fraction of SDO requests that never reach the node."""
     sdo_response_lost: float = 0.0
-    """Fraction of the SDO responses that are lost."""
+    """Fraction of SDO responses lost."""
     lss_request_lost: float = 0.0
-    """Fraction of the LSS requests that the node does not receive."""
+    """Fraction of LSS requests that never reach the node."""
     lss_response_lost: float = 0.0
-    """Fraction of the LSS responses that are lost."""
+    """Fraction of LSS responses lost."""
     heartbeat_lost: float = 0.0
-    """Fraction of the heartbeats to and from the node that are lost."""
+    """Fraction of heartbeats lost, both to and from the node."""
     boot_up_lost: float = 0.0
-    """Fraction of the boot-up messages that are lost."""
+    """Fraction of boot-up messages lost."""
     emcy_lost: float = 0.0
-    """Fraction of the emergency messages that are lost, including *error reset* messages."""
+    """Fraction of emergency messages lost, including *error reset* messages."""
     command_lost: float = 0.0
-    """Fraction of the command PDOs, such as tare commands, that the node does not receive."""
+    """Fraction of command PDOs, such as tare commands, that never reach the node."""
 
     # --- faults of the node, the converter and the wires
     silent: bool = False
-    """Whether the node is silent: its frames do not reach the bus."""
+    """Whether the node is silent: none of its frames reach the bus."""
     deaf: bool = False
-    """Whether the node is deaf: it does not receive any frames."""
+    """Whether the node is deaf: it receives no frames."""
     frozen: bool = False
-    """Whether the converter is frozen: it repeats its last values and does not count conversions."""
+    """Whether the converter is frozen: its readings and its conversion count stop changing."""
     uncounted: bool = False
-    """Whether the converter provides no count of its conversions. A host can then detect a stopped converter
+    """Whether the converter provides no conversion count. A host can then detect a stopped converter
     only by constant codes."""
     unplugged: bool = False
-    """Whether the node is disconnected from the bus and from its power supply. The node boots when the fault
-    ends."""
+    """Whether the node is cut off from bus and power. It boots when the fault ends."""
     wrong_identity: bool = False
     """Whether the node reports a wrong product code."""
     wrong_layout: bool = False
     """Whether the node reports a wrong layout hash."""
     open_upper: int | None = None
-    """Number of a broken upper wire. Wires are numbered from 0. All wires are intact during the tare at
+    """Number of an open upper wire. Wires are numbered from 0. Wire faults take effect after the tare at
     power-on."""
     open_lower: int | None = None
-    """Number of a broken lower wire."""
+    """Number of an open lower wire."""
     shorted_upper: int | None = None
     """Number of an upper wire that is shorted to all lower wires."""
     shorted_lower: int | None = None
     """Number of a lower wire that is shorted to all upper wires."""
     noisy_upper: int | None = None
-    """Number of an upper wire with a bad contact, so that its resistances have additional noise of 0.3 %."""
+    """Number of an upper wire with a bad contact, which adds 0.3 % noise to its resistances."""
     noisy_lower: int | None = None
-    """Number of a lower wire with a bad contact, so that its resistances have additional noise of 0.3 %."""
+    """Number of a lower wire with a bad contact, which adds 0.3 % noise to its resistances."""
     frozen_upper: int | None = None
-    """Number of an upper wire whose resistances remain constant from the start of the fault."""
+    """Number of an upper wire whose resistances stop changing when the fault starts."""
     frozen_lower: int | None = None
-    """Number of a lower wire whose resistances remain constant from the start of the fault."""
+    """Number of a lower wire whose resistances stop changing when the fault starts."""
     stuck_upper: int | None = None
-    """Number of the upper wire at a stuck crossing, whose resistance remains constant from the start of the
-    fault. The lower wire at the crossing is ``stuck_lower``."""
+    """Upper wire of a stuck crossing, whose resistance stops changing when the fault starts. The lower wire
+    of the crossing is ``stuck_lower``."""
     stuck_lower: int | None = None
-    """Number of the lower wire at the stuck crossing; see ``stuck_upper``."""
+    """Lower wire of the stuck crossing; see ``stuck_upper``."""
     crossed_upper: int | None = None
-    """Number of an upper wire whose connection is exchanged with that of the next upper wire."""
+    """Number of an upper wire whose connection is swapped with that of the next upper wire."""
     crossed_lower: int | None = None
-    """Number of a lower wire whose connection is exchanged with that of the next lower wire."""
+    """Number of a lower wire whose connection is swapped with that of the next lower wire."""
     flipped: float = 0.0
-    """Fraction of the readings in which one bit of one code is flipped. The check of the scan is computed
-    after the bit is flipped."""
+    """Fraction of readings with one flipped bit in one code. The check of the scan includes the flipped bit,
+    so it passes."""
     drift_per_s: float = 0.0
-    """Relative drift of all resistances per second, from -1 to 1. The drift accumulates up to a factor of 10
-    or 0.1, and is reset to zero when the fault ends."""
+    """Relative drift of all resistances per second, from -1 to 1. The accumulated factor stays between 0.1
+    and 10, and the drift disappears when the fault ends."""
     warmer_k: float = 0.0
-    """Sudden temperature change of the patch, K, from -100 to 100. All resistances change according to the
-    temperature coefficient ``Imperfections.temperature_per_k`` of the patch."""
+    """Temperature step of the patch, K, from -100 to 100. ``Imperfections.temperature_per_k`` is the
+    temperature coefficient of the resistances."""
     error_passive: bool = False
-    """Whether the node's CAN controller is error-passive. The node reports the error-passive state as
-    emergency 0x8120."""
+    """Whether the node's CAN controller is error-passive. The node reports this with emergency 0x8120."""
     duplicate_node_id: bool = False
-    """Whether there is a second node with the same node-ID on the bus. The second node boots, responds to all
-    commands, and reports a skin at rest. The second node disappears when the fault ends."""
+    """Whether a second node on the bus has the same node-ID. The second node boots, responds to all commands
+    and reports a skin at rest. It disappears when the fault ends."""
     restart_every_s: float = 0.0
-    """Time between spontaneous resets of the node, s; 0 for no resets."""
+    """Interval between spontaneous resets of the node, s; 0 for no resets."""
     emcy_per_s: float = 0.0
-    """Rate of additional emergency messages, 1/s. When the emergency messages end, the node sends an *error
-    reset* message."""
+    """Rate of spurious emergency messages, 1/s. When the fault ends, the node sends an *error reset*
+    message."""
     babble_per_s: float = 0.0
-    """Rate of additional frames with the unused COB-ID 0x3F0, 1/s."""
+    """Rate of stray frames with the unused COB-ID 0x3F0, 1/s."""
 
     def __post_init__(self) -> None:
         for name in _SHARES:
@@ -232,7 +226,7 @@ class Faults:
 
 @dataclass(slots=True)
 class Injected:
-    """Counts of the faults that have been injected into one node."""
+    """Counts of the faults injected into one node."""
 
     lost: int = 0
     duplicated: int = 0
@@ -249,7 +243,7 @@ class Injected:
     """Number of resets in the middle of a scan."""
     corrupted: int = 0
     displaced: int = 0
-    """Number of scans in which a chunk was sent with the counter of the next scan."""
+    """Number of scans in which one chunk carried the counter of the next scan."""
     understated: int = 0
     unchecked: int = 0
     sync_lost: int = 0
@@ -268,9 +262,9 @@ class Injected:
     unheard: int = 0
     """Number of frames that the node missed because it was deaf or unplugged."""
     frozen: int = 0
-    """Number of readings that repeated the previous reading due to a frozen converter."""
+    """Number of readings in which a frozen converter repeated the previous reading."""
     uncounted: int = 0
-    """Number of readings without a count of conversions."""
+    """Number of readings without a conversion count."""
     miswired: int = 0
     """Number of readings with at least one faulty wire or crossing."""
     flipped: int = 0
@@ -281,9 +275,9 @@ class Injected:
     """Number of readings affected by ``warmer_k``."""
     unplugged: int = 0
     error_passive: int = 0
-    """Number of times that the controller became error-passive."""
+    """Number of times the controller became error-passive."""
     twins: int = 0
-    """Number of second nodes with the same node-ID that have been started."""
+    """Number of times that a second node with the same node-ID was started."""
     twin_frames: int = 0
     """Number of frames sent by second nodes with the same node-ID."""
     restarts: int = 0
@@ -295,15 +289,14 @@ class Injected:
     scans_spoilt: int = 0
     """Number of scans with missing or wrong chunks: lost, late, short, remote, miscounted or corrupted."""
     pdos: int = 0
-    """Number of data frames sent with the COB-ID of a chunk or summary, including frames from second
-    nodes."""
+    """Number of data frames sent with the COB-ID of a chunk or summary, including those of second nodes."""
 
 
 NO_FAULTS: Final = Faults()
 
 
 def check_wires(faults: Faults, patch: str, shape: tuple[int, int]) -> None:
-    """Check that a patch has the wires to which its faults refer.
+    """Check that a patch has the wires named in its faults.
 
     Args:
         faults: Faults of the patch.

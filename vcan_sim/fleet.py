@@ -1,4 +1,4 @@
-"""Simulated nodes of a hand, with one port and one thread for each bus."""
+"""Simulated nodes of a hand. The nodes on a bus share one port and one thread."""
 
 from __future__ import annotations
 
@@ -29,13 +29,13 @@ from vcan_sim.skin.imperfections import EXACT, Imperfections
 from vcan_sim.tally import Tally
 
 PREPARED_S: Final = 120.0
-"""Duration of the scene for which the contact mechanics are computed before the nodes start, s. The rest of
-the scene is computed on first use."""
+"""Length of the scene computed before the nodes start, s. The contact mechanics of the rest is computed on
+demand."""
 
 
 @dataclass(frozen=True, slots=True)
 class NodeReport:
-    """State of one simulated node, with counters since the start of the node."""
+    """State of one simulated node, and its counters since start-up."""
 
     patch: str
     node_id: int
@@ -46,7 +46,7 @@ class NodeReport:
     scans_sent: int
     """Number of complete scans sent."""
     overruns: int
-    """Number of scans skipped because two previous scans had not been sent yet."""
+    """Number of scans skipped because the two preceding scans had not been sent yet."""
     slow_overruns: int
     """Number of scans skipped because this machine was too busy."""
 
@@ -54,22 +54,22 @@ class NodeReport:
 class Fleet:
     """Simulated patches of a hand, each with a CANopen node.
 
-    A patch remains untouched until its node has sent the first scan, so that the tare at power-on is valid.
-    :meth:`start` opens the buses and powers the nodes on. :meth:`stop` sets the nodes to pre-operational and
-    closes the buses. A ``with`` block calls both methods.
+    Nothing touches a patch until its node has sent a scan, so the tare at power-on sees the skin at rest.
+    :meth:`start` opens the buses and powers on the nodes. :meth:`stop` sets the nodes to pre-operational and
+    closes the buses. A ``with`` block calls both.
 
     Args:
-        hand: Configuration with the buses, patches and simulation settings.
-        interface: python-can interface that overrides the interface in the hand file.
-        channel: Channel that overrides the channel in the hand file.
-        faults: Initial faults of every node; see also :meth:`inject`.
-        wire_up: Function that returns the resistance source for a patch's converter; default: the simulated
-            patch.
-        unchecked: Names of patches with protocol revision 1.0, whose summaries contain no check.
+        hand: Hand configuration, with its ``[simulation]`` settings.
+        interface: python-can interface to use instead of the one in the hand file.
+        channel: Channel to use instead of the one in the hand file.
+        faults: Initial faults of every node. :meth:`inject` replaces them.
+        wire_up: Function from a simulated patch to the resistance source of its converter; default: the patch
+            itself.
+        unchecked: Names of the patches that use protocol revision 1.0, without a check in the summary.
         imperfections: Manufacturing errors, common to all patches or by patch name; default: the
             imperfections of the scene. The random errors differ from patch to patch.
-        scene: Scene that replaces the random strokes of ``[simulation]``. The scene starts on all patches at
-            the same time, when the first node has sent its first scan.
+        scene: Scene to play instead of the random strokes of ``[simulation]``. It starts on all patches at
+            once, when any node has sent its first scan.
 
     Raises:
         ConfigError: If a channel is given for a hand with several buses; if ``imperfections`` name an unknown
@@ -116,12 +116,12 @@ class Fleet:
             for bus in self.hand.buses
         }
         self.faults: Final = FleetFaults(self._places(), faults)
-        """Current faults of the patches and buses, with a log of all changes."""
+        """Current faults of the patches and buses, and a log of their changes."""
         schedule = None if scene is None else schedule_of(scene, self.hand)
         self._player = FaultPlayer(schedule, self.faults) if schedule and schedule.faults else None
 
     def _places(self) -> Places:
-        """Return the patches and buses into which faults can be injected."""
+        """Return the places where faults can be injected: patches and buses."""
         stations, segments = self._stations, self._segments
         return Places(
             tuple(stations),
@@ -133,13 +133,13 @@ class Fleet:
         )
 
     def _skin(self, patch: PatchConfig, number: int) -> SkinMotion:
-        """Return the motion of a patch's skin, either from the scene or as random strokes."""
+        """Return the motion of a patch's skin: the scene, or random strokes if there is no scene."""
         if self._scenes:
             return self._scenes[patch.name]
         return Scene(patch.layout.build(), self.hand.simulation, number)
 
     def _begin(self, source: SimulatedPatch) -> None:
-        """Start the random strokes of a patch, or the scene on all patches."""
+        """Start the scene on all patches, or the random strokes on one patch."""
         t_ns = source.last_read_ns
         with self._beginning:
             if self._player is not None and not source.started:
@@ -152,7 +152,7 @@ class Fleet:
         """Compute the beginning of the scene, open the buses and power the nodes on.
 
         Raises:
-            BusError: If any bus cannot be opened. In this case, the other buses are closed again.
+            BusError: If a bus cannot be opened. Buses already opened are closed again.
         """
         for scene in self._scenes.values():
             scene.prepare(PREPARED_S)
@@ -176,7 +176,7 @@ class Fleet:
     def stop(self) -> None:
         """Set the nodes to pre-operational, join the threads and close the buses. Can be called repeatedly.
 
-        Raises the error of a thread that has failed.
+        If a thread has failed, raises its error.
         """
         self._running.close()
 
@@ -195,7 +195,7 @@ class Fleet:
         return tuple(station.report() for station in self._stations.values())
 
     def inject(self, faults: Faults, patch: str | None = None) -> None:
-        """Replace the faults of one patch or of all patches, but keep the initial seed.
+        """Replace the faults of one patch or of all patches. The initial random seed remains in use.
 
         Args:
             faults: New faults.
@@ -220,11 +220,11 @@ class Fleet:
         self.faults.set_bus(bus, faults)
 
     def injected(self, patch: str) -> Injected:
-        """Return the counts of the faults that have been injected into the node of a patch."""
+        """Return the counts of the faults injected into the node of a patch."""
         return self._stations[patch].injected()
 
     def injected_bus(self, bus: str) -> InjectedOnBus:
-        """Return the counts of the faults that have been injected into a bus."""
+        """Return the counts of the faults injected into a bus."""
         return self._segments[bus].injected()
 
     def counts(self) -> dict[str, dict[str, int]]:
@@ -239,11 +239,11 @@ class Fleet:
         }
 
     def tally(self, patch: str) -> Tally:
-        """Return the frame counts of a patch's node by kind, updated while the node is running."""
+        """Return the frame counts of a patch's node, by kind. The counts change while the node runs."""
         return self._stations[patch].tally()
 
     def passed(self, bus: str) -> Passed:
-        """Return the counts of the frames that the nodes have sent to and received from a bus, by kind."""
+        """Return the counts of frames that the nodes of a bus have sent and received, by kind."""
         return self._ports[bus].passed
 
     def bus_off(self, bus: str, *, off: bool) -> None:
@@ -356,7 +356,7 @@ def _by_patch(
 
 
 class _Station:
-    """Simulated patch with its node, and the number of frames that the node has sent."""
+    """Simulated patch, its node and the counts of frames sent by the node."""
 
     def __init__(  # noqa: PLR0913 - the parts of a node
         self,
@@ -376,7 +376,7 @@ class _Station:
         self._frames = self._pdos = 0
 
     def connect(self, emit: Emit) -> FaultyNode:
-        """Create the node of the patch. The node sends its frames through ``emit``."""
+        """Create the node of the patch, which sends its frames through ``emit``."""
         config = self._config
         self._node = FaultyNode(
             config.node_id,

@@ -1,7 +1,7 @@
-"""Surface displacement of an elastic layer that is bonded to a rigid base.
+"""Surface displacement of an elastic layer bonded to a rigid base.
 
-A sinusoidal surface traction with wave number k and unit amplitude causes displacements with these
-amplitudes, where x = k h:
+A sinusoidal surface traction of unit amplitude and wave number k displaces the surface by these amplitudes,
+where h is the thickness and x = k h:
 
     normal, due to normal traction       (1 − ν) / (G k) · (2κ sinh 2x − 4x) / D
     along k, due to traction along k     (1 − ν) / (G k) · (2κ sinh 2x + 4x) / D
@@ -28,10 +28,9 @@ from scipy.special import j0, j1
 Float = NDArray[np.float64]
 
 DEEPEST: Final = 14.0
-"""Value of x = k h above which the layer is treated as a half-space. The relative error of this approximation
-is below 2e-10."""
+"""Value of x = k h above which the layer is treated as a half-space, with a relative error below 2e-10."""
 STEPS: Final = 32
-"""Number of table points per layer thickness, in tables of displacement versus distance."""
+"""Table points per layer thickness, in tables of displacement against distance."""
 NODES: Final = 16
 """Number of Gauss-Legendre quadrature nodes per panel."""
 
@@ -74,10 +73,7 @@ class Layer:
         return self.young_pa / (1.0 - self.poisson**2)
 
     def response(self, wave_number_per_m: Float) -> tuple[Float, Float, Float, Float]:
-        """Return the four amplitudes in the module's docstring, multiplied by k, 1/Pa.
-
-        The order is: normal due to normal traction, along k due to traction along k, along k due to normal
-        traction, and across k due to traction across k.
+        """Return the four amplitudes of the module docstring, in that order, multiplied by k (1/Pa).
 
         Args:
             wave_number_per_m: Wave numbers k > 0, 1/m, of any shape.
@@ -85,7 +81,7 @@ class Layer:
         nu, modulus = self.poisson, self.shear_modulus_pa
         kappa = 3.0 - 4.0 * nu
         x = np.minimum(wave_number_per_m * self.thickness_m, 300.0)
-        fall = np.exp(-2.0 * x)  # all terms are multiplied by 2 e^(−2x) to prevent overflow
+        fall = np.exp(-2.0 * x)  # all terms are scaled by 2 e^(−2x) to prevent overflow
         sinh, cosh = 1.0 - fall**2, 1.0 + fall**2
         below = 2.0 * kappa * cosh + 2.0 * fall * (4.0 * x**2 + 1.0 + kappa**2)
         scale = (1.0 - nu) / modulus
@@ -97,9 +93,9 @@ class Layer:
 
 
 class PointResponse:
-    """Difference between the surface displacements of a layer and a half-space due to a point force.
+    """Surface displacement of a layer under a point force, minus that of a half-space.
 
-    The difference is tabulated, because it is a smooth function of the distance from the force.
+    The difference is a smooth function of the distance from the force, so it is tabulated.
 
     Args:
         layer: Elastic layer of finite thickness.
@@ -134,7 +130,7 @@ class PointResponse:
     def __call__(self, distance_m: Float) -> tuple[Float, Float, Float, Float]:
         """Return the coefficients Z, A, B and K (m/N) of the displacement due to a point force f.
 
-        A normal force causes u_z = Z f_z. The tangential displacement along x is
+        Under a normal force, u_z = Z f_z. At the polar angle θ, the displacement along x is
         u_x = (A + B cos 2θ) f_x + B sin 2θ f_y + K cos θ f_z.
         """
         found = [np.asarray(spline(distance_m)) for spline in self._splines]
@@ -142,21 +138,21 @@ class PointResponse:
 
 
 def cell_response(layer: Layer, offset_m: Float, size_m: float, reach_m: float) -> Float:
-    """Return the surface displacement due to a uniform unit traction on a square cell at the origin.
+    """Return the surface displacement under a uniform unit traction on a square cell at the origin.
 
-    For a half-space, the displacement has a closed form (Love, Philosophical Transactions A 228, 377, 1929;
-    Johnson, eq. 3.25, for all directions). The closed form contains the integrals of 1/R, x²/R³, y²/R³,
-    xy/R³, x/R² and y/R² over a rectangle. The smooth difference between a layer and a half-space is
+    The displacement of a half-space has a closed form (Love, Philosophical Transactions A 228, 377, 1929;
+    generalisation of Johnson, eq. 3.25, to all directions). It combines the integrals of 1/R, x²/R³, y²/R³,
+    xy/R³, x/R² and y/R² over the cell. The difference between layer and half-space is smooth, and is
     integrated by Gauss-Legendre quadrature.
 
     Args:
         layer: Elastic layer.
         offset_m: (…, 2) positions relative to the centre of the cell, metres.
         size_m: Side length of the cell, metres.
-        reach_m: Maximum distance of a position from the centre of the cell, metres.
+        reach_m: Largest distance of a position from the centre of the cell, metres.
 
     Returns:
-        (…, 3, 3) displacement components (second to last axis) due to traction components (last axis), m/Pa.
+        (…, 3, 3) displacement per unit traction, m/Pa. The last axis is the direction of the traction.
     """
     integrals = np.zeros((6, *offset_m.shape[:-1]))
     for sign_x in (-1.0, 1.0):

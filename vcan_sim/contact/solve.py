@@ -1,12 +1,12 @@
 """Pressure and friction between a rigid body and an elastic layer.
 
-The pressure p is not negative, and it is zero where the body does not touch the surface. The body and the
-surface must not overlap. This complementarity problem is solved by the conjugate gradient method of Polonsky
-and Keer (Wear 231, 206, 1999). Friction follows Coulomb's law: each cell in contact either sticks, or slips
-with a shear traction μ p that opposes the slip. For a given pressure, the shear traction minimises a convex
-function subject to the limit μ p in each cell. The minimum is found by an accelerated projected gradient
-method (Beck and Teboulle, SIAM Journal on Imaging Sciences 2, 183, 2009). Pressure and shear are weakly
-coupled, so they are computed alternately.
+The pressure p is nonnegative and vanishes outside the contact, and the body does not penetrate the deformed
+surface. This complementarity problem is solved by the conjugate gradient method of Polonsky and Keer (Wear
+231, 206, 1999). Friction follows Coulomb's law: each cell in contact either sticks, or slips with a shear
+traction μ p that opposes the slip. For a given pressure, the shear traction minimises a convex function
+subject to the limit μ p in each cell. The minimum is found by an accelerated projected gradient method (Beck
+and Teboulle, SIAM Journal on Imaging Sciences 2, 183, 2009). Pressure and shear are weakly coupled, so the
+solver alternates between them.
 """
 
 from __future__ import annotations
@@ -20,24 +20,24 @@ from vcan_sim.contact.grid import Grid
 from vcan_sim.contact.layer import Float
 
 CLOSE: Final = 1e-6
-"""Default tolerance: maximum remaining overlap or gap in a contact, relative to the maximum overlap between
-the undeformed body and surface."""
+"""Default tolerance: largest residual overlap or gap in a contact, relative to the largest overlap of the
+body with the undeformed surface."""
 STEPS: Final = 400
-"""Maximum number of iterations for the pressure or the shear."""
+"""Maximum number of iterations for either the pressure or the shear."""
 TURNS: Final = 24
 """Maximum number of alternations between pressure and shear."""
 DAMPED: Final = 5
-"""Number of alternations after which the changes are halved. Without damping, the iteration can oscillate if
-the layer is thin and the friction is high."""
+"""Number of undamped alternations, after which each change is halved. Without damping, the alternation can
+oscillate on a thin layer with high friction."""
 
 
 class NoSolution(RuntimeError):
-    """The iteration that computes a contact did not converge."""
+    """The computation of a contact did not converge."""
 
 
 @dataclass(frozen=True, eq=False)
 class Contact:
-    """State of a contact between a body and the skin.
+    """Tractions, displacements and stick zone of a contact between a body and the skin.
 
     Attributes:
         traction_pa: (3, X, Y) tractions on the skin, Pa.
@@ -50,12 +50,12 @@ class Contact:
     sticks: np.ndarray
 
     def force_n(self, grid: Grid) -> Float:
-        """Return the force (3,) of the body on the skin, N."""
+        """Return the force (3,) that the body exerts on the skin, N."""
         return np.asarray(self.traction_pa.sum(axis=(1, 2)) * grid.size_m**2)
 
 
 def untouched(grid: Grid) -> Contact:
-    """Return the state of the skin without contact."""
+    """Return the state of the skin with no body in contact."""
     zero = np.zeros((3, *grid.shape))
     return Contact(zero, zero, np.zeros(grid.shape, bool))
 
@@ -65,10 +65,10 @@ def press(grid: Grid, overlap_m: Float, start_pa: Float | None = None, *, close:
 
     Args:
         grid: Cells on the surface.
-        overlap_m: (X, Y) overlap between the undeformed body and the undeformed surface, metres; negative
-            where they do not overlap.
-        start_pa: (X, Y) initial guess of the pressure, such as the pressure in the previous time step, Pa.
-        close: Maximum remaining overlap or gap, relative to the maximum of ``overlap_m``.
+        overlap_m: (X, Y) overlap of the body with the undeformed surface, metres; negative where there is a
+            gap.
+        start_pa: (X, Y) initial guess of the pressure, Pa, such as that of the previous time step.
+        close: Largest permissible residual overlap or gap, relative to the maximum of ``overlap_m``.
 
     Raises:
         NoSolution: If the iteration does not converge.
@@ -91,7 +91,7 @@ def press(grid: Grid, overlap_m: Float, start_pa: Float | None = None, *, close:
         active = pressure > 0.0
         if max(float(np.abs(gap[active]).max(initial=0.0)), -float(gap.min())) < close * largest:
             return pressure
-        if not active.any():  # a much too large initial guess left no cell in contact
+        if not active.any():  # the initial guess was so large that no cell is left in contact
             pressure, conjugate = _steepest(grid, gap), 0.0
             continue
         square = float((gap[active] ** 2).sum())
@@ -109,21 +109,21 @@ def press(grid: Grid, overlap_m: Float, start_pa: Float | None = None, *, close:
 
 
 def _steepest(grid: Grid, gap_m: Float) -> Float:
-    """Return a pressure (X, Y) in Pa that is proportional to the overlap, scaled by an exact line search."""
+    """Return a pressure (X, Y), Pa: a multiple of the overlap, scaled by an exact line search."""
     direction = np.maximum(-gap_m, 0.0)
     return np.asarray(direction * ((direction**2).sum() / (grid.normal_m(direction) * direction).sum()))
 
 
 def rub(grid: Grid, limit_pa: Float, target_m: Float, start_pa: Float, *, close: float = CLOSE) -> Float:
-    """Return the shear traction (2, X, Y) in Pa under a body that moves with friction.
+    """Return the frictional shear traction (2, X, Y) under a body, Pa.
 
     Args:
         grid: Cells on the surface.
         limit_pa: (X, Y) maximum shear traction μ p, Pa.
-        target_m: (2, X, Y) displacement that a cell would have without slip, metres.
+        target_m: (2, X, Y) displacement of each cell in the absence of slip, metres.
         start_pa: (2, X, Y) initial guess of the shear traction, Pa.
-        close: Tolerance. The iteration ends if no shear traction changes by more than 0.1 ``close`` times the
-            maximum of ``limit_pa``.
+        close: Tolerance. The iteration stops when every shear traction changes by less than
+            0.1 ``close`` times the maximum of ``limit_pa``.
 
     Raises:
         NoSolution: If the iteration does not converge.
@@ -168,11 +168,10 @@ def advance(  # noqa: PLR0913 - the last two control the search
     Args:
         grid: Cells on the surface.
         last: State of the contact before the movement.
-        overlap_m: (X, Y) overlap between the undeformed body and surface after the movement, metres.
-        slide_m: Tangential movement of the body's surface, metres, of shape (2,), or (2, X, Y) if the body
-            rotates.
+        overlap_m: (X, Y) overlap of the body with the undeformed surface after the movement, metres.
+        slide_m: Tangential movement of the body's surface, metres: (2,), or (2, X, Y) if the body rotates.
         friction: Coefficient of friction μ.
-        start: Initial guess of the new state, which does not affect the result; default: ``last``.
+        start: Initial guess of the new state; default: ``last``. The guess affects only the computing time.
         close: Tolerance, as in :func:`press` and :func:`rub`.
 
     Raises:

@@ -50,7 +50,7 @@ _REQUIRED_OF_MOTION: Final[dict[str, tuple[str, ...]]] = {
     "press": (),
 }
 KEY_OF_TRAVEL: Final[dict[str, str]] = {"slide": "by_m", "shear": "by_m", "roll": "by_m", "walk": "reach_m"}
-"""Key with the displacement or distance, for each kind of motion along the skin."""
+"""Key that gives the displacement or distance of each kind of motion along the skin."""
 
 _Coordinate = Annotated[float, Field(ge=-1, le=1, allow_inf_nan=False), Allowed("a number from -1 to 1")]
 _Place = Annotated[
@@ -242,7 +242,7 @@ class TouchConfig(Table):
         return self
 
     def _check_motions(self) -> None:
-        """Check that motions occur only during the touch, and that ``press`` motions do not overlap."""
+        """Check that all motions lie within the touch and that ``press`` motions do not overlap."""
         pressed_s = 0.0
         for i, motion in enumerate(self.motions):
             key = f"motions[{i}]"
@@ -408,21 +408,21 @@ class SceneConfig(Table):
 
 
 def _meet(one: TouchConfig, two: TouchConfig) -> bool:
-    """Return whether two touches, including their repetitions, overlap in time."""
+    """Return whether two touches or any of their repetitions overlap in time."""
     return any(a.from_s < b.to_s and b.from_s < a.to_s for a in one.each for b in two.each)
 
 
 def read_scene(path: Path | str) -> SceneConfig:
-    """Read a scene file without checking the scene for a particular hand.
+    """Read a scene file without checking it against a hand.
 
-    To check the scene for a hand as well, use :func:`vcan_sim.scenes.load_scene`.
+    :func:`vcan_sim.scenes.load_scene` also checks the scene against a hand.
 
     Args:
         path: Scene file.
 
     Raises:
-        ConfigError: If the file cannot be read or is not a scene. The message states the line and column of
-            the error.
+        ConfigError: If the file cannot be read or is not a valid scene. The message gives the line and column
+            of the error.
     """
     path = Path(path)
     return _parse(read_toml(path, "scene file"))
@@ -432,7 +432,7 @@ def parse_scene(table: Mapping[str, Any], *, where: str = "") -> SceneConfig:
     """Create a scene from a table with the keys of a scene file.
 
     Args:
-        table: Scene as a table, as returned by tomllib.
+        table: Scene in the form that tomllib returns.
         where: File name for error messages.
 
     Raises:
@@ -457,7 +457,7 @@ def _require_keys(
     allowed: Mapping[str, tuple[str, ...]],
     required: Mapping[str, tuple[str, ...]],
 ) -> None:
-    """Raise ConfigError if a key is given but not allowed with ``value``, or required but missing."""
+    """Raise ConfigError if ``value`` forbids a given key or requires a missing one."""
     for name in sorted({each for keys in allowed.values() for each in keys}):
         given = getattr(table, name)
         if given is not None and name not in allowed[value]:

@@ -1,12 +1,11 @@
-"""Simulated CAN bus: arbitration between stations, transmission attempts, error counters, and events.
+"""Simulated CAN bus: arbitration, transmission attempts, error counters and events.
 
-A station starts a frame immediately if the bus is idle, otherwise at the end of the intermission. A frame
-that is queued less than one bit time after a start of frame still takes part in the arbitration (Davis,
-Burns, Bril, Lukkien, "Controller Area Network (CAN) schedulability analysis", 2007, section 3). The model
-therefore decides each arbitration one bit time after the start of frame.
+On an idle bus, a frame starts at once; on a busy bus, it starts at the end of the intermission. A frame
+queued less than one bit time after a start of frame still takes part in the arbitration (Davis, Burns, Bril,
+Lukkien, "Controller Area Network (CAN) schedulability analysis", 2007, section 3). Arbitration is therefore
+decided one bit time after the start of frame.
 
-All stations see each bit at the same time, because cables have no delay and all controllers have the same bit
-time.
+The model has no propagation delay and no oscillator tolerance: all stations see each bit at the same time.
 """
 
 from __future__ import annotations
@@ -47,7 +46,7 @@ from vcan_sim.timed_bus.wire_frame import wire_frame
 
 
 class TimedBus:
-    """CAN bus with its stations. Times passed to the methods must not decrease.
+    """CAN bus with its stations. The times of successive calls must not decrease.
 
     Args:
         stations: options of the stations; methods refer to a station by its index in this sequence.
@@ -115,7 +114,7 @@ class TimedBus:
         return True
 
     def clear(self, time_ns: int, station: int) -> None:
-        """Drop all frames in a station's queue; a frame that is being sent is not interrupted.
+        """Discard the queued frames of a station. A transmission in progress continues.
 
         Args:
             time_ns: current time, ns.
@@ -130,9 +129,10 @@ class TimedBus:
         self._withdraw(sender)
 
     def disconnect(self, time_ns: int, station: int) -> None:
-        """Disconnect a station; its queue is kept.
+        """Disconnect a station, but keep its queue.
 
-        A frame that the station is sending ends in an error frame.
+        If the station is the only sender of a frame that has not been acknowledged yet, the frame ends in an
+        error frame.
 
         Args:
             time_ns: current time, ns.
@@ -154,7 +154,7 @@ class TimedBus:
         self._withdraw(leaving)
 
     def connect(self, time_ns: int, station: int) -> None:
-        """Reconnect a station, with both error counters at 0.
+        """Reconnect a station, and reset both of its error counters to 0.
 
         Args:
             time_ns: current time, ns.
@@ -177,7 +177,7 @@ class TimedBus:
         self._offer(joining)
 
     def restart(self, time_ns: int, station: int) -> None:
-        """Start a station's recovery from bus-off; this method has no effect in any other state.
+        """Start the recovery of a station from bus-off. In any other state, this method does nothing.
 
         Args:
             time_ns: current time, ns.
@@ -194,7 +194,7 @@ class TimedBus:
             self._plan()
 
     def disturb(self, rule: Disturbance) -> None:
-        """Add a rule that injects errors, starting with the next arbitration.
+        """Add a rule that injects errors from the next arbitration onwards.
 
         Args:
             rule: disturbance rule.
@@ -208,12 +208,12 @@ class TimedBus:
         self._disturbances.add(rule)
 
     def undisturb(self, rule: Disturbance) -> None:
-        """Remove a rule that :meth:`disturb` added.
+        """Remove a disturbance rule.
 
-        Removing a rule does not change the transmission attempt in progress.
+        The transmission attempt in progress is not affected.
 
         Args:
-            rule: disturbance rule, the same object as in :meth:`disturb`.
+            rule: the object that was passed to :meth:`disturb`.
 
         Raises:
             ValueError: if the rule is not active.
@@ -224,19 +224,19 @@ class TimedBus:
 
     @property
     def next_event_ns(self) -> int | None:
-        """Time (ns) to pass to the next call of :meth:`advance`; None if no event is pending.
+        """Time (ns) at which to call :meth:`advance` next; None if nothing is pending.
 
-        At some of these times, the bus only makes an internal decision, and ``advance`` returns no event.
+        The call may return no events, because some steps of the bus are internal.
         """
         if self._events:
             return self._rates.ceil_ns(self._now)
         return None if self._next is None else self._rates.ceil_ns(self._next)
 
     def advance(self, time_ns: int) -> list[Event]:
-        """Return all new events up to a given time, in chronological order.
+        """Simulate the bus up to a given time, and return the new events in chronological order.
 
         Args:
-            time_ns: time up to which to return events, ns.
+            time_ns: end of the simulated interval, ns.
 
         Raises:
             ValueError: if the time is earlier than in a previous call.
@@ -248,7 +248,7 @@ class TimedBus:
     # --- queries
 
     def counters(self, station: int) -> Counters:
-        """Return a station's error counters, which determine the station's error state.
+        """Return the error counters of a station. They determine its error state.
 
         Args:
             station: index of the station.
@@ -256,7 +256,7 @@ class TimedBus:
         return self._stations[station].counters
 
     def waiting(self, station: int) -> int:
-        """Return the number of frames pending in a station, including the frame being sent.
+        """Return the number of unsent frames of a station, including the frame in transmission.
 
         Args:
             station: index of the station.
@@ -266,7 +266,7 @@ class TimedBus:
 
     @property
     def only_sender(self) -> int | None:
-        """Index of the only station that sends or has a frame to send; None unless there is exactly one."""
+        """Index of the station with frames to send, if it is the only one; otherwise None."""
         senders = set(self._pending)
         if self._flight is not None:
             senders.update(self._flight.senders)
@@ -274,7 +274,7 @@ class TimedBus:
 
     @property
     def frames(self) -> Mapping[tuple[int, bool], int]:
-        """Number of delivered frames. Each key is an identifier and whether it is an extended identifier."""
+        """Number of delivered frames for each identifier. A key is the pair (identifier, is extended)."""
         return MappingProxyType(self._frames)
 
     def busy_share(self, from_ns: int, to_ns: int) -> float:
@@ -282,7 +282,7 @@ class TimedBus:
 
         Args:
             from_ns: start of the interval, ns.
-            to_ns: end of the interval, ns; not later than the time passed to the most recent call.
+            to_ns: end of the interval, ns; at most the time of the last call.
 
         Raises:
             ValueError: if the interval is empty or ends in the future.
@@ -298,10 +298,10 @@ class TimedBus:
         return busy_ns / (to_ns - from_ns)
 
     def forget_load(self, before_ns: int) -> None:
-        """Delete the records of the bus load before a given time, to free memory.
+        """Discard the record of the bus load before a given time, to free memory.
 
         Args:
-            before_ns: given time, ns. Later calls of :meth:`busy_share` must not start before this time.
+            before_ns: start of the remaining record, ns. :meth:`busy_share` must not look further back.
         """
         self._occupancy.forget(before_ns)
 
@@ -324,15 +324,15 @@ class TimedBus:
         self._now = ticks
 
     def _deliver_burst(self, until: int) -> bool:
-        """Deliver the frame being sent and its sender's further frames, if no other station can interfere.
+        """Deliver a run of frames from one sender while no other station can interfere.
 
-        The result is the same as that of :meth:`_step`, but this method takes about a third of the time.
+        This is a fast path. The result is that of :meth:`_step`, in about a third of the time.
 
         Args:
-            until: time up to which to deliver frames, ticks.
+            until: end of the simulated interval, ticks.
 
         Returns:
-            False if the conditions are not met; in this case, nothing has been delivered.
+            False if another station could interfere. In that case, nothing has been delivered.
         """
         flight, pending = self._flight, self._pending
         if flight is None or self._recovering or self._disturbances or not self._counts_are_zero:
@@ -393,7 +393,7 @@ class TimedBus:
         self._plan()
 
     def _plan(self) -> None:
-        """Set the time of the next internal step of the bus."""
+        """Schedule the next internal step of the bus."""
         if self._flight is not None:
             self._next = self._flight.next
             return
@@ -409,7 +409,7 @@ class TimedBus:
         self._next = due
 
     def _offer(self, sender: Station) -> None:
-        """Include a station in the next arbitration if it has a frame to send."""
+        """Enter a station in the next arbitration if it has a frame to send."""
         if not len(sender.queue) or not sender.on_bus:
             return
         self._pending[sender.index] = sender
@@ -420,7 +420,7 @@ class TimedBus:
                 self._plan()
 
     def _withdraw(self, sender: Station) -> None:
-        """Update the next start of frame when a station can no longer send."""
+        """Withdraw a station from the next arbitration, and reschedule the start of frame."""
         if self._pending.pop(sender.index, None) and self._flight is None:
             started = self._start is not None and self._start <= self._now
             if not started:
@@ -440,7 +440,7 @@ class TimedBus:
         start = now - self._bit
         self._start = None
         contenders = [station for station in self._pending.values() if station.ready <= start]
-        if not contenders:  # all pending frames have been removed from the queues since the start of frame
+        if not contenders:  # every contender has withdrawn since the start of frame
             self._choose_start(now)
             return
         if len(contenders) == 1:
@@ -489,7 +489,7 @@ class TimedBus:
         return Attempt(frame, n_bits, bit_at)
 
     def _bit_at(self, frame: CanFrame, esi: bool, ticks: int) -> int | None:
-        """Return the position of the bit on the bus at ``ticks`` after the start of frame, or None."""
+        """Return the position of the bit sent ``ticks`` after the start of frame; None outside the frame."""
         if ticks < 0 or ticks >= undisturbed((), frame, esi, self._rates).end:
             return None
         wire = wire_frame(frame, esi)
@@ -569,7 +569,7 @@ class TimedBus:
                 self._set_counters(now, station, reception_failed(station.counters))
 
     def _still_receiving(self, flight: Flight) -> tuple[int, ...]:
-        """Return the stations that have received the frame in progress without error so far."""
+        """Return the connected stations that have detected no error in the frame so far."""
         receivers, side_errors = flight.receivers, flight.course.side_errors
         if not side_errors and self._receivers.get(flight.senders) is receivers:
             return receivers
@@ -585,7 +585,7 @@ class TimedBus:
         self._choose_start(now)
 
     def _return(self, station: Station) -> None:
-        """Put the frame that a station was sending back into the station's queue."""
+        """Put the interrupted frame of a station back into its queue."""
         if station.sending is not None:
             station.queue.put_back(station.sending)
             station.sending = None
@@ -593,13 +593,13 @@ class TimedBus:
             self._pending[station.index] = station
 
     def _suspend(self, station: Station, flight: Flight) -> None:
-        """Suspend an error-passive transmitter after its frame (Bosch CAN 2.0, part B, section 3.1.5)."""
+        """Apply suspend transmission to an error-passive station (Bosch CAN 2.0, part B, section 3.1.5)."""
         if station.passive:
             free = flight.start + flight.course.free
             station.ready = free + SUSPEND_BITS * self._rates.nominal_ticks
 
     def _leave(self, leaving: Station, flight: Flight) -> None:
-        """Update the course of the transmission attempt in progress after a station has been disconnected."""
+        """Revise the course of the current transmission attempt after a station has been disconnected."""
         course = flight.course
         if course.error is not None:
             return
@@ -613,7 +613,7 @@ class TimedBus:
         frame = flight.waiting[sender.index].frame
         bit = self._bit_at(frame, sender.passive, self._now - flight.start)
         if bit is None or bit > wire_frame(frame, sender.passive).ack_slot:
-            return  # the receivers have acknowledged the frame
+            return  # the frame has been acknowledged
         receivers = self._participants(self._still_receiving(flight))
         if leaving is sender:
             changed = cut_off(frame, sender.passive, bit, receivers, self._rates)
@@ -654,20 +654,20 @@ class TimedBus:
             self._recovering.append(station)
 
     def _runs(self, station: Station, until: int) -> int:
-        """Return the number of complete recessive runs between the last dominant bit and ``until``."""
+        """Return the number of complete recessive runs that a recovering station has seen by ``until``."""
         assert station.recovers_from is not None
         since = max(station.recovers_from, self._recessive_from)
         return max(0, until - since) // (RECOVERY_RUN_BITS * self._rates.nominal_ticks)
 
     def _recovery_end(self, station: Station) -> int:
-        """Return the time in ticks at which a station's recovery ends if the bus stays recessive."""
+        """Return the time (ticks) at which a station recovers if the bus stays recessive."""
         assert station.recovers_from is not None
         since = max(station.recovers_from, self._recessive_from)
         missing = (RECOVERY_RUNS - station.runs_seen) * RECOVERY_RUN_BITS
         return since + missing * self._rates.nominal_ticks
 
     def _recover(self, now: int) -> bool:
-        """Complete all recoveries from bus-off that are due; return whether there were any."""
+        """Complete the bus-off recoveries that are due, and return whether there were any."""
         complete = [station for station in self._recovering if self._recovery_end(station) == now]
         if self._start is not None and self._start < now:
             return False

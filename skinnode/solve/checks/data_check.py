@@ -34,7 +34,7 @@ from skinnode.solve.linalg.cholesky import multiply_vector, solve_positive
 from skinnode.solve.wires.problem import PatchProblem
 
 ROUNDS: Final = 3
-"""Number of left-out groups of readings at which the check stops solving the frame again."""
+"""Number of groups of readings left out of a frame after which it is not solved again."""
 WRONG: Final = 0.1
 """Expected relative error of a wrong reading. Not tuned: reducing it to 0.01 would change the cost of a wrong
 reading by only 2 nats."""
@@ -42,7 +42,8 @@ SUSPICIOUS: Final = 5.0
 """Gain in log evidence (nats) from assuming a fault, above which a frame is suspicious. The check examines
 suspicious frames: it searches for the most likely explanation of their readings."""
 OFFSETS: Final = (0, 1, 3, 5)
-"""Prior scales at which single readings are tested, as numbers of indices below the best-fitting κ."""
+"""Prior scales at which single readings are tested: offsets from the index of the best-fitting κ,
+downwards."""
 CLEAR: Final = -30.0
 """Log evidence of faults minus that of loads (nats), below which loads clearly explain a frame. The check
 then skips similar frames for a while."""
@@ -50,8 +51,8 @@ EXCUSED: Final = 10.0
 """Maximum amount (nats) by which the gain of a frame may exceed that of an examined frame, for the two frames
 to count as similar."""
 EXCUSED_FRAMES: Final = 8
-"""Number of frames after an examination at which similar frames are examined again. An examination takes 9
-ms."""
+"""Number of frames for which the result of an examination also applies to similar frames. Each examination
+takes 9 ms."""
 PATIENCE: Final = 4
 """One in this many suspicious frames is examined even if the deadline leaves no time. A fault makes every
 subsequent frame suspicious; a press rarely does."""
@@ -171,8 +172,8 @@ class DataCheck:
                 in :attr:`left_out`.
             until: Deadline as a value of :func:`skinnode.process.clock.perf_counter`, s. A suspicious frame
                 that cannot be examined in time is not trusted; every :data:`PATIENCE`-th such frame is
-                examined regardless. Pass −inf if the solver ran out of time: unsolved wires are then no
-                evidence of a fault.
+                examined regardless. Pass −inf if the solver ran out of time: wires without a solution are
+                then not taken for faulty.
         """
         self._frame += 1
         last = self._last
@@ -221,10 +222,10 @@ class DataCheck:
         return field
 
     def _is_clean(self, solved: Solved) -> bool:
-        """Return whether a frame is free of faults according to a quick test.
+        """Return whether a quick test finds no fault in a frame.
 
-        The test applies only to fields of the exact inverse that converged with all readings. For such
-        fields, it replaces :meth:`_find`.
+        The test applies only to fields of the exact inverse that converged with all readings. A frame that
+        passes it is not searched for wrong readings (:meth:`_find`).
         """
         field, layout = solved.field, self._problem.layout
         clean = (
@@ -245,12 +246,12 @@ class DataCheck:
         return self._needs_no_explanation(max(self._largest_gains(self._present, best, cost, sigma)))
 
     def _needs_no_explanation(self, gain: float) -> bool:
-        """Return whether a frame can be accepted without an examination.
+        """Return whether a frame is accepted without an examination; ``gain`` is that from assuming a fault.
 
-        This is the case if the gain from assuming a fault, ``gain`` (nats), is small. It is also the case if
-        loads clearly explained a recent frame with a similar gain and the same suspected reading. The
-        suspected reading matters because a reading can become wrong during a press. A frame that follows a
-        noisy frame is always examined.
+        A frame is accepted if ``gain`` (nats) is small. It is also accepted if loads clearly explained a
+        recent frame with a similar gain and the same suspected reading. If another reading is suspected, the
+        frame is examined, because a reading can become wrong during a press. The frame after a noisy frame is
+        always examined.
         """
         excused = (
             self._frame < self._excused_until

@@ -1,20 +1,20 @@
 """Contact regions: assign the loaded cells of a patch to contacts.
 
-The load sum of a cell is the sum of the pressing loads in its 3 × 3 neighbourhood; a peak is a local maximum
-of the load sum. The cells are processed in order of decreasing load sum, and each cell is added to the area
-of a neighbouring peak. Two peaks with adjacent areas are separate contacts only if the load sum between them
+The load sum of a cell is the sum of the pressing loads in its 3 × 3 neighbourhood. A peak is a local maximum
+of the load sum. The cells are visited in order of decreasing load sum, and each is added to the area of a
+neighbouring peak. Where two areas meet, their peaks stay separate contacts only if the load sum between them
 is much smaller than at both peaks, and the difference is significant (topological persistence).
 
-A peak is a contact if one of three values is significant: its load sum, the χ² of the loads of the same
-cells, or the sum of the loads over its area. The strongest peak is also a contact if the skin at this peak is
-significantly indented. Significant indentation indicates a touch even if the loads cannot be located.
+A peak is a contact if its load sum, the χ² of the loads of the same cells, or the sum of the loads over its
+area is significant. The strongest peak is also a contact if the skin there is significantly indented: the
+skin is then touched, even if the loads cannot be located.
 
-Only cells with an electrode are tested. Beyond the outermost electrodes, a small load nearby and a large load
-farther away cause nearly the same displacement. Cells beyond the outermost electrodes are added to the
-adjacent contact.
+Only cells with an electrode are tested. The loads on cells beyond the outermost electrodes are ambiguous,
+because a small load nearby and a large load farther away cause nearly the same displacement. These cells are
+added to the adjacent contact.
 
-The thresholds have hysteresis, so that contacts do not appear and disappear because of noise. To split a
-contact in two, or to merge two contacts, the load sum between the peaks must change by a third.
+The thresholds have hysteresis, so that noise does not make contacts appear and disappear. To split a contact
+in two, or to merge two contacts, the load sum between the peaks must change by a third.
 """
 
 from __future__ import annotations
@@ -30,43 +30,43 @@ from skinnode.model.layout import Float
 from skinnode.solve.linalg.vectors import Index
 
 SIGNIFICANT: Final = 5.0
-"""Minimum significance of a load, in standard deviations, for the load to be a contact. With 100 load sums
-per frame, noise exceeds five standard deviations about once in ten thousand frames."""
+"""Minimum load of a contact, in standard deviations. Among the 100 load sums of a frame, noise exceeds this
+limit about once in ten thousand frames."""
 SIGNIFICANT_STILL: Final = 4.0
 """Value of :data:`SIGNIFICANT` for a contact that existed in the last frame."""
 BLOCK_EXTRA: Final = 22.0
-"""Amount by which the χ² of the nine loads around a peak must exceed the square of the significance
-threshold. With nine degrees of freedom, χ² exceeds 25 + 22 as rarely as a normal variable exceeds five
-standard deviations."""
+"""Amount by which the χ² of the nine loads around a peak must exceed the squared significance threshold. With
+nine degrees of freedom, χ² exceeds 25 + 22 as rarely as a normal variable exceeds five standard
+deviations."""
 PRESSED: Final = 6.0
-"""Minimum indentation of the skin, in standard deviations, for the strongest peak to be a contact."""
+"""Minimum indentation of the skin at the strongest peak, in standard deviations, for it to be a contact."""
 PRESSED_STILL: Final = 5.0
 """Value of :data:`PRESSED` for a contact that existed in the last frame."""
 RELEVANT: Final = 0.2
-"""Minimum load sum of each other contact, as a fraction of the load sum of the strongest contact. Errors of
-the load estimate next to a contact reach a tenth of the contact's load sum."""
+"""Minimum load sum of a contact, as a fraction of that of the strongest contact. Errors of the load estimate
+next to a contact reach a tenth of its load sum."""
 RELEVANT_STILL: Final = 0.15
 """Value of :data:`RELEVANT` for a contact that existed in the last frame."""
 PART: Final = 0.1
-"""Minimum load sum of the cells of a contact, as a fraction of the load sum at the contact's peak."""
+"""Minimum load sum of a cell in a contact, as a fraction of the load sum at the peak."""
 PART_SIGNIFICANT: Final = 3.0
-"""Minimum load sum of the cells of a contact, in standard deviations of the peak's load sum. The limit
-prevents noise from shifting the centre of a very light touch, by up to a pitch."""
+"""Minimum load sum of a cell in a contact, in standard deviations of the peak's load sum. Without this limit,
+noise shifts the centre of a very light touch by up to a pitch."""
 PART_MOST: Final = 0.6
-"""Load sum, as a fraction of the peak's, above which a cell belongs to the contact even if its load sum is
-not significant."""
+"""Load sum, as a fraction of that at the peak, above which a cell is part of the contact even if it does not
+reach :data:`PART_SIGNIFICANT`."""
 GAP: Final = 0.5
-"""Two peaks are separate contacts only if the load sum between them is below this fraction of the smaller
-peak's load sum. Limits from 0.4 to 0.6 split no single body in ``tests/solve/test_contact_number.py``; a
-limit of 0.75 split plates at the edge of the patch. Two spheres are separated if they are at least 5 pitches
+"""Maximum load sum between two contacts, as a fraction of that at the smaller peak. In
+``tests/solve/test_contact_number.py``, no single body was split with limits from 0.4 to 0.6; with 0.75,
+plates at the edge of the patch were. With 0.5, two spheres are separated if they are at least 5 pitches
 apart."""
 GAP_ONE: Final = 0.4
-"""Value of :data:`GAP` for two peaks that were one contact in the last frame."""
+"""Value of :data:`GAP` for two peaks that belonged to one contact in the last frame."""
 GAP_TWO: Final = 0.6
-"""Value of :data:`GAP` for two peaks that were two contacts in the last frame."""
+"""Value of :data:`GAP` for two peaks that belonged to two contacts in the last frame."""
 GAP_SIGNIFICANT: Final = 3.0
-"""Two peaks are separate contacts only if the load sum of the smaller peak exceeds the load sum between the
-peaks by this number of standard deviations."""
+"""Minimum drop of the load sum from the smaller of two contacts' peaks to the gap between them, in standard
+deviations."""
 
 
 RegionScratch = tuple[
@@ -88,7 +88,7 @@ def region_scratch(cells: int) -> RegionScratch:
 def _variance(  # noqa: PLR0913 - a kernel: loads and their posterior by name
     cells: Index, signs: Float, count: int, rows: Float, weight: Float, share: Float, scale2: float
 ) -> float:
-    """Return the posterior variance of the sum of ``signs`` times the normal loads of ``cells``."""
+    """Return the posterior variance of Σ ``signs`` q, for the normal loads q of ``cells``."""
     own, seen = 0.0, 0.0
     for c in range(count):
         own += signs[c] * signs[c] * share[cells[c]]
@@ -113,7 +113,7 @@ def _block_chi2(  # noqa: PLR0913, C901 - a kernel: loads and their posterior by
     s: Float,
     b: Float,
 ) -> float:
-    """Return the χ² qᵀ Σ⁻¹ q for the normal loads q of up to nine cells with the posterior covariance Σ.
+    """Return χ² = qᵀ Σ⁻¹ q for the normal loads q of up to nine cells, with their posterior covariance Σ.
 
     ``s`` (9, 9) and ``b`` (9,) are work arrays.
     """
@@ -130,7 +130,7 @@ def _block_chi2(  # noqa: PLR0913, C901 - a kernel: loads and their posterior by
     for c in range(count):
         s[c, c] = max(s[c, c] + scale2 * share[cells[c]], 1e-9 * scale2 * share[cells[c]])
     chi2 = 0.0
-    for c in range(count):  # compute the Cholesky factor L of Σ and L⁻¹ q, row by row
+    for c in range(count):  # compute the Cholesky factor L of Σ, and L⁻¹ q, row by row
         value = press[cells[c]]
         for d in range(c):
             entry = s[c, d]
@@ -149,7 +149,7 @@ def _block_chi2(  # noqa: PLR0913, C901 - a kernel: loads and their posterior by
 
 @njit_part
 def _box(cell: int, near: Index, own: NDArray[np.bool_], out: Index) -> int:
-    """Write the cells with an electrode among a cell and its neighbours into ``out``; return their number."""
+    """Write a cell and its neighbours into ``out``, if they have an electrode; return the number written."""
     count = 0
     for i in near[cell]:
         if i >= 0 and own[i]:
@@ -174,7 +174,7 @@ def _apart(  # noqa: PLR0913 - a kernel: loads and their posterior by name
     cells: Index,
     signs: Float,
 ) -> bool:
-    """Return whether ``peak`` and the smaller peak ``other`` are two contacts.
+    """Return whether ``peak`` and the smaller peak ``other`` belong to two contacts.
 
     ``between`` is a cell between them. ``cells`` (27,) and ``signs`` (18,) are work arrays.
     """
@@ -204,7 +204,7 @@ def _apart(  # noqa: PLR0913 - a kernel: loads and their posterior by name
 
 @njit_part
 def _sort_peaks(press: Float, own: NDArray[np.bool_], near: Index, total: Float, order: Index) -> int:
-    """Write the load sums into ``total``, and the cells in order of decreasing load sum into ``order``.
+    """Write the load sums into ``total``, and the cells by decreasing load sum into ``order``.
 
     Returns the number of cells with an electrode.
     """
@@ -244,7 +244,7 @@ def _grow_areas(  # noqa: PLR0913, C901 - a kernel: loads, their posterior and s
     signs: Float,
     split: NDArray[np.bool_],
 ) -> None:
-    """Write the peak to which each cell belongs into ``area`` (Q,); −1 for cells with a small load sum."""
+    """Write the peak of each cell's area into ``area`` (Q,); −1 for cells with a small load sum."""
     cells, top = total.size, total[order[0]]
     for cell in range(cells):
         area[cell], parent[cell] = -1, cell
@@ -311,7 +311,7 @@ def _number_contacts(  # noqa: PLR0913, C901 - a kernel: loads, their posterior 
     block: Float,
     number: Index,
 ) -> int:
-    """Number the cells of the peaks that are contacts, and return the number of contacts."""
+    """Number the cells of each peak that is a contact, and return the number of contacts."""
     cells = total.size
     found, strongest = 0, 0.0
     for k in range(electrodes):
@@ -366,21 +366,21 @@ def find_regions(  # noqa: PLR0913 - a kernel: loads, their posterior, lattice a
     outside: Index,
     scratch: RegionScratch,
 ) -> int:
-    """Find the contacts and return their number; contact 1 has the strongest peak.
+    """Find the contacts, and return their number. Contact 1 has the strongest peak.
 
     Args:
         press: (Q,) pressing loads.
         depth: (Q,) depth of the skin at the electrode of each cell, in standard deviations.
-        rows: (m, 3Q) L⁻¹ J G, before its rows are multiplied by ``weight``.
-        weight: (m,) factors by which the rows are multiplied.
+        rows: (m, 3Q) rows of L⁻¹ J G before multiplication by ``weight``.
+        weight: (m,) factors of the rows.
         share: (Q,) prior variances of the loads, relative to ``scale2``.
         scale2: Squared scale s² of the prior, pitch².
         own: (Q,) bool, whether a cell has an electrode.
         near: (Q, 9) indices of each cell and its neighbours; −1 outside the lattice.
-        before: (Q,) contact numbers of the cells in the last frame.
-        number: (Q,) receives each cell's contact number; 0 for cells without contact and in the outermost
-            ring.
-        outside: (Q,) receives the contact numbers of the cells in the outermost ring; 0 for other cells.
+        before: (Q,) contact number of each cell in the last frame.
+        number: (Q,) receives the contact number of each cell; 0 for cells without contact and for the
+            outermost ring.
+        outside: (Q,) receives the contact numbers of the outermost ring; 0 for all other cells.
         scratch: Work arrays from :func:`region_scratch`.
     """
     total, ones, block_cov, block, signs, order, parent, area, patch, around, few, split = scratch
@@ -406,7 +406,7 @@ def find_regions(  # noqa: PLR0913 - a kernel: loads, their posterior, lattice a
 def _dilate(  # noqa: C901 - neighbours as loops
     total: Float, near: Index, number: Index, outside: Index, added: Index
 ) -> None:
-    """Add the neighbouring cells to each contact, and number the adjacent cells of the outermost ring."""
+    """Add the neighbouring cells to each contact, and number the cells of the outermost ring next to it."""
     cells = number.size
     for cell in range(cells):
         added[cell] = 0

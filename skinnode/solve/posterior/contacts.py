@@ -1,11 +1,11 @@
-"""Contacts on the skin, measured from the posterior of the loads.
+"""Contacts on the skin, computed from the posterior of the loads.
 
-In the prior, the loads q ~ N(0, s² D) displace the electrodes by u = G q plus a small independent term. The
-posterior mean of q for a displacement u is D Gᵀ C⁻¹ u. The posterior variance of a sum wᵀ q is s² wᵀ D w −
-‖L⁻¹ J G s² D w‖², in the notation of :mod:`skinnode.solve.posterior.measurement_update`.
+In the prior, the loads q ~ N(0, s² D) cause the displacement u = G q plus a small independent term. For a
+displacement u, the posterior mean of q is D Gᵀ C⁻¹ u. The posterior variance of a weighted sum wᵀ q is s² wᵀ
+D w − ‖L⁻¹ J G s² D w‖², in the notation of :mod:`skinnode.solve.posterior.measurement_update`.
 
-:mod:`skinnode.solve.posterior.contact_regions` assigns the cells to contacts. This module computes the force,
-centre, area and shear of each contact, and their standard deviations.
+:mod:`skinnode.solve.posterior.contact_regions` assigns cells to contacts. This module computes the force,
+centre, area and shear of each contact, with standard deviations.
 """
 
 from __future__ import annotations
@@ -27,56 +27,54 @@ from skinnode.solve.posterior.elastic_prior import ElasticPrior
 from skinnode.solve.posterior.map_estimate import PRIOR_DOUBT
 
 HERTZ_SPREAD: Final = 2.5
-"""Ratio of a² to the mean of r² under a Hertz contact of radius a, weighted with the pressure √(1 −
-r²/a²)."""
+"""Ratio of a² to the pressure-weighted mean of r² in a Hertz contact of radius a, where the pressure is
+proportional to √(1 − r²/a²)."""
 PULLING: Final = 0.25
 """Ratio of the sum of all loads of a contact to the sum of its pressing loads, below which pulling loads are
 left out. The half-space model needs pulling loads at the rim of a contact to reproduce the displacement of a
-supported layer. Measured ratios of the two sums were at most 0.15 on bonded layers of 8 mm or less, and at
-least 0.33 on a half-space."""
+supported layer. In measurements, the ratio was at most 0.15 on bonded layers of up to 8 mm, and at least 0.33
+on a half-space."""
 PULLED_OFF: Final = 0.1
-"""Standard deviation, in cell widths, of a contact's centre along the surface if pulling loads are left out.
-The measured RMS error of the centre on layers of 2 to 8 mm was at most 0.11 cell widths. If pulling loads are
-left out, the standard deviation of the area is at least as large as the area."""
+"""Standard deviation of a contact's centre along the surface if pulling loads are left out, in cell widths.
+The measured RMS error on layers of 2 to 8 mm was at most 0.11 cell widths."""
 BEYOND: Final = 1.0
-"""Standard deviation of the loads in the outermost ring of cells, relative to these loads. The outermost ring
-represents all loads beyond the patch. If the value were 0.5, force errors under plates larger than the patch
+"""Standard deviation of the loads in the outermost ring of cells, relative to these loads. The ring stands
+for all loads beyond the patch. With a value of 0.5, errors of the force under plates larger than the patch
 would reach 4.8 standard deviations."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LoadEstimate:
-    """Loads estimated from a frame; their covariance is s² (D − s² D Wᵀ W D) with W = diag(weight) rows."""
+    """Loads estimated from a frame. Their covariance is s² (D − s² D Wᵀ W D), with W = diag(weight) rows."""
 
     mean: Float
     """(Q, 3) mean loads, in units of the prior's loads."""
     rows: Float
-    """(m, 3Q) rows of W before they are multiplied by ``weight``."""
+    """(m, 3Q) rows of W before multiplication by ``weight``."""
     weight: Float
-    """(m,) factors by which the rows of W are multiplied."""
+    """(m,) factors of the rows."""
     share: Float
-    """(Q,) diagonal of D: load variance of each cell relative to s²."""
+    """(Q,) diagonal of D: load variance of each cell, relative to s²."""
     scale2: float
     """Squared scale s² of the prior, pitch²."""
 
 
 class ContactFinder:
-    """Contact finder of one patch for a stream of frames. Each stream needs its own instance.
+    """Search for the contacts on one patch, frame by frame. Each stream needs its own instance.
 
-    The number of contacts depends on the contacts of the last frame
-    (:mod:`skinnode.solve.posterior.contact_regions`), which :meth:`reset` discards.
+    The thresholds depend on the contacts of the last frame (:mod:`skinnode.solve.posterior.contact_regions`).
 
     Args:
-        prior: Elasticity of the patch.
+        prior: Elastic prior of the patch.
         layout: The patch.
         rubber: Material of the skin.
-        calibrated: Whether the forces are calibrated. Without calibration, the standard deviation of a normal
-            force covers the difference between a half-space and a layer that is as thick as the clearance and
-            bonded to a rigid support.
+        calibrated: Whether forces are calibrated. If not, the standard deviation of a normal force covers the
+            range from a half-space to a layer that is as thick as the clearance and bonded to a rigid
+            support.
         thickness: Tolerance of the thickness, as a fraction of the clearance.
-        outermost: Whether to add the loads of the outermost ring of cells to an adjacent contact. Use False
-            if the prior expects equal loads everywhere; too much load is then estimated in the outermost
-            ring.
+        outermost: Whether a contact includes the loads of adjacent cells in the outermost ring. Set this to
+            False if the prior expects equal loads everywhere, because the loads of the ring are then
+            overestimated.
     """
 
     def __init__(  # noqa: PLR0913 - what the patch is
@@ -101,7 +99,7 @@ class ContactFinder:
         near = np.pad(np.arange(cells).reshape(prior.shape), 1, constant_values=-1)
         rows, columns = prior.shape
         box = np.stack([near[i : i + rows, j : j + columns] for i in range(3) for j in range(3)], axis=-1)
-        self._near: Index = box.reshape(cells, 9)  # cell and neighbour indices; −1 outside the lattice
+        self._near: Index = box.reshape(cells, 9)  # each cell and its neighbours; −1 outside the lattice
         self._has_electrode = np.zeros(cells, bool)
         self._has_electrode[self._own] = True
         self._number, self._outside, self._before = np.zeros((3, cells), np.int64)
@@ -121,13 +119,13 @@ class ContactFinder:
         """Return the forces on the electrodes' cells, and the contacts.
 
         Args:
-            loads: Estimate of the frame's loads.
-            displacement_m: (U, N, 3) displacement, metres.
-            std_m: (U, N, 3) standard deviation of the displacement, metres; inf for unsolved
-                electrodes.
+            loads: Loads estimated from the frame.
+            displacement_m: (U, N, 3) displacement, m.
+            std_m: (U, N, 3) standard deviation of the displacement, m; inf for unsolved electrodes.
 
         Returns:
-            (U, N, 3) forces on the electrodes' cells, N, and the contacts, largest normal force first.
+            (U, N, 3) forces on the electrodes' cells, N, and the contacts in order of decreasing normal
+                force.
         """
         np.copyto(self._field[0], displacement_m.reshape(-1, 3))
         np.copyto(self._field[1], std_m.reshape(-1, 3))
@@ -147,7 +145,7 @@ class ContactFinder:
         return force, tuple(found)
 
     def warm_up(self, loads: LoadEstimate) -> None:
-        """Compile the kernels that find contacts."""
+        """Compile the kernels."""
         pressed = LoadEstimate(-np.ones_like(loads.mean), loads.rows, loads.weight, loads.share, loads.scale2)
         self.find(pressed, -self._own_frame[:, 2].reshape(self._electrodes), np.ones(self._electrodes))
         self.reset()
@@ -160,7 +158,7 @@ class ContactFinder:
             loads.rows, loads.weight, loads.share, loads.scale2, mean, std, *self._work,
         )  # fmt: skip
         force_n, force_std_n = float(mean[0]), float(std[0])
-        # cell_area / 6 is the mean r² of a load that is uniform over its cell
+        # a load distributed uniformly over a square cell has a mean r² of cell_area / 6
         area = math.pi * HERTZ_SPREAD * (max(float(mean[4]), 0.0) + prior.cell_area_m2 / 6.0)
         if not self._calibrated:
             depth_m = max(float(self._depth_m[self._number == number].max()), 0.0)
@@ -198,10 +196,11 @@ def _prepare(  # noqa: PLR0913 - a kernel: loads, field and outputs by name
     depth: Float,
     force: Float,
 ) -> None:
-    """Write pressing loads (Q,), depths (Q,) in m, depths (Q,) in standard deviations, and forces (UN, 3), N.
+    """Write pressing loads (Q,), depths (Q,) in m and in standard deviations, and forces (UN, 3) in N.
 
-    ``field`` (2, UN, 3) contains the displacement and its standard deviations, m. If the standard deviation
-    of a depth is infinite, 0 is written. Depths of cells without an electrode are not written.
+    ``field`` (2, UN, 3) contains the displacement and its standard deviations, m. A depth with an infinite
+    standard deviation is written as 0. Cells without an electrode have no depth; their entries are not
+    written.
     """
     for cell in range(press.size):
         press[cell] = -q[cell, 2]
@@ -238,13 +237,14 @@ def _measure(  # noqa: PLR0913, C901 - a kernel: cells, loads and outputs by nam
     r2: Float,
     slopes: Float,
 ) -> tuple[int, bool, float]:
-    """Measure the force in N, centre (3) in m, mean r² in m² and shear (2) in N of one contact.
+    """Compute the force in N, centre (3) in m, mean r² in m² and shear (2) in N of one contact.
 
-    Writes the seven values into ``mean``, and their standard deviations (computed by the delta method) into
-    ``std``. Returns the cell closest to the centre, whether pulling loads were left out, and the sum of the
-    pressing loads in N. The variances are multiplied by ``PRIOR_DOUBT``, because the distribution of the load
-    over the cells mainly depends on the prior. ``cells`` (Q,), ``r2`` (Q,) and ``slopes`` (Q, 5) are work
-    arrays.
+    The seven values are written into ``mean``, and their standard deviations (by the delta method) into
+    ``std``. The variances are multiplied by ``PRIOR_DOUBT``, because the distribution of the load over the
+    cells depends mainly on the prior. ``cells`` (Q,), ``r2`` (Q,) and ``slopes`` (Q, 5) are work arrays.
+
+    Returns the cell closest to the centre, whether pulling loads were left out, and the sum of the pressing
+    loads in N.
     """
     size, every, pressing = 0, 0.0, 0.0
     for cell in range(number.size):

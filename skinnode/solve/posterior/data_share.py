@@ -11,14 +11,14 @@ from skinnode.solve.posterior.map_estimate import PRIOR_DOUBT, SMOOTH_SHARE
 def data_share(std: Float, core: Float, prior_variance: Float) -> Float:
     """Return 1 minus the ratio of the posterior variance to the prior variance; 0 where ``std`` is infinite.
 
-    ``std``² is larger than the posterior variance, because the part that depends on the prior is multiplied
-    by :data:`PRIOR_DOUBT`. In ``core``², the same part is multiplied by :data:`SMOOTH_SHARE`, so the part can
-    be computed from the difference between ``std``² and ``core``².
+    ``std``² exceeds the posterior variance, because it contains :data:`PRIOR_DOUBT` times the part that
+    depends on the prior. ``core``² contains :data:`SMOOTH_SHARE` times the same part. The part therefore
+    follows from the difference between ``std``² and ``core``².
 
     Args:
         std: (U, f) standard deviations, pitches.
         core: (U, f) standard deviations for the 95 % interval, pitches.
-        prior_variance: (U f,) variances of the prior, pitch².
+        prior_variance: (U f,) prior variances, pitch².
 
     Returns:
         (U, f) data shares, from 0 to 1.

@@ -1,14 +1,14 @@
 """Elastic prior: the displacement of the rubber expected before any resistance is measured.
 
-Each electrode site is in the centre of a cell one pitch wide. Independent surface loads on the cells displace
-the electrodes by the response G of an elastic half-space (Boussinesq, Cerruti;
+Each electrode is at the centre of a cell one pitch wide. Independent loads on the surfaces of the cells
+displace the electrodes by the response G of an elastic half-space (Boussinesq, Cerruti;
 :func:`skinnode.model.elastic.rectangle_compliance`). The prior of the displacement u is
 
     u ~ N(0, s² C),   C = G diag(q) Gᵀ + ε² I
 
-The scale s, common to the whole patch, is estimated from the data. The cells extend beyond the outermost
-electrodes, because the skin can also be pressed there. The ε term allows each electrode to deviate slightly
-and independently from the half-space.
+The scale s applies to the whole patch and is estimated from the data. Further cells lie beyond the outermost
+electrodes, because the skin can be pressed there as well. The term ε² I allows each electrode to deviate
+slightly from the half-space, independently of the others.
 """
 
 from __future__ import annotations
@@ -27,29 +27,29 @@ from skinnode.solve.linalg.cholesky import multiply
 from skinnode.solve.posterior.load_cells import MARGIN, LoadCells
 
 SHEAR_SHARE: Final = 0.4
-"""Ratio of the expected shear loads to the expected normal loads (standard deviations). The marginal
-likelihood of the data is nearly constant for shear ratios from 0.25 to 0.4. If the prior expects less shear,
-the standard deviations are too small on layouts that are insensitive to shear (`aligned`)."""
+"""Ratio of expected shear loads to expected normal loads (standard deviations). The marginal likelihood of
+the data hardly changes between 0.25 and 0.4. With smaller values, the standard deviations are too small on
+layouts that are insensitive to shear (`aligned`)."""
 LAYER_SHARE: Final = 0.25
 """Size of the displacements that the data check expects on a bonded layer, relative to those on a half-space.
-If the value is too small (0.1), a dent in a thin layer is mistaken for a faulty wire. If the value is too
-large (0.5), delayed readings of an upper wire are not detected."""
+With 0.1, a dent in a thin layer is mistaken for a faulty wire. With 0.5, delayed readings of an upper wire
+are not detected."""
 SLACK: Final = 0.005
-"""Ratio of ε to the standard deviation of the normal displacement. A positive ε makes C invertible. The
-estimates do not change for values of ε from 0.001 to 0.02."""
+"""Ratio of ε to the standard deviation of the normal displacement. Because ε is positive, C is invertible.
+Values from 0.001 to 0.02 lead to the same estimates."""
 
 
 @dataclass(frozen=True, eq=False)
 class ElasticPrior:
-    """Elastic prior of one layout for s = 1.
+    """Elastic prior of one layout, at s = 1.
 
-    The median standard deviation of the normal displacement is 1 pitch.
+    The loads are scaled so that the median standard deviation of the normal displacement is 1 pitch.
     """
 
     covariance: Float
     """(3UN, 3UN) covariance C of the displacement, pitch²."""
     response: Float
-    """(3UN, 3Q) displacement per unit load, pitches; loads have a standard deviation of 1 at s = 1."""
+    """(3UN, 3Q) displacement per unit load, pitches. At s = 1, each load has a standard deviation of 1."""
     load_n: Float
     """(3,) force of a unit load along the wire, across the wire and along the normal, N."""
     cell_m: Float
@@ -63,7 +63,7 @@ class ElasticPrior:
 
     @classmethod
     def of(cls, layout: PatchLayout, rubber: Rubber | None = None) -> ElasticPrior:
-        """Return the prior for ``layout`` on ``rubber``; the rubber's modulus only scales the forces."""
+        """Return the prior of ``layout`` on ``rubber``. The modulus of the rubber scales only the forces."""
         rubber = Rubber() if rubber is None else rubber
         cells = LoadCells.of(layout)
         own, size = cells.electrode_frame, cells.size_m
@@ -91,10 +91,10 @@ class ElasticPrior:
 def bonded_response(layout: PatchLayout) -> Float:
     """Return the response (3UN, Q) of a bonded layer to normal loads, pitches per unit load.
 
-    The layer is incompressible, and its thickness equals the height of the electrodes. Of all supports, this
-    one differs most from a half-space: around a contact, the surface moves outwards rather than downwards.
-    For loads with a standard deviation of 1, the median standard deviation of the normal displacement is
-    :data:`LAYER_SHARE` pitches.
+    The layer is incompressible and as thick as the electrodes are high. It differs from a half-space more
+    than any other support: around a contact, the surface moves outwards rather than downwards. For loads with
+    a standard deviation of 1, the median standard deviation of the normal displacement is :data:`LAYER_SHARE`
+    pitches.
     """
     cells = LoadCells.of(layout)
     radius_m = math.sqrt(cells.size_m[0] * cells.size_m[1] / math.pi)  # disc with the area of a cell

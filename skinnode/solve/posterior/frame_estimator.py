@@ -1,14 +1,14 @@
-"""Posterior of a patch for each frame of a stream, without a test of the readings for faults.
+"""Posterior of a patch for each frame of a stream, without a search for wrong readings.
 
-Each frame is processed in these steps:
+Each frame passes through these steps:
 
-- Gate: use only the equations of wires whose resistances differ from those at rest by more than the noise.
-- Hold: keep the last field if this field explains the whole frame within the noise.
-- Track: take chord or Gauss-Newton steps from the last field; if this fails, anneal from rest
+- Gate: use the equations only of wires whose resistances differ from those at rest by more than the noise.
+- Hold: if the last field explains the whole frame within the noise, keep it.
+- Track: solve from the last field by chord or Gauss-Newton steps. If this fails, anneal from rest
   (``map_estimate``).
-- Adapt: estimate the prior's scale, the expected load locations and (optionally) the noise from the frame.
-- Reject: if no deformation explains a wire's residual, mark the wire as INCONSISTENT, leave it out, and solve
-  the other wires again.
+- Adapt: estimate the prior scale, the expected load locations and, if requested, the noise.
+- Reject: if no deformation explains the residual of a wire, mark the wire as INCONSISTENT and solve again
+  without it.
 """
 
 from __future__ import annotations
@@ -41,16 +41,16 @@ from skinnode.solve.wires.decode import A_MAX, A_MIN
 from skinnode.solve.wires.problem import PatchProblem
 
 NOISE_LEAST: Final = 1e-6
-"""Minimum relative noise used in a solve. The value also represents the accuracy of the forward model. If the
-noise were smaller, every solve would end at a root of F = b, possibly a wrong root. On layouts with folds
-(det J = 0), wrong roots occur even with a noise of 1e-5."""
+"""Minimum relative noise assumed in a solve; also allows for the accuracy of the forward model. With less
+noise, every solve would end at a root of F = b, which can be the wrong root. On layouts with folds (det J =
+0), wrong roots occur even at a noise of 1e-5."""
 LEFT_OUT: Final = 3
-"""Maximum number of inconsistent wires that are left out of a frame. If more wires are inconsistent, all
-wires of the frame are INCONSISTENT."""
+"""Maximum number of inconsistent wires left out of a frame. If there are more, all wires of the frame are
+INCONSISTENT."""
 LEAST_STEPS: Final = 3.0
-"""Minimum duration of a solve from rest, as a multiple of the time to factorise all wires and compute their
-standard deviations. In measurements, solves of presses on 1 to 10 wires took 11 to 20 times as long as this
-computation."""
+"""Minimum duration of a solve from rest, relative to the time to factorise the equations of all wires and
+compute their standard deviations. Measured solves of presses on 1 to 10 wires took 11 to 20 times as long as
+this computation."""
 
 Mask = NDArray[np.bool_]
 
@@ -58,21 +58,21 @@ Mask = NDArray[np.bool_]
 class FrameEstimator:
     """Estimator of the displacement, loads and contacts of one patch, frame by frame.
 
-    This class uses all available readings; :class:`skinnode.Posterior` also detects wrong readings. Each
-    stream needs its own instance. The kernels release the GIL; :meth:`warm_up` compiles them.
+    It relies on all available readings; :class:`skinnode.Posterior` also detects wrong readings. Each stream
+    needs its own instance. The kernels release the GIL; :meth:`warm_up` compiles them.
 
     Args:
         layout: The patch, with any number of lower wires.
-        options: Options of the estimate; the default is :class:`skinnode.solve.options.PosteriorOptions()`.
-        **arguments: Options by name, which override ``options``.
+        options: Options of the estimate; :class:`skinnode.solve.options.PosteriorOptions()` by default.
+        **arguments: Options by name; these take precedence over ``options``.
 
     Attributes:
         layout: The patch.
         options: Options in effect.
-        from_rest_s: Minimum time to solve a touched frame from rest, s; 0 before :meth:`warm_up` or if no
-            deadline is set.
-        noise_estimate: Estimate of the stream's noise, which scales the stated noise; None if the stated
-            noise is used unchanged.
+        from_rest_s: Minimum time to solve a touched frame from rest, s. It is 0 if no deadline is set, and
+            before :meth:`warm_up`.
+        noise_estimate: Estimate of the stream's noise, by which the stated noise is scaled; None if the
+            stated noise is used as it is.
 
     Raises:
         ValueError: If an option has the wrong shape or is out of range.
@@ -121,18 +121,18 @@ class FrameEstimator:
             self.noise_estimate = NoiseEstimate(layout.shape)
 
     def warm_up(self) -> None:
-        """Solve a touched frame so that the first touch in a stream does not wait for the compiler.
+        """Compile the kernels by solving a touched frame, so that the first touch in a stream is not delayed.
 
-        With a deadline, this method also measures :attr:`from_rest_s`.
+        If a deadline is set, this method also measures :attr:`from_rest_s`.
         """
         touched = self.layout.upper_m.copy()
         touched[0, 0, 2] -= 0.1 * self._problem.clearance[0, 0] * self.layout.pitch_m
         potential = potential_per_m(self.layout, touched) * self.layout.pitch_m
-        seconds, self._seconds = self._seconds, math.inf  # a deadline could prevent some kernels from running
+        seconds, self._seconds = self._seconds, math.inf  # with a deadline, some kernels might not run
         a = 1.0 / (potential * self._problem.gain)
         self.estimate(a, np.ones(self.layout.shape, bool), 1e-4)
         self._seconds = seconds
-        self._estimator.gamma()  # compile the kernel of gamma() before the first frame
+        self._estimator.gamma()  # compile its kernel
         if self._contacts is not None:
             self._contacts.warm_up(self._hyper.loads.estimate())
         self._forget()
@@ -143,7 +143,7 @@ class FrameEstimator:
             self._forget()
 
     def reset(self) -> None:
-        """Discard the state of the stream: the next frame is solved from the rest position."""
+        """Discard the state of the stream; the next frame is solved from rest."""
         self._forget()
 
     def _forget(self) -> None:
@@ -160,7 +160,7 @@ class FrameEstimator:
             self._contacts.reset()
         self._contacts_found: tuple[Contact, ...] = ()
         self._force = np.zeros((*self.layout.upper_m.shape,))
-        self._compared = np.zeros_like(self._trusted)  # last field that was compared with an annealed field
+        self._compared = np.zeros_like(self._trusted)  # last field compared with an annealed one
         self._annealed = False  # whether the current field was annealed from rest
         self._known = False  # whether the estimator's factors belong to the trusted field
         self._wires = np.arange(wires)
@@ -171,15 +171,15 @@ class FrameEstimator:
         """Estimate the field of one frame like :meth:`skinnode.Posterior.update`, without the data check.
 
         Args:
-            frame_ohm: (U, K) resistances, ohm; values that are not positive and finite are ignored.
-            valid: (U, K) bool, False if a reading is missing.
+            frame_ohm: (U, K) resistances, ohm. Values that are not positive and finite are ignored.
+            valid: (U, K) bool, False where a reading is missing.
             relative_noise: Relative noise of this frame, a number or (U, K).
 
         Returns:
             The field, with one status per wire.
 
         Raises:
-            ValueError: If a shape is wrong.
+            ValueError: If an array has the wrong shape.
         """
         start = perf_counter()
         return self._estimate(self._readings(frame_ohm, valid, relative_noise, None), start)
@@ -200,22 +200,23 @@ class FrameEstimator:
             except TimeoutError:
                 known = self._known
                 status, held = self._give_up(Status.DEADLINE)
-                self._known = known  # start the next frame from the last trusted field
+                self._known = known  # the trusted field is still a valid start for the next frame
             observation = self._observe(readings)
         return self._field(observation, status, held, start)
 
     def stop_at(self, until: float) -> None:
-        """Set the deadline for subsequent updates; inf removes the deadline.
+        """Set the deadline of subsequent updates.
 
         Args:
-            until: Deadline as a value of :func:`skinnode.process.clock.perf_counter`, s.
+            until: Deadline as a value of :func:`skinnode.process.clock.perf_counter`, s; inf for none.
         """
         self._until = until
 
     def covariance_m2(self) -> Float:
-        """Return the covariance of the last frame's displacement, computed from that frame's factors.
+        """Return the posterior covariance of the last frame's displacement.
 
-        The covariance does not include the allowance for errors of the prior (``PRIOR_DOUBT``).
+        It does not include the allowance for an inaccurate prior that the standard deviations of the field
+        contain (``PRIOR_DOUBT``).
 
         Returns:
             (3UN, 3UN) covariance, m²; 0 for coordinates that are not free.
@@ -232,12 +233,12 @@ class FrameEstimator:
         return full
 
     def energy(self, moved: Float) -> float:
-        """Return uᵀ (s² C)⁻¹ u: −2 log of the prior density of a displacement, up to a constant.
+        """Return uᵀ (s² C)⁻¹ u for a displacement u, with the prior of the last frame.
 
-        The method uses the prior of the last frame.
+        This is −2 log of the prior density, up to a constant.
 
         Args:
-            moved: (U, 3N) displacement, pitches.
+            moved: (U, 3N) displacement u, pitches.
         """
         return self._estimator.roughness(moved) / self._estimator.load_prior.scale2
 
@@ -256,7 +257,7 @@ class FrameEstimator:
         estimate = self.noise_estimate
         if estimate is not None:
             if estimate.see(frame, noise, rounding_ohm, mask):
-                self._seen = np.zeros_like(self._seen)  # the noise of the trusted field was different
+                self._seen = np.zeros_like(self._seen)  # the trusted field was solved with a different noise
             if estimate.factor != 1.0:
                 noise = estimate.factor * noise
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
@@ -274,19 +275,19 @@ class FrameEstimator:
         return self._model.observe(readings, self._hyper.noise_factor)
 
     def _beyond_prior(self, observation: Observation, deviations: float) -> bool:
-        # the lower limit ignores geometry errors: one of a hundred can exceed it by chance
+        # the lower limit does not apply to geometry errors: one of a hundred can exceed it by chance
         count = self._model.fixed if deviations < roots.BELIEVABLE else observation.d.size
         return roots.beyond_prior(self._estimator.g[:count], observation.d[:count], deviations)
 
     def _is_quiet(self, observation: Observation) -> bool:
-        """Return whether the last field explains the frame within noise.
+        """Return whether the last field explains the frame within the noise.
 
-        For wires that were used in the last field, the noise variance is doubled, because the last field
-        contains noise as well.
+        For wires that were used to compute the last field, the noise variance is doubled, because the field
+        contains the noise of its own frame.
         """
         seen_before = self._known and np.array_equal(observation.weight > 0, self._seen)
         if not (self.options.hold and seen_before):
-            return False  # with other resistances, the standard deviations would change
+            return False  # the standard deviations depend on which resistances are usable
         if self._beyond_prior(observation, roots.SUSPICIOUS):
             return False
         noises = np.ones(len(self._wires))
@@ -296,14 +297,17 @@ class FrameEstimator:
         return not self._gate.moved(fit, observation.count, noises).any()
 
     def _solve(self, observation: Observation, readings: Readings) -> tuple[NDArray[np.int64], Mask]:
-        """Solve a frame; return statuses (U,) and held wires (U,). On success, update the trusted field."""
+        """Solve a frame, and return the statuses (U,) and a mask (U,) of the held wires.
+
+        If the solve succeeds, the solution becomes the trusted field.
+        """
         if not readings.usable.any():
             return self._give_up(Status.ILL_CONDITIONED)
         status = np.full(len(self._wires), int(Status.CONVERGED))
         self._gate.next_frame()
         at_rest = self._estimator.fit(observation, None)
         touched = self._gate.touched(at_rest, observation.count, self._members)
-        # if no wire is touched, confirm this with all wires
+        # if no wire seems touched, solve with all wires to confirm it
         wanted = touched if self.options.hold and touched.size else self._wires
         seen = readings.usable
         for _ in range(LEFT_OUT + 3):
@@ -334,7 +338,7 @@ class FrameEstimator:
         return self._give_up(Status.INCONSISTENT)
 
     def _joining(self, fit: Fit, observation: Observation, wanted: Index) -> Index:
-        """Return the wires outside ``wanted`` that contradict the field, and keep them in the estimate."""
+        """Return the wires outside ``wanted`` that contradict the field, and add them to later estimates."""
         moved = self._gate.moved(fit, observation.count)
         moved[wanted] = False
         joining = np.flatnonzero(moved)
@@ -344,7 +348,7 @@ class FrameEstimator:
     def _accept(
         self, status: NDArray[np.int64], members: Index, seen: Mask
     ) -> tuple[NDArray[np.int64], Mask]:
-        """Accept the current field as the trusted field, unless an electrode is out of reach."""
+        """Make the current field the trusted field, unless an electrode is out of reach."""
         estimator = self._estimator
         if self._problem.out_of_reach(self._problem.rest + estimator.moved).any():
             return self._give_up(Status.ILL_CONDITIONED)
@@ -353,7 +357,7 @@ class FrameEstimator:
         self._members, self._known, self._seen = members, True, seen
         held = np.ones(len(status), bool)
         held[members] = False
-        held &= seen.any(axis=1)  # the frame contains no information on a wire without resistances
+        held &= seen.any(axis=1)  # without resistances, a wire may have moved
         return status, held
 
     def _give_up(self, status: Status) -> tuple[NDArray[np.int64], Mask]:
@@ -365,12 +369,12 @@ class FrameEstimator:
     # -- finding the maximum ---------------------------------------------------------------------------
 
     def _converge(self, observation: Observation, members: Index) -> bool:
-        """Solve by tracking from the last trusted field or, if tracking fails, by annealing from rest."""
+        """Solve by tracking from the trusted field or, if tracking fails, by annealing from rest."""
         estimator = self._estimator
         estimator.moved[:] = self._trusted
         estimator.g[:] = self._trusted_g
         self._annealed = False
-        hurry = self._seconds < math.inf  # annealing takes as long as solving several frames
+        hurry = self._seconds < math.inf  # annealing takes as long as several normal solves
         if (self._known or hurry) and estimator.track(observation, members):
             gone = float(np.abs(estimator.moved - self._compared).max())
             far = gone >= self._far or self._beyond_prior(observation, roots.SUSPICIOUS)
@@ -381,10 +385,9 @@ class FrameEstimator:
         return estimator.anneal(observation, members)
 
     def _anneal_and_compare(self, observation: Observation, members: Index) -> bool:
-        """Anneal from rest, and keep the more likely of the tracked and the annealed field.
+        """Anneal from rest, and keep the tracked or the annealed field, whichever is more likely.
 
-        Called after large movements, because tracking can end at a wrong maximum if the field changes
-        strongly.
+        This method is called after a large movement, because tracking can then end at a wrong maximum.
         """
         estimator = self._estimator
         self._compared[:] = estimator.moved
@@ -402,11 +405,12 @@ class FrameEstimator:
     def _refine(
         self, observation: Observation, readings: Readings, members: Index, *, local: bool
     ) -> Observation:
-        """Adapt the hyperparameters and, if the layout has folds, select the more likely of two maxima.
+        """Adapt the hyperparameters; on a layout with folds, also choose between two maxima.
 
-        Annealing with a prior that expects loads everywhere can lead to a wrong maximum. The frame is
-        therefore annealed again with a prior that expects loads where they were found. The new field replaces
-        the old field if its −2 log posterior is lower by at least :data:`skinnode.solve.roots.LIKELIER`.
+        Annealing with a prior that expects loads everywhere can lead to a wrong maximum. On layouts with
+        folds, an annealed frame is therefore annealed again, with the loads expected where they were found.
+        The second field is kept if its −2 log posterior is lower by more than
+        :data:`skinnode.solve.roots.LIKELIER`.
         """
 
         def observe(noise_factor: float) -> Observation:
@@ -440,7 +444,7 @@ class FrameEstimator:
         displacement = problem.displacement_m(problem.rest + self._trusted)
         std, core = np.zeros_like(self._trusted), np.zeros_like(self._trusted)
         std[:, self._free], core[:, self._free] = estimator.std, estimator.core
-        if held.all():  # cover displacements that the gate does not detect
+        if held.all():  # allow for displacements too small for the gate to detect
             for each in (std, core):
                 each[:, self._free] = np.maximum(each[:, self._free], 0.5 * self._overlooked)
         if self._contacts is not None and self._known and not held.all():

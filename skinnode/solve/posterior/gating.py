@@ -1,7 +1,7 @@
-"""Gating: χ² tests that find the wires that moved, and the wires whose resistances no deformation explains.
+"""Gating: χ² tests for the wires that moved, and for those whose resistances no deformation explains.
 
-Each wire is tested with the χ² of its residuals and with the apparent movement of each coordinate. The test
-of χ² alone can miss a movement of one electrode by 7 standard deviations.
+Each wire is tested in two ways: with the χ² of its residuals, and with the apparent movement of each
+coordinate. χ² alone can miss a movement of one electrode by 7 standard deviations.
 """
 
 from __future__ import annotations
@@ -16,10 +16,10 @@ from skinnode.solve.linalg.vectors import Index
 from skinnode.solve.roots import IMPOSSIBLE_CHANCE
 
 QUIET_CHANCE: Final = 0.005
-"""Probability per frame that the χ² test reports an unmoved wire as moved."""
+"""Probability per frame that the χ² test takes an unmoved wire for a moved one."""
 QUIET_DEVIATIONS: Final = 3.7
-"""Maximum apparent movement of a coordinate, in standard deviations, for its wire to be considered unmoved.
-For 300 coordinates at rest, noise alone exceeds the limit of 3.7 in one frame in 15."""
+"""Maximum apparent movement of a coordinate of an unmoved wire, in standard deviations. With 300 coordinates
+at rest, noise exceeds this limit in one frame in 15."""
 KEPT: Final = 50
 """Number of frames for which a wire stays in the estimate after an unexpected movement."""
 
@@ -30,13 +30,13 @@ class Fit(NamedTuple):
     chi_squared: Float
     """(U,) χ² of each wire."""
     sharpest: Float
-    """(U,) largest apparent error of a single coordinate, in standard deviations."""
+    """(U,) largest apparent error of any one coordinate of each wire, in standard deviations."""
     move: Float
-    """(U, f) movement of each coordinate that fits best if no other coordinate moves, pitches."""
+    """(U, f) best-fitting movement of each coordinate while all others are fixed, pitches."""
 
 
 class Gate:
-    """χ² tests for the wires of one patch, and a list of wires that moved in recent frames.
+    """χ² tests of the wires of one patch, with a memory of the wires that moved recently.
 
     Args:
         wires: Number of upper wires.
@@ -47,14 +47,14 @@ class Gate:
         self._quiet, self._impossible = (
             chi_squared_limits(equations, chance) for chance in (QUIET_CHANCE, IMPOSSIBLE_CHANCE)
         )
-        self._kept = np.zeros(wires, np.int64)  # number of frames for which each wire is still kept
+        self._kept = np.zeros(wires, np.int64)  # remaining frames for which each wire is kept
 
     def reset(self) -> None:
-        """Remove all wires from the list of kept wires."""
+        """Forget which wires moved recently."""
         self._kept[:] = 0
 
     def next_frame(self) -> None:
-        """Decrement the number of frames for which each kept wire remains in the estimate."""
+        """Count down the frames for which each kept wire stays in the estimate."""
         self._kept -= self._kept > 0
 
     def keep(self, wires: Index) -> None:
@@ -66,8 +66,8 @@ class Gate:
 
         Args:
             fit: Misfit of the tested displacement.
-            count: (U,) usable resistances of each wire.
-            noises: Noise variance of the residuals, relative to that of one frame; a number or (U,).
+            count: (U,) number of usable resistances of each wire.
+            noises: Variance of the residuals' noise, relative to that of one frame; a number or (U,).
         """
         limit = self._quiet[count]
         return np.asarray(
@@ -79,8 +79,8 @@ class Gate:
 
         Args:
             fit: Misfit of the rest position.
-            count: (U,) usable resistances of each wire.
-            members: Wires in the last estimate, to which a lower threshold applies.
+            count: (U,) number of usable resistances of each wire.
+            members: Wires in the last estimate, which are tested with a lower threshold.
         """
         touched = self.moved(fit, count)
         stay = np.zeros(len(touched), bool)
@@ -91,7 +91,7 @@ class Gate:
         return np.flatnonzero(touched)
 
     def excess(self, fit: Fit, count: Index) -> Float:
-        """Return the ratios (U,) of each wire's χ² to the limit above which the wire is INCONSISTENT."""
+        """Return the χ² of each wire (U,) relative to the limit above which the wire is INCONSISTENT."""
         return np.asarray(fit.chi_squared / self._impossible[count])
 
 

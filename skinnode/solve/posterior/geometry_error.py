@@ -1,21 +1,20 @@
-"""Geometry errors: nuisance parameters for a patch's manufacturing errors, and their effects on residuals.
+"""Geometry errors: the manufacturing errors of a patch, estimated as nuisances.
 
-The resistances at rest (R₀) are measured, so a geometry error θ does not affect the residuals at rest. Away
-from rest, the effect is θ times the difference between ∂ ln F/∂θ and its value at rest; the effect increases
-with the depth of the press. In units of their tolerances, the errors have a variance of 1; they are estimated
-as nuisances.
+The resistances at rest (R₀) are measured, so a geometry error θ has no effect on the residuals at rest. Away
+from rest, the effect is θ times the difference between ∂ ln F/∂θ and its value at rest. It grows with the
+depth of a press. Each error is expressed in units of its tolerance, so its prior variance is 1.
 
 - Thickness: all upper electrodes are shifted along their normals, in proportion to the clearance.
-- Radius: for electrodes of radius ρ, the mean of F over their rims is F + (ρ²/2) ∇²F, to which each layer
-  contributes half. ∇² is the Laplacian within the surface. The nuisance is ρ² in units of the squared
-  tolerance.
+- Radius: the mean of F over the rims of electrodes of radius ρ is F + (ρ²/2) ∇²F, where ∇² is the Laplacian
+  within the surface. Each layer contributes half of the correction. The nuisance is ρ² in units of the
+  squared tolerance.
 - Gain: the change in each resistance is multiplied by e^γ. Half of the variance of γ is common to the patch;
-  the other half is independent in each upper wire.
+  the other half is independent for each upper wire.
 - Placement: each upper and each lower wire is shifted along x, y and z.
 
-The residuals are computed from the shifted geometry without linearising the errors. With a relative noise of
-1e-5, the second-order effect of a placement error of 0.02 pitch is a hundred standard deviations. Each
-residual depends on ten of the nuisances; the other elements of H are zero and are not stored.
+The residuals are computed from the shifted geometry itself; the shifts are not linearised. At a relative
+noise of 1e-5, the second-order effect of a placement error of 0.02 pitch is a hundred standard deviations.
+Each residual depends on ten of the nuisances; the other elements of H are zero and are not stored.
 """
 
 from __future__ import annotations
@@ -37,32 +36,31 @@ THICKNESS: Final = 0
 RADIUS: Final = 1
 GAIN: Final = 2
 COMMON: Final = 3
-"""Number of nuisances common to the whole patch (thickness, radius and gain); these are the first elements of
+"""Number of nuisances common to the whole patch: thickness, radius and gain. They are the first elements of
 g."""
 UPPER: Final = 4
 """Number of nuisances of each upper wire: shifts along x, y and z, and gain."""
 LOWER: Final = 3
 """Number of nuisances of each lower wire: shifts along x, y and z."""
 EFFECTS: Final = COMMON + UPPER + LOWER
-"""Number of geometry nuisances on which each residual depends."""
+"""Number of geometry nuisances that affect each residual."""
 GAIN_SHARE: Final = math.sqrt(0.5)
-"""Standard deviation, in tolerances, of the gain error common to all wires, and of the additional gain error
-of each upper wire. A converter shared by all wires causes the common error; a converter per wire causes the
-additional error."""
+"""Standard deviation of each of the two parts of a gain error, in tolerances. One part is common to all
+wires, as if they shared a converter. The other is independent for each upper wire, as if each had its own."""
 
 
 def nuisances(wires: int, equations: int) -> int:
-    """Return the number of geometry nuisances of a patch with U upper and K lower wires."""
+    """Return the number of geometry nuisances of a patch with U = ``wires`` and K = ``equations``."""
     return COMMON + UPPER * wires + LOWER * equations
 
 
 class GeometryError:
-    """Residuals of a patch whose geometry has the errors g, and their derivatives H with respect to g.
+    """Residuals of a patch with the geometry errors g, and their derivatives with respect to g.
 
     Args:
         problem: The patch.
-        elastic: Elastic prior of the patch, which contains the surface normals.
-        tolerances: Manufacturing tolerances of the patch, which are the standard deviations of the errors.
+        elastic: Elastic prior of the patch, which provides the surface normals.
+        tolerances: Manufacturing tolerances of the patch; the standard deviations of the errors.
     """
 
     def __init__(self, problem: PatchProblem, elastic: ElasticPrior, tolerances: Tolerances) -> None:
@@ -86,16 +84,16 @@ class GeometryError:
         self, members: Index, moved: Float, a: Float, weight: Float, g: Float, r: Float, jt: Float,
         effect: Float,
     ) -> None:  # fmt: skip
-        """Compute the residuals, the transposed Jacobian and H at a displacement for the wires ``members``.
+        """Compute the residuals, their Jacobian and H at a displacement, for the wires ``members``.
 
         Args:
             members: (P,) numbers of the wires.
             moved: (U, 3N) displacement, pitches.
             a: (U, K) resistances times gain, R · gain.
             weight: (U, K) weights 1/σ of the resistances.
-            g: Nuisances of the geometry; :func:`nuisances` returns their number.
-            r: (U, K) receives the residuals, which depend on ``g``.
-            jt: (U, 3N, K) receives ∂r/∂xᵀ.
+            g: Geometry nuisances; their number is given by :func:`nuisances`.
+            r: (U, K) receives the residuals for ``g``.
+            jt: (U, 3N, K) receives the transposed Jacobian ∂r/∂xᵀ.
             effect: (U, K, EFFECTS) receives H = −∂r/∂g.
         """
         shift, lower = self._shifts(g)
@@ -111,8 +109,8 @@ class GeometryError:
     ) -> float:
         """Write the residuals of the wires ``members`` into ``r`` (U, K), and return their sum of squares.
 
-        The residuals are r − H g, where ``h`` (U, K, p) and ``own`` (p,) contain all nuisances except the
-        geometry errors.
+        The residuals are r − H g. ``h`` (U, K, p) and ``own`` (p,) are the effects and the values of the
+        other nuisances. The geometry nuisances ``g`` enter through the shifted geometry.
         """
         shift, lower = self._shifts(g)
         problem = self._problem
@@ -134,7 +132,10 @@ class GeometryError:
 def _bend(  # noqa: PLR0913 - a kernel: arrays by name
     x: Float, lower: Float, normal: Float, square: float, out: Float, slope_t: Float
 ) -> None:
-    """Write the effect of the electrodes' radius on F, and its derivative; 0 for point electrodes."""
+    """Write the effect of the electrodes' radius on F into ``out``, and its derivative into ``slope_t``.
+
+    For point electrodes, the effect is 0 and the derivative is not written.
+    """
     if square > 0.0:
         surface_laplacian(x, lower, normal, out, slope_t)
     else:
@@ -148,7 +149,7 @@ def _linearise(  # noqa: PLR0913 - a kernel: arrays by name
     normal: Float, outward: Float, placement: float, square: float, gain: float, g: Float, rows: Float,
     slopes: Float, r: Float, jt: Float, effect: Float,
 ) -> None:  # fmt: skip
-    """Write the residuals, Jacobians and effects H for the shifted positions ``x``, ``rest`` and ``lower``.
+    """Write the residuals, Jacobians and H for the shifted positions ``x``, ``rest`` and ``lower``.
 
     ``rows`` (4, K) and ``slopes`` (3, 3N, K) are work arrays.
     """
@@ -171,7 +172,7 @@ def _linearise(  # noqa: PLR0913 - a kernel: arrays by name
             h_u[k, GAIN] = w * gain * change * own / before
             h_u[k, COMMON + 3] = h_u[k, GAIN]
             r_u[k] = scale * own - w + rim * g[RADIUS]
-            # reuse the work arrays for the factors by which _slopes multiplies the derivatives
+            # reuse the work arrays for the factors that _slopes applies to the derivatives
             rims[k] = w * square * g[RADIUS] / own
             bend[k] = scale - rims[k] * bend[k] / own
             at_rest = w * square * g[RADIUS] / before
@@ -236,7 +237,7 @@ def _residuals(  # noqa: PLR0913 - a kernel: arrays by name
 def effect_on(  # noqa: PLR0913 - a kernel
     effect: Float, u: int, k: int, g: Float, first: int, wires: int
 ) -> float:
-    """Return the effect H g on one residual; the nuisances of the geometry start at ``g[first]``."""
+    """Return the effect H g on one residual; the geometry nuisances start at ``g[first]``."""
     total, row = 0.0, effect[u, k]
     upper, lower = first + COMMON + UPPER * u, first + COMMON + UPPER * wires + LOWER * k
     for q in range(COMMON):
@@ -265,7 +266,7 @@ def add_effect(  # noqa: PLR0913 - a kernel
 
 @njit_part
 def _product(first: Float, second: Float, start: int, stop: int) -> float:
-    """Return the dot product of the effects on two residuals, from ``start`` to ``stop`` − 1."""
+    """Return the dot product of the effects on two residuals, over the indices ``start`` to ``stop`` − 1."""
     total = 0.0
     for q in range(start, stop):
         total += first[q] * second[q]
@@ -276,8 +277,9 @@ def _product(first: Float, second: Float, start: int, stop: int) -> float:
 def add_covariance(members: Index, effect: Float, g: Float, y: Float, s: Float) -> None:
     """Add H Hᵀ to the upper triangle of ``s``, and −H g to ``y``, for the wires ``members``.
 
-    ``g`` contains only the geometry nuisances. Two residuals of the same upper wire share its nuisances, as
-    do two residuals of the same lower wire. All residuals share the common nuisances.
+    ``g`` contains only the geometry nuisances. All residuals depend on the common nuisances. In addition,
+    residuals of the same upper wire share the nuisances of that wire, and so do residuals of the same lower
+    wire.
     """
     wires, equations = effect.shape[0], effect.shape[1]
     for j in range(members.size):
@@ -296,7 +298,7 @@ def add_covariance(members: Index, effect: Float, g: Float, y: Float, s: Float) 
 
 @njit
 def estimate(members: Index, effect: Float, v: Float, g: Float) -> None:
-    """Write −Hᵀ v with v = S⁻¹ y into the geometry nuisances ``g``."""
+    """Write −Hᵀ v, with v = S⁻¹ y, into the geometry nuisances ``g``."""
     wires, equations = effect.shape[0], effect.shape[1]
     for q in range(g.size):
         g[q] = 0.0
@@ -309,7 +311,7 @@ def estimate(members: Index, effect: Float, v: Float, g: Float) -> None:
 def add_variance(  # noqa: C901 - a kernel: sums as loops
     members: Index, effect: Float, gain_t: Float, work: Float, out: Float
 ) -> None:
-    """Add diag(K H Hᵀ Kᵀ) to ``out`` (n,); ``gain_t`` (m, n) is Kᵀ, and ``work`` (EFFECTS, n) is scratch."""
+    """Add diag(K H Hᵀ Kᵀ) to ``out`` (n,). ``gain_t`` (m, n) is Kᵀ; ``work`` (EFFECTS, n) is a work array."""
     equations, n = effect.shape[1], out.size
     for j in range(COMMON * n):
         work[j // n, j % n] = 0.0

@@ -1,7 +1,7 @@
-"""Hyperparameters of the posterior: scale s of the prior, expected load locations, and noise.
+"""Hyperparameters of the posterior: the scale s of the prior, the expected load locations, and the noise.
 
-All hyperparameters are estimated by maximising the marginal likelihood (evidence) of the frames (MacKay,
-Neural Computation 4, 415, 1992).
+They are estimated by maximising the marginal likelihood (evidence) of the frames (MacKay, Neural Computation
+4, 415, 1992).
 """
 
 from __future__ import annotations
@@ -19,28 +19,29 @@ from skinnode.solve.posterior.map_estimate import MapEstimator
 from skinnode.solve.posterior.observation import Observation
 
 SCALE_WORTH: Final = 2.0
-"""Weight of the prior on s², as an equivalent number of parameters. The weight is small, because the data
-typically determine 100 to 200 parameters."""
+"""Weight of the prior on s², as an equivalent number of parameters. It is small compared with the 100 to 200
+parameters that the data typically determine."""
 SCALE_REST: Final = 0.005
-"""Expected value of the prior scale s, in clearances; typical of presses that indent the layer by a tenth of
+"""Expected prior scale s, in clearances. The value is typical of presses that indent the layer by a tenth of
 its thickness."""
 SCALE_MOST: Final = 1.0
-"""Maximum prior scale s, in clearances; with a larger scale, the surface could be below the lower layer."""
+"""Maximum prior scale s, in clearances. With a larger scale, the prior would allow the surface to be below
+the lower layer."""
 SCALE_STEP: Final = math.log(1.25)
-"""Minimum change in the logarithm of the prior scale that triggers an update. The standard deviations of the
-field change by a smaller factor than the prior scale."""
+"""Minimum change in ln s for the scale to be updated. The standard deviations change by a smaller factor than
+the scale."""
 SCALE_LEAST: Final = 1.0
-"""Minimum prior scale, relative to the scale at which the expected change in the resistances equals their
-noise. Displacements below the noise cannot be detected, so the standard deviations must cover them."""
+"""Minimum prior scale, relative to the scale at which the expected changes in the resistances equal their
+noise. Displacements below the noise cannot be detected, so the standard deviations must allow for them."""
 ADAPTIONS: Final = 5
-"""Maximum number of updates of the prior or the noise per frame."""
+"""Maximum number of updates of the hyperparameters per frame."""
 REFINEMENTS: Final = 3
-"""Maximum number of updates of the expected load locations per frame; each update costs as much as two
+"""Maximum number of updates of the expected load locations per frame. Each update costs as much as two
 solves."""
 NOISE_WORTH: Final = 20.0
-"""Weight of the configured noise in the noise estimate, as a number of resistances."""
+"""Weight of the configured noise in the noise estimate, as an equivalent number of resistances."""
 NOISE_STEP: Final = math.log(1.1)
-"""Minimum change in the logarithm of the estimated noise that triggers an update."""
+"""Minimum change in the logarithm of the estimated noise for the estimate to be updated."""
 
 Observe = Callable[[float], Observation]
 """Function that returns the observation of a frame for a given noise factor."""
@@ -52,11 +53,11 @@ class Hyperparameters:
     Args:
         estimator: MAP estimator of the patch.
         clearance: Median clearance, pitches.
-        scale2: Fixed s², pitch²; None if s² is set from the evidence.
-        estimate_noise: Whether the noise is estimated.
+        scale2: Fixed s², pitch²; None to estimate it.
+        estimate_noise: Whether to estimate the noise.
 
     Attributes:
-        noise_factor: Ratio of the estimated noise to the configured noise.
+        noise_factor: Ratio of the estimated to the configured noise.
         loads: Posterior of the loads.
     """
 
@@ -86,20 +87,20 @@ class Hyperparameters:
         self._least = min(least, self._most)
 
     def spread(self, observation: Observation, members: Index) -> None:
-        """Reset the prior to equal loads over the whole patch, then set its scale from the frame."""
+        """Expect equal loads over the whole patch, and estimate their scale from the frame."""
         self._prior.spread(self._fixed or self._expected)
         if self._fixed is None:
             self._prior.scale2 = self._bounded(self._estimator.guess_scale(observation, members))
 
     def spread_as_seen(self, observation: Observation, members: Index) -> None:
-        """Reset the prior to equal loads, and estimate its initial scale from the frame and the old prior."""
+        """Expect equal loads over the whole patch, with a scale estimated under the old prior."""
         guess = self._fixed or self._bounded(self._estimator.guess_scale(observation, members))
         self._prior.spread(guess)
 
     def adapt(
         self, observation: Observation, observe: Observe, members: Index, *, local: bool
     ) -> Observation:
-        """Set the hyperparameters from the field, and solve again until the hyperparameters stop changing.
+        """Estimate the hyperparameters from the field and solve again, until they stop changing.
 
         Args:
             observation: The frame.
@@ -130,7 +131,7 @@ class Hyperparameters:
             if not changed:
                 break
             if not (estimator.track(observation, members) or estimator.anneal(observation, members)):
-                # restore the previous field and prior, but use the new noise from the next frame on
+                # restore the previous field and prior, but use the new noise in the next frame
                 self.noise_factor = found
                 estimator.moved[:], estimator.g[:], observation = moved, g, before
                 if not prior.localise(scale2 * share):
@@ -154,7 +155,7 @@ class Hyperparameters:
         return changed
 
     def _noise_found(self, observation: Observation, members: Index) -> float:
-        """Return the noise factor at which the residuals are consistent with the noise (MacKay)."""
+        """Return the noise factor for which the residuals are as large as expected (MacKay)."""
         residuals: Float = self._estimator.residuals(observation)
         total = float((residuals[members] ** 2).sum())
         count = float(np.count_nonzero(observation.weight[members]))

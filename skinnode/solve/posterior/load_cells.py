@@ -1,7 +1,7 @@
-"""Cells on which surface loads act: one cell around each electrode, and rings of cells beyond the edge.
+"""Cells on which surface loads act: one around each electrode, and rings of cells beyond the edge.
 
-Curved skin is unrolled: distances are chords, and the response to a load is expressed in the tangent frame
-of each electrode.
+Curved skin is unrolled. Distances are chords, and the response to a load is expressed in the tangent frame of
+each electrode.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from skinnode.model.layout import Float, PatchLayout
 
 MARGIN: Final = 2
-"""Number of rings of cells beyond the outermost electrodes. In tests with Hertz presses on and half outside
-the patch, more rings hardly changed the marginal likelihood."""
+"""Number of rings of cells beyond the outermost electrodes. In tests with Hertz presses on the patch and
+across its edge, more rings hardly changed the marginal likelihood."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,9 +28,9 @@ class LoadCells:
     frame: Float
     """(Q, 3, 3) unit vectors as rows: tangent along the wire, tangent across the wire, outward normal."""
     electrode_frame: Float
-    """(E, 3, 3) the same unit vectors at the electrodes."""
+    """(E, 3, 3) unit vectors at the electrodes, in the same order."""
     offset_m: Float
-    """(E, Q, 2) offset of each electrode from each cell along the tangents of the cell, m."""
+    """(E, Q, 2) offset of each electrode from each cell, along the tangents of the cell, m."""
     height_m: float
     """Median height of the electrodes above the lower layer, m."""
     size_m: tuple[float, float]
@@ -68,28 +68,30 @@ class LoadCells:
         """Return the displacements (E, 3, Q, L) per unit load in the axes of the patch, m.
 
         Args:
-            compliance: (E, Q, 3, L) displacements per unit load along the electrode's tangents and normal, m.
+            compliance: (E, Q, 3, L) displacements per unit load along the tangents and the normal of the
+                electrode, m.
         """
         return np.asarray(np.einsum("eti,eqtl->eiql", self.electrode_frame, compliance))
 
 
 def _lattice(layout: PatchLayout) -> tuple[Float, Float, Float, Float]:
-    """Return the electrode sites, :data:`MARGIN` more sites at each edge, and the surface through them.
+    """Return the sites of the cells, the steps along and across the wires, and the surface normals.
 
-    The sites (U + 2 MARGIN, N + 2 MARGIN, 3) are in m. The surface consists of the steps along and across the
-    wires, m, and the unit normals, which point away from the lower layer.
+    The lattice consists of the electrode sites and :data:`MARGIN` further rows at each edge. Each array has
+    the shape (U + 2 MARGIN, N + 2 MARGIN, 3). Sites and steps are in m. The normals are unit vectors that
+    point away from the lower layer.
     """
     site = layout.upper_m
     lower = layout.lower_m.reshape(-1, 3)
     up = (site - lower[_nearest(site, lower)]).mean(axis=(0, 1))
     wires, electrodes = site.shape[:2]
-    if min(wires, electrodes) == 1:  # one row defines no surface, so use the lower layer
+    if min(wires, electrodes) == 1:  # a single row defines no plane; use that of the lower layer
         flat = np.linalg.svd(lower - lower.mean(axis=0))[2][-1]
         up = flat * np.sign(flat @ up) if len(lower) > 2 and flat @ up != 0 else up
     up = up / np.linalg.norm(up)
     if electrodes > 1:
         along = np.gradient(site, axis=1)
-    else:  # a wire with one electrode does not define a direction, so derive a direction
+    else:  # a wire with one electrode has no direction; derive one
         axis = np.diff(site[:, 0], axis=0).mean(axis=0) if wires > 1 else np.eye(3)[np.argmin(np.abs(up))]
         along = np.broadcast_to(_sized(np.cross(axis, up), layout.pitch_m), site.shape)
     if wires > 1:
@@ -105,7 +107,7 @@ def _lattice(layout: PatchLayout) -> tuple[Float, Float, Float, Float]:
 
 
 def _nearest(site: Float, lower: Float) -> NDArray[np.intp]:
-    """Return the index (U, N) of the lower electrode that is nearest to each site."""
+    """Return the index (U, N) of the lower electrode nearest to each site."""
     return np.asarray(np.argmin(((site[:, :, None] - lower) ** 2).sum(axis=-1), axis=-1))
 
 
@@ -116,7 +118,7 @@ def _sized(direction: Float, length: float) -> Float:
 def _carried_on(
     fields: tuple[Float, Float, Float, Float], axis: int, step: Float
 ) -> tuple[Float, Float, Float, Float]:
-    """Extrapolate sites linearly by :data:`MARGIN` rows at each end of ``axis``; repeat steps and normals."""
+    """Add :data:`MARGIN` rows at each end of ``axis``; extrapolate sites, repeat steps and normals."""
     pad = [(MARGIN, MARGIN) if i == axis else (0, 0) for i in range(3)]
     site, along, across, normal = fields
     along, across, normal = (np.pad(field, pad, mode="edge") for field in (along, across, normal))

@@ -1,6 +1,6 @@
-"""Posterior of the loads on a patch: their mean and covariance, and the significant loads of a frame.
+"""Posterior of the loads on a patch: mean, covariance, and the loads that are significant in a frame.
 
-All results use the current factors of a :class:`skinnode.solve.posterior.map_estimate.MapEstimator`.
+All results refer to the current factors of a :class:`skinnode.solve.posterior.map_estimate.MapEstimator`.
 """
 
 from __future__ import annotations
@@ -16,15 +16,15 @@ from skinnode.solve.posterior.contacts import LoadEstimate
 from skinnode.solve.posterior.map_estimate import MapEstimator
 
 LOCAL_SIGNIFICANT: Final = 4.0
-"""Minimum ratio of a squared load to its noise variance for the load to be considered detected."""
+"""Minimum ratio of a squared load to its noise variance for the load to be detected."""
 LOCAL_CERTAIN: Final = 100.0
-"""Minimum ratio of a squared load to its noise variance for a press to be considered certain. In tests,
-displacement errors were 1 % larger with a value of 25 (at high noise), and 14 % larger with values of 1000
-and above (on `aligned` layouts)."""
+"""Minimum ratio of a squared load to its noise variance for a press to be certain. In tests, displacement
+errors were 1 % larger with a value of 25 (at high noise), and 14 % larger with 1000 or more (on `aligned`
+layouts)."""
 
 
 class LoadPosterior:
-    """Posterior of the loads on one patch, for the frame that the estimator solved last.
+    """Posterior of the loads on one patch in the last frame that the estimator solved.
 
     Args:
         estimator: Estimator of the patch.
@@ -36,10 +36,10 @@ class LoadPosterior:
         self._whitened = np.empty((estimator.equations, loads))
         self._ones = np.ones(estimator.equations)
         self._stiffness = np.empty(loads)
-        self._factors = -1  # serial number of the factors from which the cached arrays were computed
+        self._factors = -1  # serial number of the factors to which the cached arrays belong
 
     def estimate(self) -> LoadEstimate:
-        """Return the loads and their covariance; the arrays are valid until the next frame."""
+        """Return the loads and their covariance. The arrays are valid until the next frame."""
         rows, prior = self._whiten(), self._prior
         return LoadEstimate(self.mean(), rows, self._ones[: len(rows)], prior.share, prior.scale2)
 
@@ -48,11 +48,11 @@ class LoadPosterior:
         return self._prior.loads(self._estimator.free_displacement())
 
     def expected(self, least: float) -> Float:
-        """Return the next prior variances (Q,) of the loads, pitch²; each is at least ``least``.
+        """Return the prior variances (Q,) of the loads for the next solve, pitch²; none is below ``least``.
 
-        If a load's own prior is removed, its estimate is q / (s² k) and its variance is 1/k − s², where k is
-        the sensitivity of the data to the load, Σ (L⁻¹ J G)² (Tipping and Faul, Fast marginal likelihood
-        maximisation for sparse Bayesian models, 2003).
+        Let k = Σ (L⁻¹ J G)² be the sensitivity of the data to a load with posterior mean q and prior variance
+        s². Without its own prior, the estimate of the load is q / (s² k), with variance 1/k − s² (Tipping and
+        Faul, Fast marginal likelihood maximisation for sparse Bayesian models, 2003).
         """
         prior = self._prior
         found = np.empty(len(prior.share))
@@ -73,11 +73,11 @@ class LoadPosterior:
 
 @njit
 def _found(q: Float, own: Float, stiffness: Float, significant: float, found: Float) -> float:
-    """Write the largest significant squared load of each cell, without its own prior, into ``found`` (Q,).
+    """Write the largest significant squared load of each cell into ``found`` (Q,); 0 if none is significant.
 
-    If no load of a cell is significant, 0 is written. ``q`` (Q, 3) contains the loads, ``own`` (Q,) their
-    prior variances, and ``stiffness`` (3Q,) the sensitivities k (see :meth:`LoadPosterior.expected`). Returns
-    the largest ratio of a squared load to its noise variance.
+    The loads are estimated without their own priors (see :meth:`LoadPosterior.expected`). ``q`` (Q, 3)
+    contains the posterior means, ``own`` (Q,) the prior variances, and ``stiffness`` (3Q,) the sensitivities
+    k. Returns the largest ratio of a squared load to its noise variance.
     """
     most = 0.0
     for cell in range(found.size):

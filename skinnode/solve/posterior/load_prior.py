@@ -1,9 +1,9 @@
-"""Prior of the loads on a patch, and of the displacement that the loads cause.
+"""Prior of the loads on a patch, and of the displacement that they cause.
 
-Initially, the prior expects equal loads over the whole patch, with one scale s². After loads have been found,
-the prior expects loads mainly where they were found (:meth:`LoadPrior.localise`). The estimated displacement
-of the skin next to a contact is then only as large as the contact's loads require. In tests, concentrating
-the expected loads reduced displacement errors by a factor of two to three.
+The prior first expects equal loads over the whole patch, with a single scale s². Once loads have been found,
+it expects further loads mainly at the same places (:meth:`LoadPrior.localise`). The skin next to a contact is
+then estimated to move only as far as the loads of the contact require. In tests, this reduced displacement
+errors by a factor of two to three.
 """
 
 from __future__ import annotations
@@ -24,37 +24,36 @@ from skinnode.solve.linalg.vectors import Index
 from skinnode.solve.posterior.elastic_prior import SLACK, ElasticPrior
 
 LOCAL_SPREAD: Final = 0.7
-"""Standard deviation, in cells, of the Gaussian that spreads the squared loads over neighbouring cells. A
-smaller spread improves the displacement if the rubber behaves like a half-space; if it does not, the standard
-deviations are too small. A spread of 1 reduces the benefit of :meth:`LoadPrior.localise` by a quarter."""
+"""Standard deviation of the Gaussian that spreads squared loads over neighbouring cells, in cells. A smaller
+value improves the displacement if the rubber behaves like a half-space; otherwise, the standard deviations
+become too small. A value of 1 reduces the benefit of :meth:`LoadPrior.localise` by a quarter."""
 LOCAL_FLOOR: Final = 0.05
-"""Mean square load expected in cells where no load was found, relative to the mean over the patch. The
-minimum allows for light touches near a press."""
+"""Mean square load expected in cells where no load was found, relative to the mean over the patch. It allows
+for light touches near a press."""
 LOCAL_CHANGE: Final = 0.35
-"""The prior is rebuilt if at least this fraction of the expected loads has changed location. In slow presses,
-displacement errors reached 6 standard deviations if the fraction was 0.5; the prior was rebuilt twice as
-often if the fraction was 0.25."""
+"""Fraction of the expected loads that must change location for the prior to be rebuilt. In slow presses,
+displacement errors reached 6 standard deviations with a fraction of 0.5. With 0.25, the prior was rebuilt
+twice as often."""
 LOCAL_SURPRISE: Final = 16.0
-"""Maximum ratio of a cell's squared load to its expected squared load; at larger ratios, the prior is rebuilt
-even if the load locations hardly changed. The limit is needed when the depth of a press doubles in one frame:
-displacement errors reached 7 standard deviations without the limit. In slow presses, the limit does not
-increase the number of factorisations."""
+"""Ratio of the squared load to the expected squared load of a cell, above which the prior is rebuilt even if
+the load locations have hardly changed. Without this limit, displacement errors reached 7 standard deviations
+when the depth of a press doubled in one frame."""
 
 
 class LoadPrior:
-    """Prior u ~ N(0, s² C) of a patch's free coordinates u; the variances of the loads may be unequal.
+    """Prior u ~ N(0, s² C) of the free coordinates u of a patch, for loads with individual variances.
 
     Args:
-        elastic: Elasticity of the patch.
+        elastic: Elastic prior of the patch.
         free: (U f,) indices of the free coordinates.
 
     Attributes:
         scale2: s², pitch².
-        share: (Q,) load variance of each cell relative to s²; the mean is 1.
+        share: (Q,) load variance of each cell, relative to s²; the mean is 1.
         covariance: (U f, U f) matrix C.
         uniform: (U f, U f) matrix C for equal expected loads over the whole patch.
-        response: (U f, 3Q) displacement caused by unit loads, pitches.
-        version: Number of times C has been rebuilt.
+        response: (U f, 3Q) displacement per unit load, pitches.
+        version: Number of times that C has been rebuilt.
     """
 
     def __init__(self, elastic: ElasticPrior, free: Index) -> None:
@@ -66,10 +65,10 @@ class LoadPrior:
         self.scale2 = 1.0
         self.share = np.ones(len(self._blur))
         self.version = 0
-        self._loads: tuple[Float, Float] | None = None  # last displacement, and its mean loads
+        self._loads: tuple[Float, Float] | None = None  # last displacement and its mean loads
 
     def spread(self, scale2: float) -> None:
-        """Reset the prior to equal loads over the whole patch, at scale s²."""
+        """Expect equal loads over the whole patch, with the scale s² = ``scale2``, pitch²."""
         self.scale2 = scale2
         self.share[:] = 1.0
         self.covariance[:] = self.uniform
@@ -79,10 +78,10 @@ class LoadPrior:
         """Set the variances of the loads, and rebuild the prior if they have changed enough.
 
         Args:
-            variance: (Q,) variance of the loads of each cell, pitch².
+            variance: (Q,) load variance of each cell, pitch².
 
         Returns:
-            Whether the prior was rebuilt; False if the expected load locations hardly changed.
+            Whether the prior was rebuilt.
         """
         mean = float(variance.mean())
         share = variance / mean
@@ -97,15 +96,15 @@ class LoadPrior:
         return True
 
     def expected(self, found: Float, least: float, *, certain: bool) -> Float:
-        """Return the next prior variances (Q,) of the loads, pitch².
+        """Return the load variances (Q,) for the next solve, pitch².
 
-        Each variance moves halfway from its current value to the variance of the loads found, because the
-        variances of neighbouring cells would oscillate with full steps. A full step is taken only if a press
-        is certain and equal loads were expected over the whole patch before.
+        Each variance moves halfway from its current value to that of the loads found. With full steps, the
+        variances of neighbouring cells would oscillate. A full step is taken only from equal expected loads,
+        and only if a press is certain.
 
         Args:
             found: (Q,) squared loads found in the frame, pitch².
-            least: Minimum variance of a cell, pitch².
+            least: Minimum variance, pitch².
             certain: Whether a press is certain.
         """
         floor = LOCAL_FLOOR * float(found.mean()) + least
@@ -117,13 +116,13 @@ class LoadPrior:
         return np.asarray(0.5 * (wanted + self.scale2 * self.share))
 
     def loads(self, displacement: Float) -> Float:
-        """Return the mean of the loads for a given displacement.
+        """Return the mean loads for a given displacement.
 
         Args:
             displacement: (U f,) free coordinates, pitches.
 
         Returns:
-            (Q, 3) mean loads of each cell, in units of the prior's loads.
+            (Q, 3) mean loads, in units of the prior's loads.
         """
         if self._loads is not None and np.array_equal(self._loads[0], displacement):
             return self._loads[1]
@@ -135,9 +134,9 @@ class LoadPrior:
         return self._loads[1]
 
     def roughness(self, displacement: Float) -> float:
-        """Return uᵀ C⁻¹ u in pitch² for a displacement (U f,), which is overwritten.
+        """Return uᵀ C⁻¹ u, pitch², for a displacement u (U f,). The array is overwritten.
 
-        The result is the number of unknowns times the best-fitting squared scale s².
+        The most likely s² for u is this value divided by the number of coordinates.
         """
         solve_lower_vector(self._root, displacement, displacement.size)
         return float(displacement @ displacement)
@@ -150,7 +149,7 @@ class LoadPrior:
 
 
 def _blur(shape: tuple[int, int]) -> Float:
-    """Return Gaussian weights (Q, Q) with standard deviation :data:`LOCAL_SPREAD` cells; rows sum to 1."""
+    """Return the weights (Q, Q) of a Gaussian blur over the cells; each row sums to 1."""
     cell = np.indices(shape).reshape(2, -1)
     square = ((cell[:, :, None] - cell[:, None, :]) ** 2).sum(axis=0)
     weight = np.exp(-0.5 * square / LOCAL_SPREAD**2)

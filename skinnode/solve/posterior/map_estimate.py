@@ -1,12 +1,12 @@
-"""MAP estimate of one frame: Gauss-Newton steps, chord steps, and annealing for large jumps.
+"""MAP estimate of one frame, by Gauss-Newton steps, chord steps and annealing.
 
-- Chord: start at the last field with the factors of an older frame. A typical solve by chord steps needs two
-  evaluations of F and J.
-- Newton: refactorise at the current field, then take chord steps.
-- Anneal: start at the rest position with an assumed noise of 3 %, which is divided by four until it reaches
-  the true noise. At high noise, the posterior has a single maximum, close to the maximum of the prior.
-  Tracking this maximum while the noise decreases usually leads to the correct maximum, even if a press
-  indents the layer by 70 % between two frames.
+- Chord steps start at the last field and reuse the factors of an earlier frame. A typical solve needs two
+  evaluations of F and its Jacobian.
+- A Gauss-Newton step computes new factors at the current field. Chord steps follow it.
+- Annealing starts at rest and assumes a noise of 3 %, which it divides by four in each step until the actual
+  noise is reached. At high noise, the posterior has a single maximum, near that of the prior. Following this
+  maximum as the noise decreases usually leads to the correct one, even if a press indents the layer by 70 %
+  of its thickness within one frame.
 """
 
 from __future__ import annotations
@@ -32,48 +32,46 @@ from skinnode.solve.posterior.observation import Observation, eased
 from skinnode.solve.wires.problem import PatchProblem
 
 ANNEAL_NOISE: Final = 0.03
-"""Initial relative noise for annealing. If the assumed noise is 3 %, one Gauss-Newton step from rest nearly
+"""Relative noise at the start of annealing. At this noise, a single Gauss-Newton step from rest almost
 reaches the maximum."""
 ANNEAL_RATIO: Final = 4.0
-"""Ratio of the noise in one annealing step to the noise in the next step. In tests with 80 presses of up to
-70 %, annealing reached the correct maximum in all cases with a ratio of 3, and in 79 cases with a ratio of
-5."""
+"""Factor by which each annealing step reduces the noise. In tests with 80 presses of up to 70 %, annealing
+reached the correct maximum in all cases with a factor of 3, and in 79 cases with a factor of 5."""
 SETTLED: Final = 0.02
-"""Tolerance of the chord steps: the RMS of the last step, relative to the RMS standard deviation."""
+"""Convergence tolerance of chord steps: RMS of the step, relative to the RMS standard deviation."""
 CHORDS: Final = 4
 """Maximum number of chord steps per factorisation."""
 CHORD_RATE: Final = 0.35
-"""Maximum ratio of successive chord step sizes; at larger ratios, a new factorisation is cheaper than further
-chord steps. A factorisation costs as much as ten chord steps."""
+"""Maximum ratio of the sizes of two successive chord steps. If convergence is slower, a new factorisation is
+cheaper than further chord steps. A factorisation costs as much as ten chord steps."""
 NEWTONS: Final = 12
-"""Maximum number of factorisations in a solve that starts near the maximum. One or two factorisations are
-typical; more are needed if full steps oscillate."""
+"""Maximum number of factorisations in a solve that starts near the maximum. One or two are typical; more are
+needed if full steps oscillate."""
 NEWTONS_MADE: Final = 40
-"""Maximum number of factorisations in a solve with geometry errors. Geometry errors slow down convergence,
-because the maximum of the posterior is at the end of a curved ridge."""
+"""Maximum number of factorisations in a solve with geometry errors. Such solves converge slowly, because the
+maximum of the posterior lies at the end of a curved ridge."""
 FLAT: Final = 0.1
-"""Convergence threshold of a solve with geometry errors: the decrease in −2 log posterior over
-:data:`FLAT_STEPS` factorisations."""
+"""Convergence tolerance of a solve with geometry errors: decrease in −2 log posterior over :data:`FLAT_STEPS`
+factorisations."""
 FLAT_STEPS: Final = 4
-"""Number of factorisations over which the decrease in −2 log posterior is compared with :data:`FLAT`."""
+"""Number of factorisations over which the decrease in −2 log posterior is measured."""
 EFFECT_STEP: Final = 0.2
-"""Relative change (root sum of squares) in the effects of the geometry errors above which the factors and
-standard deviations are recomputed. If the effects change by less, the relative change in the standard
-deviations is also below 0.2."""
+"""Relative change in the effects of the geometry errors (root sum of squares) above which the factors are
+recomputed. Below this limit, the standard deviations are out of date by less than 20 %."""
 HALVINGS: Final = 6
-"""Maximum number of halvings of a Gauss-Newton step."""
+"""Maximum number of times that a Gauss-Newton step is halved."""
 PRIOR_DOUBT: Final = 3.0
-"""Factor by which the prior's part of the variance is multiplied, because the expected loads are known only
-roughly. With a factor of 1, displacement errors in difficult cases reached 7 standard deviations (first
-touches, dents that cannot form on a half-space); with a factor of 2, errors reached 5.6."""
+"""Factor on the part of the variance that depends on the prior; allows for the uncertainty of the expected
+loads. In difficult cases (first touches, dents that cannot form on a half-space), displacement errors reached
+7 standard deviations with a factor of 1, and 5.6 with a factor of 2."""
 SMOOTH_SHARE: Final = 0.25
-"""Factor by which the prior's part of the variance is multiplied for the 95 % interval. The factor is below
-1, because the loads of real bodies are smoother than the prior's independent loads. Factors computed from
-measured displacement errors were at most 0.13 for spheres and 0.5 for Gaussian dents."""
+"""Factor on the part of the variance that depends on the prior, for the 95 % interval. It is less than 1,
+because the loads of real bodies are smoother than the independent loads of the prior. Measured displacement
+errors correspond to factors of at most 0.13 for spheres and 0.5 for Gaussian dents."""
 
 
 class MapEstimator:
-    """MAP estimator of one patch, with its displacement, nuisances and last factors.
+    """MAP estimator of one patch. It keeps the displacement, the nuisances and the last factors.
 
     Each stream needs its own instance.
 
@@ -81,21 +79,21 @@ class MapEstimator:
         problem: The patch.
         elastic: Elastic prior of the patch.
         free: (f,) indices of the free coordinates of a wire.
-        nuisances: Number p of nuisances, not counting the geometry errors.
+        nuisances: Number p of nuisances, excluding the geometry errors.
         tolerances: Manufacturing tolerances of the patch.
 
     Attributes:
         load_prior: Prior of the loads and of the displacement.
         moved: (U, 3N) displacement, pitches; 0 for fixed coordinates.
-        g: Nuisances: p nuisances, followed by those of the geometry errors.
+        g: The p nuisances, followed by the geometry errors.
         std: (U, f) standard deviations from the last factors, pitches.
         core: (U, f) standard deviations for the 95 % interval, which assume smooth bodies, pitches.
         noise_variance: (U f,) variance of the displacement due to noise and nuisances, pitch².
         members: Wires whose equations are in the factors.
         factors: Serial number of the current factors.
-        evaluations: Number of evaluations of F and J, per wire, since the counter was set to 0.
-        factorisations: Number of factorisations since the counter was set to 0.
-        until: Deadline as a value of :func:`skinnode.process.clock.perf_counter`, s, after which a solve
+        evaluations: Number of evaluations of F and its Jacobian, counted per wire. The caller resets it.
+        factorisations: Number of factorisations. The caller resets it.
+        until: Deadline as a value of :func:`skinnode.process.clock.perf_counter`, s. A solve that exceeds it
             raises TimeoutError.
     """
 
@@ -117,7 +115,7 @@ class MapEstimator:
         self._b = kernels.make_buffers(wires, equations, coordinates, free.size, nuisances, effects)
         self._rows = len(self._b.v) // wires
         self._reach = roots.NEAR * float(problem.clearance.min())
-        self._enough = math.inf  # tolerance for the RMS of a chord step
+        self._enough = math.inf  # convergence tolerance for the RMS of a chord step, pitches
         self._at_rest = np.zeros((wires, equations)), np.zeros((wires, coordinates, equations))
         kernels.potentials(np.arange(wires), problem.rest.copy(), problem.lower, *self._at_rest)
         self.g = np.zeros(nuisances + (geometry_error.nuisances(wires, equations) if effects else 0))
@@ -148,14 +146,14 @@ class MapEstimator:
         return self.members.size * self._rows
 
     def reset(self, scale2: float) -> None:
-        """Return to rest without factors, and reset the prior to equal loads with s² = ``scale2``, pitch²."""
+        """Return to rest without factors, and expect equal loads everywhere with s² = ``scale2``, pitch²."""
         self.moved[:] = 0.0
         self.g[:] = 0.0
         self.forget_factors()
         self.load_prior.spread(scale2)
 
     def forget_factors(self) -> None:
-        """Discard the factors and standard deviations of the current field."""
+        """Discard the factors and the standard deviations."""
         self.std[:] = np.inf
         self.core[:] = np.inf
         self._enough = math.inf
@@ -164,10 +162,10 @@ class MapEstimator:
     # -- solving ---------------------------------------------------------------------------------------
 
     def track(self, observation: Observation, members: Index) -> bool:
-        """Solve from the current displacement, using the equations of the wires ``members`` (P,).
+        """Solve from the current displacement with the equations of the wires ``members`` (P,).
 
         Returns:
-            Whether the solve converged; False if no maximum was found nearby.
+            True if the solve converged; False if it found no maximum nearby.
         """
         if self._fits(observation, members) and self._settle(observation) and self._effects_fit():
             return True
@@ -188,10 +186,10 @@ class MapEstimator:
         return False
 
     def anneal(self, observation: Observation, members: Index) -> bool:
-        """Solve from rest, lowering the noise from :data:`ANNEAL_NOISE` to its true value.
+        """Solve from rest while reducing the noise from :data:`ANNEAL_NOISE` to its actual value.
 
         Returns:
-            Whether the solve converged; False if a step failed.
+            True if the solve converged; False if a step failed or the last solve did not converge.
         """
         self.moved[:] = 0.0
         self.g[:] = 0.0
@@ -207,9 +205,9 @@ class MapEstimator:
         return self._settle(observation) or self.track(observation, members)
 
     def step_s(self, observation: Observation) -> float:
-        """Measure the time to factorise all wires and compute their standard deviations, s.
+        """Measure the time to factorise the equations of all wires and compute the standard deviations, s.
 
-        This method discards the factors.
+        The factors are discarded.
         """
         self.until = least = math.inf
         for _ in range(3):  # the first run may include memory allocation
@@ -223,12 +221,12 @@ class MapEstimator:
     # -- properties of the current field ---------------------------------------------------------------
 
     def residuals(self, observation: Observation, moved: Float | None = None) -> Float:
-        """Return the residuals r − H g (U, K), in units of their noise, at the current or a given field."""
+        """Return the residuals r − H g (U, K), in units of their noise, at the current field or ``moved``."""
         self._square(observation, self._every, self.moved if moved is None else moved, self.g)
         return self._b.r.copy()
 
     def fit(self, observation: Observation, moved: Float | None) -> Fit:
-        """Return the misfit between a frame and a displacement (U, 3N) in pitches; None means rest."""
+        """Return the misfit between a frame and a displacement (U, 3N), pitches; None stands for rest."""
         if moved is None:
             self._linearise_at_rest(observation)
         else:
@@ -241,14 +239,14 @@ class MapEstimator:
     def objective(
         self, observation: Observation, moved: Float | None = None, g: Float | None = None
     ) -> float:
-        """Return −2 log posterior of the current or a given field, up to a constant set by the factors."""
+        """Return −2 log posterior of the current or a given field, up to a constant."""
         moved, g = (self.moved if moved is None else moved), (self.g if g is None else g)
         square = self._square(observation, self.members, moved, g)
         prior = self.roughness(moved) / self.load_prior.scale2
         return square + prior + float((g**2 / observation.d).sum())
 
     def roughness(self, moved: Float) -> float:
-        """Return uᵀ C⁻¹ u in pitch² for a displacement (U, 3N)."""
+        """Return uᵀ C⁻¹ u, pitch², for a displacement u (U, 3N)."""
         return self.load_prior.roughness(np.ascontiguousarray(moved[:, self._free]).ravel())
 
     def free_displacement(self) -> Float:
@@ -256,14 +254,14 @@ class MapEstimator:
         return np.ascontiguousarray(self.moved[:, self._free]).ravel()
 
     def covariance(self) -> Float:
-        """Return the covariance (U f, U f) of the displacement, pitch²."""
+        """Return the posterior covariance (U f, U f) of the displacement, pitch²."""
         v = self._b.whitened[: self.factored_rows]
         explained = np.empty_like(self.load_prior.covariance)
         multiply(np.ascontiguousarray(v.T), v, explained)
         return np.asarray(self.load_prior.scale2 * self.load_prior.covariance - explained)
 
     def whiten(self, response: Float, out: Float) -> None:
-        """Write L⁻¹ J G into ``out`` (m, C) for a response G (U f, C), with the current factors."""
+        """Write L⁻¹ J G into ``out`` (m, C) for the response G (U f, C), using the current factors."""
         b, f, rows = self._b, self._free.size, self._rows
         for i, u in enumerate(self.members.tolist()):
             block = slice(i * rows, (i + 1) * rows)
@@ -273,7 +271,7 @@ class MapEstimator:
     # -- evidence --------------------------------------------------------------------------------------
 
     def signal(self) -> Float:
-        """Return the prior variance (U, K) of each relative change in R, in pitch⁻², at rest for s = 1."""
+        """Return the prior variance (U, K) of each relative change in R at rest, for s = 1, in pitch⁻²."""
         wires, f, a = len(self.moved), self._free.size, self._problem.a_rest
         plain = Observation(a, np.ones_like(a), np.zeros((*a.shape, 0)), np.zeros(0))
         self._linearise_at_rest(plain)
@@ -282,7 +280,7 @@ class MapEstimator:
         return np.asarray(np.einsum("uik,uij,ujk->uk", slopes, own, slopes))
 
     def guess_scale(self, observation: Observation, members: Index) -> float:
-        """Return the s² in pitch² for which the expected change in R from rest equals the measured change."""
+        """Return the s², pitch², for which the expected change in R from rest equals the measured change."""
         self._linearise_at_rest(observation)
         trace = self._assemble(observation, members, 1.0, np.zeros_like(self.moved))
         square = float((self._b.r[members] ** 2).sum())
@@ -298,11 +296,11 @@ class MapEstimator:
         return self._gamma
 
     def evidence_scale(self, weight: float, scale2: float) -> float:
-        """Return the next s² in pitch² by MacKay's fixed-point iteration (Neural Computation 4, 415, 1992).
+        """Return the next s², pitch², of MacKay's fixed-point iteration (Neural Computation 4, 415, 1992).
 
         Args:
             weight: Weight of the prior on s², as an equivalent number of parameters.
-            scale2: Expected value of s² in its prior, pitch².
+            scale2: Value of s² expected by this prior, pitch².
         """
         return (self.roughness(self.moved) + weight * scale2) / (self.gamma() + weight)
 
@@ -318,7 +316,7 @@ class MapEstimator:
         return kernels.residuals(members, x, self._problem.lower, o.a, o.weight, o.h, g, self._b.r)
 
     def _fits(self, observation: Observation, members: Index) -> bool:
-        """Return whether the current factors are valid for the given wires, prior and noise."""
+        """Return whether the current factors are valid for the given wires and noise and the prior."""
         if self._factored is None:
             return False
         weight, scale2, version = self._factored
@@ -326,10 +324,12 @@ class MapEstimator:
         if version != prior.version or scale2 != prior.scale2 or not np.array_equal(members, self.members):
             return False
         new, old = observation.weight[members], weight[members]
-        return bool((np.abs(new - old) <= 0.1 * old).all())  # False if a resistance became unusable or usable
+        return bool(
+            (np.abs(new - old) <= 0.1 * old).all()
+        )  # False if a resistance has become usable or unusable
 
     def _effects_fit(self) -> bool:
-        """Return whether the geometry errors' effects are still close to their values in the factors."""
+        """Return whether the effects of the geometry errors are still close to those in the factors."""
         if self._geometry is None:
             return True
         now, then = self._b.effect[self.members], self._b.factored_effect[self.members]
@@ -350,7 +350,7 @@ class MapEstimator:
         kernels.linearise(members, x, self._problem.lower, o.a, o.weight, b.r, b.jt)
 
     def _linearise_at_rest(self, observation: Observation) -> None:
-        """Linearise all wires at rest, using the stored F and J."""
+        """Linearise all wires at rest, using the stored F and Jacobian."""
         b = self._b
         b.r[:], b.jt[:] = self._at_rest
         kernels.weigh(self._every, observation.a, observation.weight, b.r, b.jt)
@@ -388,11 +388,11 @@ class MapEstimator:
         return size
 
     def _shorten(self, observation: Observation, moved: Float, g: Float) -> None:
-        """Shorten the last step to the minimum of a parabola fitted to the objective.
+        """Shorten the last step to the minimum of a parabola through the objective at three points.
 
-        ``moved`` and ``g`` are the displacement and the nuisances before the step. Gauss-Newton neglects the
-        curvature of F. If the data determine only a few parameters, full steps can therefore oscillate about
-        the minimum without converging.
+        A Gauss-Newton step neglects the curvature of F. If the data determine only a few parameters, full
+        steps can oscillate about the minimum without converging. ``moved`` and ``g`` are the displacement and
+        the nuisances before the step.
         """
         way = self.moved - moved, self.g - g
 
@@ -401,7 +401,7 @@ class MapEstimator:
 
         start, far = at(0.0), 1.0
         middle, end = at(0.5), at(1.0)
-        for _ in range(HALVINGS):  # far from the minimum the objective is not parabolic
+        for _ in range(HALVINGS):  # far from the minimum, the objective is not parabolic
             if end < 4.0 * start + 1.0:
                 break
             far *= 0.5
@@ -411,7 +411,7 @@ class MapEstimator:
         self.moved[:], self.g[:] = moved + share * way[0], g + share * way[1]
 
     def _measure(self, observation: Observation) -> None:
-        """Compute standard deviations from the current factors."""
+        """Compute the standard deviations from the current factors."""
         b, m, prior = self._b, self.factored_rows, self.load_prior
         self._gamma = None
         b.whitened[:m] = b.cross_covariance[:m]
@@ -427,7 +427,7 @@ class MapEstimator:
         self._enough = SETTLED * math.sqrt(float(np.mean(self.core**2)))
 
     def _settle(self, observation: Observation) -> bool:
-        """Take chord steps; if they do not converge, keep the better of the old and the new field."""
+        """Take chord steps, and return whether they converged; if not, keep the better of the two fields."""
         moved, g = self.moved.copy(), self.g.copy()
         if self._chord(observation):
             return True
@@ -436,9 +436,9 @@ class MapEstimator:
         return False
 
     def _chord(self, observation: Observation) -> bool:
-        """Take chord steps; return whether they converged.
+        """Take chord steps, and return whether they converged.
 
-        The steps have converged if the last step is small compared with the standard deviations.
+        They have converged if the last step is small compared with the standard deviations.
         """
         b, wires, prior, step = self._b, len(self.moved), self.load_prior, self._correction
         before = math.inf

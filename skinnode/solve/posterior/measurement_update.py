@@ -1,35 +1,35 @@
 """Measurement update: the linear algebra of one Gauss-Newton step of the posterior.
 
-The update is computed in data space, like the update of a Kalman filter.
+The update works in data space, like the measurement update of a Kalman filter.
 
 The unknowns are the free coordinates x of all electrodes, with the prior x ~ N(0, s² C), and a few nuisances
-g ~ N(0, diag(d)). The residual of a wire is r = w (a F(x) − 1) with w = 1/σ, and its model is
+g ~ N(0, diag(d)). A wire has the residual r = w (a F(x) − 1) with w = 1/σ. The model is
 
     r(x) − H g = noise of variance 1,      H = effect of a unit of each nuisance on r
 
-With J = ∂r/∂x, block-diagonal over wires, one Gauss-Newton step from x is
+Let J = ∂r/∂x, which is block-diagonal over wires. A Gauss-Newton step from x leads to
 
     x⁺ = s² C Jᵀ S⁻¹ y,   g⁺ = −d Hᵀ S⁻¹ y,   y = J x − r,   S = I + s² J C Jᵀ + H d Hᵀ
 
 S is the innovation covariance, s² J C the cross-covariance and K = s² C Jᵀ S⁻¹ the Kalman gain. The posterior
-covariance at x⁺ is s² C − Vᵀ V with V = L⁻¹ (s² J C) and L Lᵀ = S (Tarantola, Inverse Problem Theory, 2005,
-3.4). All eigenvalues of S are at least 1, so rounding errors do not depend on the condition number of J. The
-rounding errors are at most ε ‖S‖ standard deviations, where ε is the machine precision; for signals of 10⁶ σ,
-that is a thousandth of a standard deviation.
+covariance at x⁺ is s² C − Vᵀ V, where V = L⁻¹ (s² J C) and L Lᵀ = S (Tarantola, Inverse Problem Theory, 2005,
+section 3.4). No eigenvalue of S is less than 1, so rounding errors do not grow with the condition number of
+J. They are at most ε ‖S‖ standard deviations, where ε is the machine precision. For signals of 10⁶ σ, this is
+a thousandth of a standard deviation.
 
-Newton steps with the factors of an older J (chord steps) converge to the same maximum. At the maximum of the
-posterior, e_x = −s² C Jᵀ (r − H g) − x and e_g = d Hᵀ (r − H g) − g vanish. With the old J, H and S, a chord
-step is
+A chord step is a Newton step with the factors of an earlier J. Chord steps converge to the same maximum. At
+the maximum, the vectors e_x = −s² C Jᵀ (r − H g) − x and e_g = d Hᵀ (r − H g) − g are zero. With the earlier
+J, H and S, a chord step is
 
     δ = e − (s² C Jᵀ; −d Hᵀ) S⁻¹ (J e_x − H e_g)
 
-A chord step requires two triangular solves.
+It requires only two triangular solves.
 
 If a wire has more equations than unknowns, a QR decomposition of [J H] first reduces them to one equation per
-unknown without loss of information. The QR reduction is not possible with geometry errors
-(:mod:`skinnode.solve.posterior.geometry_error`), because each lower wire has its own nuisances. In g, the
-geometry errors follow the other p nuisances. For the geometry errors, H is sparse, and only the non-zero
-effects on each residual are stored.
+unknown. No information is lost. The reduction is not possible with geometry errors
+(:mod:`skinnode.solve.posterior.geometry_error`), because each lower wire then has its own nuisances. The
+geometry errors follow the other p nuisances in g. Their part of H is sparse, and only its non-zero elements
+are stored.
 """
 
 from __future__ import annotations
@@ -54,10 +54,10 @@ from skinnode.solve.posterior.geometry_error import add_effect, effect_on
 
 
 class Buffers(NamedTuple):
-    """Arrays written by a Gauss-Newton step, for one patch.
+    """Arrays that a Gauss-Newton step writes, for one patch.
 
-    A patch has U wires with K equations and f free coordinates each, and p nuisances. Each wire has
-    R = min(K, f + p) rows after reduction, or R = K with geometry errors.
+    Each of the U wires has K equations and f free coordinates; there are p nuisances. A reduced wire has R =
+    min(K, f + p) rows. With geometry errors, R = K.
     """
 
     r: Float
@@ -65,7 +65,7 @@ class Buffers(NamedTuple):
     jt: Float
     """(U, 3N, K) transposed Jacobians."""
     free_jt: Float
-    """(f + p, K) rows of one wire's Jᵀ for its free coordinates, followed by its Hᵀ."""
+    """(f + p, K) rows of Jᵀ for the free coordinates of one wire, followed by its Hᵀ."""
     jacobian: Float
     """(U R, f) stacked matrices J of the wires in the step."""
     nuisance: Float
@@ -75,7 +75,7 @@ class Buffers(NamedTuple):
     cross_covariance: Float
     """(U R, U f) cross-covariance s² J C of the data and the displacement."""
     innovation_covariance: Float
-    """(U R, U R) innovation covariance S, later replaced by its Cholesky factor L."""
+    """(U R, U R) innovation covariance S; the factorisation overwrites it with the Cholesky factor L."""
     whitened: Float
     """(U R, U f) whitened cross-covariance V = L⁻¹ (s² J C)."""
     kalman_gain_t: Float
@@ -99,15 +99,15 @@ class Buffers(NamedTuple):
     e: Float
     """(K,) work array."""
     effect: Float
-    """(U, K, E) non-zero elements of H for the geometry errors; E = 0 if the geometry is exact."""
+    """(U, K, E) non-zero elements of H for the geometry errors; E = 0 if none are modelled."""
     factored_effect: Float
-    """(U, K, E) copy of ``effect`` from which the current factors were computed."""
+    """(U, K, E) copy of ``effect`` that belongs to the current factors."""
 
 
 def make_buffers(  # noqa: PLR0913 - the sizes of a patch
     wires: int, equations: int, coordinates: int, free: int, nuisances: int, effects: int = 0
 ) -> Buffers:
-    """Return zeroed buffers for a patch; the sizes other than ``wires`` and ``nuisances`` are per wire."""
+    """Return zeroed buffers. All sizes except ``wires`` and ``nuisances`` are for one wire."""
     columns = free + nuisances
     rows = equations if effects else min(equations, columns)
     m, n = wires * rows, wires * free
@@ -142,7 +142,7 @@ def potentials(members: Index, x: Float, lower: Float, f: Float, jt: Float) -> N
 
 @njit
 def weigh(members: Index, a: Float, weight: Float, r: Float, jt: Float) -> None:
-    """Replace F and its Jacobian with r = w (a F − 1) and the Jacobian of r."""
+    """Replace F and its Jacobian by r = w (a F − 1) and the Jacobian of r."""
     for i in range(members.size):
         u = members[i]
         r_u, jt_u, a_u, w_u = r[u], jt[u], a[u], weight[u]
@@ -177,11 +177,11 @@ def residuals(  # noqa: PLR0913 - a kernel: arrays by name
 def measure_fit(  # noqa: PLR0913 - a kernel: arrays by name
     free: Index, h: Float, g: Float, jt: Float, r: Float, square_sum: Float, top: Float, move: Float
 ) -> None:
-    """Measure the misfit of the residuals ``r`` (U, K), and replace ``r`` with r − H g.
+    """Compute the misfit of the residuals ``r`` (U, K), and replace ``r`` by r − H g.
 
-    Writes χ² of each wire into ``square_sum`` (U,). Writes the error |Jᵢᵀ r| / ‖Jᵢ‖² of each coordinate i,
-    assuming that no other coordinate moves, into ``move`` (U, f). Writes the largest error of each wire in
-    standard deviations, |Jᵢᵀ r| / ‖Jᵢ‖, into ``top`` (U,).
+    Three results are written: the χ² of each wire into ``square_sum`` (U,); the error |Jᵢᵀ r| / ‖Jᵢ‖² of each
+    coordinate i, with all other coordinates fixed, into ``move`` (U, f); and the largest error of each wire
+    in standard deviations, |Jᵢᵀ r| / ‖Jᵢ‖, into ``top`` (U,).
     """
     for u in range(jt.shape[0]):
         r_u = r[u]
@@ -204,7 +204,7 @@ def measure_fit(  # noqa: PLR0913 - a kernel: arrays by name
 def _reduce(  # noqa: PLR0913, C901 - a kernel: arrays by name, sums as loops
     u: int, top: int, free: Index, h: Float, x: Float, b: Buffers
 ) -> None:
-    """Write J, H and y of wire ``u``, reduced to at most f + p rows, into ``b``, starting at row ``top``."""
+    """Write J, H and y of wire ``u`` into ``b`` from row ``top``, reduced to at most f + p rows."""
     f, p = free.size, h.shape[2]
     equations = h.shape[1]
     y = b.e
@@ -244,11 +244,11 @@ def _reduce(  # noqa: PLR0913, C901 - a kernel: arrays by name, sums as loops
 def assemble(  # noqa: PLR0913, C901 - a kernel: arrays by name, sums as loops
     members: Index, free: Index, c: Float, s2: float, h: Float, d: Float, x: Float, b: Buffers
 ) -> float:
-    """Write J, H, y, s² J C and S of the wires ``members`` (P,) from the r and Jᵀ in ``b``.
+    """Write J, H, y, s² J C and S of the wires ``members`` (P,), using the r and Jᵀ in ``b``.
 
-    ``free`` (f,) contains the indices of a wire's free coordinates, and ``c`` (U f, U f) is C. The array
-    ``h`` (U, K, p) contains the effects of the nuisances and ``d`` (p,) their variances. Writes only the
-    upper triangle of S. Returns the trace of s² J C Jᵀ.
+    ``free`` (f,) contains the indices of a wire's free coordinates, and ``c`` (U f, U f) is C. ``h`` (U, K,
+    p) contains the effects of the nuisances, and ``d`` (p,) their variances. Only the upper triangle of S is
+    written. Returns the trace of s² J C Jᵀ.
     """
     f, p = free.size, h.shape[2]
     rows = b.jacobian.shape[0] // x.shape[0]
@@ -289,7 +289,7 @@ def assemble(  # noqa: PLR0913, C901 - a kernel: arrays by name, sums as loops
 def gauss_newton_step(  # noqa: PLR0913 - a kernel: arrays by name
     members: Index, free: Index, d: Float, x: Float, g: Float, b: Buffers
 ) -> None:
-    """Write the result of a Gauss-Newton step into ``x`` (U, 3N) and ``g`` (p,); S must be factorised."""
+    """Write the result of a Gauss-Newton step into ``x`` (U, 3N) and ``g`` (p,), given the factors of S."""
     f = free.size
     rows = b.jacobian.shape[0] // x.shape[0]
     m = members.size * rows
@@ -319,7 +319,7 @@ def noise_variance(  # noqa: C901 - a kernel: sums as loops
 ) -> None:
     """Write the variance of the estimate due to noise and nuisances into ``out`` (U f,), pitch².
 
-    The variance is diag(K (I + H d Hᵀ) Kᵀ), where Kᵀ = L⁻ᵀ V has ``m`` rows. Reads V and L from ``b``.
+    This is diag(K (I + H d Hᵀ) Kᵀ), where Kᵀ = L⁻ᵀ V has ``m`` rows. V and L are read from ``b``.
     """
     n = out.size
     for k in range(m):
@@ -348,10 +348,10 @@ def noise_variance(  # noqa: C901 - a kernel: sums as loops
 def standard_deviations(  # noqa: PLR0913 - a kernel: arrays by name
     m: int, c: Float, s2: float, noise: Float, doubt: float, share: float, std: Float, core: Float, b: Buffers
 ) -> None:
-    """Compute the posterior's standard deviations (U, f) from its covariance s² C − Vᵀ V, with V from ``b``.
+    """Compute standard deviations (U, f) from the posterior covariance s² C − Vᵀ V, with V from ``b``.
 
-    ``noise`` (U f,) is the part of the variance due to noise. The remaining part depends on the prior; it is
-    multiplied by ``doubt`` for ``std`` and by ``share`` for ``core``.
+    ``noise`` (U f,) is the part of the variance due to noise; the rest depends on the prior. The part that
+    depends on the prior is multiplied by ``doubt`` for ``std``, and by ``share`` for ``core``.
     """
     n, f = noise.size, std.shape[1]
     explained = b.gradient
@@ -380,16 +380,16 @@ def chord_step(  # noqa: PLR0913, C901 - a kernel: arrays by name, sums as loops
     step: Float,
     b: Buffers,
 ) -> tuple[float, float]:
-    """Compute a chord step with the current factors: U f coordinates, followed by the nuisances.
+    """Write a chord step with the current factors into ``step``: U f coordinates, followed by the nuisances.
 
-    Writes the step into ``step``. Reads r, Jᵀ and the effects at ``x`` (U, 3N) from ``b``. Returns the RMS
-    and the largest absolute value of the U f coordinate changes, pitches.
+    The residuals r, Jᵀ and the effects of the geometry errors at ``x`` (U, 3N) are read from ``b``. Returns
+    the RMS and the largest absolute value of the changes in the coordinates, pitches.
     """
     f, p = free.size, h.shape[2]
     wires, equations = b.r.shape
     rows = b.jacobian.shape[0] // wires
     m, n = members.size * rows, b.gradient.size
-    made = b.effect.shape[2] > 0  # True if geometry errors are modelled
+    made = b.effect.shape[2] > 0  # whether geometry errors are modelled
     for j in range(n):
         b.gradient[j] = 0.0
     for q in range(g.size):

@@ -1,9 +1,9 @@
-"""Observation model of a frame: residuals, weights, and the effect of the nuisances.
+"""Observation model of a frame: residuals, weights, and the effects of the nuisances.
 
-A wire's residual is r = w (a F(x) − 1) with w = 1/σ. In the model, r(x) − H g is noise of variance 1, where H
-is the effect of the nuisances g ~ N(0, diag(d)). The nuisances are a gain error of the patch or of each wire
-(drift), an error of the forward model proportional to the change in each resistance, and errors of the
-geometry. For the geometry errors, H depends on the displacement
+A wire has the residual r = w (a F(x) − 1) with w = 1/σ. In the model, r(x) − H g is noise of variance 1,
+where H is the effect of the nuisances g ~ N(0, diag(d)). The nuisances are gain errors of the patch or of
+each wire (drift), an error of the forward model in proportion to the change in each resistance, and errors of
+the geometry. For the geometry errors, H depends on the displacement
 (:mod:`skinnode.solve.posterior.geometry_error`).
 """
 
@@ -25,38 +25,38 @@ from skinnode.solve.wires.problem import PatchProblem
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Readings:
-    """Resistances of one frame, in the units of the :class:`PatchProblem`."""
+    """Resistances of one frame, in the units of :class:`PatchProblem`."""
 
     a: Float
-    """(U, K) resistances times gain, R · gain; the value at rest for unusable resistances."""
+    """(U, K) resistances times gain, R · gain; the value at rest where a resistance is unusable."""
     noise: Float
     """(U, K) relative standard deviation of the resistances R."""
     usable: NDArray[np.bool_]
     """(U, K) mask of the usable resistances."""
 
     def without(self, wires: list[int]) -> Readings:
-        """Return a copy in which the readings of ``wires`` are marked as unusable."""
+        """Return a copy in which the readings of ``wires`` are unusable."""
         usable = self.usable.copy()
         usable[wires] = False
         return Readings(self.a, self.noise, usable)
 
     def except_for(self, left_out: NDArray[np.bool_]) -> Readings:
-        """Return a copy in which the readings ``left_out`` (U, K) are marked as unusable."""
+        """Return a copy in which the readings in the mask ``left_out`` (U, K) are unusable."""
         return Readings(self.a, self.noise, self.usable & ~left_out)
 
 
 @dataclass
 class Observation:
-    """Estimator input for one frame, with U wires, K resistances per wire and p nuisances."""
+    """Input of the estimator for one frame, with U wires, K resistances per wire and p nuisances."""
 
     a: Float
     """(U, K) resistances times gain, R · gain."""
     weight: Float
-    """(U, K) weights 1/σ of the resistances; 0 if a resistance is missing."""
+    """(U, K) weights 1/σ of the resistances; 0 where a resistance is missing."""
     h: Float
-    """(U, K, p) H, change in the residual per unit of each nuisance, excluding errors of the geometry."""
+    """(U, K, p) H, effect of a unit of each nuisance on the residuals, without the geometry errors."""
     d: Float
-    """Prior variances of the nuisances: p variances, followed by those of the geometry errors."""
+    """Prior variances of the p nuisances, followed by those of the geometry errors."""
 
     @functools.cached_property
     def count(self) -> Index:
@@ -65,7 +65,7 @@ class Observation:
 
 
 class ObservationModel:
-    """Converter of readings to observations.
+    """Conversion of readings to observations.
 
     Args:
         problem: The patch.
@@ -75,9 +75,9 @@ class ObservationModel:
         tolerances: Manufacturing tolerances of the patch.
 
     Attributes:
-        gains: Number of gain errors, which are the first nuisances.
+        gains: Number of gain errors; these are the first nuisances.
         fixed: Number p of nuisances whose H does not depend on the displacement.
-        variance: Prior variances of the nuisances: p variances, followed by those of the geometry errors.
+        variance: Prior variances of the p nuisances, followed by those of the geometry errors.
     """
 
     def __init__(
@@ -102,7 +102,7 @@ class ObservationModel:
             self.variance = np.concatenate([self.variance, np.ones(geometry)])
 
     def observe(self, readings: Readings, noise_factor: float) -> Observation:
-        """Return the observation of a frame, with the readings' noise multiplied by ``noise_factor``."""
+        """Return the observation of a frame whose noise is ``noise_factor`` times that of the readings."""
         a = readings.a
         change = a / self._problem.a_rest - 1.0
         variance = (noise_factor * readings.noise) ** 2 + 0.5 * (self._model_error * change) ** 2
@@ -118,7 +118,7 @@ class ObservationModel:
 
 
 def eased(observation: Observation, level: float) -> Observation:
-    """Return a copy with added noise of relative standard deviation ``level``, for annealing."""
+    """Return a copy with additional noise of relative standard deviation ``level``, for annealing."""
     weight = observation.weight
     loose = 1.0 / np.hypot(
         level, np.divide(1.0, weight, out=np.full_like(weight, math.inf), where=weight > 0)

@@ -1,8 +1,7 @@
-"""Posterior of a patch: estimates fields from a stream of frames, and tests the readings of each frame.
+"""Posterior of a patch: estimate fields from a stream of frames, and test the readings of each frame.
 
-Each frame is solved by ``frame_estimator``. :mod:`skinnode.solve.checks.data_check` then tests the readings
-for consistency with the field; if the data check finds wrong readings, the frame is solved again without
-these readings.
+``frame_estimator`` solves each frame. :mod:`skinnode.solve.checks.data_check` then tests whether the readings
+contradict each other. If some readings are wrong, the frame is solved again without them.
 """
 
 from __future__ import annotations
@@ -22,27 +21,27 @@ from skinnode.solve.options import PosteriorArguments, PosteriorOptions, merged
 from skinnode.solve.posterior.frame_estimator import FrameEstimator, Mask
 
 PLACED: Final = 2.0
-"""Assumed error of a reading, as a fraction of the largest change of any reading, per pitch of placement
-error."""
+"""Assumed error of a reading per pitch of placement error, as a fraction of the largest change of any
+reading."""
 
 
 class Posterior(FrameEstimator):
     """Estimator of the displacement, loads and contacts of one patch, frame by frame.
 
-    Each stream needs its own instance. The kernels release the GIL. The constructor compiles them.
+    Each stream needs its own instance. The constructor compiles the kernels, which release the GIL.
 
     Args:
         layout: The patch, with any number of lower wires.
-        options: Options of the estimate; the default is :class:`skinnode.solve.options.PosteriorOptions()`.
-        **arguments: Options by name, which override ``options``.
+        options: Options of the estimate; :class:`skinnode.solve.options.PosteriorOptions()` by default.
+        **arguments: Options by name; these take precedence over ``options``.
 
     Attributes:
         layout: The patch.
         options: Options in effect.
         check: Data check of the readings.
         from_rest_s: Minimum time to solve a touched frame from rest, s; 0 if no deadline is set.
-        noise_estimate: Estimate of the stream's noise, which scales the stated noise; None if the stated
-            noise is used unchanged.
+        noise_estimate: Estimate of the stream's noise, by which the stated noise is scaled; None if the
+            stated noise is used as it is.
 
     Raises:
         ValueError: If an option has the wrong shape or is out of range.
@@ -60,7 +59,7 @@ class Posterior(FrameEstimator):
         self.warm_up()
 
     def reset(self) -> None:
-        """Discard the state of the stream: the next frame is solved from the rest position."""
+        """Discard the state of the stream; the next frame is solved from rest."""
         super().reset()
         self.check.reset()
 
@@ -73,25 +72,25 @@ class Posterior(FrameEstimator):
     ) -> FieldFrame:
         """Estimate the displacement field, loads and contacts of one frame.
 
-        Resistance values never raise an exception. The displacement of a wire without usable resistances is
-        estimated from its neighbours; its standard deviation is larger. A wire whose resistances no
-        deformation explains is INCONSISTENT and left out of the estimate. If a wire does not converge even
-        when solved alone, it has the status MAX_STEPS and is also left out. If the whole frame cannot be
-        solved, the last trusted field is returned with an infinite standard deviation.
+        No resistance value raises an exception. If a wire has no usable resistances, its displacement is
+        estimated from its neighbours, and its standard deviation is larger. If no deformation explains the
+        resistances of a wire, the wire is INCONSISTENT and left out of the estimate. A wire that does not
+        converge even when solved alone is MAX_STEPS and also left out. If the whole frame cannot be solved,
+        the last trusted field is returned with an infinite standard deviation.
 
         Args:
-            frame_ohm: (U, K) resistances, ohm; values that are not positive and finite are ignored.
-            valid: (U, K) bool, False if a reading is missing; all True by default.
+            frame_ohm: (U, K) resistances, ohm. Values that are not positive and finite are ignored.
+            valid: (U, K) bool, False where a reading is missing; all True by default.
             relative_noise: Relative noise of this frame only, a number or (U, K). Resistances whose noise is
                 not positive and finite are ignored.
-            rounding_ohm: (U, K) standard deviation of the error from rounding to codes, ohm; added to
-                ``relative_noise``.
+            rounding_ohm: (U, K) standard deviation of the quantisation error of the codes, ohm. It is
+                combined with ``relative_noise`` as independent noise.
 
         Returns:
             The field, with one status per wire.
 
         Raises:
-            ValueError: If a shape is wrong.
+            ValueError: If an array has the wrong shape.
         """
         start = perf_counter()
         readings = self._readings(frame_ohm, valid, relative_noise, rounding_ohm)
@@ -109,7 +108,7 @@ class Posterior(FrameEstimator):
 
 
 def _model_std(options: PosteriorOptions) -> float:
-    """Return the forward model's standard error from the options, relative to the largest change."""
+    """Return the forward model's standard error under the options, relative to the largest change."""
     made = options.tolerances or EXACT
     placed = PLACED * math.hypot(made.placement, made.electrode_radius)
     return math.hypot(options.model_error, placed, made.thickness, made.gain)

@@ -1,12 +1,11 @@
-"""Conformance suite for CANopen nodes: 127 cases that test any node with raw frames on any CAN interface.
+"""Conformance suite for CANopen nodes: 127 cases that test any node on any CAN interface.
 
-``eds_reader`` parses the device's EDS, and ``tester`` sends and receives frames. ``sdo`` (the SDO
-client) and ``dut`` (the device under test) build on these two modules, and the cases build on ``sdo`` and
-``dut``. ``run`` resets the device before each case and restores its configuration; ``report`` and
-``html_report`` write the results.
+``eds_reader`` parses the EDS of the node, and ``tester`` sends and receives raw frames. ``sdo`` is the SDO
+client, ``dut`` represents the device under test, and ``cases`` contains the cases. ``run`` runs them, and
+``report`` and ``html_report`` format the results.
 
-The suite relies only on a node's EDS and on the frames that the node sends. The suite has its own tester,
-SDO client, EDS reader and constants, because it could not detect errors in code shared with the node.
+The suite uses only the EDS of the node and the frames that the node sends. It has its own SDO client, EDS
+reader and constants, because it could not detect an error in code that it shares with the node.
 """
 
 from skinnode.conformance.case import Case, NotApplicable, Result, Verdict

@@ -1,4 +1,4 @@
-"""Conformance case and its result."""
+"""A conformance case, its verdict and its result."""
 
 from __future__ import annotations
 
@@ -18,35 +18,35 @@ class Verdict(StrEnum):
 
     PASSED = "passed"
     WARNING = "warning"
-    """The device passes, but CiA discourages its behaviour or some tools cannot handle it."""
+    """The device passes, but its behaviour is discouraged by CiA or unsupported by some tools."""
     FAILED = "failed"
     NOT_APPLICABLE = "not applicable"
 
 
 class NotApplicable(Exception):
-    """Raised if the device does not offer the feature that the case checks.
+    """Raised if the device does not have the feature that the case checks.
 
-    The exception text gives the evidence: a missing object, a missing EDS entry or the device's response.
+    The message names the evidence, such as a missing EDS entry or the response of the device.
     """
 
 
 class Warned(Exception):
-    """Raised if the device passes but its behaviour is doubtful. The exception text explains why."""
+    """Raised if the device passes with a warning, which is the message of the exception."""
 
 
 @dataclass(frozen=True, slots=True)
 class Case:
     """One conformance case.
 
-    ``run`` returns if the device passes without a warning. Otherwise, it raises Failed, NotApplicable or
+    ``run`` returns if the verdict is "passed". For the other verdicts, it raises Failed, NotApplicable or
     Warned.
     """
 
     id: str
-    """Identifier of the case: its area and number, such as "SDO-07"."""
+    """Area and number of the case, such as ``SDO-07``."""
     title: str
     clause: str
-    """Clause that the case checks: a clause of CiA 301 v4.2.0 unless another document is named."""
+    """Clause of CiA 301 v4.2.0 that the case checks, or of another document if one is named."""
     run: Callable[[Dut], None]
 
     @property
@@ -62,13 +62,13 @@ class Result:
     case: Case
     verdict: Verdict
     why: str = ""
-    """Reason for the verdict; empty if the device passed without a warning.
+    """Reason for the verdict; empty if the device passed.
 
-    The reason gives the expected and received data, the cause of a warning, or why the case does not apply.
+    For a failure, this is what was expected and what was received.
     """
     seconds: float = 0.0
     trace: tuple[TraceLine, ...] = field(default=(), repr=False)
-    """Frames sent and received during the case."""
+    """Newest frames sent and received during the case."""
 
 
 def case(id: str, title: str, clause: str) -> Callable[[Callable[[Dut], None]], Case]:

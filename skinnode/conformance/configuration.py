@@ -1,4 +1,4 @@
-"""Saves the device's configuration before the tests and restores it afterwards."""
+"""Reads the configuration of the device before a run, and restores it afterwards."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ _PDO_PARAMETERS: Final = (*range(0x1400, 0x1600), *range(0x1800, 0x1A00))
 _MAPPINGS: Final = (*range(0x1600, 0x1800), *range(0x1A00, 0x1C00))
 _INVALID: Final = 1 << 31
 _LAST: Final = {_SYNC_COUNTER: 1, _PERIOD: 2, _SYNC: 3, _VERIFY: 4}
-"""Objects to write after all others, in this order. The SYNC counter overflow value can be written only while
-the SYNC period (0x1006) is 0. Writing 0x1005 starts the SYNC producer. 0x1020 is written last, because a
-write to any other object clears it."""
+"""Objects that are written after all others, and their order. The SYNC counter overflow value can be written
+only while the SYNC period (0x1006) is 0. Writing 0x1005 may start the SYNC producer. 0x1020 comes last,
+because writing any other object clears it."""
 
 
 def read_configuration(dut: Dut) -> dict[tuple[int, int], bytes]:
-    """Read all readable and writable objects except 0x1003, 0x1010, 0x1011 and objects of variable length."""
+    """Read all rw objects of fixed length, except 0x1003, 0x1010 and 0x1011."""
     values: dict[tuple[int, int], bytes] = {}
     for entry in dut.eds.between(0x1000, 0x9FFF):
         if entry.index in _COMMANDS or not entry.size or not (entry.readable and entry.writable):
@@ -30,19 +30,19 @@ def read_configuration(dut: Dut) -> dict[tuple[int, int], bytes]:
         try:
             values[entry.index, entry.subindex] = dut.sdo.read(entry.index, entry.subindex)
         except Failed:
-            continue  # read failures are reported by the cases in area OD
+            continue  # the cases of area OD report this
     return values
 
 
 def write_back(dut: Dut, before: Values) -> list[str]:
-    """Restore a node's original configuration after a case that stored or restored parameters.
+    """Restore the original configuration after a case that stored or restored parameters.
 
-    Restores the defaults, writes the values of ``before`` that differ from the defaults, and stores all
-    parameters. The caller must have reset the node beforehand.
+    The function restores the defaults, writes all original values that differ from them, and stores the
+    parameters. The caller must reset the node first.
 
     Args:
         dut: The device.
-        before: Values to restore.
+        before: Original values, by index and sub-index.
 
     Returns:
         One line for each value that could not be written.
@@ -73,7 +73,7 @@ def write_back(dut: Dut, before: Values) -> list[str]:
 
 
 def _parameter_of(index: int) -> int:
-    """Return the index of the PDO communication parameter to which ``index`` belongs; 0 if to none."""
+    """Return the communication parameter of the PDO to which ``index`` belongs; 0 if it belongs to none."""
     if index in _MAPPINGS:
         return index - 0x200
     return index if index in _PDO_PARAMETERS else 0

@@ -1,4 +1,4 @@
-"""The device under test, controlled over the bus."""
+"""Device under test: NMT, error control and object dictionary."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from skinnode.conformance.tester import QUIET_S, Failed, Tester, describe
 from skinnode.errors import NodeTimeout
 
 START, STOP, PRE_OPERATIONAL, RESET_NODE, RESET_COMMUNICATION = 1, 2, 128, 129, 130
-"""NMT commands."""
+"""NMT command specifiers."""
 
 STATES: Final = {0: "initialising", 4: "STOPPED", 5: "OPERATIONAL", 127: "PRE-OPERATIONAL"}
 
 _HEARTBEATS: Final = tuple(bytes((state,)) for state in STATES if state)
 
 BOOT_S: Final = 5.0
-"""Maximum start-up time of a device, s."""
+"""Maximum boot time of a device, s."""
 
 _ASK_EACH_S: Final = 0.25
 
@@ -28,7 +28,7 @@ HEARTBEAT: Final = 0x1017
 GUARD_TIME, LIFE_TIME_FACTOR = 0x100C, 0x100D
 STORE, RESTORE = 0x1010, 0x1011
 _ABSENT: Final = (0x0602_0000, 0x0609_0011)
-"""SDO abort codes for a missing object and a missing sub-index."""
+"""SDO abort codes for a missing object and for a missing sub-index."""
 
 
 class Dut:
@@ -38,13 +38,13 @@ class Dut:
         self.bus, self.node_id, self.eds = bus, node_id, eds
         self.sdo = SdoClient(bus, node_id)
         self.stored = False
-        """Whether a case has stored or restored parameters since the configuration was last restored."""
+        """Whether a case has stored or restored parameters, so that the configuration must be restored."""
         self.up = False
-        """Whether the node responded after the last reset."""
+        """Whether the node responded after its last reset."""
 
     @property
     def error_control_id(self) -> int:
-        """COB-ID of heartbeats and node guarding."""
+        """COB-ID of boot-up, heartbeat and node guarding."""
         return 0x700 + self.node_id
 
     @property
@@ -59,7 +59,7 @@ class Dut:
         self.bus.send(0x000, bytes((command, self.node_id)))
 
     def reset(self, command: int = RESET_NODE) -> None:
-        """Reset the node and await its boot-up message. Raises Failed if no such message arrives."""
+        """Reset the node and wait for its boot-up message. Raises Failed if it does not arrive."""
         self.bus.clear()
         self.nmt(command)
         frame = self.bus.expect(
@@ -75,8 +75,8 @@ class Dut:
     def prepare(self) -> None:
         """Reset the node and bring it to PRE-OPERATIONAL.
 
-        Accepts a boot-up message or an SDO response as a sign that the node is ready. Case STATE-01
-        checks the boot-up message itself.
+        The node is ready when it sends its boot-up message or an SDO response. The boot-up message is not
+        required here, because case STATE-01 checks it.
 
         Raises:
             NodeTimeout: The node does not answer.
@@ -108,7 +108,7 @@ class Dut:
     # --- error control
 
     def start_heartbeat(self, period_ms: int = 20) -> None:
-        """Start the node's heartbeat, unless the node supports only guarding.
+        """Start the node's heartbeat. A node that supports only guarding needs no start.
 
         Raises:
             NotApplicable: The node supports neither heartbeat nor guarding.
@@ -119,10 +119,10 @@ class Dut:
             self.need(GUARD_TIME)
 
     def state(self, what: str) -> int:
-        """Return the NMT state from a heartbeat, or from node guarding if the node has no heartbeat.
+        """Return the NMT state from a heartbeat, or by node guarding if the node has no heartbeat.
 
-        Uses the second heartbeat received, because the first may have been sent before the call. Call
-        :meth:`start_heartbeat` first.
+        Call :meth:`start_heartbeat` first. The second heartbeat counts, because the first may have been sent
+        before the call.
         """
         if self.eds.find(HEARTBEAT) is None:
             return (self.guard(what) or 0) & 0x7F
@@ -134,13 +134,13 @@ class Dut:
         return frame.data[0]
 
     def expect_state(self, state: int, what: str) -> None:
-        """Raise Failed unless the node reports the NMT state ``state``."""
+        """Raise Failed unless the node is in the NMT state ``state``."""
         got = self.state(what)
         if got != state:
             raise Failed(f"{STATES[state]} {what}", STATES.get(got, f"state {got}"))
 
     def guard(self, what: str) -> int | None:
-        """Request the state by remote frame; return the response byte, or None if there is no response."""
+        """Send a guarding request (remote frame); return the response byte, or None if there is none."""
         self.bus.pending(self.error_control_id)
         self.bus.send(self.error_control_id, remote=True)
         frame = self.bus.take(self.error_control_id, 4 * QUIET_S)
@@ -151,7 +151,7 @@ class Dut:
     # --- object dictionary
 
     def need(self, index: int, subindex: int = 0) -> EdsEntry:
-        """Return the EDS entry of an object. Raises NotApplicable if the EDS has no such entry."""
+        """Return an EDS entry. Raises NotApplicable if the EDS does not contain it."""
         entry = self.eds.find(index, subindex)
         if entry is None:
             raise NotApplicable(f"the EDS has no object 0x{index:04X}:{subindex:02X}")
@@ -160,7 +160,7 @@ class Dut:
     def need_storage(self, index: int, subindex: int) -> None:
         """Raise NotApplicable if the device cannot store (0x1010) or restore (0x1011) parameters on command.
 
-        Bit 0 of the object's value indicates this capability (CiA 301, 7.5.2.13 and 7.5.2.14).
+        This capability is bit 0 of the value read (CiA 301, 7.5.2.13 and 7.5.2.14).
         """
         self.need(index, subindex)
         try:
@@ -175,14 +175,14 @@ class Dut:
             raise NotApplicable(f"{entry} = 0x{capability:08X}: bit 0, {what}, is not set")
 
     def to_defaults(self) -> None:
-        """Restore the node's defaults if it supports 0x1011, and reset the node."""
+        """Restore the default values if the node supports 0x1011, then reset the node."""
         with contextlib.suppress(NotApplicable):
             self.need_storage(RESTORE, 1)
             self.restore(1)
         self.reset()
 
     def store(self, subindex: int, signature: bytes = b"save") -> None:
-        """Store parameters (0x1010). The original configuration is restored after the case."""
+        """Store parameters (0x1010); the original configuration is restored after the case."""
         self.stored = True
         self.sdo.write(STORE, subindex, signature)
 

@@ -1,8 +1,8 @@
-"""Reads the electronic data sheet (CiA 306) of a device under test.
+"""Reads the electronic data sheet (CiA 306) of the device under test.
 
-The reader uses only :mod:`configparser`, so that its result depends neither on the EDS writer of this project
-nor on the canopen library. Case EDS-01 reports contradictions within the file. A file
-that cannot be parsed raises ProfileError.
+The reader is based on :mod:`configparser` and shares no code with this project's EDS writer or with the
+canopen library, so that it does not repeat their errors. Contradictions within a file are collected for case
+EDS-01. A file that cannot be parsed raises ProfileError.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ SIZES: Final = {
     0x01: 1, 0x02: 1, 0x03: 2, 0x04: 4, 0x05: 1, 0x06: 2, 0x07: 4, 0x08: 4, 0x0C: 6, 0x0D: 6,
     0x10: 3, 0x11: 8, 0x12: 5, 0x13: 6, 0x14: 7, 0x15: 8, 0x16: 3, 0x18: 5, 0x19: 6, 0x1A: 7, 0x1B: 8,
 }  # fmt: skip
-"""Sizes in bytes of the data types that have a fixed length (CiA 301 v4.2.0, table 44)."""
+"""Size of each data type of fixed length, bytes (CiA 301 v4.2.0, table 44)."""
 
 _MOST_ENTRIES: Final = 1 << 16
 SIGNED: Final = (0x02, 0x03, 0x04, 0x10, 0x12, 0x13, 0x14, 0x15)
@@ -44,7 +44,7 @@ _VAR, _ARRAY, _RECORD, _DOMAIN = 0x7, 0x8, 0x9, 0x2
 
 @dataclass(frozen=True, slots=True)
 class EdsEntry:
-    """One value of the object dictionary."""
+    """EDS entry of one value, identified by index and sub-index."""
 
     index: int
     subindex: int
@@ -52,18 +52,19 @@ class EdsEntry:
     data_type: int
     access: str
     default: str
-    """Default value as written in the file; empty if the file specifies no default."""
+    """Default value as written in the file; empty if there is none."""
     low: int | None
     high: int | None
     mappable: bool
     flags: int
     """ObjFlags: bit 0 is "refuse write on download", bit 1 is "refuse read on scan"."""
     given: bytes | None = None
-    """Default value as raw bytes, if the file specifies bytes; :attr:`default` is then empty."""
+    """Exact value as bytes, which takes precedence over ``default``; None if the file does not specify
+    bytes."""
 
     @property
     def size(self) -> int:
-        """Size of the value in bytes; 0 if its length is variable."""
+        """Size of the value, bytes; 0 for a type of variable length."""
         return SIZES.get(self.data_type, 0)
 
     @property
@@ -78,28 +79,27 @@ class EdsEntry:
 
     @property
     def into_rpdo(self) -> bool:
-        """Whether an RPDO may map the entry: it is mappable, writable and not declared as process input."""
+        """Whether the entry may be mapped into an RPDO: mappable, writable and not a process input (rwr)."""
         return self.mappable and self.access in ("wo", "rww", "rw")
 
     @property
     def into_tpdo(self) -> bool:
-        """Whether a TPDO may map the entry: it is mappable, readable and not declared as process output."""
+        """Whether the entry may be mapped into a TPDO: mappable, readable and not a process output (rww)."""
         return self.mappable and self.access in ("ro", "rwr", "rw", "const")
 
     @property
     def mapping(self) -> int:
-        """Value of a PDO mapping entry that maps this object."""
+        """PDO mapping entry for this value: index, sub-index and length in bits."""
         return self.index << 16 | self.subindex << 8 | 8 * self.size
 
     def default_bytes(self, node_id: int) -> bytes | None:
-        """Return the entry's default value in the byte order of an SDO transfer.
+        """Return the default value as the data of an SDO transfer.
 
         Args:
-            node_id: Replaces $NODEID.
+            node_id: Value of $NODEID.
 
         Returns:
-            The bytes; text is transferred as written in the file. None if the file specifies no default, or a
-            default that the data type cannot encode.
+            The bytes; None if there is no default, or if the default cannot be converted to the data type.
 
         Raises:
             ValueError: A number is malformed.
@@ -125,37 +125,40 @@ class EdsEntry:
 
 @dataclass(frozen=True, slots=True)
 class Eds:
-    """Parsed EDS: device information, and entries in ascending order of index and sub-index."""
+    """Parsed EDS; its entries are in ascending order of index and sub-index."""
 
     source: str
-    """Origin of the EDS, for use in messages."""
+    """File name or other origin of the EDS, for messages."""
     device: Mapping[str, str]
-    """Entries of section DeviceInfo; the keys are in lower case."""
+    """Options of section DeviceInfo, with keys in lower case."""
     dummies: frozenset[int]
-    """Data types that may be mapped as dummy entries."""
+    """Data types that may be mapped as dummy entries (section DummyUsage)."""
     entries: Mapping[tuple[int, int], EdsEntry]
     contradictions: tuple[str, ...]
-    """Contradictions within the file."""
+    """Contradictions within the file, as text."""
 
     def find(self, index: int, subindex: int = 0) -> EdsEntry | None:
-        """Return the entry of an object; None if the EDS does not describe it."""
+        """Return an entry; None if the EDS does not contain it."""
         return self.entries.get((index, subindex))
 
     def has(self, index: int) -> bool:
-        """Return whether the EDS describes an object."""
+        """Return whether the EDS contains an object with this index."""
         return any(key[0] == index for key in self.entries)
 
     def between(self, first: int, last: int) -> Iterator[EdsEntry]:
-        """Return the entries from index ``first`` to ``last``."""
+        """Return the entries with an index from ``first`` to ``last``."""
         return (entry for key, entry in self.entries.items() if first <= key[0] <= last)
 
     def indices(self, first: int, last: int) -> list[int]:
-        """Return the indices of all objects from ``first`` to ``last``."""
+        """Return the indices from ``first`` to ``last`` that have an object."""
         return sorted({index for index, _ in self.entries if first <= index <= last})
 
 
 def number(text: str, node_id: int = 0) -> int:
-    """Parse a number: decimal, 0x…, octal with a leading zero, or $NODEID+…. Raises ValueError."""
+    """Parse a number in CiA 306 notation: decimal, ``0x`` hexadecimal, octal with leading 0, or $NODEID+….
+
+    Raises ValueError if the text is not a number.
+    """
     total = 0
     for part in text.replace(" ", "").split("+"):
         if part.upper() == "$NODEID":
@@ -168,7 +171,7 @@ def number(text: str, node_id: int = 0) -> int:
 
 
 def _hex(text: str) -> bytes | None:
-    """Return the bytes of hexadecimal text (CiA 306 form of an OCTET_STRING); None for any other text."""
+    """Parse hexadecimal text, the CiA 306 notation of an OCTET_STRING; None if it is not hexadecimal."""
     try:
         return bytes.fromhex(text)
     except ValueError:
@@ -176,14 +179,14 @@ def _hex(text: str) -> bytes | None:
 
 
 def parse_eds_file(path: Path, key: str = "EDS") -> tuple[Eds, EdsText]:
-    """Read an EDS or DCF in any encoding; a non-ASCII encoding is named in ``source`` of the result.
+    """Read an EDS or DCF in any common encoding.
 
     Args:
         path: The file.
-        key: Option or key that named the file, for messages.
+        key: Option or key that specifies the file, for messages.
 
     Returns:
-        The EDS and its text.
+        The EDS, whose ``source`` names a non-ASCII encoding, and the text of the file.
 
     Raises:
         ConfigError: The file cannot be read.
@@ -230,7 +233,7 @@ def parse_eds(text: str, source: str, codec: str = "utf-8") -> Eds:
     try:
         found += _listed(sections, {index for index, _ in entries})
         dummy_types = [kind for kind in range(1, 0x20) if number(dummies.get(f"dummy{kind:04x}", "0") or "0")]
-    except ValueError as error:  # the file has text where a number is required
+    except ValueError as error:  # an option that must be a number is not
         allowed = "numbers in CiA 306 format in the lists of objects and dummy entries"
         raise ProfileError("EDS", Shown(str(error)), allowed, where=source) from None
     return Eds(
@@ -245,7 +248,7 @@ def parse_eds(text: str, source: str, codec: str = "utf-8") -> Eds:
 def _entries(
     sections: Mapping[str, Mapping[str, str]], source: str
 ) -> tuple[dict[tuple[int, int], EdsEntry], list[str]]:
-    """Return the entries of all sections, and one line for each inconsistent section."""
+    """Return the entries of all sections, and one line for each section with an error."""
     found: list[str] = []
     entries: dict[tuple[int, int], EdsEntry] = {}
     for title in sorted(sections, key=_order):
@@ -260,14 +263,14 @@ def _entries(
                 _object(entries, index, sections[title], found)
         except (ValueError, KeyError) as error:
             found.append(f"[{title}]: {error}")
-        if len(entries) > _MOST_ENTRIES:  # 60 characters can declare 255 entries (CompactSubObj)
+        if len(entries) > _MOST_ENTRIES:  # with CompactSubObj, 60 characters declare 255 entries
             got = Shown(f"more than {_MOST_ENTRIES} values in the sections up to {title}")
             raise ProfileError("EDS", got, f"at most {_MOST_ENTRIES}", where=source)
     return entries, found
 
 
 def _order(title: str) -> tuple[int, str]:
-    """Return a sort key that places objects before their sub-objects."""
+    """Return a sort key that puts objects before their sub-objects."""
     return len(title), title
 
 
@@ -284,7 +287,7 @@ def _object(
     if compact > 254:
         found.append(f"[{index:04X}]: CompactSubObj={compact}, must be at most 254")
         compact = 0
-    if compact:  # CompactSubObj declares identical sub-objects that have no sections in the file
+    if compact:  # CompactSubObj declares identical sub-objects without a section of their own
         count = {"parametername": "NrOfObjects", "datatype": "5", "accesstype": "ro", "pdomapping": "0"}
         _add(entries, index, 0, {**count, "defaultvalue": str(compact)})
         for subindex in range(1, compact + 1):
@@ -311,7 +314,7 @@ def _add(
 
 
 def _listed(sections: Mapping[str, Mapping[str, str]], described: set[int]) -> Iterator[str]:
-    """Yield a line for each object listed but not described, or vice versa, and for each wrong count."""
+    """Yield one line for each object that is only listed or only described, and for each wrong count."""
     listed: set[int] = set()
     for name in ("mandatoryobjects", "optionalobjects", "manufacturerobjects"):
         options = sections.get(name, {})

@@ -1,7 +1,8 @@
-"""Checks whether frames arrive with an expected period.
+"""Checks the period of periodic frames.
 
-A busy machine delays individual frames, so both mean and median are checked. A delayed frame lengthens one
-interval and shortens the next, so the mean hardly changes. A few late frames do not change the median.
+The check must tolerate individual frames that a busy machine receives late. A late frame lengthens one
+interval and shortens the next, so it hardly changes the mean, and a few late frames do not change the median.
+The check therefore uses the mean and the median of the intervals.
 """
 
 from __future__ import annotations
@@ -25,8 +26,8 @@ def check_period(frames: Sequence[Frame], period_ms: float, what: str, *, or_soo
     Args:
         frames: At least two frames.
         period_ms: Expected period, ms.
-        what: Name of the frames, for the message.
-        or_sooner: Whether events may trigger additional frames between the periodic frames.
+        what: Description of the frames, for the message.
+        or_sooner: Whether shorter intervals are allowed, because events trigger additional frames.
     """
     gaps = gaps_ms(frames)
     mean, median = statistics.mean(gaps) / period_ms, statistics.median(gaps) / period_ms

@@ -1,4 +1,4 @@
-"""Writes the results of a run as one self-contained HTML file: verdicts by area, and each case's frames."""
+"""Formats the results of a run as a self-contained HTML page with verdicts and recorded frames."""
 
 from __future__ import annotations
 
@@ -72,12 +72,12 @@ auto; font: 12.5px/1.45 ui-monospace, monospace; max-height: 26rem; }
 
 
 def as_html(report: Report, title: str, when: datetime.datetime) -> str:
-    """Return the report as HTML, with failed cases expanded.
+    """Return the report as an HTML page, in which failed cases are expanded.
 
     Args:
         report: Results of the run.
-        title: Node and bus.
-        when: Time of the run.
+        title: Name of the node and of the bus.
+        when: Date and time of the run.
     """
     areas: dict[str, list[Result]] = {}
     for result in report.results:

@@ -1,4 +1,4 @@
-"""Lists the PDOs of the device under test, configures them and waits for their frames."""
+"""Helpers for cases about PDOs: list, configure, trigger and receive the PDOs of the device under test."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ INVALID: Final = 1 << 31
 NO_REMOTE: Final = 1 << 30
 CAN_ID: Final = 0x7FF
 COB_ID, KIND, INHIBIT, EVENT_TIMER, SYNC_START = 1, 2, 3, 5, 6
-"""Sub-indices of a PDO communication parameter."""
+"""Sub-indices of the PDO communication parameter."""
 
 SYNC_ID: Final = 0x80
 
@@ -47,21 +47,21 @@ class Pdo:
 
 
 class Unsupported(Exception):
-    """Raised if the device lacks an optional sub-index or transmission type of a PDO."""
+    """Raised if a PDO does not support an optional sub-index, transmission type or remote frames."""
 
 
 def rpdos(dut: Dut) -> list[Pdo]:
-    """Return the RPDOs described in the EDS."""
+    """Return the RPDOs in the EDS."""
     return [Pdo(index) for index in dut.eds.indices(0x1400, 0x15FF)]
 
 
 def tpdos(dut: Dut) -> list[Pdo]:
-    """Return the TPDOs described in the EDS."""
+    """Return the TPDOs in the EDS."""
     return [Pdo(index) for index in dut.eds.indices(0x1800, 0x19FF)]
 
 
 def sync(dut: Dut, counter: int | None = None) -> int:
-    """Send a SYNC and return the timestamp (ns) of its transmission."""
+    """Send a SYNC; return the time of transmission (monotonic clock, ns)."""
     return dut.bus.send(SYNC_ID, b"" if counter is None else bytes((counter,)))
 
 
@@ -79,7 +79,7 @@ def mapped(dut: Dut, pdo: Pdo) -> list[int]:
 
 
 def payload_bytes(entries: list[int]) -> int:
-    """Return the length, in bytes, of a PDO with the given mapping entries."""
+    """Return the length of a PDO with these mapping entries, bytes."""
     return sum(entry & 0xFF for entry in entries) // 8
 
 
@@ -94,13 +94,13 @@ class PdoSetup:
     start: int = 0
     """SYNC start value."""
     remote: bool = False
-    """Whether remote frames are permitted (bit 30 of the COB-ID)."""
+    """Whether to allow remote frames by clearing bit 30 of the COB-ID."""
 
 
 def set_up(dut: Dut, pdo: Pdo, parameters: PdoSetup) -> int:
-    """Disable the PDO, write its parameters and enable it.
+    """Disable a PDO, write its communication parameters and enable it again.
 
-    Discards frames of this PDO that have already arrived, for example from a self-starting node.
+    Frames of the PDO that arrived earlier, for example from a self-starting node, are discarded.
 
     Args:
         dut: The device.
@@ -111,7 +111,7 @@ def set_up(dut: Dut, pdo: Pdo, parameters: PdoSetup) -> int:
         The CAN-ID of the PDO.
 
     Raises:
-        Unsupported: The node rejects the parameters.
+        Unsupported: The device refuses a parameter.
     """
     cob_id = disable(dut, pdo)
     _set(dut, pdo, KIND, parameters.kind, 1)
@@ -145,12 +145,12 @@ Trial = Callable[[Dut, Pdo], None]
 
 
 def each_tpdo(dut: Dut, trial: Trial) -> None:
-    """Run ``trial`` on each TPDO that maps an object, with all other TPDOs disabled.
+    """Run a trial on each TPDO that maps an object, with all other TPDOs disabled.
 
-    Resets the node after each trial.
+    The node is reset after each trial.
 
     Raises:
-        NotApplicable: No TPDO supports the trial.
+        NotApplicable: There is no TPDO on which the trial can be run.
     """
     found = tpdos(dut)
     if not found:
@@ -175,7 +175,7 @@ def each_tpdo(dut: Dut, trial: Trial) -> None:
 
 
 def expect_pdo(dut: Dut, can_id: int, length: int, what: str) -> Frame:
-    """Return the next frame of a PDO. Raises Failed if the frame's length does not match the mapping."""
+    """Wait for the next frame of a PDO. Raises Failed if none arrives, or if it has another length."""
     frame = dut.bus.expect(can_id, what)
     if len(frame.data) != length:
         raise Failed(f"{counted(length, 'byte')} as mapped, {what}", describe(frame))
@@ -183,7 +183,7 @@ def expect_pdo(dut: Dut, can_id: int, length: int, what: str) -> Frame:
 
 
 def drain(dut: Dut, can_id: int) -> None:
-    """Discard frames with ``can_id`` until none arrives for 20 ms; stop after at most half a second."""
+    """Discard frames with ``can_id`` until none arrives for 20 ms, but for half a second at most."""
     end_s = time.monotonic() + 0.5
     while time.monotonic() < end_s and dut.bus.take(can_id, _PAUSE_S) is not None:
         pass

@@ -1,4 +1,4 @@
-"""Provokes errors in the device under test by short PDOs, missing heartbeats or missing guarding requests."""
+"""Provokes errors of the device: RPDOs that are too short, missing heartbeats or guarding requests."""
 
 from __future__ import annotations
 
@@ -15,28 +15,28 @@ CONSUMER: Final = 0x1016
 
 
 def emcy_code(frame: Frame) -> int:
-    """Return the error code of an emergency message. Raises Failed unless the message has 8 bytes."""
+    """Return the error code of an emergency message. Raises Failed if it does not have 8 bytes."""
     if len(frame.data) != 8:
         raise Failed("an emergency message of 8 bytes", describe(frame))
     return int.from_bytes(frame.data[:2], "little")
 
 
 def expect_emcy(dut: Dut, code: int, what: str) -> Frame:
-    """Wait for the next emergency message with ``code`` and return it."""
+    """Wait for an emergency message with the error code ``code``, and return it."""
     return dut.bus.expect(
         dut.emcy_id, f"EMCY 0x{code:04X} {what}", match=lambda frame: emcy_code(frame) == code
     )
 
 
 def expect_no_emcy(dut: Dut, code: int, what: str) -> None:
-    """Raise Failed if an emergency message with ``code`` has arrived."""
+    """Raise Failed if an emergency message with the error code ``code`` has arrived."""
     for frame in dut.bus.pending(dut.emcy_id):
         if emcy_code(frame) == code:
             raise Failed(f"no EMCY 0x{code:04X} {what}", describe(frame))
 
 
 def short_pdo(dut: Dut) -> Frame:
-    """Send an RPDO without data in OPERATIONAL and return the device's emergency message."""
+    """Start the device, send it an RPDO without data, and return its emergency message."""
     for pdo in rpdos(dut):
         cob_id = dut.sdo.integer(pdo.parameter, 1)
         if cob_id & INVALID or not mapped(dut, pdo):
@@ -54,13 +54,13 @@ def foreign_id(dut: Dut) -> int:
 
 
 def consume(dut: Dut, node_id: int, within_ms: int, subindex: int = 1) -> None:
-    """Configure the device to monitor the heartbeats of node ``node_id``."""
+    """Configure the device to monitor the heartbeat of node ``node_id`` (0x1016)."""
     dut.need(CONSUMER, subindex)
     dut.sdo.write_integer(CONSUMER, subindex, node_id << 16 | within_ms, 4)
 
 
 def beat(dut: Dut, node_id: int, times: int = 1, each_s: float = 0.0, state: int = 5) -> int:
-    """Send heartbeats as another node; return the timestamp (ns) of the last heartbeat."""
+    """Send heartbeats of another node; return the time of the last one (monotonic clock, ns)."""
     sent_ns = 0
     for number in range(times):
         if number:
@@ -70,9 +70,9 @@ def beat(dut: Dut, node_id: int, times: int = 1, each_s: float = 0.0, state: int
 
 
 def lose_partner(dut: Dut, within_ms: int = 100) -> None:
-    """Provoke a communication error by withholding heartbeats or guarding requests.
+    """Provoke a communication error: begin to send heartbeats or guarding requests, then stop.
 
-    Withholds guarding requests only if the device has no heartbeat consumer.
+    Guarding requests are used only if the device has no heartbeat consumer.
 
     Raises:
         NotApplicable: The device has neither heartbeat consumer nor life guarding.
@@ -90,7 +90,7 @@ def lose_partner(dut: Dut, within_ms: int = 100) -> None:
 
 
 def not_before(frame: Frame, since_ns: int, least_ms: int, what: str) -> None:
-    """Raise Failed if ``frame`` arrived earlier than ``least_ms`` milliseconds after ``since_ns``."""
+    """Raise Failed if ``frame`` arrived less than ``least_ms`` milliseconds after ``since_ns``."""
     elapsed_ms = (frame.t_ns - since_ns) * 1e-6
-    if elapsed_ms < least_ms - 1:  # 1 ms tolerance, because the two timestamps come from different clocks
+    if elapsed_ms < least_ms - 1:  # 1 ms tolerance for the difference between the clocks
         raise Failed(f"{what} not before {least_ms} ms", f"after {elapsed_ms:.1f} ms")

@@ -1,4 +1,4 @@
-"""Writes run results as text, JSON and JUnit XML; :mod:`skinnode.conformance.html_report` writes HTML."""
+"""Formats the results of a run as text, JSON and JUnit XML; ``html_report`` formats them as HTML."""
 
 from __future__ import annotations
 
@@ -16,20 +16,20 @@ _VERDICT_WIDTH = 15
 
 
 def result_line(result: Result) -> str:
-    """Return the ID, verdict and title on one line, followed by the reason, if any."""
+    """Return one line with the ID, verdict and title of a case, and the reason for the verdict, if any."""
     head = f"{result.case.id:{_ID_WIDTH}} {result.verdict:{_VERDICT_WIDTH}}{result.case.title}"
     return _one_line(f"{head}: {result.why}" if result.why else head)
 
 
 def list_lines(cases: Iterable[Case]) -> list[str]:
-    """Return the ID, title and clause of each case, one case per line."""
+    """Return one line with the ID, title and clause of each case."""
     listed = list(cases)
     width = max((len(case.title) for case in listed), default=0)
     return [f"{case.id:{_ID_WIDTH}} {case.title:{width}}  {case.clause}" for case in listed]
 
 
 def summary_line(report: Report) -> str:
-    """Return one line with the number of cases for each verdict."""
+    """Return one line with the number of cases with each verdict, the duration and the EDS."""
     not_applicable = report.count(Verdict.NOT_APPLICABLE)
     applicable = len(report.results) - not_applicable
     seconds = sum(result.seconds for result in report.results)
@@ -41,10 +41,10 @@ def summary_line(report: Report) -> str:
 
 
 def as_json(report: Report) -> dict[str, Any]:
-    """Return the run as JSON-compatible data.
+    """Return the results as JSON-compatible data.
 
-    Each frame is a string: seconds since the start of the case, Tx (sent by the tester) or Rx, COB-ID, length
-    and data.
+    Each frame is a string with the time since the start of the case (s), Tx or Rx as seen by the tester,
+    COB-ID, length and data.
     """
     return {
         "eds": report.eds,
@@ -69,10 +69,10 @@ def as_json(report: Report) -> dict[str, Any]:
 
 
 def as_junit(report: Report) -> str:
-    """Return JUnit XML with one suite per area.
+    """Return the results as JUnit XML with one test suite per area.
 
-    A failure contains the frames of the failed case. A case that does not apply is reported as skipped. A
-    warning appears as the output of a passed test.
+    A failed test contains the recorded frames. A case that is not applicable is a skipped test. A warning is
+    a passed test with output.
     """
     root = ElementTree.Element("testsuites", name="CANopen conformance")
     areas: dict[str, list[Result]] = {}

@@ -1,4 +1,4 @@
-"""Runs each case after a reset, and finally restores the node's original configuration."""
+"""Runs conformance cases, each after a reset, and restores the configuration of the node."""
 
 from __future__ import annotations
 
@@ -20,17 +20,17 @@ from skinnode.protocol.profile import BusType, PatchProfile
 from skinnode.transport import CanPort
 
 SILENT_CASES: Final = 3
-"""Number of consecutive cases without a response after which the remaining cases are skipped."""
+"""Number of successive cases without any response to a reset, after which no further cases are run."""
 
 
 @dataclass(frozen=True, slots=True)
 class Report:
-    """Results of a conformance run, and problems encountered while restoring the node's configuration."""
+    """Results of a conformance run; ``problems`` lists errors while restoring the node's configuration."""
 
     results: tuple[Result, ...]
     problems: tuple[str, ...]
     eds: str
-    """Origin of the EDS."""
+    """File name or other origin of the EDS."""
 
     @property
     def failed(self) -> int:
@@ -43,17 +43,17 @@ class Report:
 
 
 def connect(port: CanPort, node_id: int, eds: Eds | None = None) -> Dut:
-    """Reset a node and return the device under test.
+    """Reset a node and return it as the device under test.
 
     Args:
         port: The bus.
         node_id: The node.
-        eds: The node's EDS; optional for a patch of this project, whose EDS is derived from its descriptor
+        eds: EDS of the node; not needed for a skinnode patch, whose EDS is generated from its descriptor
             (0x2000).
 
     Raises:
-        NodeTimeout: No node answers.
-        ConfigError: The device is not a patch of this project, and no EDS is given.
+        NodeTimeout: The node does not answer.
+        ConfigError: The node is not a skinnode patch, and no EDS is given.
     """
     bus = Tester(port)
     Dut(bus, node_id, _NO_EDS).prepare()
@@ -90,15 +90,15 @@ def _own_eds(sdo: SdoClient) -> Eds:
 
 
 def run_cases(dut: Dut, cases: Iterable[Case], say: Callable[[Result], None] = lambda _: None) -> Report:
-    """Run ``cases`` one after another.
+    """Run cases one after another.
 
-    Every case produces a result, even if the node misbehaves. At the end, the node is reset and its original
-    configuration is restored.
+    Every case has a result, even if the node misbehaves. After a case that stored or restored parameters, the
+    original configuration of the node is restored. The node is reset at the end.
 
     Args:
         dut: The device.
-        cases: Cases to run.
-        say: Callback that receives each result.
+        cases: The cases.
+        say: Called with each result.
 
     Raises:
         BusError: The interface failed.
@@ -141,7 +141,7 @@ def run_case(dut: Dut, case: Case) -> Result:
         verdict, why = Verdict.FAILED, str(failure)
     except BusError:
         raise
-    except Exception as error:  # an unexpected response fails the case but does not abort the run
+    except Exception as error:  # e.g. a response that the case could not decode
         verdict, why = Verdict.FAILED, f"unexpected response ({type(error).__name__}: {error})"
     return Result(case, verdict, why, time.monotonic() - begun_s, dut.bus.trace)
 

@@ -1,7 +1,7 @@
-"""SDO client built on raw frames (CiA 301 v4.2.0, 7.2.4.3): expedited, segmented and block transfer.
+"""SDO client for conformance tests (CiA 301 v4.2.0, 7.2.4.3): expedited, segmented and block transfer.
 
-The client is designed for tests: it checks every response byte by byte and can violate the protocol on
-request. The client shares no code with this project's SDO server.
+The client checks every byte of a response and can violate the protocol on purpose. It shares no code with
+this project's SDO server.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from skinnode.text.words import counted
 from skinnode.transport import Frame
 
 GENERAL_ERROR: Final = 0x0800_0000
-"""Abort code for a general error, which a device may send instead of a more specific code."""
+"""Abort code "general error", which a device may send instead of a specific code."""
 
 MEANINGS: Final = {
     0x0503_0000: "toggle bit not alternated",
@@ -53,12 +53,12 @@ MEANINGS: Final = {
 """Meanings of the SDO abort codes (CiA 301 v4.2.0, table 22)."""
 
 _SEGMENT: Final = 7
-_MOST_BYTES: Final = 1 << 20  # maximum length of an upload, in case the last segment never arrives
+_MOST_BYTES: Final = 1 << 20  # upload limit, in case the device never sends the last segment
 _BLOCK_SIZE: Final = 20
 
 
 class Aborted(Failed):
-    """Raised if the device aborts a transfer that should succeed; ``code`` is the abort code."""
+    """Raised if the device aborts a transfer that must succeed; ``code`` is the abort code."""
 
     def __init__(self, what: str, code: int) -> None:
         self.code = code
@@ -66,7 +66,7 @@ class Aborted(Failed):
 
 
 def name(code: int) -> str:
-    """Return an abort code in hexadecimal, followed by its meaning."""
+    """Return an abort code in hexadecimal with its meaning."""
     return f"0x{code:08X} ({MEANINGS.get(code, 'not defined in CiA 301')})"
 
 
@@ -81,7 +81,7 @@ def crc16(data: bytes) -> int:
 
 
 def mux(index: int, subindex: int) -> bytes:
-    """Return the multiplexor: index and sub-index as sent on the bus."""
+    """Return the multiplexer of an SDO message: index and sub-index, three bytes."""
     return struct.pack("<HB", index, subindex)
 
 
@@ -99,17 +99,17 @@ class SdoClient:
         self._bus.send(self.request_id, request.ljust(8, b"\0"))
 
     def answer(self, what: str) -> bytes:
-        """Return the next response. Raises Failed if no response of eight bytes arrives."""
+        """Return the next response. Raises Failed if none arrives, or if it does not have eight bytes."""
         return self._checked(self._bus.take(self.answer_id, ANSWER_S), what)
 
     def ask(self, request: bytes, what: str) -> bytes:
-        """Discard earlier responses, send a request and return the response, which may be an abort."""
+        """Discard pending responses, send a request, and return its response, which may be an abort."""
         self._bus.pending(self.answer_id)
         self.send(request)
         return self.answer(what)
 
     def served(self, request: bytes, what: str) -> bytes:
-        """Send a request as :meth:`ask` does and return the response. Raises Aborted if the node aborts."""
+        """Send a request and return its response, like :meth:`ask`. Raises Aborted if it is an abort."""
         return _not_aborted(self.ask(request, what), what)
 
     def _checked(self, frame: Frame | None, what: str) -> bytes:
@@ -120,7 +120,7 @@ class SdoClient:
         return frame.data
 
     def abort(self, index: int, subindex: int, code: int = GENERAL_ERROR) -> None:
-        """Send an abort, to which the device sends no response."""
+        """Abort the current transfer; the device does not respond."""
         self.send(b"\x80" + mux(index, subindex) + struct.pack("<I", code))
 
     def aborts(self, request: bytes, index: int, subindex: int, codes: Collection[int], what: str) -> int:
@@ -134,7 +134,8 @@ class SdoClient:
     def check_abort(answer: bytes, index: int, subindex: int, codes: Collection[int], what: str) -> int:
         """Return the abort code of ``answer``.
 
-        Raises Failed unless the abort names the object and has one of ``codes`` or the general-error code.
+        Raises Failed unless ``answer`` is an abort that names the object and has one of ``codes`` or the
+        general-error code.
         """
         allowed = " or ".join(f"0x{code:08X}" for code in sorted({*codes, GENERAL_ERROR}))
         expected = f"{what} aborted with {allowed}"
@@ -150,7 +151,7 @@ class SdoClient:
     # --- upload
 
     def read(self, index: int, subindex: int = 0) -> bytes:
-        """Upload a value by expedited or segmented transfer, whichever the device selects."""
+        """Upload a value by expedited or segmented transfer, as the device chooses."""
         what = f"read of 0x{index:04X}:{subindex:02X}"
         answer = self.served(b"\x40" + mux(index, subindex), what)
         if answer[0] & 0xE0 != 0x40 or answer[1:4] != mux(index, subindex):
@@ -182,15 +183,15 @@ class SdoClient:
     def read_block(
         self, index: int, subindex: int = 0, *, crc: bool = False, size: int = _BLOCK_SIZE
     ) -> bytes:
-        """Upload by block transfer.
+        """Upload a value by block transfer, and check sequence numbers, length and CRC.
 
-        Checks sequence numbers, the announced length and, if both sides support it, the CRC.
+        The length is checked if the device announces it, the CRC if both sides support it.
 
         Args:
             index: Index.
             subindex: Sub-index.
-            crc: Whether the client requests a CRC.
-            size: Segments per sub-block.
+            crc: Whether the client announces CRC support.
+            size: Number of segments per sub-block.
         """
         what = f"block read of 0x{index:04X}:{subindex:02X}"
         start = bytes((0xA0 | crc << 2,)) + mux(index, subindex) + bytes((size, 0))
@@ -219,7 +220,7 @@ class SdoClient:
         return data
 
     def _read_sub_block(self, size: int, what: str) -> tuple[bytes, int, bool]:
-        """Read a sub-block; return its data, its number of segments, and whether it ends the transfer."""
+        """Return the data of a sub-block, its number of segments, and whether it is the last sub-block."""
         data = b""
         for number in range(1, size + 1):
             segment = _not_aborted(self.answer(f"segment {number}, {what}"), what)
@@ -233,7 +234,7 @@ class SdoClient:
     # --- download
 
     def write(self, index: int, subindex: int, data: bytes) -> None:
-        """Download a value by expedited transfer if it has one to four bytes, otherwise in segments."""
+        """Download a value: one to four bytes by expedited transfer, otherwise by segmented transfer."""
         if len(data) > 4 or not data:
             self.write_segments(index, subindex, data)
             return
@@ -246,7 +247,7 @@ class SdoClient:
         self.write(index, subindex, value.to_bytes(size, "little"))
 
     def write_segments(self, index: int, subindex: int, data: bytes) -> None:
-        """Download a value in segments, even if the value would fit in an expedited transfer."""
+        """Download a value by segmented transfer, whatever its length."""
         what = f"segmented write to 0x{index:04X}:{subindex:02X}"
         start = b"\x21" + mux(index, subindex) + struct.pack("<I", len(data))
         _check(self.served(start, what), b"\x60" + mux(index, subindex) + bytes(4), what)
@@ -262,7 +263,7 @@ class SdoClient:
     def write_block(
         self, index: int, subindex: int, data: bytes, *, crc: bool = False, wrong_crc: bool = False
     ) -> None:
-        """Download at most one sub-block by block transfer, optionally with a wrong CRC."""
+        """Download a value that fits into one sub-block by block transfer, optionally with a wrong CRC."""
         what = f"block write to 0x{index:04X}:{subindex:02X}"
         start = bytes((0xC2 | crc << 2,)) + mux(index, subindex) + struct.pack("<I", len(data))
         answer = self.served(start, what)
@@ -286,7 +287,7 @@ class SdoClient:
 
 
 def expedited(index: int, subindex: int, data: bytes) -> bytes:
-    """Return the request for an expedited download of one to four bytes, with the data size indicated."""
+    """Return the request for an expedited download of one to four bytes."""
     return bytes((0x23 | (4 - len(data)) << 2,)) + mux(index, subindex) + data.ljust(4, b"\0")
 
 

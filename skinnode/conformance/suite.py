@@ -1,4 +1,4 @@
-"""Lists the conformance cases in test plan order, and selects cases by area or ID."""
+"""Lists all conformance cases, and selects cases by area or ID."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ def select(names: Sequence[str]) -> tuple[Case, ...]:
     """Select conformance cases by area or ID.
 
     Args:
-        names: Areas and IDs; empty for all cases.
+        names: Areas and IDs; an empty sequence selects all cases.
 
     Returns:
-        The cases in the order of the suite.
+        The cases, in the order of the test plan.
 
     Raises:
         ConfigError: A name is neither an area nor an ID.

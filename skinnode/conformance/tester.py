@@ -1,7 +1,7 @@
-"""Sends and receives raw frames on a bus, and keeps a trace of them.
+"""Sends and receives raw frames, and keeps a trace of them for the report.
 
-Received frames are kept in an inbox, in order of arrival, until a case requests them. A PDO that arrives
-before an expected SDO response is therefore not lost. Every wait is bounded.
+Received frames stay in an inbox until a case asks for them. A PDO that arrives while a case waits for an SDO
+response is therefore not lost. Every wait has a time limit.
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ from skinnode.transport import CanPort, Frame
 ANSWER_S: Final = 1.0
 """Maximum wait for a response, s.
 
-Devices respond much faster; the limit is generous so that a busy machine does not cause failures.
+Devices respond much faster. The limit is generous, so that a delay on the tester's machine is not a failure.
 """
 
 QUIET_S: Final = 0.06
-"""Time without frames after which the bus is considered silent, s."""
+"""Waiting time after which an absent frame counts as not sent, s."""
 
 _INBOX_FRAMES: Final = 20_000
 _TRACE_FRAMES: Final = 400
@@ -38,7 +38,7 @@ class TraceLine(NamedTuple):
     """Frame sent or received during a case."""
 
     t_s: float
-    """Time since the case began."""
+    """Time since the start of the case, s."""
     sent: bool
     """Whether the tester sent the frame."""
     can_id: int
@@ -51,14 +51,14 @@ class TraceLine(NamedTuple):
 
 
 def describe(frame: Frame | None) -> str:
-    """Describe a frame, or its absence, for a failure message."""
+    """Return a frame as text for a failure message; None means that no frame arrived."""
     if frame is None:
         return "nothing"
     return f"0x{frame.can_id:03X} [{len(frame.data)}] {frame.data.hex(' ').upper()}".rstrip()
 
 
 class Tester:
-    """Sender and receiver of raw frames, for use by a single thread."""
+    """Sends and receives raw frames on a bus; must be used by one thread only."""
 
     def __init__(self, port: CanPort) -> None:
         self._port = port
@@ -69,44 +69,44 @@ class Tester:
         self._begun_ns = time.monotonic_ns()
 
     def begin(self) -> None:
-        """Start a case: discard all frames received so far and clear the trace."""
+        """Begin a case: discard all received frames and clear the trace."""
         self.clear()
         self._trace.clear()
         self._begun_ns = time.monotonic_ns()
 
     @property
     def trace(self) -> tuple[TraceLine, ...]:
-        """Newest frames sent or received since the last :meth:`begin`."""
+        """Newest frames sent and received since :meth:`begin`, at most 400."""
         return tuple(self._trace)
 
     def send(self, can_id: int, data: bytes = b"", *, remote: bool = False) -> int:
-        """Send a frame and return the timestamp (ns, monotonic clock) of its transmission."""
+        """Send a frame; return the time of transmission (monotonic clock, ns)."""
         now_ns = time.monotonic_ns()
         self._note(now_ns, True, can_id, data, remote)
         self._port.send(can_id, data, remote=remote)
         return now_ns
 
     def clear(self) -> None:
-        """Discard all frames received so far, including those still queued at the interface."""
+        """Discard all frames received so far, including those still queued in the interface."""
         self._fetch()
         self.forget()
 
     def forget(self) -> None:
-        """Empty the inbox without discarding frames that are still queued at the interface."""
+        """Empty the inbox; frames that are still queued in the interface are kept."""
         self._inbox.clear()
 
     def take(
         self, can_id: int, within_s: float = ANSWER_S, match: Callable[[Frame], bool] | None = None
     ) -> Frame | None:
-        """Return the first matching frame with ``can_id`` from the inbox, or else from the bus.
+        """Return the oldest data frame with ``can_id`` in the inbox, or wait for the next one.
 
         Args:
-            can_id: CAN-ID of a data frame.
-            within_s: Maximum wait.
-            match: Additional condition on the frame.
+            can_id: CAN-ID of the frame.
+            within_s: Maximum wait, s.
+            match: Further condition that the frame must meet.
 
         Returns:
-            The frame; None if no matching frame arrives within ``within_s``.
+            The frame; None if none arrives within ``within_s``.
         """
 
         def wanted(frame: Frame) -> bool:
@@ -129,9 +129,9 @@ class Tester:
         within_s: float = ANSWER_S,
         match: Callable[[Frame], bool] | None = None,
     ) -> Frame:
-        """Return a frame as :meth:`take` does.
+        """Return a frame, like :meth:`take`.
 
-        Raises Failed if no frame arrives; the message then describes the frame as ``what``.
+        Raises Failed if none arrives; ``what`` describes the frame in the message.
         """
         frame = self.take(can_id, within_s, match)
         if frame is None:
@@ -139,19 +139,19 @@ class Tester:
         return frame
 
     def listen(self, can_id: int, for_s: float) -> list[Frame]:
-        """Return all frames with ``can_id`` that arrive within the next ``for_s`` seconds."""
+        """Return the data frames with ``can_id`` that arrive during the next ``for_s`` seconds."""
         self.pending(can_id)
         self.wait(for_s)
         return self.pending(can_id)
 
     def wait(self, for_s: float) -> None:
-        """Wait ``for_s`` seconds and store the frames that arrive in the inbox."""
+        """Receive frames into the inbox for ``for_s`` seconds."""
         end_s = time.monotonic() + for_s
         while (left_s := end_s - time.monotonic()) > 0:
             self._receive(left_s)
 
     def pending(self, can_id: int) -> list[Frame]:
-        """Remove the frames with ``can_id`` received so far from the inbox and return them."""
+        """Return the data frames with ``can_id`` received so far, and remove them from the inbox."""
         self._fetch()
         found = [frame for frame in self._inbox if frame.can_id == can_id and not frame.remote]
         for frame in found:
@@ -159,13 +159,13 @@ class Tester:
         return found
 
     def expect_silence(self, can_id: int, what: str, for_s: float = QUIET_S) -> None:
-        """Raise Failed if a frame with ``can_id`` is in the inbox or arrives within ``for_s`` seconds."""
+        """Raise Failed if a data frame with ``can_id`` is in the inbox or arrives within ``for_s``."""
         frame = self.take(can_id, for_s)
         if frame is not None:
             raise Failed(f"no {what}", describe(frame))
 
     def _fetch(self) -> None:
-        # The loop is bounded, because frames may arrive continuously on a fully loaded bus.
+        # On a fully loaded bus, frames never stop arriving.
         for _ in range(_INBOX_FRAMES):
             if not self._receive(0.0):
                 return

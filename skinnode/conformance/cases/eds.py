@@ -48,7 +48,7 @@ def _missing(eds: Eds) -> Iterator[str]:
 
 
 def _miscounted(eds: Eds) -> Iterator[str]:
-    """Yield a line for each PDO count in DeviceInfo that differs from the number of PDOs in the EDS."""
+    """Yield one line for each PDO count in DeviceInfo that differs from the number of PDOs in the EDS."""
     for key, name, first in (("nrofrxpdo", "NrOfRXPDO", 0x1400), ("nroftxpdo", "NrOfTXPDO", 0x1800)):
         stated, count = eds.device.get(key) or "", len(eds.indices(first, first + 0x1FF))
         try:
@@ -93,7 +93,7 @@ def _entry(entry: EdsEntry, node_id: int) -> Iterator[str]:
 
 
 def _doubtful(entry: EdsEntry, node_id: int) -> Iterator[str]:
-    """Yield a line for each permitted property of an EDS entry that some tools cannot handle."""
+    """Yield one line for each property of an entry that is permitted but that some tools cannot handle."""
     if entry.mappable and not entry.size and entry.data_type in _TEXTS and entry.data_type != _DOMAIN:
         yield f"{entry}: mappable, but of variable length"
     if entry.low is not None and entry.high is not None and entry.low > entry.high:
@@ -109,9 +109,9 @@ def _doubtful(entry: EdsEntry, node_id: int) -> Iterator[str]:
 
 
 def _default(entry: EdsEntry, node_id: int) -> int | None:
-    """Return the default value of a numeric EDS entry; None if the entry has no default or is not numeric.
+    """Return the default value of an integer entry; None if it has none or is not an integer.
 
-    Raises ValueError if the default is not a number.
+    Raises ValueError if the default is malformed.
     """
     if not entry.default or entry.data_type in (*_TEXTS, *_REALS):
         return None

@@ -12,9 +12,9 @@ _GUARD_MS, _FACTOR = 100, 3
 
 
 def guarded(dut: Dut, state: int, toggle: int | None, what: str) -> None:
-    """Raise Failed unless the node answers a remote frame with NMT state ``state`` and toggle bit ``toggle``.
+    """Check the NMT state and the toggle bit in the response to a remote frame.
 
-    If ``toggle`` is None, either toggle bit is accepted.
+    If ``toggle`` is None, the toggle bit is not checked. Raises Failed if the response differs.
     """
     got = dut.guard(what)
     toggle_text = "any toggle bit" if toggle is None else f"toggle bit {toggle}"

@@ -1,6 +1,6 @@
-"""Conformance cases HBVG-01 to HBVG-07: a device uses either heartbeat or guarding (CiA 301, 7.2.8.2.2).
+"""Conformance cases HBVG-01 to HBVG-07: heartbeat versus node guarding (CiA 301, 7.2.8.2.2).
 
-If both are enabled, heartbeat has priority.
+A device uses one of the two. If both are enabled, it uses the heartbeat.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ _CLAUSE = "7.2.8.2.2"
 def _both(dut: Dut, heartbeat_ms: int, guard_ms: int) -> None:
     """Set the heartbeat period and the guard time.
 
-    Raises NotApplicable if the device supports only heartbeat or only guarding.
+    Raises NotApplicable unless the device supports both heartbeat and guarding.
     """
     dut.need(HEARTBEAT)
     dut.need(GUARD_TIME)
@@ -30,9 +30,9 @@ def _both(dut: Dut, heartbeat_ms: int, guard_ms: int) -> None:
 
 
 def _heartbeats(dut: Dut, *, remote: bool) -> None:
-    """Check that heartbeats arrive with the configured period and no other error-control frames arrive.
+    """Check that heartbeats, and no other error-control frames, arrive with the configured period.
 
-    If ``remote`` is true, a remote frame is sent after each heartbeat.
+    If ``remote`` is set, a guarding request is sent after each heartbeat.
     """
     frames = []
     for _ in range(8):

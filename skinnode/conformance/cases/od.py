@@ -49,10 +49,9 @@ def _none(expected: str, faults: list[str]) -> None:
 
 
 def _compare_defaults(dut: Dut, entries: Iterable[EdsEntry]) -> None:
-    """Compare the device's default values with those in the EDS.
+    """Compare the default values on the device with those in the EDS.
 
-    Reading 0x1010 or 0x1011 returns storage capabilities, so a value that differs from the EDS causes only a
-    warning.
+    For 0x1010 and 0x1011, a difference is only a warning, because these objects return storage capabilities.
     """
     faults: list[str] = []
     doubts: list[str] = []
@@ -91,7 +90,7 @@ def read_only(dut: Dut) -> None:
     for entry in dut.eds.entries.values():
         if entry.access in ("ro", "const"):
             request = expedited(entry.index, entry.subindex, bytes(entry.size if 0 < entry.size <= 4 else 4))
-            if entry.size > 4:  # an expedited request contains at most four bytes of data
+            if entry.size > 4:  # too long for an expedited transfer
                 request = b"\x21" + mux(entry.index, entry.subindex) + bytes((entry.size, 0, 0, 0))
             dut.sdo.aborts(request, entry.index, entry.subindex, READ_ONLY, f"write to {entry}")
 
@@ -133,7 +132,7 @@ def structure(dut: Dut) -> None:
 def limits(dut: Dut) -> None:
     found = False
     for entry in dut.eds.entries.values():
-        # Different rules apply to mapping counts (see PDO-25), signatures, and the error field.
+        # Mapping counts (PDO-25), signatures and the error field have rules of their own.
         if (entry.index in _PDOS and entry.subindex == 0) or entry.index in (*_COMMANDS, _ERROR_FIELD):
             continue
         for limit, beyond, codes in ((entry.high, 1, TOO_HIGH), (entry.low, -1, TOO_LOW)):

@@ -22,11 +22,11 @@ RESTRICTED = (
     range(0x6E0, 0x700),
     range(0x701, 0x800),
 )
-"""Restricted CAN-IDs: NMT, default SDO, error control, and reserved CAN-IDs."""
+"""Ranges of restricted CAN-IDs (CiA 301, 7.3.5): NMT, default SDO, error control and reserved ones."""
 
 
 def _change(dut: Dut) -> tuple[dict[int, bytes], dict[int, bytes]]:
-    """Write non-default values to 0x1015 and 0x1017; return the old and new values."""
+    """Change 0x1015 and 0x1017; return the old values and the new values, by index."""
     before, after = {}, {}
     for index, value in ((_EMCY_INHIBIT, 1000), (HEARTBEAT, 20_000)):
         entry = dut.eds.find(index)
@@ -47,10 +47,10 @@ def _compare(dut: Dut, wanted: Mapping[int, bytes], when: str) -> None:
 
 
 def _wrong_signature(dut: Dut, index: int, subindex: int) -> None:
-    """Check that a wrong signature is refused and changes nothing, even after a reset."""
+    """Check that a wrong signature is refused and has no effect, neither at once nor after a reset."""
     dut.need_storage(index, subindex)
     before, after = _change(dut)
-    # If the device accepts a wrong signature, its stored parameters must be restored after the case.
+    # A device that accepts a wrong signature has stored or restored parameters.
     dut.stored = True
     for signature in (b"wron", b"\0\0\0\0", b"SAVE", b"LOAD"):
         request = expedited(index, subindex, signature)
@@ -70,7 +70,7 @@ def _store(dut: Dut, subindex: int) -> None:
 
 
 def _restore(dut: Dut, subindex: int) -> None:
-    """Check that a command to restore defaults takes effect at the next reset, not before."""
+    """Check that the command to restore defaults takes effect at the next reset and not before."""
     dut.need_storage(RESTORE, subindex)
     if dut.eds.find(STORE, subindex) is not None:
         _store(dut, subindex)
@@ -167,7 +167,7 @@ def restricted(dut: Dut) -> None:
     found = False
     for index, subindex in _cob_ids(dut):
         found = True
-        if index == _EMCY or index >= 0x1280:  # CiA 301 forbids changes to a valid COB-ID
+        if index == _EMCY or index >= 0x1280:  # a valid COB-ID must be disabled before it is changed
             current = dut.sdo.integer(index, subindex)
             dut.sdo.write_integer(index, subindex, current | INVALID, 4)
         for block in RESTRICTED:
@@ -180,7 +180,7 @@ def restricted(dut: Dut) -> None:
 
 
 def _cob_ids(dut: Dut) -> Iterator[tuple[int, int]]:
-    """Yield index and sub-index of each writable COB-ID: SYNC, TIME, EMCY, first RPDO and first TPDO."""
+    """Yield index and sub-index of the writable COB-IDs among SYNC, TIME, EMCY, first RPDO and first TPDO."""
     pdos = [indices[0] for first in (0x1400, 0x1800) if (indices := dut.eds.indices(first, first + 0x1FF))]
     for index, subindex in ((0x1005, 0), (0x1012, 0), (_EMCY, 0), *((index, COB_ID) for index in pdos)):
         entry = dut.eds.find(index, subindex)

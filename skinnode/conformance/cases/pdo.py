@@ -30,19 +30,17 @@ from skinnode.conformance.tester import ANSWER_S, QUIET_S, Failed
 
 _EVENT_MS = 50
 _FIRST_S = 0.4
-"""Maximum time (s) to wait after a SYNC for the first TPDO of a cycle.
-
-If the TPDO does not arrive within this time, one of the next SYNCs may trigger it.
-"""
+"""Waiting time after each SYNC for the first TPDO of a cycle, s; only then is the next SYNC sent."""
 _SYNC_COUNTER = 0x1019
 _RESERVED_KINDS = range(241, 252)
 
 
 def _scan(dut: Dut, pdos: list[Pdo], base: int) -> None:
-    """Check the COB-IDs and transmission types of PDOs.
+    """Check the COB-IDs and transmission types of all RPDOs or all TPDOs.
 
-    The COB-IDs must equal those in the EDS. Valid PDOs must have unique CAN-IDs, and the first four PDOs must
-    have the CAN-IDs of the pre-defined connection set.
+    COB-IDs must equal the defaults in the EDS, and valid PDOs must have different CAN-IDs. If the first four
+    PDOs are valid, they must have the CAN-IDs of the pre-defined connection set. Transmission types must not
+    be reserved.
     """
     valid: dict[int, Pdo] = {}
     for pdo in pdos:
@@ -110,9 +108,9 @@ def remote(dut: Dut) -> None:
 
 
 def _for_remote(dut: Dut, pdo: Pdo) -> tuple[int, int]:
-    """Configure a PDO to answer remote frames; return its CAN-ID and length in bytes.
+    """Configure a TPDO to be sent on request by a remote frame; return its CAN-ID and its length in bytes.
 
-    Raises Unsupported if bit 30 of the COB-ID forbids remote frames.
+    Raises Unsupported if bit 30 of the COB-ID disallows remote frames.
     """
     if dut.sdo.integer(pdo.parameter, 1) & NO_REMOTE:
         raise Unsupported(f"{pdo} does not allow remote frames: bit 30 of 0x{pdo.parameter:04X}:01 is set")
@@ -136,7 +134,7 @@ def event_driven(dut: Dut) -> None:
         dut.operational()
         frames = [expect_pdo(dut, can_id, length, f"{pdo} when its event timer elapses") for _ in range(8)]
         gaps = gaps_ms(frames)
-        # A delayed frame shortens the next interval, so the mean is the better estimate of the inhibit time.
+        # A delayed frame shortens the following interval; the mean is hardly affected.
         if statistics.mean(gaps) < 40 * 0.95 or min(gaps) < 20:
             shown = ", ".join(f"{gap:.1f}" for gap in gaps)
             raise Failed(f"{pdo} at intervals of at least its inhibit time of 40 ms", f"gaps of {shown} ms")
@@ -154,7 +152,7 @@ def event_timer(dut: Dut) -> None:
         length = payload_bytes(mapped(dut, pdo))
         can_id = set_up(dut, pdo, PdoSetup(254))
         dut.operational()
-        # Application events may also trigger the PDO.
+        # Events of the application may also trigger the PDO.
         busy = bool(dut.bus.listen(can_id, 3 * _EVENT_MS * 1e-3))
         dut.nmt(PRE_OPERATIONAL)
         set_up(dut, pdo, PdoSetup(254, event_ms=_EVENT_MS))
@@ -188,7 +186,7 @@ def cyclic(dut: Dut) -> None:
 
 
 def _first_of_cycle(dut: Dut, can_id: int, kind: int, name: str) -> int:
-    """Send SYNCs until the first TPDO of a cycle arrives; return the number of SYNCs sent."""
+    """Send SYNCs until a TPDO arrives; return the number of SYNCs sent."""
     for number in range(1, kind + 1):
         sync(dut)
         if dut.bus.take(can_id, _FIRST_S if number < kind else ANSWER_S) is not None:
@@ -258,9 +256,9 @@ def _for_start(dut: Dut, pdo: Pdo) -> int:
 
 
 def _silent(command: int, kind: int, state: str, *, event_ms: int = 0, start: bool = False) -> Trial:
-    """Return a test which checks that no PDO is sent in ``state``.
+    """Return a trial that checks that a TPDO is not sent in ``state``.
 
-    The test moves the device from OPERATIONAL to ``state``, and then triggers the PDO.
+    The trial moves the device from OPERATIONAL to ``state`` and then triggers the TPDO.
     """
 
     def trial(dut: Dut, pdo: Pdo) -> None:

@@ -1,7 +1,4 @@
-"""Conformance cases PDO-21 to PDO-33: default mapping and remapping of PDOs.
-
-The cases follow the standard procedure of remapping, deviate from it, and write invalid mapping entries.
-"""
+"""Conformance cases PDO-21 to PDO-33: default mapping of PDOs, remapping, and invalid mappings."""
 
 from __future__ import annotations
 
@@ -36,7 +33,7 @@ Fits = Callable[[EdsEntry], bool]
 
 
 def _changeable(dut: Dut, pdos: list[Pdo]) -> list[Pdo]:
-    """Return the PDOs that can be remapped. Raises NotApplicable if no PDO can be remapped."""
+    """Return the PDOs that can be remapped. Raises NotApplicable if there are none."""
     found = []
     for pdo in pdos:
         count, cob_id = dut.eds.find(pdo.mapping, 0), dut.eds.find(pdo.parameter, 1)
@@ -62,19 +59,19 @@ def _any_for(dut: Dut, pdo: Pdo) -> EdsEntry:
 
 
 def _clear(dut: Dut, pdo: Pdo) -> int:
-    """Disable the PDO and its mapping, as remapping requires; return the previous COB-ID."""
+    """Take the first steps of remapping: disable the PDO, then its mapping. Return the previous COB-ID."""
     cob_id = disable(dut, pdo)
     dut.sdo.write_integer(pdo.mapping, 0, 0, 1)
     return cob_id
 
 
 def _most_bytes(dut: Dut) -> int:
-    """Return the maximum number of data bytes in a frame on the bus."""
+    """Return the maximum number of data bytes in a frame: 8, or 64 with CAN FD."""
     return 64 if dut.bus.fd else 8
 
 
 def _slots(dut: Dut, pdo: Pdo) -> int:
-    """Return the highest sub-index of a PDO's mapping in the EDS: the maximum number of entries."""
+    """Return the maximum number of mapping entries: the highest sub-index of the mapping in the EDS."""
     return max(entry.subindex for entry in dut.eds.between(pdo.mapping, pdo.mapping))
 
 
@@ -97,12 +94,12 @@ def default_mapping(dut: Dut) -> None:
 
 def _check_mapped(dut: Dut, pdo: Pdo, subindex: int, word: int) -> None:
     where = f"0x{pdo.mapping:04X}:{subindex:02X}"
-    if word < 0x0020_0000:  # a dummy entry names a data type instead of an object
+    if word < 0x0020_0000:  # a dummy entry: its index is a data type
         if pdo.transmits or word >> 16 not in dut.eds.dummies:
             raise Failed(f"{where} to contain an object or an allowed dummy", f"0x{word:08X}")
         return
     entry = dut.eds.find(word >> 16, word >> 8 & 0xFF)
-    # A mapped string may have any length.
+    # The length of a mapped string is not checked.
     if entry is None or (entry.size and word & 0xFF != 8 * entry.size):
         raise Failed(f"{where} to contain an object of the EDS with its length", f"0x{word:08X}")
     if not (entry.into_tpdo if pdo.transmits else entry.into_rpdo):
@@ -206,7 +203,7 @@ def too_long(dut: Dut) -> None:
                 dut.sdo.write_integer(pdo.mapping, subindex, entry.mapping, 4)
         except Aborted as abort:
             if abort.code in TOO_MUCH:
-                continue  # a device may refuse the first entry that exceeds the frame
+                continue  # a device may refuse the entry that no longer fits
             raise
         request = expedited(pdo.mapping, 0, bytes((count,)))
         what = f"{pdo}: mapping of {count} × {8 * entry.size} bits"
@@ -228,9 +225,9 @@ def _accepts(dut: Dut, pdos: list[Pdo], fits: Fits, lack: str) -> None:
 
 
 def _refuses(dut: Dut, pdos: list[Pdo], fits: Fits, lack: str) -> None:
-    """Check that the device refuses an invalid mapping entry.
+    """Check that the device refuses an invalid mapping.
 
-    The device may refuse either the entry itself or the number of entries, which is written last.
+    The device may abort the write of the entry or the subsequent write of the number of entries.
     """
     for pdo, word in _each(dut, pdos, fits, lack):
         what = f"{pdo}: mapping of 0x{word:08X}"

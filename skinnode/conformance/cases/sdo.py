@@ -1,4 +1,4 @@
-"""Conformance cases SDO-01 to SDO-18: expedited and segmented transfer, and refused requests."""
+"""Conformance cases SDO-01 to SDO-18: expedited and segmented transfer, and aborted requests."""
 
 from __future__ import annotations
 
@@ -24,16 +24,16 @@ TOO_LOW = (0x0609_0030, 0x0609_0032)
 
 _DEVICE_TYPE = 0x1000
 _HARMLESS = (HEARTBEAT, 0x1015, 0x1006, 0x1007, GUARD_TIME)
-"""Objects of CiA 301 that accept any value and have no immediate effect."""
+"""CiA 301 objects to which any value can be written without an immediate effect."""
 _SPECIAL = (0x1003, 0x1010, 0x1011, 0x1020, 0x1F50, 0x1F51)
-"""Objects to which only commands or particular values can be written."""
+"""Objects that accept only commands or certain values."""
 _STRINGS = (0x1008, 0x1009, 0x100A)
 
 
 def first(entries: Iterable[EdsEntry], fits: Callable[[EdsEntry], bool], lack: str) -> EdsEntry:
-    """Return the first entry that ``fits`` accepts.
+    """Return the first entry that fits, except objects that accept only commands or certain values.
 
-    Raises NotApplicable if there is no such entry; ``lack`` describes the missing object.
+    Raises NotApplicable if there is none; ``lack`` describes the object for the message.
     """
     for entry in entries:
         if fits(entry) and entry.index not in _SPECIAL:
@@ -42,7 +42,7 @@ def first(entries: Iterable[EdsEntry], fits: Callable[[EdsEntry], bool], lack: s
 
 
 def long_object(dut: Dut) -> tuple[EdsEntry, bytes]:
-    """Return a readable object longer than four bytes and its value; prefer a device name or version."""
+    """Return a readable object longer than four bytes, preferably device name or version, and its value."""
     texts = [dut.eds.find(index) for index in _STRINGS]
     others = (entry for entry in dut.eds.entries.values() if entry.size not in (1, 2, 3, 4))
     for entry in (*texts, *others):
@@ -118,7 +118,7 @@ def no_object(dut: Dut) -> None:
 def unknown_command(dut: Dut) -> None:
     what = "command specifier 7"
     answer = dut.sdo.ask(b"\xe0" + mux(_DEVICE_TYPE, 0), what)
-    # The standard does not specify which object the abort must name.
+    # The standard does not specify the multiplexer of this abort.
     index, subindex = struct.unpack("<HB", answer[1:4])
     dut.sdo.check_abort(answer, index, subindex, UNKNOWN_COMMAND, what)
     dut.sdo.read(_DEVICE_TYPE)
@@ -168,7 +168,7 @@ def _unchanged(dut: Dut, entry: EdsEntry, before: bytes) -> None:
 
 
 def limited(entry: EdsEntry, limit: int | None, beyond: int) -> bytes | None:
-    """Return the value just beyond a limit; None if there is no limit or the type cannot hold the value."""
+    """Return ``limit + beyond`` as bytes; None if there is no limit or the value exceeds the data type."""
     if limit is None or not entry.writable or entry.data_type not in (*SIGNED, *UNSIGNED):
         return None
     try:

@@ -15,7 +15,7 @@ _BLOCK_SIZE, _SEQUENCE, _CRC = 0x0504_0002, 0x0504_0003, 0x0504_0004
 
 
 def _block(transfer: Callable[[], bytes | None]) -> bytes | None:
-    """Run a block transfer. Raises NotApplicable if the server does not support block transfers."""
+    """Run a block transfer. Raises NotApplicable if the device does not support block transfer."""
     try:
         return transfer()
     except Aborted as abort:
@@ -89,7 +89,7 @@ def block_write_heartbeat_crc(dut: Dut) -> None:
     start = dut.sdo.served(b"\xc6" + mux(HEARTBEAT, 0) + struct.pack("<I", 2), "a block write to 0x1017:00")
     dut.sdo.abort(HEARTBEAT, 0)
     if not start[0] & 4:
-        return  # the server does not support CRC checks
+        return  # the device does not support the CRC
     try:
         dut.sdo.write_block(HEARTBEAT, 0, b"\x34\x12", crc=True, wrong_crc=True)
     except Aborted as abort:

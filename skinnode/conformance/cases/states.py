@@ -46,7 +46,7 @@ def boot_up(dut: Dut) -> None:
         other = bytes(byte ^ 0x5A for byte in value)
         request = bytes((0x23 | (4 - len(other)) << 2,)) + mux(index, subindex) + other
         if len(other) <= 4:
-            # The device may refuse the write, but a new value must not survive the reset.
+            # The device may refuse a value; if it accepts one, the reset must discard it.
             changed += dut.sdo.ask(request, f"write to 0x{index:04X}:{subindex:02X}")[0] == 0x60
     if not changed:
         raise Failed("at least one parameter from 0x1000 to 0x1FFF that can be changed", "none")
@@ -62,7 +62,7 @@ def boot_up(dut: Dut) -> None:
 
 
 def _check_state(dut: Dut, state: int, what: str) -> None:
-    """Check the NMT state that the device reports by heartbeat and by guarding, if supported."""
+    """Check the NMT state in heartbeats and in guarding responses, as far as the device supports them."""
     dut.start_heartbeat()
     dut.expect_state(state, what)
     if dut.eds.find(HEARTBEAT) is not None:
@@ -85,7 +85,7 @@ def pre_operational(dut: Dut) -> None:
 
 
 def _timed(dut: Dut) -> dict[int, int]:
-    """Configure TPDOs to be sent every 20 ms in OPERATIONAL; return their lengths, keyed by CAN-ID."""
+    """Set the event timer of all TPDOs to 20 ms; return the length of each TPDO in bytes, by CAN-ID."""
     found = {}
     for pdo in tpdos(dut):
         if not mapped(dut, pdo):
@@ -98,7 +98,7 @@ def _timed(dut: Dut) -> dict[int, int]:
 
 
 def _no_pdos(dut: Dut, state: str) -> None:
-    """Check that no TPDO is sent when the event timer elapses or a SYNC arrives."""
+    """Check that neither the event timer nor a SYNC triggers a TPDO."""
     can_ids = _timed(dut) if state == "PRE-OPERATIONAL" else {}
     sync(dut)
     for can_id in can_ids:
@@ -169,7 +169,7 @@ def stopped(dut: Dut) -> None:
 
 
 def _no_emcy(dut: Dut) -> None:
-    """Check that an RPDO without data, which is an error in OPERATIONAL, causes no emergency message."""
+    """Check that an RPDO without data causes no emergency message; in OPERATIONAL, it is an error."""
     dut.bus.pending(dut.emcy_id)
     dut.bus.send(0x200 + dut.node_id)
     dut.bus.expect_silence(dut.emcy_id, "emergency message in STOPPED")

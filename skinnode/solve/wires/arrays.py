@@ -1,7 +1,8 @@
-"""Names, element types and axes of the arrays that the compiled kernels read and write.
+"""Arrays of the compiled kernels: names, element types and axes.
 
-A patch has U upper wires with N electrodes each and K lower wires with M electrodes each. The n unknowns of
-an upper wire are coordinates of E of its electrodes. Lengths are in pitches (see ``problem``).
+A patch has U upper wires with N electrodes each, and K lower wires with M electrodes each. The n unknowns of
+an upper wire are coordinates of E of its electrodes. Positions are in pitches, and ``a`` is the scaled
+resistance defined in ``problem``.
 """
 
 from __future__ import annotations
@@ -23,30 +24,30 @@ from skinnode.solve.wires.problem import PatchProblem
 Bytes = NDArray[np.uint8]
 Mask = NDArray[np.bool_]
 
-# Columns of a wire's integer report
+# Columns of the integer report on a wire. SPARE is the number of equations minus the number of unknowns.
 STATUS, EVALUATIONS, STEPS, BRANCH, HELD, SPARE, TURN, REPORT = range(8)
-# Columns of a wire's floating-point report. RESIDUAL is the weighted RMS residual of the equations in use.
-# CHI2 is the χ² of the final residual, with SPARE degrees of freedom.
+# Columns of the floating-point report on a wire. RESIDUAL is the weighted RMS residual of the equations in
+# use. CHI2 is the χ² of the final residual, with SPARE degrees of freedom.
 RESIDUAL, OPTIMALITY, ERROR_ESTIMATE, CHI2, MEASURES = range(5)
 
-# Index of the front end's relative noise in a code map
+# Index of the relative noise in a code map
 NOISE: Final = 3
 
-# Actions for a wire
+# Actions for a wire in a call of the solver
 LEAVE: Final = 0
 SOLVE: Final = 1
 PREDICT: Final = 2
-"""Solve the wire, starting at x + (∂x/∂a) (a − a of the last solve)."""
+"""Solve the wire, starting at x + (∂x/∂a) Δa, where Δa is the change in a since the last solve."""
 HOLD: Final = 3
-"""Like PREDICT, but keep x unchanged if the residual at x does not exceed the noise."""
+"""Keep x if the residual at x does not exceed the noise; otherwise as PREDICT."""
 
-# Optional tasks of a solve, combined with bitwise or
+# Optional tasks of a solve; combine them with bitwise OR
 COVARIANCE: Final = 1
-"""Compute J⁻¹, the standard deviation of x and the rounding error of x."""
+"""Compute J⁻¹, and the standard deviation and the rounding error of x."""
 SKIP: Final = 2
 """Skip a wire whose first-order optimality ‖Jᵀr‖∞ is below tol_f (Xu et al. 2018, section 5.2)."""
 REUSE: Final = 4
-"""If a wire has moved only slightly, reuse the J⁻¹ of an earlier solve."""
+"""Reuse the J⁻¹ of an earlier solve for wires that have moved only slightly."""
 
 
 class SolveOptions(ArrayTable):
@@ -54,7 +55,7 @@ class SolveOptions(ArrayTable):
 
     Args:
         operator: Operator code, from :data:`skinnode.solve.operators.codes.OPERATORS`.
-        tasks: COVARIANCE, SKIP and REUSE, combined with bitwise or.
+        tasks: Any of COVARIANCE, SKIP and REUSE, combined with bitwise OR.
         tol_f: Maximum |r| at a root.
         tol_x: Maximum estimated error of x at a root, relative to max(1, max|x|).
         max_steps: Maximum number of trial steps per wire.
@@ -85,31 +86,31 @@ def solve_options(
 
 
 class SolverArrays(ArrayTable):
-    """State, results and workspace of a patch's solver. Each wire has unknowns on E electrodes."""
+    """State, results and workspace of a solver for wires that each have unknowns on E electrodes."""
 
     x: Annotated[Float, "U 3N"]
-    """Starting point before a solve, solution after the solve."""
+    """Positions: the starting point before a solve, the solution after it."""
     inverse: Annotated[Float, "U 3N K"]
     """∂x/∂r at each wire's last converged solution."""
     a_solved: Annotated[Float, "U K"]
-    """1/F at the last converged solution; 1 for an equation that was not used."""
+    """1/F at each wire's last converged solution; 1 for an equation that was not used."""
     noise: Annotated[Float, "U K"]
-    """Relative variance of a in the last converged solve; inf for an equation that was not used."""
+    """Relative variance of a in each wire's last converged solve; inf for an equation that was not used."""
     std: Annotated[Float, "U 3N"]
     """Standard deviation of x; inf if unknown."""
     report: Annotated[Index, "U report"]
     measure: Annotated[Float, "U measures"]
     tally: Annotated[Index, "3"]
-    """Numbers of evaluations of F, evaluations of J, and steps since the last reset."""
+    """Numbers of evaluations of F, evaluations of J, and steps since the array was last set to 0."""
     lower: Annotated[Float, "3 M K", READONLY]
     electrodes: Annotated[Index, "U N"]
-    """Indices of each wire's electrodes, beginning with the electrodes that have unknowns."""
+    """Indices of each wire's electrodes; the electrodes with unknowns come first."""
     still: Annotated[Float, "U K"]
-    """Contribution of the electrodes without unknowns to F."""
+    """Contribution to F of the electrodes without unknowns."""
     still_std: Annotated[Float, "U 3N"]
     """Standard deviations of the coordinates that are not unknowns."""
     turn: Annotated[Index, "1"]
-    """Frame number. With REUSE, the frame number determines which wires recompute their inverses."""
+    """Frame number, which determines the wires that compute a new inverse despite REUSE."""
     step_limit: float
     """Initial trust radius, pitches per coordinate."""
     point: Annotated[Float, "3E"]
@@ -120,15 +121,14 @@ class SolverArrays(ArrayTable):
 
 
 class FrameArrays(ArrayTable):
-    """Data of a patch's current frame and of its last trusted solution."""
+    """Current frame of a patch, and its last trusted solution."""
 
     codes: Annotated[NDArray[np.uint32], "U K"]
     baseline_ohm: Annotated[Float, "U K"]
     code_gain: Annotated[Float, "U K"]
     rounding_ohm: Annotated[Float, "U K"]
     code_map: Annotated[Float, "4"]
-    """Four values: R/R0 at code 0, change in R/R0 per code, largest valid code, and relative noise of the
-    front end."""
+    """R/R0 at code 0, change in R/R0 per code, largest valid code, relative noise before the converter."""
     ohm: Annotated[Float, "U K"]
     noise: Annotated[Float, "U K"]
     """Relative standard deviation of each resistance."""
@@ -136,47 +136,47 @@ class FrameArrays(ArrayTable):
     gain: Annotated[Float, "U K"]
     """a / R."""
     a: Annotated[Float, "U K"]
-    """Resistance in solver units."""
+    """Scaled resistance R · gain."""
     weight: Annotated[Float, "U K"]
-    """Minimum standard deviation of the frame's resistances, divided by the standard deviation of each
+    """Weight of each equation: the frame's smallest relative standard deviation divided by that of the
     resistance. The weight is 0 if the resistance is invalid or its standard deviation is unknown."""
     used: Annotated[Float, "U K"]
-    """Like ``weight``, but also 0 if ``a`` is out of range."""
+    """As ``weight``, but also 0 if ``a`` is out of range."""
     todo: Annotated[Bytes, "U"]
     """Action for each wire: LEAVE, SOLVE, PREDICT or HOLD."""
     order: Annotated[Index, "U"]
-    """Indices of the wires in the order in which they are solved."""
+    """Indices of the wires, in the order in which to solve them."""
     first: int
-    """Action for a wire that has a usable inverse: HOLD or PREDICT."""
+    """Action for wires with a usable inverse: HOLD or PREDICT."""
     pitch_m: float
     x: Annotated[Float, "U 3N"]
-    """Last trusted position."""
+    """Last trusted positions."""
     a_solved: Annotated[Float, "U K"]
-    """1/F at the last trusted position."""
+    """1/F at the last trusted positions."""
     weight_solved: Annotated[Float, "U K"]
     """Weights of the equations in each wire's last trusted solution."""
     predictable: Annotated[Mask, "U"]
-    """Whether each wire has an inverse that belongs to its last trusted position."""
+    """Mask of the wires whose inverse was computed at their last trusted position."""
     unknowns: Annotated[Index, "U"]
-    """Number of unknowns of each wire."""
+    """Number of unknowns per wire."""
     rest: Annotated[Float, "U 3N"]
     rest_branch: Annotated[Index, "U"]
     """Sign of det J at rest."""
     clearance: Annotated[Float, "U N"]
     good: Annotated[Mask, "U"]
-    """Whether an acceptable root was found for each wire."""
+    """Mask of the wires with an acceptable root."""
     status: Annotated[Index, "U"]
     moved_m: Annotated[Float, "U 3N"]
-    """Displacement of the electrodes."""
+    """Displacement of each coordinate, m."""
     std_m: Annotated[Float, "U 3N"]
-    """Standard deviation of ``moved_m``."""
+    """Standard deviation of ``moved_m``, m."""
     held: Annotated[Mask, "U"]
 
     def __init__(self, problem: PatchProblem, rest_branch: Index, unknowns: Index, first: int) -> None:
         shape, rest = problem.layout.shape, problem.rest
         upper = shape[0]
         self.outcome_m = np.empty((2, *problem.layout.upper_m.shape))
-        """(2, U, N, 3) displacement of the electrodes, and its standard deviation, m."""
+        """(2, U, N, 3) displacements of the electrodes and their standard deviations, m."""
         moved_m, std_m = self.outcome_m.reshape(2, *rest.shape)
         baseline_ohm, code_gain, rounding_ohm = np.ones((3, *shape))
         ohm, noise, a, weight, used = np.empty((5, *shape))
@@ -213,11 +213,11 @@ class FrameArrays(ArrayTable):
         )
 
     def set_codes(self, codes: CodeMap) -> None:
-        """Use ``codes`` to convert codes to resistances."""
+        """Set the mapping of codes to resistances."""
         self.baseline_ohm[:], self.rounding_ohm[:] = codes.baseline_ohm, codes.rounding_ohm
         self.code_gain[:] = 1.0 if codes.gain is None else codes.gain
         self.code_map[:] = codes.lo, codes.step, codes.steps, codes.relative_noise
 
 
 read_options, read_solver, read_frame = reader(SolveOptions), reader(SolverArrays), reader(FrameArrays)
-"""Functions that kernels use to access the arrays in a table."""
+"""Functions with which kernels access the arrays of a table."""

@@ -1,11 +1,12 @@
 """Compiled corrector: solves r = w (a F − 1) = 0 for one wire by Newton-like iteration.
 
-The unknowns are the coordinates of a wire's electrodes. Some electrodes may be fixed at rest, and x and y may
-be fixed (``normal_only``). A system with more equations than unknowns is called tall. The solution of a tall
-system minimises χ² = Σ (ρ_k/σ_k)², where ρ_k = a_k F_k − 1 is a relative residual and σ_k is its standard
-deviation. If χ² exceeds its 1 − 1e-9 quantile, the frame is inconsistent with the model, and the wire is
-ILL_CONDITIONED. If χ² exceeds its 95 % quantile, the standard deviations are multiplied by √(χ²/dof) (Birge,
-Physical Review 40, 207, 1932). For square systems, the sign of det J is tested instead of χ².
+The unknowns are coordinates of the wire's electrodes. Some electrodes may be fixed at rest, and x and y may
+be fixed (``normal_only``). A system with more equations than unknowns is called tall.
+
+The solution of a tall system minimises χ² = Σ (ρ_k/σ_k)². Here ρ_k = a_k F_k − 1 is the relative residual,
+and σ_k is its standard deviation. If χ² exceeds its 1 − 1e-9 quantile, the resistances contradict the model,
+and the wire is ILL_CONDITIONED. If χ² exceeds its 95 % quantile, the standard deviations are multiplied by
+√(χ²/dof) (Birge, Physical Review 40, 207, 1932). For a square system, the sign of det J is reported instead.
 """
 
 from __future__ import annotations
@@ -45,8 +46,7 @@ from skinnode.solve.wires.arrays import (
 from skinnode.solve.wires.hold import chi2_quantile_part
 
 DATA_ROUNDING: Final = 2.0
-"""Relative rounding error of a F, in eps. The rounding errors of R, of the gain, of their product and of F
-are eps/2 each."""
+"""Relative rounding error of a F, in units of eps: eps/2 each for R, the gain, their product and F."""
 
 Z_95_ONE_SIDED: Final = 1.645
 """95 % quantile of the standard normal distribution."""
@@ -54,7 +54,7 @@ Z_95_ONE_SIDED: Final = 1.645
 
 @njit_part
 def _data_rounding(inverse: Float, weight: Float) -> float:
-    """Return the maximum error of a coordinate due to rounding errors in a F."""
+    """Return the largest error of a coordinate due to the rounding error of a F."""
     top = 0.0
     for j in range(inverse.shape[0]):
         row, total = inverse[j], 0.0
@@ -68,7 +68,7 @@ def _data_rounding(inverse: Float, weight: Float) -> float:
 def _evaluate(  # noqa: PLR0913 - arrays of one wire
     x: Float, point: Float, still: Float, lower: Float, a: Float, weight: Float, r: Float, raw: Float
 ) -> None:
-    """Copy the unknowns ``x`` to ``point``; compute r = w (a F − 1) and the Jacobian ``raw`` of F there.
+    """Copy the unknowns ``x`` to ``point``, and evaluate the residual ``r`` and the Jacobian ``raw`` of F.
 
     ``still`` (K,) is the contribution of the fixed electrodes to F.
     """
@@ -85,7 +85,7 @@ def _evaluate(  # noqa: PLR0913 - arrays of one wire
 
 @njit_part
 def _take_jacobian(raw: Float, a: Float, weight: Float, jt: Float) -> None:
-    """Compute ``jt``, the Jacobian of r with respect to the unknowns, from the Jacobian ``raw`` of F."""
+    """Compute ``jt``, the transposed Jacobian of r with respect to the unknowns, from ``raw``."""
     normal_only = jt.shape[0] != raw.shape[0]
     for j in range(jt.shape[0]):
         target, source = jt[j], raw[3 * j + 2 if normal_only else j]
@@ -95,7 +95,10 @@ def _take_jacobian(raw: Float, a: Float, weight: Float, jt: Float) -> None:
 
 @njit_part
 def coordinate(electrodes: Index, j: int, each: int) -> int:
-    """Return the index of unknown ``j`` among 3N coordinates; ``each`` is the unknowns per electrode."""
+    """Return the index of unknown ``j`` among a wire's 3N coordinates.
+
+    ``each`` is the number of unknowns per electrode: 3, or 1 if only z is unknown.
+    """
     if each == 3:
         return int(3 * electrodes[j // 3] + j % 3)
     return int(3 * electrodes[j] + 2)
@@ -115,8 +118,9 @@ def correct(  # noqa: PLR0913 - one wire of a call
 ) -> tuple[int, int, int, int, bool]:  # fmt: skip
     """Solve wire ``u``, starting at ``x`` in the workspace, until the iteration converges or fails.
 
-    ``steps`` is the number of steps taken before the call. Returns the status, the numbers of evaluations of
-    F and of J, the total number of steps, and whether the wire was skipped (see SKIP).
+    ``steps`` is the number of steps that the wire has already taken in this frame. Returns the status, the
+    number of evaluations of F, the number of evaluations of J, the total number of steps, and whether the
+    wire was skipped (see SKIP).
     """
     w: Any = solver.work
     operator, tasks, tol_f, tol_x = options.operator, options.tasks, options.tol_f, options.tol_x
@@ -131,8 +135,8 @@ def correct(  # noqa: PLR0913 - one wire of a call
         w.s[ERROR] = 0.0
         return CONVERGED, evaluations, jacobians, steps, True
     while status < 0:
-        # A tall system's residual does not vanish at the solution, so tol_f limits only the component in the
-        # range of J.
+        # At the solution of a tall system, only the component of r in the range of J vanishes. tol_f limits
+        # this component.
         tol_r = tol_f
         if tall and sigma > 0.0:
             tol_r = min(0.1, tol_f / max(tol_f, w.s[NORM]))
@@ -159,10 +163,10 @@ def report_correction(  # noqa: C901, PLR0913 - one wire of a call; its results 
     u: int, solver: SolverArrays, options: SolveOptions, a_u: Float, w_u: Float, sigma: float, count: int,
     status: int, skipped: bool,
 ) -> int:  # fmt: skip
-    """Store the solution and the reports of wire ``u`` after :func:`correct` has returned ``status``.
+    """Store the solution and the reports of wire ``u``, for which :func:`correct` has returned ``status``.
 
-    ``count`` is the number of equations in use. With COVARIANCE, the inverse and the standard deviations are
-    stored as well. Returns ILL_CONDITIONED if the root is poorly determined or fails the χ² test, otherwise
+    With COVARIANCE, also store the inverse and the standard deviations. ``count`` is the number of equations
+    in use. Returns ILL_CONDITIONED if the root is poorly determined or fails the χ² test, otherwise
     ``status``.
     """
     w: Any = solver.work

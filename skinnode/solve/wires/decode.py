@@ -1,8 +1,8 @@
-"""Compiled conversion of a scan's codes to resistances in solver units.
+"""Compiled conversion of the codes of a scan to scaled resistances.
 
-``decode`` computes the resistances and their standard deviations with the formula in
-:mod:`skinnode.protocol.codes`. ``scale`` computes the scaled resistances a and the weights of the equations
-(see ``problem``).
+``decode`` computes the resistances and their relative standard deviations; :mod:`skinnode.protocol.codes`
+defines the formula. ``scale`` computes the scaled resistances a and the weights of the equations, as defined
+in ``problem``.
 """
 
 from __future__ import annotations
@@ -16,16 +16,16 @@ from skinnode.solve.wires.arrays import FrameArrays
 
 A_MIN: Final = 1e-12
 A_MAX: Final = 1e12
-"""Valid range of the scaled resistance a. All plausible values are within this range; at rest, a is about 1 /
-(N M)."""
+"""Limits of the scaled resistance a. All plausible values are within these limits; at rest, a is about
+1 / (N M)."""
 
 
 @njit_part
 def decode(frame: FrameArrays) -> int:
-    """Convert ``codes`` to ``ohm``, ``noise`` and ``valid``. The resistance of an invalid code is NaN.
+    """Compute ``ohm``, ``noise`` and ``valid`` from ``codes``; return the number of invalid codes.
 
-    ``noise`` combines the noise of the front end with the rounding error of the codes. Returns the number of
-    invalid codes.
+    The resistance of an invalid code is NaN. ``noise`` combines the noise before the converter with the
+    quantization error.
     """
     codes, baseline, gain = frame.codes, frame.baseline_ohm, frame.code_gain
     rounding, code_map = frame.rounding_ohm, frame.code_map
@@ -48,10 +48,10 @@ def decode(frame: FrameArrays) -> int:
 
 @njit_part
 def scale(frame: FrameArrays, sigma: float) -> float:
-    """Compute the arrays ``a``, ``weight`` and ``used`` from ``ohm``, ``noise`` and ``valid``.
+    """Compute ``a``, ``weight`` and ``used`` from ``ohm``, ``noise`` and ``valid``.
 
-    Returns the minimum relative standard deviation of the resistances, or ``sigma`` if no standard deviation
-    is known.
+    Returns the smallest relative standard deviation of the frame's resistances, or ``sigma`` if all of them
+    are unknown.
     """
     frame_ohm, gain, noise, valid = frame.ohm, frame.gain, frame.noise, frame.valid
     a, weight, used = frame.a, frame.weight, frame.used

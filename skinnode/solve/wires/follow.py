@@ -1,8 +1,8 @@
-"""Compiled solver for wires that moved only slightly, which reuses the J⁻¹ of an earlier solve.
+"""Compiled solver that reuses the J⁻¹ of an earlier solve, for wires that moved only slightly.
 
-A simplified Newton step uses the inverse from an earlier position and does not evaluate J (Deuflhard, Newton
-methods for nonlinear problems, 2004, section 2.1). If successive steps shrink quickly, the inverse is still
-accurate, and the standard deviations are computed from the same inverse.
+The solver takes simplified Newton steps, which do not evaluate J (Deuflhard, Newton methods for nonlinear
+problems, 2004, section 2.1). If successive steps shrink quickly, the inverse is still accurate, and the
+standard deviations are computed from it too.
 """
 
 from __future__ import annotations
@@ -17,19 +17,16 @@ from skinnode.model.layout import Float
 from skinnode.solve.linalg.vectors import largest
 
 FOLLOW_STEPS: Final = 4
-"""Maximum number of simplified Newton steps. A simplified Newton step takes a fifth of the time of computing
-a new inverse."""
+"""Maximum number of simplified Newton steps. One step takes a fifth of the time of a new inverse."""
 CONTRACTION: Final = 0.1
-"""Maximum size of a simplified Newton step, relative to the previous step. After a larger step, the wire is
-solved with a new Jacobian."""
+"""Ratio of successive simplified Newton steps above which the wire is solved with a new Jacobian instead."""
 FRESH: Final = 0.01
-"""Maximum size of the first simplified Newton step, relative to the predicted step, for which the old inverse
-is kept."""
+"""Ratio of the first simplified Newton step to the predicted step above which the old inverse is replaced."""
 
 
 @njit_part
 def newton_step(inverse: Float, rho: Float, step: Float) -> float:
-    """Compute ``step`` (n,), −Σ_k (∂x_j/∂r_k) ρ_k; return the maximum of its absolute values."""
+    """Compute ``step`` (n,), −Σ_k (∂x_j/∂r_k) ρ_k; return its maximum norm."""
     for j in range(step.size):
         row, along = inverse[j], splat(0.0)
         for k in range(0, rho.size, LANES):
@@ -40,7 +37,7 @@ def newton_step(inverse: Float, rho: Float, step: Float) -> float:
 
 @njit_part
 def standard_deviations(inverse: Float, variance: Float, std: Float) -> None:
-    """Compute ``std`` (n,), √Σ_k (∂x_j/∂r_k)² σ_k²."""
+    """Compute the standard deviations ``std`` (n,), √Σ_k (∂x_j/∂r_k)² σ_k²."""
     for j in range(std.size):
         row, square = inverse[j], splat(0.0)
         for k in range(0, variance.size, LANES):
@@ -54,12 +51,12 @@ def follow(  # noqa: PLR0913 - arrays of one wire
     x: Float, lower: Float, a: Float, inverse: Float, moved: float, tol_f: float, tol_x: float,
     rho: Float, step: Float,
 ) -> tuple[int, int, float]:  # fmt: skip
-    """Solve for all coordinates ``x`` (3N,) of a wire by simplified Newton steps; the system must be square.
+    """Solve a square system for all coordinates ``x`` (3N,) of a wire by simplified Newton steps.
 
-    ``moved`` is the size of the predicted step, which has already been added to ``x``. Returns the number of
-    evaluations of F (negative if no root was found), the number of steps taken, and the ratio of the first
-    step to the predicted step. If a root was found, the root is at ``x`` + ``step``, and ``rho`` (K,)
-    contains the residual at ``x``. If no root was found, ``x`` is the last iterate.
+    ``moved`` is the size of the predicted step, which ``x`` already includes. Returns the number of
+    evaluations of F (negative if no root was found), the number of steps added to ``x``, and the ratio of the
+    first step to the predicted step. If a root was found, it is ``x`` + ``step``, and ``rho`` (K,) is the
+    residual at ``x``; otherwise, ``x`` is the last iterate.
     """
     before, first = moved, math.inf
     for evaluations in range(1, FOLLOW_STEPS + 1):

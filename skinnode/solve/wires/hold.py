@@ -1,18 +1,19 @@
-"""Compiled test for whether the resistances of a wire have changed by more than their noise.
+"""Compiled test that decides whether to hold a wire.
 
-A wire whose resistances have not changed significantly is held: its last position x is kept, and the wire is
-not solved again. The test uses the residual ρ_k = a_k F_k(x) − 1, where F_k(x) is known from the last solve.
-A wire is held if the sum Σ (ρ_k/σ_k)² is below its 99 % quantile. Two errors contribute to ρ. The noise of
-the new frame has variance σ². The noise of the frame for which x was solved causes an error with variance s²
-in the n directions of the range of J. With t = s²/σ², the mean of the sum is K + n t, and half of its
-variance is K + 2 n t + n t². The quantile is taken from a scaled distribution c χ²_ν with the same mean and
-variance (Satterthwaite 1946).
+A wire is held, which means that it keeps its last position x without being solved again, if its resistances
+have changed by no more than their noise. The test uses the residuals ρ_k = a_k F_k(x) − 1, where F_k(x) is
+known from the solve for x. The wire is held if Σ (ρ_k/σ_k)² is below its 99 % quantile.
 
-The test may miss a slow movement, so the variance of a held coordinate includes an estimate of the movement.
-The correction c = Σ_k (∂x_j/∂r_k) ρ_k of a coordinate is caused by the movement and by the noise of both
-frames. The variance of the coordinate is therefore set to at least c² minus the variance due to noise. In
-simulations of the staggered layout (h = 0.5, noise 1e-5), the 95 % intervals of held coordinates contained
-the true position in 98 % of the frames without movement, and in 96 to 97 % of the frames with slow movements.
+The noise of two frames contributes to ρ. The noise of the current frame has the variance σ². The noise of the
+frame for which x was solved has the variance s², but only in the n dimensions of the range of J. With
+t = s²/σ², the sum has the mean K + n t and the variance 2 (K + 2 n t + n t²). The quantile is that of a
+scaled distribution c χ²_ν with the same mean and variance (Satterthwaite 1946).
+
+The test can miss a slow movement, so the variance of a held coordinate includes an estimate of the movement.
+The correction c = Σ_k (∂x_j/∂r_k) ρ_k of the coordinate is the sum of the movement and the noise of the two
+frames; the variance is at least c² minus the variance of this noise. In simulations of the staggered layout
+(h = 0.5, noise 1e-5), the 95 % intervals of held coordinates contained the true position in 98 % of the
+frames without movement, and in 96 to 97 % of the frames with slow movement.
 """
 
 from __future__ import annotations
@@ -25,18 +26,21 @@ from skinnode.compiled.simd import LANES, fma, load, splat, total
 from skinnode.model.layout import Float
 
 Z_HOLD: Final = 2.326
-"""99 % quantile of the standard normal distribution. A wire at rest fails the test in 1 % of the frames."""
+"""99 % quantile of the standard normal distribution. Wires at rest are solved again in 1 % of the frames."""
 FRESHER: Final = 2.0
-"""Maximum ratio of the noise variance of the frame for which x was solved to that of the current frame. Above
-this ratio, a wire is not held."""
+"""Ratio of the noise variance of the last solved frame to that of the current frame above which a wire is
+solved again."""
 
 
 def chi2_quantile(dof: float, z: float) -> float:
-    """Return the χ² quantile that has the same probability as the normal quantile ``z``.
+    """Return the χ² quantile for the probability of the standard normal quantile ``z``.
 
-    The quantile is approximated by the formula of Wilson & Hilferty (1931). At 99 %, the error of this
-    approximation is below 1 % for 3 or more degrees of freedom. At very high probabilities, the quantile is
-    never underestimated.
+    The approximation is that of Wilson & Hilferty (1931). At 99 %, its error is below 1 % for 3 or more
+    degrees of freedom. At very high probabilities, it never underestimates the quantile.
+
+    Args:
+        dof: Degrees of freedom, greater than 0.
+        z: Quantile of the standard normal distribution.
     """
     spread = 2.0 / (9.0 * dof)
     root = 1.0 - spread + z * math.sqrt(spread)
@@ -54,9 +58,9 @@ def within_noise(  # noqa: PLR0913 - arrays of one wire
     """Return the RMS of w ρ and compute ``std`` (n,) if the wire can be held; otherwise return −1.
 
     ``noise`` (K,) is the noise variance of the frame for which x was solved. ``rho``, ``variance`` and
-    ``before`` (K,) are workspace. The variance of a held coordinate is the maximum of three values: the
+    ``before`` (K,) are scratch. The variance of a held coordinate is the largest of three values: the
     variance due to ``noise``, the variance due to the noise of the current frame, and the squared correction
-    minus both of these variances.
+    minus both variances.
     """
     count, square, weighted, ratios, squares = 0, 0.0, 0.0, 0.0, 0.0
     for k in range(a.size):

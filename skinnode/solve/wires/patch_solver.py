@@ -1,7 +1,7 @@
-"""Buffers of one patch, and the compiled function that solves all wires of a frame in one call.
+"""Solver for all wires of a patch: its buffers, and one compiled function for all stages of a frame.
 
-The computations of a frame run in a single call, because passing arguments from Python to compiled code takes
-longer than most of the computations themselves.
+All stages run in a single call, because passing arguments from Python to compiled code takes longer than most
+of the stages.
 """
 
 from __future__ import annotations
@@ -31,26 +31,26 @@ from skinnode.solve.wires.problem import PatchProblem
 from skinnode.solve.wires.solve_wires import solve_wires
 from skinnode.solve.wires.stages import accept_roots, choose, start, store
 
-# Stages of a call in the order in which they run, combined with bitwise or
+# Stages of a call, in the order in which they run; combine them with bitwise OR
 DECODE: Final = 1
 """Convert codes to resistances."""
 SCALE: Final = 2
-"""Convert resistances to solver units, and start at the last trusted positions."""
+"""Scale the resistances, and set the starting points to the last trusted positions."""
 CHOOSE: Final = 4
-"""Choose an action for each wire, such as SOLVE or HOLD."""
+"""Choose the action for each wire: SOLVE, PREDICT or HOLD."""
 SOLVE: Final = 8
 ACCEPT: Final = 16
 """Determine which wires have an acceptable root."""
 STORE: Final = 32
-"""Store the results. In a call with ACCEPT, results are stored only if all wires have an acceptable root."""
+"""Store the results; in a call with ACCEPT, only if all wires have an acceptable root."""
 
-# Flags returned by a call, combined with bitwise or
+# Flags that a call returns, combined with bitwise OR
 ALL_GOOD: Final = 1
 INCOMPLETE: Final = 2
-"""See :func:`skinnode.solve.wires.stages.store`."""
+"""A new trusted solution was stored for which some equations had the weight 0."""
 
 REST_TOLERANCE: Final = 1e-9
-"""Tolerance of the solve at the rest position, where the residual is zero apart from rounding errors."""
+"""Tolerance of the solve at the rest position, where the residual consists of rounding errors only."""
 _NO_FRAME: Final = np.zeros((1, 4), np.int64)
 
 
@@ -67,9 +67,10 @@ def solve_patch(  # noqa: PLR0913 - numba unpacks a tuple of arguments eight tim
     sigma: float,
     units: float,
 ) -> tuple[float, float, int, int]:
-    """Run the given ``stages`` of a frame. See :func:`solve_wires` for the other arguments.
+    """Run the given ``stages`` of a frame; the last six arguments are those of :func:`solve_wires`.
 
-    Returns the time spent as in :func:`solve_wires`, ``sigma``, the number of invalid codes, and the flags.
+    Returns the time spent, as in :func:`solve_wires`; ``sigma``, which SCALE updates; the number of invalid
+    codes; and the flags.
     """
     solver: SolverArrays = read_solver(solver_table)
     spent, invalid, found = 0.0, 0, 0
@@ -95,12 +96,12 @@ def solve_patch(  # noqa: PLR0913 - numba unpacks a tuple of arguments eight tim
 
 
 class PatchSolver:
-    """Buffers of one patch for :func:`solve_patch`. Each tracker and each thread needs its own instance.
+    """Solver for the wires of one patch; each tracker and each thread needs its own instance.
 
     Args:
         problem: The patch in solver units.
-        operator: Operator code for all solves.
-        normal_only: Whether only z is unknown.
+        operator: Operator code.
+        normal_only: Whether to solve for z only.
     """
 
     def __init__(self, problem: PatchProblem, operator: int, normal_only: bool = False) -> None:
@@ -109,20 +110,20 @@ class PatchSolver:
         self.problem = problem
         self.operator = operator
         self.x = problem.rest.copy()
-        """(U, 3N) starting point or solution of each wire, pitches."""
+        """(U, 3N) positions, pitches: starting points before a solve, solutions after it."""
         self.inverse = np.zeros((upper, unknowns, lower))
         self.a_solved = np.ones((upper, lower))
         self.noise = np.zeros((upper, lower))
         self.std = np.full((upper, unknowns), np.inf)
-        """(U, 3N) standard deviation of x, pitches."""
+        """(U, 3N) standard deviation of ``x``, pitches; inf if unknown."""
         self.report = np.zeros((upper, wires.REPORT), np.int64)
         self.measure = np.zeros((upper, wires.MEASURES))
         self.tally = np.zeros(3, np.int64)
-        """Numbers of evaluations of F, evaluations of J, and steps since the last reset of this array."""
+        """Numbers of evaluations of F, evaluations of J, and steps since the array was last set to 0."""
         self.turn = np.zeros(1, np.int64)
         """(1,) frame number, which SCALE increments.
 
-        With REUSE, the frame number determines which wires recompute their inverses.
+        The frame number determines the wires that compute a new inverse despite REUSE.
         """
         self.still_std = np.full((upper, unknowns), np.inf)
         """(U, 3N) standard deviations of the coordinates that are not unknowns, pitches."""
@@ -131,7 +132,7 @@ class PatchSolver:
         most = unknowns // 3
         self.free = np.full(upper, most)
         """(U,) number of electrodes with unknowns."""
-        self._sizes: list[int] | None = [most]  # distinct values of ``free``; None if outdated
+        self._sizes: list[int] | None = [most]  # distinct values of ``free``; None if unknown
         self._in_turn = np.arange(upper)
         self._electrodes = np.tile(np.arange(most), (upper, 1))
         self._still = np.zeros((upper, lower))
@@ -143,9 +144,9 @@ class PatchSolver:
         return self._electrodes[u, : self.free[u]]
 
     def set_electrodes(self, u: int, electrodes: Index) -> None:
-        """Solve wire u for the given electrodes only, and fix all its other electrodes at rest.
+        """Make the given electrodes of wire u its unknowns, and fix all its other electrodes at rest.
 
-        ``inverse`` and the standard deviations of the wire are invalid until the next converged solve.
+        The inverse and the standard deviations of the wire are invalid until its next converged solve.
         """
         n = self.problem.layout.unknowns // 3
         rest = np.setdiff1d(np.arange(n), electrodes)
@@ -155,7 +156,7 @@ class PatchSolver:
         self._still[u] = self.problem.share_at_rest[u, rest].sum(axis=0)
 
     def solve_rest(self) -> Index:
-        """Compute J⁻¹ at the rest position; return the sign of det J (U,), 0 where J is not square."""
+        """Compute J⁻¹ at the rest position; return the signs of det J (U,), 0 if J is not square."""
         todo, weight = np.full(len(self.x), wires.SOLVE, np.uint8), np.ones_like(self.a_solved)
         self.x[:] = self.problem.rest
         options = solve_options(self.operator, wires.COVARIANCE, REST_TOLERANCE, REST_TOLERANCE, 1)
@@ -177,14 +178,14 @@ class PatchSolver:
         """Solve the wires selected by ``todo``, starting at :attr:`x`, and store the results in this object.
 
         Args:
-            todo: (U,) uint8, action for each wire: LEAVE, SOLVE, PREDICT or HOLD.
-            a: (U, K) resistances in solver units; may be overwritten.
-            weight: (U, K) weights of the equations; may be overwritten.
+            todo: (U,) uint8 action for each wire: LEAVE, SOLVE, PREDICT or HOLD.
+            a: (U, K) scaled resistances; values out of range are overwritten.
+            weight: (U, K) weights of the equations; overwritten with 0 for values of ``a`` out of range.
             options: Operator, tasks and tolerances.
             sigma: Standard deviation of a residual of weight 1; 0 if unknown.
-            order: (U,) order in which the wires are solved; default: 0, 1, 2, …
-            units: Time limit, as in :func:`skinnode.solve.wires.solve_wires.solve_wires`. TURN is 1 in the
-                report of each wire that was processed in time.
+            order: (U,) indices of the wires, in the order in which to solve them; default: 0, 1, 2, …
+            units: Time limit, as in :func:`skinnode.solve.wires.solve_wires.solve_wires`. The report of each
+                processed wire has a TURN of 1.
 
         Raises TypeError if ``todo``, ``a`` or ``weight`` has the wrong element type or shape.
         """
@@ -220,10 +221,10 @@ class PatchSolver:
     def advance(
         self, stages: int, frame: FrameArrays, options: SolveOptions, sigma: float, units: float
     ) -> tuple[float, int, int]:
-        """Run the given ``stages`` of a frame. For SOLVE, all wires must have the same number of unknowns.
+        """Run the given ``stages`` of a frame. SOLVE requires all wires to have the same number of unknowns.
 
         Returns the standard deviation of a residual of weight 1, the number of invalid codes, and the flags
-        (ALL_GOOD, INCOMPLETE).
+        ALL_GOOD and INCOMPLETE.
         """
         _, sigma, invalid, found = solve_patch(
             stages,
@@ -240,7 +241,7 @@ class PatchSolver:
         return sigma, invalid, found
 
     def _table(self, size: int) -> NDArray[np.int64]:
-        """Return the array table for solving wires that have unknowns on ``size`` electrodes."""
+        """Return the table of the solver's arrays for wires with unknowns on ``size`` electrodes."""
         if size not in self._arrays:
             lower = self.problem.layout.shape[1]
             self._arrays[size] = SolverArrays(

@@ -1,10 +1,10 @@
-"""Dimensionless equations of a patch, as one system of equations for each upper wire.
+"""Dimensionless equations of a patch: one system of equations per upper wire.
 
-Lengths are in pitches. The residuals are r_k = w_k (a_k F_k − 1) with the scaled resistances a_k = R_k / (R₀
-F₀)_k, where R₀ and F₀ are the values of R and F at rest. If R₀ has been measured, errors of the resistivity
-and of the front end's gain cancel; otherwise, R₀ F₀ is computed from the layout's resistivity. The weights
-w_k = σ_min / σ_k account for the noise of each resistance, so that the least-squares solution minimises χ².
-An equation with weight 0 is ignored.
+Lengths are in pitches. The residuals are r_k = w_k (a_k F_k − 1). The scaled resistances are
+a_k = R_k / (R₀ F₀)_k, where R₀ and F₀ are the values of R and F at rest. If R₀ was measured, errors of the
+resistivity and of the front end's gain cancel; otherwise, R₀ F₀ is computed from the resistivity of the
+layout. With the weights w_k = σ_min / σ_k, the least-squares solution minimises χ². An equation with weight 0
+is ignored.
 """
 
 from __future__ import annotations
@@ -21,16 +21,16 @@ from skinnode.model.kernels import lower_rows
 from skinnode.model.layout import Float, PatchLayout, require_array
 
 TRUST_SHARE: Final = 0.25
-"""Ratio of the initial trust radius to the smallest clearance between the layers at rest.
+"""Initial trust radius, relative to the smallest clearance between the layers at rest.
 
-F is nearly linear within a fraction of the clearance. In a live stream, the skin moves less than the trust
-radius from frame to frame.
+Within this radius, F is nearly linear. From one frame of a live stream to the next, the skin moves less than
+the radius.
 """
 
 
 @dataclass(frozen=True, eq=False)
 class PatchProblem:
-    """Geometry and rest resistances of a patch in solver units."""
+    """Geometry and rest resistances of a patch in solver units: lengths in pitches, scaled resistances."""
 
     layout: PatchLayout
     rest: Float
@@ -38,7 +38,7 @@ class PatchProblem:
     lower: Float
     """(3, M, K) positions of the lower electrodes, pitches."""
     gain: Float
-    """(U, K) factors 1 / (R₀ F₀) that convert resistances to solver units."""
+    """(U, K) factors 1 / (R₀ F₀) that convert resistances in ohm to scaled resistances."""
     a_rest: Float
     """(U, K) scaled resistances at rest, 1 / F₀."""
     share_at_rest: Float
@@ -48,9 +48,16 @@ class PatchProblem:
 
     @classmethod
     def of(cls, layout: PatchLayout, baseline_ohm: ArrayLike | None = None) -> PatchProblem:
-        """Convert a patch to solver units; ``baseline_ohm`` (U, K) was measured at rest, ohm.
+        """Convert a patch to solver units.
 
-        Raises ValueError if any resistance in ``baseline_ohm`` is not positive.
+        Args:
+            layout: The patch.
+            baseline_ohm: (U, K) resistances measured at rest, ohm; by default, they are computed from the
+                resistivity of the layout.
+
+        Raises:
+            ValueError: If ``baseline_ohm`` has the wrong shape or contains a value that is not positive and
+                finite.
         """
         pitch = layout.pitch_m
         rest, lower, potential, share, clearance = _at_rest(layout)
@@ -73,20 +80,20 @@ class PatchProblem:
         return np.asarray((x - self.rest) * self.layout.pitch_m).reshape(self.layout.upper_m.shape)
 
     def out_of_reach(self, x: Float) -> NDArray[np.bool_]:
-        """Return a mask (U,) of the wires with an implausibly large displacement.
+        """Return a mask (U,) of the wires with an electrode farther from rest than its clearance.
 
-        A displacement is implausible if an electrode moves farther than its clearance at rest. F does not
-        change if an electrode is mirrored at the lower layer, or if two electrodes of a wire are exchanged.
-        Roots that result from these two symmetries have implausible displacements.
+        Such a displacement is implausible. The test rejects the roots that arise from the symmetries of F,
+        which does not change if an electrode is mirrored at the lower layer or if two electrodes of a wire
+        are exchanged.
         """
         moved = (x - self.rest).reshape(self.layout.upper_m.shape)
         with np.errstate(over="ignore"):
             return np.asarray(((moved**2).sum(axis=-1) > self.clearance**2).any(axis=1))
 
 
-@functools.lru_cache(maxsize=64)  # cached, because the computation takes 2 ms per layout
+@functools.lru_cache(maxsize=64)  # the computation takes 2 ms per layout
 def _at_rest(layout: PatchLayout) -> tuple[Float, Float, Float, Float, Float]:
-    """Return the read-only arrays rest, lower, F₀, share_at_rest and clearance of a :class:`PatchProblem`."""
+    """Return rest, lower, F₀, share_at_rest and clearance of a :class:`PatchProblem`, all read-only."""
     pitch = layout.pitch_m
     rest = layout.upper_m.reshape(layout.shape[0], -1) / pitch
     gaps = layout.upper_m[:, :, None, :] - layout.lower_m.reshape(1, 1, -1, 3)

@@ -1,4 +1,4 @@
-"""Compiled check of a new displacement field, which finds roots that may be wrong."""
+"""Compiled check of a displacement field for roots that may be wrong."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from skinnode.solve.wires.stages import DEADLINE
 
 Mask = NDArray[np.bool_]
 
-# Flags returned by the check, combined with bitwise or
+# Flags that the check returns, combined with bitwise OR
 SOME_SUSPECT: Final = 1
 SOME_ROUGH: Final = 2
 
@@ -25,27 +25,28 @@ class RootCheck(ArrayTable):
     """Arrays of a root check: the field to check, the limits, and the results."""
 
     moved_m: Annotated[Float, "U N 3"]
-    """Displacement in the frame to check."""
+    """Displacement in the frame to check, m."""
     last_m: Annotated[Float, "U N 3"]
-    """Displacement in the previous frame."""
+    """Displacement in the previous frame, m."""
     status: Annotated[Index, "U"]
     held: Annotated[Mask, "U"]
     folded: Annotated[Mask, "U"]
-    """Wires that a press can move past a fold of F, where two roots merge."""
+    """Mask of the wires that a press can move across a fold, where two roots merge."""
     whitening: Annotated[Float, "U N N"]
-    """Whitening matrix of each wire (see ``Smoothness``)."""
+    """Whitening matrix of each wire, from ``Smoothness``."""
     lost: Annotated[Mask, "U"]
-    """Output: wires for which no root was found."""
+    """Output: mask of the wires for which no root was found."""
     unsure: Annotated[Mask, "U"]
-    """Output: solved wires in ``folded``, and solved wires that moved by more than ``jump_m`` since the
+    """Output: mask of the solved wires that are in ``folded`` or moved by more than ``jump_m`` since the
     previous frame."""
     rough: Annotated[Mask, "U"]
-    """Output: solved wires that moved by more than ``far_m`` from rest and exceed ``rough_limit``."""
+    """Output: mask of the solved wires that exceed ``rough_limit`` and are farther than ``far_m`` from rest.
+    """
     jump_m: float
     far_m: float
     pitch_m: float
     rough_limit: float
-    """Maximum ratio of the roughness of a displacement to its Euclidean norm in pitches."""
+    """Limit of a displacement's roughness divided by its Euclidean norm in pitches."""
 
 
 _read = reader(RootCheck)
@@ -53,7 +54,7 @@ _read = reader(RootCheck)
 
 @njit_part
 def _rougher(moved_m: Float, pitch_m: float, whitening: Float, limit: float) -> bool:
-    """Return whether the roughness of a displacement (N, 3) exceeds ``limit`` times its norm in pitches."""
+    """Return whether the roughness of the displacement (N, 3) exceeds ``limit`` times its norm in pitches."""
     rough, size = 0.0, 0.0
     for j in range(3):
         for i in range(moved_m.shape[0]):
@@ -67,9 +68,9 @@ def _rougher(moved_m: Float, pitch_m: float, whitening: Float, limit: float) -> 
 
 @njit_brief
 def check_roots(table: Index) -> int:
-    """Compute the arrays ``lost``, ``unsure`` and ``rough`` of a :class:`RootCheck`.
+    """Compute ``lost``, ``unsure`` and ``rough`` of a :class:`RootCheck`.
 
-    Returns the flags SOME_SUSPECT (if any wire is lost or unsure) and SOME_ROUGH (if any wire is rough).
+    Returns SOME_SUSPECT if any wire is lost or unsure, combined with SOME_ROUGH if any wire is rough.
     """
     check = _read(table)
     moved_m, last_m, status = check.moved_m, check.last_m, check.status

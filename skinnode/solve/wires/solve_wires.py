@@ -1,7 +1,8 @@
-"""Compiled solver for all upper wires of a patch, without the GIL and without memory allocation.
+"""Compiled solver for all upper wires of a patch. It releases the GIL and allocates no memory.
 
-Three methods are tried for each wire until one of them succeeds: keep the last position (``hold``), take
-Newton steps with the inverse from an earlier solve (``follow``), or iterate with new Jacobians (``correct``).
+The solver tries up to three methods for each wire, until one succeeds: keep the last position (``hold``),
+take Newton steps with the inverse of an earlier solve (``follow``), or iterate with new Jacobians
+(``correct``).
 """
 
 from __future__ import annotations
@@ -24,19 +25,21 @@ from skinnode.solve.wires.follow import FRESH, follow, newton_step, standard_dev
 from skinnode.solve.wires.hold import within_noise
 
 REFRESH: Final = 8
-"""Maximum number of successive frames in which a wire is solved with the same inverse. Not all wires
-recompute their inverses in the same frame."""
+"""Maximum number of successive frames in which a wire is solved with the same inverse. New inverses of
+different wires are computed in different frames."""
 COVARIANCE_UNITS: Final = 3.0
-"""Time to compute the covariance of a square system with 30 unknowns. The unit is the time of one evaluation
-of F and J plus one step."""
+"""Time to compute the covariance of a square system with 30 unknowns, in units of one evaluation of F and J
+plus one step."""
 HELD_UNITS: Final = 0.25
-"""Time to test whether a wire can be held. The unit is the time of one evaluation of F and J plus one
-step."""
+"""Time to test whether a wire can be held, in units of one evaluation of F and J plus one step."""
 
 
 @njit_part
 def _drop_unusable(a: Float, weight: Float) -> tuple[int, int]:
-    """Set a = 1 and weight = 0 in unusable equations; return the numbers of usable and dropped equations."""
+    """Set a = 1 and weight = 0 for unusable equations.
+
+    Returns the number of usable equations, and the number of equations dropped because a is out of range.
+    """
     count, lost = 0, 0
     for k in range(a.size):
         if weight[k] > 0.0:
@@ -51,7 +54,10 @@ def _drop_unusable(a: Float, weight: Float) -> tuple[int, int]:
 
 @njit_part
 def _hold(u: int, solver: SolverArrays, a: Float, weight: Float, sigma: float, tol_f: float) -> bool:  # noqa: PLR0913 - one wire of a call
-    """Hold wire ``u`` if its residual is within noise, and store its residual and standard deviations."""
+    """Hold wire ``u`` if its residual is within noise; return whether it is held.
+
+    For a held wire, also store the residual and the standard deviations.
+    """
     w: Any = solver.work
     held = within_noise(
         a, weight, sigma, tol_f, solver.a_solved[u], solver.noise[u], solver.inverse[u], w.x.size,
@@ -71,7 +77,7 @@ def _hold(u: int, solver: SolverArrays, a: Float, weight: Float, sigma: float, t
 
 @njit_part
 def _predict(u: int, solver: SolverArrays, a: Float, weight: Float) -> float:
-    """Extrapolate ``x`` in the workspace to the new resistances; return the largest movement."""
+    """Extrapolate ``x`` in the workspace to the new resistances; return the largest coordinate change."""
     w: Any = solver.work
     a_solved = solver.a_solved[u]
     for k in range(a.size):
@@ -88,7 +94,8 @@ def _follow(  # noqa: PLR0913 - one wire of a call
 ) -> tuple[int, int, bool]:
     """Solve wire ``u`` with its old inverse, after a predicted step of size ``moved``.
 
-    Returns the number of evaluations of F, the number of steps, and whether the inverse can still be used.
+    Returns the number of evaluations of F, the number of steps, and whether a root was found for which the
+    old inverse can be kept.
     """
     w: Any = solver.work
     evaluations, steps, first = follow(
@@ -104,7 +111,7 @@ def _follow(  # noqa: PLR0913 - one wire of a call
 
 @njit_part
 def _report_followed(u: int, solver: SolverArrays, a: Float, weight: Float, sigma: float, count: int) -> None:  # noqa: PLR0913 - one wire of a call
-    """Store the solution and the reports of wire ``u`` after :func:`_follow` has found a root."""
+    """Store the solution and the reports of wire ``u``, for which :func:`_follow` has found a root."""
     w: Any = solver.work
     x_u, measure, a_solved, noise = solver.x[u], solver.measure[u], solver.a_solved[u], solver.noise[u]
     for j in range(w.x.size):
@@ -123,7 +130,7 @@ def _report_followed(u: int, solver: SolverArrays, a: Float, weight: Float, sigm
 def _solve_wire(  # noqa: C901, PLR0913 - one wire of a call, from start to report
     u: int, todo: int, solver: SolverArrays, options: SolveOptions, a: Float, weight: Float, sigma: float
 ) -> float:
-    """Solve wire ``u``; return the time spent, in the same unit as ``COVARIANCE_UNITS``."""
+    """Solve wire ``u``; return the estimated time spent, in the unit of ``COVARIANCE_UNITS``."""
     w: Any = solver.work
     point, x_u, electrodes = solver.point, solver.x[u], solver.electrodes[u]
     report, measure, std = solver.report[u], solver.measure[u], solver.std[u]
@@ -193,19 +200,19 @@ def solve_wires(  # noqa: PLR0913 - what changes from call to call
     """Solve r_k = w_k (a_k F_k(x) − 1) = 0 for each upper wire selected by ``todo``.
 
     Args:
-        solver: Starting points and results. On entry, ``x`` and ``inverse`` belong to the last converged
+        solver: Starting points and results. On entry, ``x`` and ``inverse`` are those of the last converged
             solve.
         options: Operator, tasks and tolerances.
         todo: (U,) action for each wire: LEAVE, SOLVE, PREDICT or HOLD.
-        a: (U, K) resistances in solver units. Values out of range are set to 1, and their weights to 0.
+        a: (U, K) scaled resistances. Values out of range are set to 1, and their weights to 0.
         weight: (U, K) weights of the equations; an equation with weight 0 is ignored.
-        order: (U,) order in which the wires are solved.
+        order: (U,) indices of the wires, in the order in which to solve them.
         sigma: Standard deviation of a residual of weight 1; 0 if unknown.
-        units: Time limit, in units of the time of one evaluation of F and J plus one step. The call returns
-            early if solving the next wire might exceed the time limit.
+        units: Time limit, in units of one evaluation of F and J plus one step. The call returns before a wire
+            whose solve could exceed the limit.
 
     Returns the estimated time spent, in the same unit as ``units``. A wire with fewer usable equations than
-    unknowns is not solved. The status of such a wire is NON_FINITE if a value was out of range, otherwise
+    unknowns is not solved; its status is NON_FINITE if a value of ``a`` is out of range, otherwise
     ILL_CONDITIONED.
     """
     spent, worst = 0.0, options.max_steps + 1 + COVARIANCE_UNITS

@@ -1,7 +1,7 @@
-"""Compiled computations before and after solving a frame.
+"""Compiled stages of a frame before and after the solve.
 
-``start`` and ``choose`` run before the solve, ``accept_roots`` and ``store`` after it. NumPy calls for these
-computations would take longer than solving a patch at rest.
+``start`` and ``choose`` run before the solve, ``accept_roots`` and ``store`` after it. NumPy calls would take
+longer for these stages than the solve of a patch at rest.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ from skinnode.solve.wires import arrays as wires
 from skinnode.solve.wires.arrays import FrameArrays, SolverArrays
 
 STALE: Final = 2.0
-"""If any weight of a tall system changes by more than this factor, the pseudoinverse J⁺ is recomputed."""
+"""Factor by which a weight of a tall system may change before the pseudoinverse J⁺ is computed anew."""
 DEADLINE: Final = int(Status.DEADLINE)
 
 
 @njit_part
 def start(solver: SolverArrays, frame: FrameArrays) -> None:
-    """Set the starting points to the last trusted positions, and mark all wires as not yet processed."""
+    """Set the starting points to the last trusted positions, and mark all wires as unprocessed."""
     x, start_x, std = frame.x, solver.x, solver.std
     report, measure = solver.report, solver.measure
     for u in range(x.shape[0]):
@@ -53,7 +53,7 @@ def _stale(weight: Float, before: Float) -> bool:
 def choose(frame: FrameArrays) -> None:
     """Choose the action for each wire: ``first`` if the wire has a usable inverse, otherwise SOLVE.
 
-    The pseudoinverse J⁺ of a tall system is unusable if the weights have changed since it was computed.
+    The pseudoinverse J⁺ of a tall system is unusable if a weight has since changed by more than ``STALE``.
     """
     predictable, unknowns, todo = frame.predictable, frame.unknowns, frame.todo
     used, weight, first = frame.used, frame.weight_solved, frame.first
@@ -77,10 +77,10 @@ def _within_reach(x: Float, rest: Float, clearance: Float) -> bool:
 
 @njit_part
 def accept_roots(solver: SolverArrays, frame: FrameArrays) -> bool:
-    """Determine for each wire whether it has an acceptable root, and store the result in ``good``.
+    """Set ``good`` for each wire with an acceptable root; return whether all wires have one.
 
-    A root is acceptable if its displacement is plausible and det J has the same sign as at rest. The solver's
-    statuses are copied to ``status``. Returns whether all wires are good.
+    A root is acceptable if every electrode is within its clearance of its rest position and det J has the
+    same sign as at rest. Copies the solver's statuses to ``status``.
     """
     report, x, rest = solver.report, solver.x, frame.rest
     branch, clearance = frame.rest_branch, frame.clearance
@@ -100,10 +100,9 @@ def accept_roots(solver: SolverArrays, frame: FrameArrays) -> bool:
 
 @njit_part
 def store(solver: SolverArrays, frame: FrameArrays) -> bool:
-    """Store each good solution as the last trusted solution, and the displacements of all wires.
+    """Make each good solution the last trusted solution; store the displacements and standard deviations.
 
-    The standard deviations of all wires are stored as well. Returns whether any new trusted solution was
-    computed without using all equations.
+    Returns whether an equation with weight 0 was left out of any new trusted solution.
     """
     report, good = solver.report, frame.good
     solved_x, solved_a, solved_std = solver.x, solver.a_solved, solver.std

@@ -1,8 +1,7 @@
 """Simulated node with injected faults. All frames to and from the node pass through this module.
 
-Faults of readings are implemented in :mod:`vcan_sim.faulty_converter`, and faults of scans in
-:mod:`vcan_sim.faulty_scans`. Except for periodic events, the faults depend only on a seed and on the sequence
-of frames.
+:mod:`vcan_sim.faulty_converter` implements the faults of readings, and :mod:`vcan_sim.faulty_scans` those of
+scans. Apart from periodic events, a seed and the sequence of frames determine all faults.
 """
 
 from __future__ import annotations
@@ -31,26 +30,25 @@ from vcan_sim.tally import Kind, Tally, kind_of
 
 BABBLE_COB_ID: Final = 0x3F0
 SIMULATED: Final = Pacing(slack_ns=THRIFTY.slack_ns, catch_up_ns=40_000_000)
-"""Timing tolerances of a simulated node. After a delay on a busy machine, the node sends the delayed chunks
-in one burst, so that it need not skip the next scan."""
+"""Timing tolerances of a simulated node. After a delay on a busy machine, the node sends its overdue chunks
+in one burst instead of skipping the next scan."""
 
 _STORM: Final = bytes.fromhex("0fff810000000000")
-"""Emergency message with error code 0xFF0F. The generic bit and the manufacturer-specific bit of the error
-register are set."""
+"""Emergency message: error code 0xFF0F, with the generic and manufacturer-specific bits of the error register
+set."""
 _MOST_AT_ONCE: Final = 32
-"""Maximum number of overdue periodic events of one kind that are executed at once. Further overdue events are
-dropped."""
+"""Maximum number of overdue periodic events of one kind to execute at once. The rest are dropped."""
 
 
 TWIN_SERIAL: Final = 0x8000_0000
-"""Bit that is inverted in the serial number of the second node of the fault ``duplicate_node_id``."""
+"""Bit in which the serial numbers of the two nodes of the fault ``duplicate_node_id`` differ."""
 
 
 class Resting:
     """Source of constant resistances, as measured on an untouched patch.
 
     Args:
-        baseline_ohm: (U, K) resistances at rest, ohm; values that are not positive are replaced by 1 ohm.
+        baseline_ohm: (U, K) resistances at rest, ohm. Values of 0 or less are replaced by 1 ohm.
     """
 
     def __init__(self, baseline_ohm: Float) -> None:
@@ -69,17 +67,17 @@ class Emit(Protocol):
 
 
 class FaultyNode(PatchNode):
-    """:class:`PatchNode` with injected faults. Any thread may replace the :attr:`faults` at any time.
+    """:class:`PatchNode` with injected faults. Any thread may assign :attr:`faults` at any time.
 
     Args:
         node_id: Node-ID.
         layout: Layout of the patch.
-        source: Resistances that the node's converter measures.
+        source: Source of the resistances that the converter reads.
         emit: Function that puts a frame on the bus.
-        on_sent: Function called with the COB-ID of each frame after the frame has been sent or lost.
+        on_sent: Function called with the COB-ID of each outgoing frame, whether it was sent or lost.
         serial: Serial number.
         profile: Protocol profile of the node.
-        faults: Initial faults. The initial seed remains in use if the faults are replaced.
+        faults: Initial faults. Their seed remains in use when the faults are replaced.
         temperature_per_k: Temperature coefficient of all resistances, 1/K.
     """
 
@@ -142,18 +140,18 @@ class FaultyNode(PatchNode):
 
     @property
     def injected(self) -> Injected:
-        """Counts of the injected faults, updated while the node is running."""
+        """Counts of injected faults; they change while the node runs."""
         return self._injector.injected
 
     @property
     def tally(self) -> Tally:
-        """Counts of the node's frames by kind, updated while the node is running."""
+        """Frame counts of the node, by kind; they change while the node runs."""
         return self._injector.tally
 
     # --- input to the node: frames and time
 
     def on_frame(self, can_id: int, data: bytes, t_ns: int, remote: bool = False) -> None:
-        """Pass a received frame to the node, unless a fault drops it, and to the second node."""
+        """Pass a frame to the node, unless a fault drops it, and to the second node if there is one."""
         self._hear(can_id, data, t_ns, remote)
         if self._twin is not None:
             self._twin.on_frame(can_id, data, t_ns, remote)
@@ -180,13 +178,13 @@ class FaultyNode(PatchNode):
         self._reset_if_due(t_ns)
 
     def _concerns(self, kind: Kind, can_id: int) -> bool:
-        """Return whether a frame is addressed to this node, so that a fault can drop the frame."""
+        """Return whether a frame is addressed to this node. Faults drop only such frames."""
         if kind is Kind.SDO_REQUEST:
             return can_id == od.sdo_request_cob_id(self.node_id)
         return kind is not Kind.COMMAND or can_id == od.command_cob_id(self.node_id)
 
     def on_timer(self, t_ns: int) -> None:
-        """Process all timers of the node and periodic events that are due at ``t_ns``."""
+        """Process the timers and periodic events that are due at ``t_ns``."""
         self._meet_twin(t_ns)
         if self.faults.unplugged != self._unplugged:
             self._plug(t_ns)
@@ -201,7 +199,7 @@ class FaultyNode(PatchNode):
         self._do_due_events(t_ns)
 
     def next_deadline_ns(self) -> int | None:
-        """Return the time (ns) at which :meth:`on_timer` must be called; None if it need not be called."""
+        """Return the time (ns) at which to call :meth:`on_timer` next; None if nothing is due."""
         faults = self.faults
         if faults.unplugged != self._unplugged or faults.duplicate_node_id != (self._twin is not None):
             return 0
@@ -212,7 +210,7 @@ class FaultyNode(PatchNode):
         return min((each for each in (own, of_twin) if each is not None), default=None)
 
     def _own_deadline_ns(self, faults: Faults) -> int | None:
-        """Return the time (ns) of the next timer or periodic event of this node; None if there is none."""
+        """Return the time (ns) of the next timer or periodic event, without the second node; None if none."""
         if faults.error_passive != self._passive:
             return 0
         own = super().next_deadline_ns()
@@ -226,7 +224,7 @@ class FaultyNode(PatchNode):
         return min(due) if own is None else min(own, *due)
 
     def on_bus(self, state: BusState, t_ns: int) -> None:
-        """Pass the state of the CAN controller to the node, or error-passive if this fault is active."""
+        """Pass the CAN controller state to the node, or error-passive while this fault is active."""
         self._controller = state
         passive = self._passive and state is not BusState.OFF
         super().on_bus(BusState.PASSIVE if passive else state, t_ns)
@@ -275,7 +273,7 @@ class FaultyNode(PatchNode):
             if name not in periods_ns:
                 self._due_ns[name] = 0
         for name, period_ns in periods_ns.items():
-            if not self._due_ns[name]:  # the first period begins when the fault starts
+            if not self._due_ns[name]:  # the first event comes one period after the fault starts
                 self._due_ns[name] = t_ns + period_ns
             for _ in range(_MOST_AT_ONCE):
                 if self._due_ns[name] > t_ns:
@@ -326,7 +324,7 @@ class FaultyNode(PatchNode):
         return self._put(can_id, data)
 
     def _imposture(self, can_id: int, data: bytes) -> bytes:
-        """Return the data of an outgoing frame, falsified if a fault requires a wrong identity or layout."""
+        """Return the data of an outgoing frame, with a false identity or layout hash if so required."""
         faults = self.faults
         if not (faults.wrong_identity or faults.wrong_layout) or can_id != od.sdo_response_cob_id(
             self.node_id
@@ -344,7 +342,7 @@ class FaultyNode(PatchNode):
         return data
 
     def _put(self, can_id: int, data: bytes, *, remote: bool = False) -> bool:
-        """Put a frame on the bus unless the node is cut off; return whether the frame was sent."""
+        """Put a frame on the bus unless the node is cut off, and return whether it was sent."""
         kind = kind_of(can_id, data, remote)
         if self._is_cut_off:
             self.injected.silenced += 1
@@ -359,7 +357,7 @@ class FaultyNode(PatchNode):
         return True
 
     def _from_twin(self, can_id: int, data: bytes) -> None:
-        """Put a frame from the second node on the bus; pass a heartbeat from the second node to this node."""
+        """Put a frame of the second node on the bus. Its heartbeats also reach this node."""
         kind = kind_of(can_id, data)
         self.tally.handed[kind] += 1
         try:
@@ -375,7 +373,7 @@ class FaultyNode(PatchNode):
 
     @property
     def _is_cut_off(self) -> bool:
-        """Whether the node cannot send frames, because it is silent, unplugged or about to be reset."""
+        """Whether the node is silent, unplugged or about to be reset, so that it sends nothing."""
         return self.faults.silent or self._unplugged or self._faulty_scans.reset_due
 
 

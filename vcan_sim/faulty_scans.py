@@ -1,4 +1,4 @@
-"""Faults of the chunks and summaries that a node sends."""
+"""Faults of outgoing chunks and summaries."""
 
 from __future__ import annotations
 
@@ -19,16 +19,17 @@ _SUMMARY_COUNTER_BYTE: Final = 0
 
 
 class Put(Protocol):
-    """Function that puts a frame on the bus, unless the node is cut off; returns whether it was sent."""
+    """Function that puts a frame on the bus unless the node is cut off, and returns whether it was sent."""
 
     def __call__(self, can_id: int, data: bytes, *, remote: bool = False) -> bool:
         """Put a frame on the bus. Raises BusError if the bus rejects the frame."""
 
 
 class FaultyScans:
-    """Applies faults to the chunks and summaries of a node, and sends the resulting frames.
+    """Sender of a node's chunks and summaries, which injects faults on the way.
 
-    A scan has either one scan fault or any number of chunk faults. A chunk has at most one fault.
+    A scan suffers either one scan fault, or chunk faults in any number of its chunks. A chunk suffers at most
+    one fault.
 
     Args:
         injector: The node's faults, random generator and counts.
@@ -48,42 +49,42 @@ class FaultyScans:
         counter_overflow: Callable[[], int],
     ) -> None:
         self.reset_due = False
-        """Whether the node must be reset. Until the reset, the frames of the node are not sent."""
+        """Whether the node must be reset. It sends nothing until then."""
         self._injector, self._profile = injector, profile
         self._put, self._counter_overflow = put, counter_overflow
         self._chunk_id, self._summary_id = od.chunk_cob_id(node_id), od.summary_cob_id(node_id)
         self._counter = -1  # counter of the current scan, as set by the node
-        self._chunks = 0  # number of chunks of the current scan so far
+        self._chunks = 0  # number of chunks so far in the current scan
         self._half = max(1, profile.n_chunks // 2)
         self._fate = ""  # fault of the current scan, from OF_SCANS
         self._spoilt = False
-        self._intact = False  # whether no fault of the scan itself or of an earlier scan affects this scan
-        self._counter_instead: int | None = None  # counter to send after a torn scan, instead of ``_counter``
+        self._intact = False  # whether neither its own fault nor that of an earlier scan affects this scan
+        self._counter_instead: int | None = None  # repeats the counter of a torn scan
         self._index_of = chunk_indexer(profile)
         self._packed: list[bytes] = []  # chunks of the current scan, as packed by the node
-        self._struck = -1  # index of the chunk to which the scan's fault applies
-        self._lost_next = -1  # index of the chunk to be lost after a displaced scan
+        self._struck = -1  # index of the chunk affected by the scan fault
+        self._lost_next = -1  # index of the chunk to drop after a displaced scan
         self._swapped: bytes | None = None  # chunk to be sent after the next frame
-        self._late: list[tuple[int, bytes]] = []  # late chunks, each with the counter of its scan
+        self._late: list[tuple[int, bytes]] = []  # late chunks, with the counters of their scans
 
     @property
     def needs_next_scan(self) -> bool:
-        """Whether the current fault also affects the next scan, so that the next SYNC must not be lost."""
+        """Whether the fault of this scan extends into the next scan, so the next SYNC must not be lost."""
         return self._fate in ("torn", "displaced")
 
     def power_off(self) -> None:
-        """Drop all late and reordered chunks that have not been sent yet."""
+        """Discard the late and reordered chunks that have not been sent yet."""
         tally = self._injector.tally
         tally.silenced[Kind.CHUNK] += tally.waiting.pop(Kind.CHUNK, 0)
         self._swapped, self._late = None, []
 
     def send_chunk(self, data: bytes) -> None:
-        """Apply the fault of the current scan or a chunk fault to a chunk, and send the chunk."""
+        """Send a chunk, after applying the scan fault or a chunk fault."""
         counter = data[_CHUNK_COUNTER_BYTE]
         if counter != self._counter:
             self._begin_scan(counter)
         self._chunks += 1
-        if self._intact and self._injector.faults is NO_FAULTS:  # the usual case, three times as fast
+        if self._intact and self._injector.faults is NO_FAULTS:  # fast path, three times as fast
             self._send(self._chunk_id, data)
             return
         changed = self._suffer_scan(data)
@@ -101,7 +102,7 @@ class FaultyScans:
             self._release([] if swapped is None else [swapped])
 
     def send_summary(self, data: bytes) -> None:
-        """Apply the fault of the current scan to a summary, and send the summary."""
+        """Send a summary, after applying the scan fault."""
         injected, tally = self._injector.injected, self._injector.tally
         if data[_SUMMARY_COUNTER_BYTE] != self._counter:  # a scan without chunks
             self._begin_scan(data[_SUMMARY_COUNTER_BYTE])
@@ -144,7 +145,7 @@ class FaultyScans:
             self._struck = int(self._injector.random.integers(chunks)) if struck is None else struck
 
     def _suffer_scan(self, data: bytes) -> bytes | None:
-        """Return a chunk after applying the fault of the current scan; None if the chunk is lost."""
+        """Apply the scan fault to a chunk. Return the resulting chunk, or None if it is lost."""
         injected = self._injector.injected
         if self._fate == "reset" and self._chunks > self._half and not self.reset_due:
             self.reset_due, self._fate = True, ""
@@ -191,13 +192,13 @@ class FaultyScans:
             self._send(self._chunk_id, data)
             return
         if not _CHUNK_FAULTS[fault](self, data):
-            return  # the node is cut off, so the frame is counted as silenced
+            return  # the node is cut off, and the frame counts as silenced
         self._injector.count(fault)
         if fault not in ("duplicated", "reordered") and not self._spoilt:
             self._spoilt = True
             self._injector.injected.scans_spoilt += 1
 
-    # Each of these methods injects a chunk fault, and returns whether the fault was injected.
+    # Each of these methods injects one chunk fault, and returns whether it was injected.
 
     def _lose(self, data: bytes) -> bool:
         self._injector.tally.lost[Kind.CHUNK] += 1
@@ -242,12 +243,10 @@ class FaultyScans:
     # --- to the bus
 
     def _send(self, can_id: int, data: bytes, *, spoilt: bool = False) -> bool:
-        """Send a chunk or summary, then all late chunks of earlier scans.
+        """Send a chunk or summary, then the late chunks of earlier scans.
 
-        Returns whether the chunk or summary was sent.
-
-        After a ``spoilt`` frame, late chunks are not sent yet, because a receiver cannot tell from this frame
-        that a new scan has begun.
+        Late chunks continue to wait after a ``spoilt`` frame, from which a receiver cannot tell that a new
+        scan has begun. Returns whether the frame itself was sent.
         """
         if not self._put(can_id, data):
             return False
@@ -259,7 +258,7 @@ class FaultyScans:
         return True
 
     def _release(self, chunks: Sequence[bytes]) -> None:
-        """Send all given chunks. Raises BusError after the last chunk if the bus has rejected any chunk."""
+        """Send delayed chunks. If the bus rejects any, raises BusError after the last one."""
         failure: BusError | None = None
         for data in chunks:
             self._injector.tally.waiting[Kind.CHUNK] -= 1

@@ -8,9 +8,9 @@
         field = host.fields(timeout_s=5).get()
         assert skin_truth(field).wrench[2] < 0
 
-The option ``--skin-bus`` selects the kind of CAN bus for all tests. By default, tests run in virtual time on
-a simulated bus. If a test fails, the plugin saves the bus trace, the scene, the ground truth and a plot. The
-test report names the folder with these files.
+The option ``--skin-bus`` selects the CAN bus for all tests; by default, they run in virtual time on a
+simulated bus. When a test fails, the plugin saves the bus trace, the scene, the ground truth and a plot, and
+the test report names the folder.
 """
 
 from __future__ import annotations
@@ -40,10 +40,10 @@ BUSES: Final = {
     "udp_multicast": ("udp_multicast", ""),
     "vcan0": ("socketcan", "vcan{}"),
 }
-"""python-can interface and channel for each choice of ``--skin-bus``. The braces stand for the number of the
-bus in the hand. If the channel is empty, each test chooses a random channel."""
+"""python-can interface and channel of each choice of ``--skin-bus``. Braces are replaced by the number of the
+bus in the hand. An empty channel stands for a random channel per test."""
 TRUTH_READINGS: Final = 200
-"""Number of newest readings per patch for which the ground truth is saved when a test fails."""
+"""Number of latest readings per patch whose ground truth is saved when a test fails."""
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -64,7 +64,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Declare the marker ``skin_bus``."""
+    """Register the marker ``skin_bus``."""
     config.addinivalue_line(
         "markers", f"skin_bus(*buses): run this test only on these buses: {', '.join(BUSES)}"
     )
@@ -86,7 +86,7 @@ class SkinTest:
 
     Args:
         bus: Value of the option ``--skin-bus``.
-        open_until_end: Stack of context managers that is closed at the end of the test.
+        open_until_end: Exit stack that is closed at the end of the test.
     """
 
     def __init__(self, bus: str, open_until_end: ExitStack) -> None:
@@ -120,13 +120,13 @@ class SkinTest:
         return self.fleet
 
     def bring_up(self, options: dict[str, Any]) -> Host:
-        """Start a host for the hand; the host is closed at the end of the test."""
+        """Start a host for the hand. It is closed at the end of the test."""
         from skinnode.host import Host
 
         return self._open.enter_context(Host.from_config(self.started("skin_host").hand, **options))
 
     def connect(self, bus: str | None = None) -> Any:
-        """Open an endpoint on a bus of the hand; the endpoint is closed at the end of the test."""
+        """Open an endpoint on a bus of the hand. It is closed at the end of the test."""
         from skinnode.transport import open_can_bus
 
         hand = self.started("skin_can").hand
@@ -175,13 +175,13 @@ class SkinTest:
         return hand.model_copy(update={"buses": tuple(buses)})
 
     def _own(self, name: str) -> str:
-        """Return a random channel, so that simultaneous tests do not share a bus."""
+        """Return a random channel name, so that parallel tests do not share a bus."""
         if self.bus == "udp_multicast":
             return f"239.75.{random.randrange(256)}.{random.randrange(1, 255)}"
         return f"{name}-{uuid.uuid4().hex[:8]}"
 
     def _trace(self, bus: Any) -> Callable[[], str]:
-        """Start to record the frames of a bus; the returned function gives the trace as text."""
+        """Start recording the frames of a bus, and return a function that returns the trace as text."""
         from skinnode.process import clock
         from vcan_sim.trace import Listener, Trace
 
@@ -198,7 +198,7 @@ class SkinTest:
 
 
 class SkinFaults:
-    """Injector of faults into the nodes and buses of a test's simulated hand."""
+    """Fault injection for the simulated hand of a test."""
 
     def __init__(self, test: SkinTest) -> None:
         self._test = test
@@ -236,11 +236,11 @@ class SkinFaults:
         self.inject(place)
 
     def injected(self, patch: str) -> Injected:
-        """Return how often each fault has been injected into a patch's node."""
+        """Return the counts of faults injected into the node of a patch."""
         return self._test.started("skin_faults").injected(patch)
 
     def injected_bus(self, bus: str) -> InjectedOnBus:
-        """Return how often each fault has been injected into a bus."""
+        """Return the counts of faults injected into a bus."""
         return self._test.started("skin_faults").injected_bus(bus)
 
     def _is_bus(self, place: str) -> bool:
@@ -276,9 +276,8 @@ def _skin_test(request: pytest.FixtureRequest, skin_clock: Any) -> Iterator[Skin
 def skin_hand(_skin_test: SkinTest) -> Callable[..., Fleet]:
     """Function that powers on a simulated hand: ``skin_hand(hand, scene=None, **options) -> Fleet``.
 
-    ``hand`` and ``scene`` are files or configurations; the options are passed to
-    :class:`vcan_sim.fleet.Fleet`. The option ``--skin-bus`` overrides the interface and channel
-    of every bus in the hand file.
+    ``hand`` and ``scene`` are files or configurations, and ``options`` are arguments of
+    :class:`vcan_sim.fleet.Fleet`. ``--skin-bus`` overrides the interface and channel of every bus.
     """
 
     def start(
@@ -293,7 +292,7 @@ def skin_hand(_skin_test: SkinTest) -> Callable[..., Fleet]:
 def skin_host(_skin_test: SkinTest) -> Callable[..., Host]:
     """Function that starts a host for the simulated hand: ``skin_host(**options) -> Host``.
 
-    The options are passed to :meth:`skinnode.host.Host.from_config`.
+    ``options`` are arguments of :meth:`skinnode.host.Host.from_config`.
     """
     return lambda **options: _skin_test.bring_up(options)
 
@@ -302,18 +301,14 @@ def skin_host(_skin_test: SkinTest) -> Callable[..., Host]:
 def skin_can(_skin_test: SkinTest) -> Callable[..., Any]:
     """Function that opens a python-can endpoint on a bus of the hand: ``skin_can(bus=None) -> can.BusABC``.
 
-    ``bus`` is the name of the bus; the default is the first bus. The endpoint is closed at
-    the end of the test.
+    ``bus`` is the name of the bus; default: the first bus. The endpoint is closed at the end of the test.
     """
     return _skin_test.connect
 
 
 @pytest.fixture
 def skin_truth(_skin_test: SkinTest) -> Callable[[FieldFrame], PatchTruth]:
-    """Function that returns the ground truth for a field from the host.
-
-    The ground truth is available only if the hand was started with a scene.
-    """
+    """Function that returns the ground truth of a field. The hand must play a scene."""
 
     def truth(field: FieldFrame) -> PatchTruth:
         if field.stamp is None:
@@ -334,7 +329,7 @@ def skin_faults(_skin_test: SkinTest) -> SkinFaults:
 def pytest_runtest_makereport(
     item: pytest.Item, call: pytest.CallInfo[None]
 ) -> Generator[None, pytest.TestReport, pytest.TestReport]:
-    """If a test with a simulated hand fails, save the hand's data and list the files in the test report."""
+    """Save the data of a simulated hand whose test fails, and name the files in the test report."""
     report = yield
     test = item.stash.get(_TEST, None)
     if test is not None and report.when == "call" and report.failed:

@@ -1,7 +1,7 @@
 """python-can interface ``timed``: endpoints of a simulated CAN bus in virtual time.
 
-Endpoints that open the same channel under the same virtual clock are stations on the same
-:class:`~vcan_sim.timed_bus.TimedBus`. Any program that uses python-can can open such an endpoint.
+Endpoints with the same channel and the same virtual clock are stations on one
+:class:`~vcan_sim.timed_bus.TimedBus`. Any python-can program can open such an endpoint.
 """
 
 from __future__ import annotations
@@ -29,17 +29,17 @@ from vcan_sim.timed_bus import (
 from vcan_sim.virtual_time import Mailbox, VirtualClock
 
 COALESCED_NS: Final = 1_000_000
-"""Minimum time (ns) between two wake-ups of a thread that reads frames."""
+"""Minimum interval between two wake-ups of a thread that reads frames, ns."""
 MOST_STATIONS: Final = 64
-"""Maximum number of endpoints on a bus, including endpoints that have been closed."""
+"""Maximum number of endpoints that can be opened on a bus. Closed endpoints count too."""
 
 
 class Inbox:
-    """Queue of frames that a station has received but not read yet.
+    """Receive queue of a station.
 
     The first frame after a pause wakes the reader immediately. Frames that arrive within the next
-    :data:`COALESCED_NS` wake the reader once, at the end of this interval. Interrupt coalescing in CAN
-    controllers has the same effect. Each frame has its own time stamp.
+    :data:`COALESCED_NS` wake it once, at the end of that interval, like interrupt coalescing in CAN
+    controllers. The time stamps of the frames are not affected.
 
     Args:
         clock: Virtual clock of the reader.
@@ -70,7 +70,7 @@ class Inbox:
         return cast(Delivered, self._queue.get(timeout=timeout_s))
 
     def get_all(self, timeout_s: float, most: int) -> list[Delivered]:
-        """Return up to ``most`` waiting frames; if there are none, wait for the first until the time-out."""
+        """Return up to ``most`` frames, after waiting up to ``timeout_s`` for the first one."""
         try:
             frames = [self.get(timeout_s)]
         except queue.Empty:
@@ -93,7 +93,7 @@ class Segment:
         rates: Bit rates of the bus.
 
     Attributes:
-        listeners: Functions that are called with each event on the bus.
+        listeners: Functions called with each event on the bus.
     """
 
     def __init__(self, channel: str, clock: VirtualClock, rates: BitRates) -> None:
@@ -108,7 +108,7 @@ class Segment:
         self._connected: set[int] = set()
         self._due_ns: int | None = None
         self.cpu_ns: Counter[str] | None = None
-        """CPU time (ns) spent on simulating the bus, by thread name; None if the time is not measured."""
+        """CPU time spent on simulating the bus, ns, by thread name; None if it is not measured."""
 
     def join(self) -> int:
         """Connect a new station and return its number."""
@@ -121,7 +121,7 @@ class Segment:
         return station
 
     def leave(self, station: int) -> None:
-        """Disconnect a station permanently after its queued frames have been sent, like a closed socket."""
+        """Disconnect a station for good once its queued frames have been sent, like a closed socket."""
         self._leaving.add(station)
         self._disconnect()
         self._plan()
@@ -129,24 +129,24 @@ class Segment:
     def send(self, station: int, frame: CanFrame) -> None:
         """Queue a frame of a station for transmission."""
         self.bus.send(self.clock.now_ns, station, frame)
-        if self._due_ns is None or self.bus.waiting(station) == 1:  # otherwise, earlier frames are planned
+        if self._due_ns is None or self.bus.waiting(station) == 1:  # otherwise, already planned
             self._plan()
 
     def disturb(self, rule: Disturbance) -> None:
-        """Add a rule that injects errors from now on."""
+        """Add a rule that injects errors, effective immediately."""
         self.catch_up()
         self.bus.disturb(rule)
 
     def undisturb(self, rule: Disturbance) -> None:
-        """Remove a rule that :meth:`disturb` added."""
+        """Remove a rule added by :meth:`disturb`."""
         self.catch_up()
         self.bus.undisturb(rule)
 
     def catch_up(self) -> None:
         """Simulate the bus up to the current virtual time.
 
-        Without this call, the bus is simulated only when a frame has to wake a reader, at most
-        :data:`COALESCED_NS` after the frame. The time stamps are exact in both cases.
+        Otherwise, the simulation catches up only when a frame must wake a reader, at most
+        :data:`COALESCED_NS` later. Time stamps are exact either way.
         """
         self._deliver()
 
@@ -164,7 +164,7 @@ class Segment:
             self.clock.call_at(due_ns, self._advance)
 
     def _quiet_until_ns(self) -> int:
-        """Return the time (ns) before which no pending frame can wake a reader."""
+        """Return the earliest time (ns) at which a pending frame can wake a reader."""
         sender = self.bus.only_sender
         inboxes = self._inboxes
         return min(
@@ -192,7 +192,7 @@ class Segment:
         self._plan()
 
     def _disconnect(self) -> None:
-        """Disconnect each closing station that has sent its frames, or all stations if all are closing."""
+        """Disconnect the closing stations that have sent their frames, or all stations if all are closing."""
         for station in sorted(self._leaving):
             if not self.bus.waiting(station) or self._connected <= self._leaving:
                 self.bus.clear(self.clock.now_ns, station)
@@ -202,10 +202,10 @@ class Segment:
 
 
 def segment(channel: str, clock: VirtualClock, rates: BitRates) -> Segment:
-    """Return the bus named ``channel`` under a virtual clock. The first call creates the bus.
+    """Return the bus ``channel`` of a virtual clock. The first call creates it.
 
     Raises:
-        can.CanInitializationError: If the bus already exists with different bit rates.
+        can.CanInitializationError: If the bus exists with different bit rates.
     """
     name = f"bus {channel}"
     if name not in clock.shared:
@@ -227,11 +227,11 @@ class TimedInterface(can.BusABC):
         bitrate: Nominal bit rate, bit/s.
         fd: Whether the bus carries CAN FD frames.
         data_bitrate: Bit rate of the data phase, bit/s; default: the nominal bit rate.
-        **options: Further options, which are ignored.
+        **options: Ignored.
 
     Raises:
-        can.CanInitializationError: If the calling thread does not run in virtual time, or the bus already
-            exists with different bit rates.
+        can.CanInitializationError: If the calling thread does not run in virtual time, or the bus exists with
+            different bit rates.
     """
 
     def __init__(
@@ -256,7 +256,7 @@ class TimedInterface(can.BusABC):
         super().__init__(channel, can_filters)
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
-        """Queue a frame for transmission without waiting until it is sent."""
+        """Queue a frame for transmission, and return immediately."""
         self._check_open()
         if msg.is_error_frame:
             raise can.CanOperationError(
@@ -303,15 +303,15 @@ class TimedInterface(can.BusABC):
             channel=self._segment.channel,
         )
 
-    # --- methods that CanPort uses in place of send and recv
+    # --- methods that CanPort prefers to send and recv
 
     def send_frame(self, can_id: int, data: bytes, *, remote: bool, fd: bool) -> None:
-        """Queue a frame for transmission; the arguments are those of :class:`FrameInterface`."""
+        """Queue a frame for transmission. See :class:`FrameInterface` for the arguments."""
         self._check_open()
         self._segment.send(self._station, CanFrame(can_id, data, False, remote, 0, fd, fd))
 
     def read_frames(self, timeout_s: float, most: int) -> list[Frame]:
-        """Return up to ``most`` received frames; the filters of python-can do not apply."""
+        """Return up to ``most`` received frames, without applying the python-can filters."""
         self._check_open()
         return [
             Frame(sent.can_id, sent.data, event.time_ns, sent.remote, False, sent.extended, sent.fd)

@@ -1,10 +1,9 @@
-"""Virtual time: threads of a program run one at a time, with a clock that jumps from event to event.
+"""Virtual time: the threads of a program take turns, and the clock jumps from event to event.
 
-Each thread of the program is a real thread, but only one thread runs at any time. A thread runs until it
-waits for an event, a queue, a lock, another thread or a time; then the thread that became ready first runs.
-If no thread is ready, the clock jumps to the next time at which a thread wakes up. Computation takes no
-virtual time. The same program therefore always runs in the same order at the same virtual times, regardless
-of the speed of the machine, and a minute of waiting takes no real time::
+Threads are real threads, but only one runs at a time. A thread runs until it waits for an event, a queue, a
+lock, another thread or a time. The thread that became ready first runs next. If no thread is ready, the clock
+jumps to the next time at which one wakes up. Computation takes no virtual time. A program therefore runs in
+the same order and at the same virtual times on every machine, and a minute of waiting takes no real time::
 
     with VirtualClock():
         with Fleet(hand), skinnode.Host(hand) as host:  # host and nodes on a bus with interface "timed"
@@ -35,26 +34,26 @@ START_NS: Final = 1_000_000_000_000
 START_WALL_NS: Final = 1_600_000_000_000_000_000
 """Start time (ns since 1970) of a virtual clock: 2020-09-13 12:26:40 UTC."""
 READINGS: Final = 10_000
-"""Maximum number of times that a thread may read the clock between two waits."""
+"""Number of clock readings between two waits after which a thread counts as polling."""
 POLL_S: Final = 1e-4
-"""Suspension time (s) of a thread that polls the clock."""
+"""Time for which each further clock reading suspends a polling thread, s."""
 
 
 class Deadlock(RuntimeError):
-    """Deadlock: every thread waits for another thread, and no timer is pending."""
+    """Every thread waits for another thread, and no timer is pending."""
 
 
 class VirtualClock:
-    """Virtual clock for the thread that enters a ``with`` block and for all threads that it starts.
+    """Virtual clock of the thread that enters the ``with`` block, and of all threads started from it.
 
-    When the block ends, all threads that were started in the block must have ended.
+    All threads started in the block must end before the block does.
 
     Attributes:
-        shared: Objects that exist once per clock, by name, such as the simulated buses.
+        shared: Objects of which there is one per clock, such as simulated buses, by name.
 
     Raises:
-        Deadlock: In the thread that entered the block, if every thread waits for another thread.
-        RuntimeError: On leaving the block, if any thread has not ended.
+        Deadlock: In the thread that entered the block, if all threads wait for each other.
+        RuntimeError: On leaving the block, if a thread is still running.
     """
 
     def __init__(self) -> None:
@@ -86,10 +85,10 @@ class VirtualClock:
             raise RuntimeError(f"virtual time: threads {names} have not ended")
 
     def _stay_on_one_cpu(self) -> None:
-        """Pin the current thread, and thereby the threads that it will start, to one CPU.
+        """Pin the current thread to one CPU. Threads that it starts inherit this setting.
 
-        Only one thread runs at a time. Resuming a thread on another CPU takes several times as long, because
-        that CPU is usually idle and must wake up first.
+        Only one thread runs at a time, and handing over to a thread on another CPU takes several times as
+        long, because that CPU is usually idle and must wake up first.
         """
         if hasattr(os, "sched_setaffinity"):  # Linux
             self._cpus = os.sched_getaffinity(0)
@@ -99,14 +98,14 @@ class VirtualClock:
 
     @property
     def now_ns(self) -> int:
-        """Monotonic time (ns). Unlike :meth:`monotonic_ns`, this property does not count as a reading."""
+        """Monotonic virtual time, ns. Unlike :meth:`monotonic_ns`, it does not count as a clock reading."""
         return self._now_ns
 
     def monotonic_ns(self) -> int:
         """Return the monotonic virtual time, ns.
 
-        A thread that reads the clock repeatedly without waiting is assumed to poll: after :data:`READINGS`
-        readings, each further reading suspends the thread for :data:`POLL_S`.
+        A thread that reads the clock more than :data:`READINGS` times without waiting is assumed to poll.
+        Each further reading suspends it for :data:`POLL_S`, so that time passes.
         """
         self._readings += 1
         if self._readings > READINGS:
@@ -115,39 +114,35 @@ class VirtualClock:
         return self._now_ns
 
     def made_progress(self) -> None:
-        """Reset the current thread's number of clock readings to zero.
+        """Reset the clock readings of the current thread to zero.
 
-        A thread that takes items from a queue does not poll the clock, because it stops when the queue is
-        empty.
+        A thread that takes items from a queue is not polling: it waits when the queue is empty.
         """
         self._readings = 0
 
     def time_ns(self) -> int:
-        """Return the virtual time since 1970, ns."""
+        """Return the virtual time of day, as nanoseconds since 1970."""
         return START_WALL_NS - START_NS + self._now_ns
 
     def sleep(self, seconds: float, /) -> None:
-        """Suspend the current thread for a duration in virtual time."""
+        """Suspend the current thread for ``seconds`` of virtual time."""
         if seconds < 0:
             raise ValueError("sleep length must be non-negative")
         self.wait(deque(), seconds)
 
     def call_at(self, t_ns: int, function: Callable[[], None]) -> None:
-        """Schedule a function call at a virtual time; the call is made while no thread runs.
-
-        The function must not wait.
+        """Call a function at a given virtual time, while no thread runs.
 
         Args:
-            t_ns: Monotonic time of the call, ns. If this time is in the past, the call is made as soon as
-                possible.
-            function: Function to call.
+            t_ns: Monotonic time of the call, ns. A time in the past means as soon as possible.
+            function: Function to call. It must not wait.
         """
         heapq.heappush(self._timers, (t_ns, next(self._number), 0, function))
 
     # --- synchronisation objects
 
     def event(self) -> threading.Event:
-        """Return an event in virtual time that is initially not set."""
+        """Return a cleared event for threads in virtual time."""
         return _Event(self)
 
     def queue(self) -> queues.Queue[Any]:
@@ -159,15 +154,15 @@ class VirtualClock:
         return cast("queues.SimpleQueue[Any]", _Queue(self))
 
     def lock(self) -> _Lock:
-        """Return a lock in virtual time."""
+        """Return an unlocked lock for threads in virtual time."""
         return _Lock(self)
 
     def thread(self, target: Callable[..., object], name: str, args: tuple[Any, ...]) -> threading.Thread:
-        """Return a daemon thread that runs in virtual time and has not been started."""
+        """Return a new daemon thread for virtual time, not yet started."""
         return _Thread(self, target, name, args)
 
     def pool(self, threads: int, name: str) -> Executor:
-        """Return a pool of threads that run in virtual time."""
+        """Return a thread pool in virtual time."""
         return _Pool(self, threads, name)
 
     # --- turns
@@ -176,11 +171,11 @@ class VirtualClock:
         """Suspend the current thread until :meth:`wake` is called with ``waiting``, or until a time-out.
 
         Args:
-            waiting: Threads that wait for the same condition, oldest first.
+            waiting: Queue of the threads that wait for the same condition, longest wait first.
             seconds: Maximum wait, s; None for no limit.
 
         Returns:
-            True if :meth:`wake` woke the thread, False after a time-out.
+            True if :meth:`wake` ended the wait, False if it timed out.
         """
         turn = self._running
         turn.woken, turn.waiting = False, waiting
@@ -223,7 +218,7 @@ class VirtualClock:
         turn.gate.release()
 
     def _next(self) -> _Turn:
-        """Return the scheduling state of the next thread to run; advance the clock if no thread is ready."""
+        """Return the turn of the next thread to run, advancing the clock while no thread is ready."""
         while not self._ready:
             if not self._timers:
                 names = ", ".join(repr(turn.name) for turn in self._alive)
@@ -247,18 +242,18 @@ class VirtualClock:
 
 
 class _Turn:
-    """Scheduling state of one thread: the gate that blocks the thread, and the current wait."""
+    """Scheduling state of one thread: the gate that blocks it, and what it waits for."""
 
     def __init__(self, name: str) -> None:
         self.name = name
         self.gate = threading.Lock()
         self.gate.acquire()
         self.woken = False
-        """Whether the last wait ended because the thread was woken."""
+        """Whether :meth:`VirtualClock.wake` ended the last wait."""
         self.waiting: deque[_Turn] = deque()
-        """Threads that wait for the same condition as this thread, including this thread."""
+        """Threads that wait for the same condition, including this one."""
         self.waits = 0
-        """Number of completed waits. A timer with a smaller number is from an earlier wait and is ignored."""
+        """Number of completed waits. Timers of earlier waits carry a smaller number and are ignored."""
         self.error: Exception | None = None
 
 
@@ -328,14 +323,14 @@ class _Queue:
 
 
 class Mailbox(_Queue):
-    """Queue that can be filled without waking the thread that reads it."""
+    """Queue whose reader can be woken separately, after several items have been stored."""
 
     def store(self, item: Any) -> None:
-        """Append an item without waking a thread; call :meth:`wake` later to wake the reader."""
+        """Append an item without waking the reader. Call :meth:`wake` later."""
         self.queue.append(item)
 
     def wake(self) -> None:
-        """Wake the thread that has waited longest for an item, if the queue is not empty."""
+        """If the queue has items, wake the thread that has waited longest."""
         if self.queue:
             self._of.wake(self._waiting)
 
@@ -369,7 +364,7 @@ class _Lock:
 
 
 class _Pool(Executor):
-    """Thread pool in virtual time that starts all of its threads immediately."""
+    """Thread pool in virtual time. All threads start immediately."""
 
     def __init__(self, of: VirtualClock, threads: int, name: str) -> None:
         self._jobs: queues.SimpleQueue[tuple[Future[Any], Callable[[], Any]] | None] = of.simple_queue()
@@ -426,7 +421,7 @@ class _Thread(threading.Thread):
     def start(self) -> None:
         super().start()
         self._of.begin(self._turn)
-        self._of.sleep(0.0)  # like a real thread, the new thread usually runs before the caller continues
+        self._of.sleep(0.0)  # lets the new thread run first, as a real thread usually does
 
     def run(self) -> None:
         self._turn.gate.acquire()

@@ -1,4 +1,4 @@
-"""Displacement of the electrodes on the skin's surface due to the tractions in a window of cells."""
+"""Displacement of the electrodes due to the tractions in a window of cells."""
 
 from __future__ import annotations
 
@@ -15,23 +15,20 @@ from vcan_sim.contact.solve import Contact
 from vcan_sim.scenes.shapes import Float
 
 BEYOND: Final = 20.0
-"""Distance from a point force, in layer thicknesses, beyond which the displacement is negligible (below
-``FAR``)."""
+"""Tabulated range of a point force's displacement, in layer thicknesses. Beyond it, the displacement is below
+``FAR``."""
 CLUSTER_CELLS: Final = 6.0
-"""Distance from the window, in cells. For electrodes beyond this distance, the tractions of 2 × 2 cells are
-combined into one point force."""
+"""Distance from the window, in cells, beyond which each block of 2 × 2 cells acts as one point force."""
 FAR: Final = 1e-5
-"""Threshold below which the displacement due to a point force is set to zero, relative to its maximum. The
-displacement of an elastic layer decays exponentially with the distance from the force."""
+"""Displacement due to a point force that is neglected, relative to the maximum. In a bonded layer, the
+displacement decays exponentially with distance from the force."""
 POINTS: Final = 4096
-"""Number of points in the table of displacement versus distance from a point force."""
+"""Number of points in the table of displacement against distance from a point force."""
 
 
 @dataclass(frozen=True, eq=False)
 class Electrodes:
-    """Electrodes on the skin's surface, and the displacement that a contact causes at them.
-
-    Use :meth:`of` to create an instance.
+    """Electrodes on the surface of an elastic layer. Create instances with :meth:`of`.
 
     Attributes:
         places_m: (E, 2) electrode positions in the patch frame, metres.
@@ -45,11 +42,11 @@ class Electrodes:
     :class:`vcan_sim.contact.layer.PointResponse` for Z, A, B and K."""
     _step_m: float
     _far_m: float
-    """Maximum distance (m) from a point force at which the displacement is not negligible."""
+    """Distance from a point force beyond which the displacement is neglected, metres."""
 
     @classmethod
     def of(cls, layer: Layer, places_m: Float, surface_m: float) -> Electrodes:
-        """Tabulate an elastic layer's displacement due to a point force.
+        """Return electrodes with a table of the layer's displacement under a point force.
 
         Args:
             layer: Elastic layer.
@@ -64,10 +61,9 @@ class Electrodes:
     def displacement_m(self, grid: Grid, origin_m: Float, contact: Contact) -> Float:
         """Return the displacement of the electrodes due to a contact.
 
-        Inside the window, the displacement of the cells is interpolated by cubic polynomials. All other
-        electrodes are at least two cells away from any loaded cell, so each cell's traction acts as a point
-        force at the cell's centre. For electrodes farther than ``CLUSTER_CELLS`` from the window, the forces
-        of each group of 2 × 2 cells act at the centre of the group.
+        Inside the window, cubic polynomials interpolate the displacement of the cells. Outside, electrodes
+        are at least two cells away from any loaded cell, so the traction of a cell acts as a point force at
+        its centre. Beyond ``CLUSTER_CELLS``, the forces of 2 × 2 cells are lumped at their common centre.
 
         Args:
             grid: Cells of the window.
@@ -96,7 +92,7 @@ class Electrodes:
         return moved
 
     def _under_forces(self, places_m: Float, at_m: Float, force_n: Float) -> Float:
-        """Return the displacement (P, 3) at positions (P, 2) due to point forces (3, F)."""
+        """Return the displacement (P, 3) in metres at positions (P, 2) under point forces (3, F)."""
         x = places_m[:, None, 0] - at_m[:, 0]
         y = places_m[:, None, 1] - at_m[:, 1]
         r = np.sqrt(x * x + y * y)
@@ -116,11 +112,10 @@ class Electrodes:
 
 @functools.lru_cache(maxsize=64)
 def _radial(layer: Layer, reach_m: float) -> tuple[Float, float]:
-    """Return a table of displacement versus distance from a point force, and the distance step in metres.
+    """Tabulate displacement against distance from a point force; return the table and its step in metres.
 
-    For a half-space, the table contains the solution of Boussinesq and Cerruti (Johnson, Contact Mechanics,
-    1985, sections 3.2 and 3.6). For a layer, :class:`vcan_sim.contact.layer.PointResponse` adds the
-    difference between layer and half-space.
+    The half-space solution is that of Boussinesq and Cerruti (Johnson, Contact Mechanics, 1985, sections 3.2
+    and 3.6). :class:`vcan_sim.contact.layer.PointResponse` adds the correction for a layer.
     """
     r = np.linspace(0.0, reach_m, POINTS)
     nu = layer.poisson
@@ -139,14 +134,14 @@ def _forces(force_n: Float, origin_m: Float, size_m: float) -> tuple[Float, Floa
 
 
 def _clustered(force_n: Float) -> Float:
-    """Sum cell forces (3, X, Y) over groups of 2 × 2 cells, and return the sums (3, X/2, Y/2) in N."""
+    """Return the forces (3, X/2, Y/2), N, on blocks of 2 × 2 cells, given the cell forces (3, X, Y)."""
     x, y = force_n.shape[1:]
     even = np.pad(force_n, ((0, 0), (0, x % 2), (0, y % 2)))
     return np.asarray(even.reshape(3, (x + 1) // 2, 2, (y + 1) // 2, 2).sum(axis=(2, 4)))
 
 
 def _cubic(field: Float, index: Float) -> Float:
-    """Interpolate a vector field (3, X, Y) at fractional indices (P, 2) by cubic polynomials in x and y."""
+    """Return a field (3, X, Y) interpolated at fractional indices (P, 2) by bicubic polynomials, (P, 3)."""
     low = np.clip(np.floor(index).astype(np.intp) - 1, 0, np.array(field.shape[1:]) - 4)
     weights = _lagrange(index - low)
     found = np.zeros((len(index), 3))
@@ -158,7 +153,7 @@ def _cubic(field: Float, index: Float) -> Float:
 
 
 def _lagrange(position: Float) -> Float:
-    """Return the cubic Lagrange weights (…, 4) of the points 0, 1, 2 and 3 at ``position`` (…)."""
+    """Return the cubic Lagrange weights (…, 4) of the nodes 0, 1, 2 and 3 at ``position`` (…)."""
     points = np.arange(4.0)
     weights = np.ones((*position.shape, 4))
     for i in range(4):

@@ -1,11 +1,10 @@
 """Plans the traffic on a hand's buses: frames, bus loads, and worst-case response times.
 
-On each bus, the plan includes SYNC, the host's heartbeat (if enabled), and the frames of other devices (if
-listed in the hand file). The fraction :data:`SDO_SHARE` of the bandwidth is reserved for SDO transfers. For
-each patch, the plan includes the chunks and the summary of one scan per SYNC period, and one heartbeat and
-one EMCY per heartbeat period. When a node rejoins the bus, the host configures it with further SDO transfers.
-These transfers are not included, because SDO frames have a lower priority than PDOs and use only spare
-bandwidth.
+The plan of a bus contains SYNC, the host's heartbeat if enabled, the frames of other devices listed in the
+hand file, and a fraction :data:`SDO_SHARE` of the bandwidth for SDO. Each patch adds the chunks and the
+summary of one scan per SYNC period, and one heartbeat and one EMCY per heartbeat period. The plan leaves out
+the SDO transfers that configure a node when it rejoins the bus: they have a lower priority than PDOs and use
+only spare bandwidth.
 """
 
 from __future__ import annotations
@@ -25,27 +24,24 @@ from skinnode.errors import BusLoadError, ConfigError, Shown
 from skinnode.protocol.profile import PatchProfile
 
 SCAN_SHARE: Final = 0.8
-"""Fraction of the SYNC period reserved for scans. The rest of the period is left for SDO, EMCY and late
-frames."""
+"""Fraction of the SYNC period reserved for scans; the rest is left for SDO, EMCY and late frames."""
 
 SDO_SHARE: Final = 0.01
-"""Fraction of the bandwidth reserved for SDO. At 1 Mbit/s, one request and one response can be sent every 27
-ms."""
+"""Fraction of the bandwidth reserved for SDO: one request and one response every 27 ms at 1 Mbit/s."""
 
 NODE_LATENCY_S: Final = 2e-3
-"""Maximum delay from SYNC to the first chunk, s, specified for a node on an otherwise idle machine."""
+"""Specified maximum delay from SYNC to the first chunk, s, of a node on an otherwise idle machine."""
 
 PACE_JITTER_S: Final = 0.2e-3
-"""Maximum deviation of a chunk from its scheduled time, s, specified for an otherwise idle machine."""
+"""Specified maximum deviation of a chunk from its scheduled time, s, on an otherwise idle machine."""
 
 _SAMPLES: Final = 512
-"""Number of random frames for estimating the mean frame length; the standard error of the mean is 0.1
-bits."""
+"""Number of random frames from which the mean frame length is estimated, to a standard error of 0.1 bits."""
 
 
 @dataclass(frozen=True, slots=True)
 class PlannedFrame:
-    """Entry of a bus's traffic plan: all frames with the same identifier."""
+    """Entry of a traffic plan: all frames with the same identifier."""
 
     name: str
     can_id: int
@@ -75,7 +71,7 @@ class PlannedFrame:
 
     @property
     def load(self) -> float:
-        """Bus load with maximum-length frames, as a fraction."""
+        """Bus load of frames with the maximum number of stuff bits, as a fraction."""
         return self.frames_per_s * self.worst_s
 
     @property
@@ -92,7 +88,7 @@ class ScanTime:
     node_id: int
     chunks: int
     paced_s: float
-    """Nominal time from the first to the last chunk, s, as determined by the inhibit time."""
+    """Nominal time from the first to the last chunk, s, set by the inhibit time."""
     worst_s: float | None
     """Worst-case time from queueing the SYNC to the end of the summary, s; None if unbounded."""
 
@@ -114,7 +110,7 @@ class BusPlan:
 
     @property
     def load(self) -> float:
-        """Bus load if all frames have maximum length; 1 is a fully loaded bus."""
+        """Bus load if every frame has the maximum number of stuff bits; 1 is a fully loaded bus."""
         return sum(frame.load for frame in self.frames)
 
     @property
@@ -130,14 +126,14 @@ class BusPlan:
 
     @property
     def shortest_period_ms(self) -> int | None:
-        """Minimum SYNC period (ms) with a load of at most ``max_load``; None if no period suffices."""
+        """Shortest SYNC period (ms) at which the load is at most ``max_load``; None if there is none."""
         free = self.bus.max_load - sum(frame.load for frame in self.frames if not frame.scans)
         scan_s = sum(frame.count * frame.worst_s for frame in self.frames if frame.scans)
         return int(-(-scan_s * 1e3 // free)) if free > 0 else None
 
 
 def check_plan(hand: HandConfig) -> tuple[BusPlan, ...]:
-    """Plan the traffic of each bus that has patches, and check the bus loads.
+    """Plan the traffic of each bus that has patches, and check its load.
 
     Args:
         hand: the hand.
@@ -189,7 +185,7 @@ def _rate(bus: BusConfig) -> str:
 
 
 def plan_of(hand: HandConfig) -> tuple[BusPlan, ...]:
-    """Plan the traffic of each bus that has patches, without checking the bus loads.
+    """Plan the traffic of each bus that has patches, whatever its load.
 
     Args:
         hand: the hand.
@@ -229,7 +225,7 @@ def _plan_of_bus(hand: HandConfig, i: int, bus: BusConfig, profiles: dict[str, P
     for patch in patches:
         frames += _of_a_patch(hand, bus, patch, profiles[patch.name])
     ours = {frame.can_id: frame.name for frame in frames}
-    # The plan has frames for only one SDO channel, but every node has its own SDO identifiers.
+    # The plan contains the frames of one SDO channel, but every node has its own SDO identifiers.
     for patch in patches:
         ours |= {
             od.command_cob_id(patch.node_id): f"commands to {patch.name}",
@@ -341,8 +337,8 @@ def _scan_time(
 ) -> ScanTime:
     """Compute the nominal and the worst-case duration of a patch's scans.
 
-    The worst case is the sum of the response times of SYNC, last chunk and summary, the node's latency, and
-    the nominal duration.
+    The worst case is the nominal duration plus the latency of the node and the response times of SYNC, last
+    chunk and summary.
     """
     spacing_s = inhibit_time_100us(hand.sync.period_ms, profile.n_chunks + 1) * 1e-4
     paced_s = (profile.n_chunks - 1) * spacing_s

@@ -1,17 +1,15 @@
-"""Computes worst-case response times on a CAN bus: from queueing a frame to the end of its last bit.
+"""Computes worst-case response times on a CAN bus, from queueing a frame to the end of its last bit.
 
-The method is described in section 3 of Davis, Burns, Bril, Lukkien, "Controller Area Network (CAN)
-schedulability analysis: Refuted, revisited and revised", Real-Time Systems 35, 2007. The frame with the
-lowest identifier wins arbitration, and a transmission is never preempted. The analysis examines all instances
-of a message in its longest priority-level busy period, because the worst response time is not always that of
-the first instance.
+The method is that of section 3 in Davis, Burns, Bril, Lukkien, "Controller Area Network (CAN) schedulability
+analysis: Refuted, revisited and revised", Real-Time Systems 35, 2007. The frame with the lowest identifier
+wins arbitration, and a transmission is never preempted. Since the first instance of a message is not always
+the slowest, the analysis examines every instance in the longest busy period of the message's priority level.
 
-This module extends the analysis to messages that are sent in bursts, such as the chunks of a scan: each
-period starts with ``count`` frames at intervals of ``spacing_ns``. The number of frames in a time window is
-greatest if the window starts with a burst. The analysis uses this maximum number of frames instead of the
-paper's ⌈(t + J) / T⌉.
+This module extends the analysis to messages sent in bursts, such as the chunks of a scan: each period begins
+with ``count`` frames at intervals of ``spacing_ns``. A time window contains most frames if it begins with a
+burst; this number replaces the paper's ⌈(t + J) / T⌉.
 
-The analysis ignores retransmissions after errors. The analysis assumes that each controller always sends its
+Two assumptions apply: no frame is retransmitted after an error, and every controller sends its
 highest-priority frame first.
 """
 
@@ -40,7 +38,7 @@ class Message:
     spacing_ns: int = 0
     """Minimum time between consecutive frames of a burst, ns."""
     jitter_ns: int = 0
-    """Maximum queueing jitter of a frame, ns. Frames keep their order despite the jitter."""
+    """Maximum queueing jitter of a frame, ns. It does not change the order of the frames."""
 
     def __post_init__(self) -> None:
         for name, least in (
@@ -57,12 +55,12 @@ class Message:
             raise ValueError(f"spacing_ns: got {burst}, must fit {self.period_ns} ns")
 
     def due_ns(self, instance: int) -> int:
-        """Return an instance's due time relative to instance 0, ns."""
+        """Return the due time of an instance relative to instance 0, ns."""
         burst, number = divmod(instance, self.count)
         return burst * self.period_ns + number * self.spacing_ns
 
     def most_in(self, window_ns: int) -> int:
-        """Return the maximum number of instances queued in a half-open window of length ``window_ns``."""
+        """Return the maximum number of instances queued within a half-open window of ``window_ns``."""
         bursts, rest_ns = divmod(window_ns + self.jitter_ns, self.period_ns)
         begun = (
             self.count
@@ -73,7 +71,7 @@ class Message:
 
 
 def response_time_ns(message: Message, others: Sequence[Message], bit_ns: int) -> int | None:
-    """Return the maximum time from the due time of a frame to the end of the frame's last bit, ns.
+    """Return the maximum time from a frame's due time to the end of its last bit, ns.
 
     Args:
         message: the message.
@@ -81,8 +79,8 @@ def response_time_ns(message: Message, others: Sequence[Message], bit_ns: int) -
         bit_ns: bit time, ns; a frame queued up to one bit time after the start of arbitration can still win.
 
     Returns:
-        The response time; None if it is unbounded, because the message and all higher-priority messages
-        together need the whole bandwidth.
+        The response time; None if it is unbounded, because the message and those of higher priority need the
+        whole bandwidth.
     """
     higher = [other for other in others if other.can_id < message.can_id]
     blocking_ns = max((other.time_ns for other in others if other.can_id > message.can_id), default=0)
@@ -96,7 +94,7 @@ def response_time_ns(message: Message, others: Sequence[Message], bit_ns: int) -
     longest_ns, wait_ns = 0, blocking_ns
     for instance in range(message.most_in(busy_ns)):
         own_ns = blocking_ns + instance * message.time_ns
-        wait_ns = max(wait_ns, own_ns)  # start from the previous instance's waiting time, a lower bound
+        wait_ns = max(wait_ns, own_ns)  # the waiting time of the previous instance is a lower bound
         while (longer_ns := own_ns + _work_ns(higher, wait_ns + bit_ns)) > wait_ns:
             wait_ns = longer_ns
         passed_ns = wait_ns - message.due_ns(instance) + message.time_ns

@@ -1,4 +1,4 @@
-"""Compiled kernels of :mod:`skinnode.bus_load.timing` that count a frame's bits, including stuff bits.
+"""Compiled kernels of :mod:`skinnode.bus_load.timing`, which count the bits of frames with stuff bits.
 
 The kernels take identifiers as uint32, lengths and payloads as uint8, and bit counts as int64 arrays.
 """
@@ -30,9 +30,9 @@ _Bytes = NDArray[np.uint8]
 def tables() -> tuple[tuple[int, ...], tuple[int, ...], tuple[int, ...]]:
     """Return three lookup tables: CRC, next run, and number of stuff bits.
 
-    The CRC table is indexed by byte, the other tables by ``run << 8 | byte``. ``run`` encodes the 1 to 4
-    equal bits that precede the byte as (value << 2 | length − 1) + 1; at the start of a frame, it is 0. After
-    five equal bits, a stuff bit is inserted, which begins a new run.
+    The CRC table is indexed by byte, the other two by ``run << 8 | byte``. ``run`` encodes the 1 to 4 equal
+    bits before the byte as (value << 2 | length − 1) + 1, or 0 at the start of a frame. Five equal bits are
+    followed by a stuff bit, which begins a new run.
     """
     crc_table = []
     for byte in range(256):
@@ -75,8 +75,8 @@ def are_loaded() -> bool:
 def load_kernels() -> None:
     """Compile the kernels, or load them from the cache.
 
-    Call this function before communication starts: loading takes half a second, and a receiving thread cannot
-    answer requests during this time.
+    Call this function before communication starts. Loading takes half a second, during which a receiving
+    thread cannot answer requests.
     """
     global _loaded
     _loaded = True
@@ -116,18 +116,18 @@ def fd_bits(ids: NDArray[np.uint32], lengths: _Bytes, payload: _Bytes, nominal: 
 
 
 def classic_frame_bits(head: int, data: bytes) -> int:
-    """Count the bits of one classic frame with an 11-bit identifier, five times as fast as ``exact_bits``.
+    """Count the bits of a classic frame with an 11-bit identifier, five times as fast as ``exact_bits``.
 
-    The first call loads a kernel, which takes a noticeable time.
+    The first call takes longer, because it loads a kernel.
 
     Args:
-        head: the bits from the start of frame to the data length code, as a number of 19 bits.
+        head: the 19 bits from the start of frame to the data length code, as a number.
         data: data bytes, at most 8.
 
     Returns:
         Number of bits, including stuff bits and inter-frame space.
     """
-    # Numba would compile the kernel twice for numbers below and above 2⁶³, hence two halves.
+    # The data are passed in two halves, because numba would compile the kernel again for numbers from 2⁶³.
     word = int.from_bytes(data, "big")
     return int(_classic_one(head, len(data), word >> 32, word & 0xFFFF_FFFF, *_arrays()))
 
@@ -139,7 +139,7 @@ def _classic_one(  # noqa: PLR0913 - arrays of a compiled kernel
     crc: Any = np.int64(crc_of[head >> 16])
     crc = (crc << 8 & 0x7FFF) ^ np.int64(crc_of[crc >> 7 ^ (head >> 8 & 0xFF)])
     crc = (crc << 8 & 0x7FFF) ^ np.int64(crc_of[crc >> 7 ^ (head & 0xFF)])
-    # as in _classic: bytes of the stuffed region are assembled from two adjacent payload bytes
+    # as in _classic, each byte to be stuffed is assembled from two adjacent payload bytes
     stream = (ALTERNATING & 0x3F) << 18 | head >> 1
     stuff: Any = 0
     run: Any = 0
@@ -172,9 +172,8 @@ def _classic(  # noqa: PLR0913 - arrays of a compiled kernel
         crc = (crc << 8 & 0x7FFF) ^ np.int64(crc_of[crc >> 7 ^ (head & 0xFF)])
         for k in range(begin, begin + length):
             crc = (crc << 8 & 0x7FFF) ^ np.int64(crc_of[crc >> 7 ^ np.int64(payload[k])])
-        # The 19 bits of the head, the 15 bits of the CRC and six filler bits make up five bytes. The head is
-        # not a whole number of bytes, so each byte to be stuffed is assembled from two adjacent payload
-        # bytes.
+        # Six filler bits make five whole bytes of the 19-bit head and the 15-bit CRC. Because the head ends
+        # inside a byte, each byte to be stuffed is assembled from two adjacent payload bytes.
         stream = (ALTERNATING & 0x3F) << 18 | head >> 1
         stuff: Any = 0
         run: Any = 0
@@ -210,9 +209,9 @@ def _fd(  # noqa: PLR0913 - arrays of a compiled kernel
         else:
             code = 11 + length // 16  # 32, 48, 64
 
-        # The 22 bits from SOF to the length code are preceded by two filler bits and followed by the data
-        # bytes. FDF, res and BRS alternate, so no stuff bit is inserted between the first two bytes (sent at
-        # the nominal bit rate) and ESI.
+        # Two filler bits precede the 22 bits from SOF to the length code; the data bytes follow them. The
+        # first two bytes are sent at the nominal bit rate. FDF, res and BRS alternate, so no stuff bit falls
+        # between these bytes and ESI.
         stream = 0b01 << 22 | np.int64(ids[i] & 0x7FF) << 10 | 0b10100000 | code
         slow: Any = 0
         stuff: Any = 0
@@ -229,7 +228,7 @@ def _fd(  # noqa: PLR0913 - arrays of a compiled kernel
             entry = np.int64(run_of[run << 8 | np.int64(payload[k])])
             stuff, run = stuff + (entry & 0xFF), entry >> 8
             last = np.int64(payload[k]) & 1
-        # If a stuff bit is due after the last bit, the first fixed stuff bit replaces it.
+        # The first fixed stuff bit replaces a stuff bit that is due after the last bit.
         if run - 1 >> 2 != last:
             stuff -= 1
         crc_bits, fixed = (17, 6) if length <= 16 else (21, 7)

@@ -1,22 +1,20 @@
 """Computes the exact duration of CAN frames on the bus (ISO 11898-1:2015), and the resulting bus load.
 
-Classic frames. From the start of frame to the end of the CRC sequence, five consecutive equal bits are
-followed by a stuff bit of the opposite value. A stuff bit may itself be the first of the next five equal
-bits. The 13-bit tail is not stuffed; it consists of CRC delimiter, ACK slot, ACK delimiter, 7-bit end of
-frame and 3-bit inter-frame space. The 15-bit CRC has the polynomial 0x4599 and the initial value 0.
+In a classic frame, five consecutive equal bits between the start of frame and the end of the CRC sequence are
+followed by a stuff bit of the opposite value. A stuff bit can be the first of the next five equal bits. The
+13-bit tail has no stuff bits; it consists of CRC delimiter, ACK slot, ACK delimiter, 7-bit end of frame and
+3-bit inter-frame space. The 15-bit CRC has the polynomial 0x4599 and the initial value 0.
 
-CRC and stuff bits are computed from tables, one byte at a time. The head of a frame is therefore padded to
-whole bytes with leading filler bits. For the CRC, the filler bits are zeros, which do not change the initial
-CRC of 0. For stuffing, the filler bits alternate and end with a 1, so that the dominant start of frame begins
-a new run.
+CRC and stuff bits are looked up in tables, one byte at a time, so leading filler bits pad the head of a frame
+to whole bytes. For the CRC, the filler bits are zeros, which leave the initial value of 0 unchanged. For
+stuffing, they alternate and end with a 1, so that the dominant start of frame begins a new run.
 
-The CAN FD frames of a hand have an 11-bit identifier and switch the bit rate. Other CAN FD frames are
-supported only by :func:`exact_fd_bits`. In CAN FD frames, the stuffing rule of classic CAN applies up to the
-end of the data. The CRC field contains a 4-bit stuff count, 17 CRC bits (21 for more than 16 data bytes), and
-fixed stuff bits: one before the first bit and one after every 4 bits. The bits from ESI to the CRC delimiter
-are sent at the data bit rate. The 17 bits before ESI (36 bits with a 29-bit identifier) and the 12 bits after
-the CRC delimiter (ACK slot, ACK delimiter, 7-bit end of frame and 3-bit inter-frame space) are sent at the
-nominal bit rate.
+The CAN FD frames of a hand have 11-bit identifiers and switch the bit rate; only :func:`exact_fd_bits`
+supports others. The stuffing rule of classic CAN applies up to the end of the data. The CRC field contains a
+4-bit stuff count, 17 CRC bits (21 for more than 16 data bytes), and fixed stuff bits: one before the first
+bit and one after every 4 bits. The bits from ESI to the CRC delimiter are sent at the data bit rate, all
+others at the nominal bit rate: the 17 bits before ESI (36 with a 29-bit identifier) and the 12 bits after the
+CRC delimiter (ACK slot, ACK delimiter, 7-bit end of frame and 3-bit inter-frame space).
 """
 
 from __future__ import annotations
@@ -61,7 +59,7 @@ def nominal_bits(dlc: int, *, extended: bool = False) -> int:
 
 
 def worst_case_bits(dlc: int, *, extended: bool = False) -> int:
-    """Return the maximum frame length (bits), with a stuff bit after the first 5 bits and after every 4 more.
+    """Return the maximum number of bits, with a stuff bit after the first 5 bits and after every 4 more.
 
     Source: Davis, Burns, Bril, Lukkien, "Controller Area Network (CAN) schedulability analysis", 2007, eq. 1.
     """
@@ -126,7 +124,7 @@ def exact_fd_bits(
         can_id: identifier.
         data: data bytes.
         extended: whether the identifier has 29 bits.
-        brs: whether the frame switches to the data bit rate; if False, all bits are sent at the nominal bit
+        brs: whether the frame switches to the data bit rate; if not, all bits are sent at the nominal bit
             rate.
         esi: whether the error state indicator is recessive, as sent by an error-passive node.
 
@@ -141,8 +139,8 @@ def exact_fd_bits(
     code = _FD_CODES.get(len(data))
     if code is None:
         raise ValueError(f"data: got {counted(len(data), 'byte')}, must be one of {FD_LENGTHS}")
-    # The last byte of the head consists of FDF, res, BRS, ESI and the length code. FDF and res differ; if the
-    # bit rate is switched, res and BRS also differ. No stuff bit is therefore inserted between FDF and ESI.
+    # The last byte of the head consists of FDF, res, BRS, ESI and the length code. FDF and res differ and, if
+    # the bit rate is switched, so do res and BRS. No stuff bit therefore falls between FDF and ESI.
     last = 0x80 | brs << 5 | esi << 4 | code
     if extended:  # filler, SOF, base identifier, SRR, IDE, identifier extension, RRS
         before = (0b1010101 << 33 | (can_id >> 18) << 21 | 0b11 << 19 | (can_id & 0x3FFFF) << 1).to_bytes(5)
@@ -162,7 +160,7 @@ def exact_fd_bits(
         at = run << 8 | byte
         stuff += stuffed[at]
         run = next_run[at]
-    # If a stuff bit is due after the last bit, the first fixed stuff bit replaces it.
+    # The first fixed stuff bit replaces a stuff bit that is due after the last bit.
     if run - 1 >> 2 != ((data[-1] if data else code) & 1):
         stuff -= 1
     crc_bits, fixed = (17, 6) if len(data) <= 16 else (21, 7)
@@ -214,9 +212,9 @@ def fd_worst_case_bits(length: int) -> tuple[int, int]:
     """
     if length not in FD_LENGTHS:
         raise ValueError(f"length: got {length}, must be one of {FD_LENGTHS}")
-    # In the 14 bits from SOF to IDE, there may be a stuff bit after the first 5 bits and after every 4 more.
-    # FDF, res and BRS alternate, ESI is 0, and the length code is known. The data are chosen for the worst
-    # case. The first run is a single recessive bit, BRS.
+    # The 14 bits from SOF to IDE have at most one stuff bit after the first 5 bits and after every 4 more.
+    # FDF, res and BRS alternate, ESI is 0, and the length code is known, so the first run is the single
+    # recessive bit BRS. The data bits are those of the worst case.
     stuff = {(1 << 2) + 1: 0}
     code = FD_LENGTHS.index(length)
     choices: list[tuple[int, ...]] = [(0,), *((code >> shift & 1,) for shift in (3, 2, 1, 0))]
@@ -229,7 +227,7 @@ def fd_worst_case_bits(length: int) -> tuple[int, int]:
                 equal = equal + 1 if bit == value else 1
                 stuffed = equal == _RUN
                 state = ((1 - bit) << 2) + 1 if stuffed else (bit << 2 | equal - 1) + 1
-                # A stuff bit due after the last bit is replaced by the first fixed stuff bit.
+                # The first fixed stuff bit replaces one that is due after the last bit.
                 total = count + (stuffed and number < len(choices))
                 after[state] = max(after.get(state, 0), total)
         stuff = after
@@ -271,8 +269,8 @@ def exact_bits_batch(can_id: ArrayLike, dlc: ArrayLike, data: ArrayLike) -> _Int
 class BusLoad:
     """Counts frames, and the exact number of their bits.
 
-    Adding a frame is fast, because the bits of several frames are later counted in one batch. An instance is
-    not thread-safe.
+    Adding a frame is fast, because bits are counted later, for a batch of frames. Instances are not
+    thread-safe.
 
     Args:
         bitrate_bps: nominal bit rate, bit/s.
@@ -307,7 +305,7 @@ class BusLoad:
     ) -> None:
         """Add a frame; its bits are counted as in :func:`exact_bits` or, for CAN FD, :func:`fd_bits`.
 
-        Until the bits are counted, the counter keeps a reference to ``data``, not a copy.
+        Until the bits are counted, ``data`` is kept by reference.
         """
         if extended or remote:
             self._bits += exact_bits(can_id, data, extended=extended, remote=remote, dlc=dlc)
@@ -340,7 +338,7 @@ class BusLoad:
         return self._bits + round(self._fast_bits * self._data_bit)
 
     def load(self, time_s: float) -> float:
-        """Return the total duration of the counted frames divided by ``time_s``; the quotient may exceed 1.
+        """Return the duration of all counted frames divided by ``time_s``; the ratio may exceed 1.
 
         Args:
             time_s: length of the interval, s.
@@ -350,9 +348,7 @@ class BusLoad:
     def _work_off(self) -> None:
         ids, data = self._classic
         self._frames += len(ids)
-        if (
-            not stuffing.are_loaded()
-        ):  # do not load the kernels, because loading would noticeably delay a short command
+        if not stuffing.are_loaded():  # loading the kernels would noticeably delay a short command
             self._bits += sum(map(exact_bits, ids, data))
         elif ids:
             self._bits += stuffing.classic_bits(*_packed(ids, data), 0, np.empty(len(ids), np.int64))
@@ -374,7 +370,7 @@ def _packed(
 ) -> tuple[NDArray[np.uint32], NDArray[np.uint8], NDArray[np.uint8]]:
     """Return (n,) identifiers, (n,) lengths and the concatenated data, in writable arrays.
 
-    The data are copied, because numba would compile the kernels again for read-only arrays.
+    The arrays are writable copies, because numba would compile the kernels again for read-only arrays.
     """
     lengths, joined = bytearray(map(len, data)), bytearray().join(data)
     return np.array(array("I", ids)), np.frombuffer(lengths, np.uint8), np.array(joined, np.uint8)

@@ -1,4 +1,4 @@
-"""Full-screen application that shows the newest view several times a second and handles keys."""
+"""Full-screen application that redraws the newest view several times a second and handles keys."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from skinnode.monitor.widgets import Canvas, Dialog
 PERIOD_S: Final = 0.1
 """Minimum interval between screen updates, s."""
 SHARE: Final = 0.2
-"""Maximum fraction of the time of one processor core that is spent on drawing.
+"""Maximum fraction of one processor core's time that is spent on drawing.
 
 If drawing is slow, the screen is updated less often.
 """
@@ -53,7 +53,7 @@ HELP: Final = """\
  sends no data."""
 
 _SHOWN_AS_EVENTS: Final = ("skinnode.host.supervisor", "skinnode.host.health")
-"""Names of loggers to ignore, because the event log already contains their warnings."""
+"""Names of loggers whose warnings the event log already contains as events."""
 
 
 class MonitorApp(App[None]):
@@ -63,7 +63,7 @@ class MonitorApp(App[None]):
         source: Host or recording; the caller closes it.
         folder: Folder for recordings.
         colours: Colours of the terminal.
-        over: Function called at each screen update; the monitor ends when the function returns True.
+        over: Function called at each screen update; the monitor ends when it returns True.
         seconds: Maximum duration; None for no limit.
     """
 
@@ -96,7 +96,7 @@ class MonitorApp(App[None]):
         super().__init__(driver_class=PatientDriver, ansi_color=colours != "rgb")
         self.faults = FaultBook(live=source.live)
         self.failure: SkinError | None = None
-        """Error that caused the monitor to end; None if no error has occurred."""
+        """Error that ended the monitor; None if no error has occurred."""
         self._source, self._folder, self._over, self._seconds = source, folder, over, seconds
         self._theme = theme_for(colours)
         self.canvas = Canvas()
@@ -110,7 +110,7 @@ class MonitorApp(App[None]):
         self._scale = Scale()
         self._view: View | None = None
         self._tares: queue.SimpleQueue[tuple[str, Level]] = queue.SimpleQueue()
-        """Message about each completed tare, and the severity of the message."""
+        """Message about each completed tare, and its severity."""
         self._begun_s = time.monotonic()
         self._cpu_s = 0.0
         self._wall_minus_mono_ns = time.time_ns() - time.monotonic_ns()
@@ -128,12 +128,12 @@ class MonitorApp(App[None]):
         self._turn()
 
     def on_unmount(self) -> None:
-        """Remove the logging handler, so that log messages are no longer added to the event log."""
+        """Remove the logging handler that adds warnings to the event log."""
         logging.getLogger().removeHandler(self._records)
 
     @property
     def terminal_is_deaf(self) -> bool:
-        """Whether the terminal did not accept the final output."""
+        """Whether the terminal has stopped accepting output."""
         return isinstance(self._driver, PatientDriver) and self._driver.deaf
 
     @property
@@ -169,7 +169,7 @@ class MonitorApp(App[None]):
         self.faults.update(view, time.monotonic_ns(), ending=ending)
         for event in self._source.events():
             begins = event.what == "operational" and time.monotonic() - self._begun_s < _BEGIN_S
-            if not begins:  # do not log that patches become operational at start-up
+            if not begins:  # at start-up, every patch becomes operational
                 self._lines.append(log_line(event, self._wall_minus_mono_ns))
         self._settle_tares()
         if not self._paused:
@@ -177,7 +177,7 @@ class MonitorApp(App[None]):
             self._scale.update(view.t_ns, view.deepest_m)
 
     def _draw(self) -> None:
-        """Draw the view unless the terminal is still receiving the previous picture."""
+        """Draw the view, unless the terminal is still receiving the previous picture."""
         driver = self._driver
         if isinstance(driver, PatientDriver):
             if driver.busy:
@@ -271,7 +271,7 @@ class MonitorApp(App[None]):
         )
 
     def _tare(self, names: list[str]) -> None:
-        """Tare patches on daemon threads, which do not delay the monitor's exit."""
+        """Tare patches on daemon threads, which do not delay the exit of the monitor."""
         self._say(f"{', '.join(names)}: tare requested")
 
         def tare(name: str) -> None:
@@ -308,7 +308,7 @@ class MonitorApp(App[None]):
 
 
 class _Records(logging.Handler):
-    """Logging handler that adds warnings to the event log. Printed warnings would corrupt the screen."""
+    """Logging handler that adds warnings to the event log, because printing them would corrupt the screen."""
 
     def __init__(self, lines: deque[LogLine]) -> None:
         super().__init__(logging.WARNING)
@@ -321,7 +321,7 @@ class _Records(logging.Handler):
 
 
 def terminal_colours(environment: Mapping[str, str]) -> Colours:
-    """Return the colours of the terminal, which rich derives from environment variables."""
+    """Return the colours of the terminal, as derived by rich from environment variables."""
     from rich.console import Console
 
     if environment.get("NO_COLOR"):

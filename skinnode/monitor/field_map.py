@@ -1,8 +1,8 @@
 """Renders a displacement field as characters: depth is shown by brightness, shear by arrows.
 
-On the map, the patch's x axis (along the upper wires) points right, and its y axis points up. Each character
-shows two pixels, one above the other, so a pixel is roughly square. Without colours, each character
-represents the mean of its two pixels; denser characters mean a deeper press.
+The x axis of the patch (along the upper wires) points right, and its y axis points up. A character shows two
+pixels, one above the other, so that pixels are roughly square. Without colours, the density of a character
+represents the mean depth of its two pixels.
 """
 
 from __future__ import annotations
@@ -28,36 +28,36 @@ Colours = Literal["rgb", "ansi", "none"]
 """Colours of the terminal: at least 256 colours, the 16 ANSI colours, or none (NO_COLOR)."""
 
 Line = list[Segment]
-"""Styled text of a screen line or of a part of a line."""
+"""Styled text of a screen line or of part of one."""
 
 # Five points of matplotlib's colour map "magma" (CC0). Its perceived brightness increases uniformly.
 _MAGMA: Final = np.array([(0, 0, 4), (81, 18, 124), (183, 55, 121), (252, 137, 97), (252, 253, 191)], float)
 LEVELS: Final = 24
-"""Number of shades. Additional shades would be indistinguishable, but take longer to draw and transmit."""
+"""Number of shades. More would look the same but take longer to draw and to transmit."""
 _UNKNOWN: Final = -1
-"""Shade level of pixels whose depth is unknown."""
+"""Shade of pixels whose depth is unknown."""
 _SIGNS: Final = "·:-=+*#%@"
-"""Characters that represent depth on terminals without colours, in order of increasing depth."""
+"""Characters for increasing depth on terminals without colours."""
 _ANSI: Final = ("black", "blue", "magenta", "red", "yellow", "bright_white")
 ARROWS: Final = "→↗↑↖←↙↓↘"
 
 SURE: Final = 4.0
-"""Minimum shear that is drawn as an arrow, as a multiple of its standard deviation."""
+"""Minimum shear drawn as an arrow, as a multiple of its standard deviation."""
 _SHORT: Final = 0.15
-"""Minimum shear that is drawn as an arrow, as a fraction of the shear drawn at full brightness."""
+"""Minimum shear drawn as an arrow, as a fraction of the shear at full brightness."""
 
 _STEPS_M: Final = tuple(
     step * 10.0**power for power in (-5, -4, -3, -2) for step in (1.0, 1.5, 2.0, 3.0, 5.0, 7.0)
 )
 _LEAST_M: Final = 5e-5
-"""Minimum depth drawn at full brightness, m. Without this limit, noise would look like a touch."""
+"""Lower limit of the depth at full brightness, m; below it, noise would look like a touch."""
 _MEMORY_NS: Final = 6_000_000_000
-"""Time for which the brightness scale still depends on a press that has ended, ns."""
+"""Time for which a press that has ended still affects the brightness scale, ns."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Surface:
-    """Quantities drawn on a map of a field: (U, N) arrays in metres, upper wire 0 first."""
+    """Quantities drawn on the map of a field: (U, N) arrays in metres, upper wire 0 first."""
 
     depth_m: Float
     """Depth, positive where the skin is pressed inwards."""
@@ -76,7 +76,7 @@ class Surface:
 
 
 def surface_of(field: FieldFrame, upper_m: Float) -> Surface:
-    """Return the quantities drawn on a map of a field.
+    """Return the quantities to draw on the map of a field.
 
     Args:
         field: Newest field of the patch.
@@ -94,7 +94,7 @@ def surface_of(field: FieldFrame, upper_m: Float) -> Surface:
 
 
 def aspect_of(upper_m: Float) -> float:
-    """Return a patch's width-to-height ratio; each electrode is the centre of one cell of the patch."""
+    """Return the width-to-height ratio of a patch whose electrodes are the centres of equal cells."""
     wires, electrodes = upper_m.shape[:2]
     width, height = np.ptp(upper_m[..., :2].reshape(-1, 2), axis=0)
     width, height = width / max(electrodes - 1, 1) * electrodes, height / max(wires - 1, 1) * wires
@@ -102,14 +102,14 @@ def aspect_of(upper_m: Float) -> float:
 
 
 def fit(width: int, height: int, aspect: float) -> tuple[int, int]:
-    """Return the size of the largest map that fits a box; characters are twice as high as wide."""
+    """Return the size of the largest map in a box of characters, which are twice as high as wide."""
     across = min(width, round(2 * height * aspect))
     return max(2, across), max(1, min(height, round(across / (2 * aspect))))
 
 
 @functools.lru_cache(maxsize=64)
 def _weights(size: int, n: int) -> Float:
-    """Return the (size, n) linear interpolation weights of n electrodes for ``size`` pixels."""
+    """Return the weights (size, n) that interpolate ``size`` pixels linearly between n electrodes."""
     at = np.clip((np.arange(size) + 0.5) / size * n - 0.5, 0.0, n - 1)
     low = np.minimum(at.astype(int), max(n - 2, 0))
     made = np.zeros((size, n))
@@ -125,7 +125,7 @@ def resample(grid: Float, width: int, height: int) -> Float:
 
 
 def arrow(x: float, y: float) -> str:
-    """Return the one of eight arrows that is closest to the direction (x, y)."""
+    """Return the arrow, one of eight, closest to the direction (x, y)."""
     return ARROWS[round(math.atan2(y, x) / (math.pi / 4)) % 8]
 
 
@@ -140,9 +140,9 @@ def mean_shear_m(surface: Surface) -> tuple[float, float]:
 
 
 class Scale:
-    """Brightness scale of the maps. Full brightness is a round number above the depth of recent presses.
+    """Brightness scale of the maps; full brightness is the depth of recent presses, rounded up.
 
-    All patches share one brightness scale, so that their maps are comparable.
+    All patches share one scale, so that their maps are comparable.
     """
 
     def __init__(self) -> None:
@@ -150,7 +150,7 @@ class Scale:
         self.full_m = _LEAST_M
 
     def update(self, t_ns: int, deepest_m: float) -> None:
-        """Update the brightness scale with ``deepest_m``, the maximum depth at ``t_ns``, in m."""
+        """Update the scale with ``deepest_m``, the maximum depth at ``t_ns``, m."""
         while self._peaks and (self._peaks[0][0] < t_ns - _MEMORY_NS or self._peaks[0][0] > t_ns):
             self._peaks.popleft()
         while self._peaks and self._peaks[-1][1] <= deepest_m:
@@ -170,7 +170,7 @@ class MapStyle:
 
     @property
     def full_shear_m(self) -> float:
-        """Shear drawn at full brightness, m. The factor 0.25 reflects that shear is smaller than depth."""
+        """Shear drawn at full brightness, m; a quarter of the depth, because shear is smaller than depth."""
         return 0.25 * self.full_m
 
 
@@ -214,8 +214,7 @@ def _arrows_on(surface: Surface, style: MapStyle, width: int, height: int) -> di
 def paint_shear(surface: Surface, style: MapStyle, width: int, height: int) -> list[Line]:
     """Draw shear as arrows. Arrows for stronger shear are brighter.
 
-    Each electrode has an arrow if the map is large enough; on larger maps, arrows are also drawn between
-    electrodes.
+    If the map is large enough, every electrode has an arrow; larger maps also have arrows between electrodes.
     """
     colours = style.colours
     wires, electrodes = surface.depth_m.shape
@@ -256,7 +255,7 @@ def _depth_line(above: Sequence[int], below: Sequence[int], arrows: dict[int, st
 
 
 def _grouped(cells: Sequence[tuple[str, Style]]) -> Line:
-    """Merge neighbouring cells of the same style, because fewer segments take less time to draw."""
+    """Merge neighbouring cells of the same style, because fewer segments are faster to draw."""
     return [
         Segment("".join(sign for sign, _ in run), style)
         for style, run in itertools.groupby(cells, key=lambda cell: cell[1])

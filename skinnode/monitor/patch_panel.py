@@ -1,4 +1,4 @@
-"""Renders a patch: as one of several tiles, or alone with all its values."""
+"""Renders a patch as one of several tiles, or alone with all its values."""
 
 from __future__ import annotations
 
@@ -21,19 +21,19 @@ GONE: Final = ("lost", "never seen", "stale", "refused", "restarting", "booting"
 _AROUND: Final = 3
 """Number of lines in a tile, excluding its map."""
 _LEAST_OUTLINED: Final = (8, 5)
-"""Minimum box size, in characters and lines, for drawing an outline around the map."""
+"""Minimum size of a box whose map has an outline, in characters and lines."""
 _LABEL: Final = 10
 """Width of the column of value names, in characters."""
 
 
 def tiles(patches: Sequence[PatchView], paint: Paint, width: int, height: int) -> list[Line]:
-    """Draw all patches as tiles within ``height`` lines, in as many columns as give the largest maps."""
+    """Draw all patches as tiles within ``height`` lines, in the columns that give the largest maps."""
     theme = paint.theme
     count = len(patches)
     aspect = max((patch.surface.aspect for patch in patches if patch.surface is not None), default=1.0)
 
     def high_of(columns: int) -> int:
-        """Return the height of each map, in lines, if the tiles are arranged in ``columns`` columns."""
+        """Return the height of a map, in lines, with ``columns`` columns of tiles."""
         box = width // columns - 1, height // -(-count // columns) - _AROUND
         across, down, frame = _fit(*box, aspect) if min(box) > 0 else (0, 0, 0)
         return down + frame if across else 0
@@ -64,9 +64,8 @@ def _tile(number: int, patch: PatchView, paint: Paint, width: int, height: int) 
 def _map(patch: PatchView, paint: Paint, width: int, height: int, *, arrows: bool) -> list[Line]:
     """Draw the depth map of a patch, centred in its box.
 
-    An outline marks the edge of the map, because untouched skin is as dark as the screen. If a patch has
-    stopped sending data, its last map is drawn without colours. The condition of the patch is then written
-    over the map, so that the map is not mistaken for live data.
+    Untouched skin is as dark as the screen, so an outline marks the edge of the map. If a patch has stopped
+    sending data, its last map is drawn without colours, with the condition of the patch written across it.
     """
     theme = paint.theme
     if patch.surface is None:
@@ -96,7 +95,7 @@ def _map(patch: PatchView, paint: Paint, width: int, height: int, *, arrows: boo
 
 
 def _fit(width: int, height: int, aspect: float) -> tuple[int, int, int]:
-    """Return the width and height of the largest map in a box, and the number of characters for its outline.
+    """Return the width and height of the largest map in a box, and the characters taken up by its outline.
 
     A small box has no outline.
     """
@@ -127,7 +126,7 @@ def _figures(patch: PatchView, theme: Theme, width: int) -> Line:
 
 
 def _health(patch: PatchView, theme: Theme, width: int) -> Line:
-    """Draw a line with the patch's most important fault or, if it has no fault, with its field rate."""
+    """Draw a line with the patch's most severe fault or, without a fault, its field rate."""
     style = theme.of(patch.level)
     if patch.words:
         return pad([Segment(f" {patch.condition}: {patch.words[0]}", style)], width, theme)
@@ -188,7 +187,7 @@ def _caption(text: str, theme: Theme) -> Line:
 
 
 def facts(patch: PatchView, theme: Theme, width: int) -> list[Line]:
-    """Return all values of a patch as lines; each line contains the name and the value."""
+    """Return all values of a patch as lines, each with a name and a value."""
     health, stream = patch.health, patch.stream
     counts = stream.assembler
     lines = [

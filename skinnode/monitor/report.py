@@ -1,4 +1,4 @@
-"""Collects the faults of a monitoring session, and reports the current view as JSON."""
+"""Collects the faults of a monitoring session and reports the current view as JSON."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from skinnode.monitor.touches import Touch
 from skinnode.monitor.view_model import History, PatchView, View
 
 SETTLE_NS: Final = 3_000_000_000
-"""Time after the start within which all patches of a running hand must become operational, ns."""
+"""Time within which all patches of a running hand must become operational, ns."""
 
 LOOK_S: Final = 0.1
-"""Interval at which the source is checked for faults, s."""
+"""Interval between checks of the source for faults, s."""
 
 LINE_S: Final = 1.0
 """Interval between JSON lines, s."""
@@ -28,9 +28,8 @@ class FaultBook:
     """Faults of a monitoring session, each listed once, in order of first occurrence.
 
     Args:
-        live: Whether the source is a running hand. The patches of a running hand must be operational soon
-            after the start. A recording may begin before the patches are started, so they are checked only
-            at the end.
+        live: Whether the source is a running hand, whose patches must be operational soon after the start. A
+            recording may begin before its patches are started, so they are checked only at the end.
     """
 
     def __init__(self, *, live: bool) -> None:
@@ -50,8 +49,7 @@ class FaultBook:
         Args:
             view: Current view of the hand.
             real_ns: Monotonic time of the monitor, ns.
-            ending: Whether the session is ending. If so, a patch that has not become operational is recorded
-                as a fault.
+            ending: Whether the session is ending; a patch that has never been operational is then a fault.
         """
         if self._begun_ns is None:
             self._begun_ns = real_ns
@@ -75,7 +73,7 @@ class FaultBook:
 
 
 def _lasting(health: PatchHealth) -> list[tuple[str, str]]:
-    """Return pairs (key, text) for the wire faults, duplicate node-ID and last EMCY of a patch."""
+    """Return pairs (key, text) for wire faults, a duplicate node-ID and the last EMCY of a patch."""
     wires = [f"{fault.side} wire {fault.number} {fault.state}" for fault in health.wires]
     found = [(text, text) for text in wires]
     if health.duplicate_id:
@@ -95,7 +93,7 @@ def watch(
         source: Host or recording.
         stop: Event that ends the iteration.
         seconds: Maximum duration; None for no limit.
-        faults: Faults of the session; updated at each check.
+        faults: Faults of the session, updated at each check.
 
     Raises:
         SkinError: The source failed.

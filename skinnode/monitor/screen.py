@@ -17,11 +17,11 @@ from skinnode.text.words import counted
 
 LEAST_WIDTH: Final = 50
 LEAST_HEIGHT: Final = 16
-"""Minimum size of the screen, in characters; a smaller screen shows only a note of the required size."""
+"""Minimum size of the screen, in characters; a smaller screen shows only the size required."""
 
 
 def screen(view: View, paint: Paint, log: Sequence[LogLine], width: int, height: int) -> list[Line]:
-    """Render the screen as ``height`` lines of ``width`` characters; the newest line of ``log`` is last."""
+    """Render the screen as ``height`` lines of ``width`` characters; ``log`` ends with the newest event."""
     theme, ui = paint.theme, paint.ui
     if width < LEAST_WIDTH or height < LEAST_HEIGHT:
         text = f"{width} × {height} is too small: at least {LEAST_WIDTH} × {LEAST_HEIGHT}"
@@ -77,7 +77,7 @@ def _header(view: View, ui: UiState, theme: Theme, width: int) -> Line:
 
 
 def _losses(view: View, bus: BusView) -> str:
-    """Return a text about lost chunks, summaries or scans on a bus; empty if nothing was lost."""
+    """Return a text about the chunks, summaries and scans lost on a bus; empty if there are none."""
     counts = [patch.stream.assembler for patch in view.patches if patch.bus == bus.name]
     for name, one, several in (
         ("chunks_lost", "chunk lost", "chunks lost"),
@@ -131,7 +131,7 @@ def _keys(ui: UiState, theme: Theme, width: int) -> Line:
 
 
 def _lower(view: View, paint: Paint, log: Sequence[LogLine], width: int, height: int) -> list[Line]:
-    """Draw touches above events; on a wide screen, draw touches and the selected patch left of events."""
+    """Draw touches above events or, on a wide screen, touches and the selected patch beside events."""
     theme, ui = paint.theme, paint.ui
     chosen = view.patch(ui.selected)
     patches = (chosen,) if ui.zoomed else view.patches
@@ -197,7 +197,7 @@ def _touch_line(patch: PatchView, touch: Touch, theme: Theme, name: int) -> Line
 
 
 def _quiet(view: View) -> str:
-    """Return the text for an empty event log, including any faults that occurred before the log began."""
+    """Return the text for an empty event log, with any faults that occurred before the log began."""
     wrong = [f"{patch.name} {patch.condition}" for patch in view.patches if patch.level == "bad"]
     wrong += [bus.name for bus in view.buses if bus.level == "bad"]
     if wrong:

@@ -1,6 +1,6 @@
 """Provides the monitor's data sources: a running host or a replayed recording.
 
-Data sources read only the newest data and never block the host.
+Sources take only the newest data and never block the host.
 """
 
 from __future__ import annotations
@@ -27,15 +27,15 @@ from skinnode.record import Recorder, Replay
 
 _CAPACITY: Final = 1
 _EVENTS: Final = 500
-"""Maximum number of events that are queued between two screen updates."""
+"""Maximum number of events queued between two screen updates."""
 
 
 @dataclass(frozen=True, slots=True)
 class Snapshot:
-    """State of a hand at one instant, as mappings from patch names or bus names."""
+    """State of a hand at one instant; the mappings are keyed by the name of a patch or bus."""
 
     t_ns: int
-    """Time on the host's monotonic clock, ns. The time in a recording is from the host that made it."""
+    """Time on the monotonic clock of the host or, for a recording, of the host that made it, ns."""
     health: Mapping[str, PatchHealth]
     bus_health: Mapping[str, BusHealth]
     buses: Mapping[str, BusStats]
@@ -56,7 +56,7 @@ class Recording:
 class Source(Protocol):
     """Protocol implemented by the monitor's data sources.
 
-    All methods return immediately, except record and stop_recording.
+    All methods but record and stop_recording return immediately.
     """
 
     hand: HandConfig
@@ -76,7 +76,7 @@ class Source(Protocol):
 
     @property
     def flaws(self) -> list[str]:
-        """Descriptions of the missing or unreadable data found so far in a replayed recording."""
+        """Descriptions of missing or unreadable data found so far in a recording."""
 
     def tare(self, patch: str) -> None:
         """Tare a patch, as :meth:`Host.tare` does."""
@@ -110,7 +110,7 @@ class HostSource:
 
     def snapshot(self) -> Snapshot:
         """Return the current state of the hand."""
-        for _ in range(_CAPACITY + 1):  # if the host has failed, the last queued item is the error
+        for _ in range(_CAPACITY + 1):  # if the host has failed, the last item in the queue is the error
             self._fields.get(0.0)
         host, stats = self._host, self._host.stats()
         return Snapshot(
@@ -261,7 +261,7 @@ class ReplaySource:
                 pass
             for flaw in self._run.flaws:
                 self._all_events.publish(HealthEvent(self._run.clock(), self.title, "recording", flaw))
-        except Exception as error:  # also report unexpected exceptions to the user
+        except Exception as error:  # report unexpected exceptions to the user, too
             self._failure = error if isinstance(error, SkinError) else SkinError(f"replay: {error!r}")
 
     def _health(self) -> dict[str, PatchHealth]:

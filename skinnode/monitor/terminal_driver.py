@@ -1,4 +1,4 @@
-"""Writes to the terminal without blocking, even if the terminal disappears or stalls."""
+"""Writes to the terminal without blocking, even if it stalls or disappears."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ if TYPE_CHECKING:
 _STDOUT: Final = 1
 
 _MAX_QUEUED: Final = 30
-"""Maximum number of writes queued for the terminal, sufficient for a few screen updates."""
+"""Maximum number of writes queued for the terminal, enough for a few screen updates."""
 
 _END_S: Final = 1.0
-"""Maximum time to wait at exit for the terminal to accept queued output, s."""
+"""Maximum wait at exit for the terminal to accept queued output, s."""
 
 
 class _Writer(threading.Thread):
     """Writes text to a file descriptor on a daemon thread.
 
-    The thread does not use ``sys.stdout``, because a write that blocks would hold the lock of ``sys.stdout``,
-    and the interpreter would wait for this lock at exit.
+    It bypasses ``sys.stdout``: a blocked write would hold the lock of ``sys.stdout``, for which the
+    interpreter waits at exit.
     """
 
     def __init__(self, descriptor: int, gone: threading.Event) -> None:
@@ -62,7 +62,7 @@ class PatientDriver(LinuxDriver):
         self._gone = threading.Event()
         self._writer: _Writer | None = None
         self.torn = False
-        """Whether the screen must be redrawn, because output was discarded when the queue was full."""
+        """Whether output was discarded because the queue was full, so that the screen must be redrawn."""
 
     def start_application_mode(self) -> None:
         """Start the writer thread, then enter application mode."""
@@ -90,7 +90,7 @@ class PatientDriver(LinuxDriver):
 
     @property
     def deaf(self) -> bool:
-        """Whether the terminal no longer exists, or has not accepted all output after :meth:`close`."""
+        """Whether the terminal no longer exists, or did not accept all output before it was closed."""
         return self.gone or (self._writer is not None and self._writer.is_alive())
 
     def run_input_thread(self) -> None:

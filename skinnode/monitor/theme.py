@@ -1,4 +1,4 @@
-"""Defines the screen's styles and the state of the user interface; lays out lines of styled text."""
+"""Provides the styles of the screen, the state of the user interface, and the layout of styled text."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class Theme:
     bad: Style
     chosen: Style
     alarm: Style
-    """Style of labels that show a recording, a pause or a lost patch."""
+    """Style of the labels for a recording, a pause or a lost patch."""
     gauge: Style
 
     def of(self, level: Level) -> Style:
@@ -134,13 +134,13 @@ def width_of(line: Line) -> int:
 
 
 def spread(left: Line, right: Line, width: int, theme: Theme, style: Style | None = None) -> Line:
-    """Join ``left`` and a right-aligned ``right`` into one line; cut ``left`` if the two do not fit."""
+    """Join ``left`` and the right-aligned ``right`` into one line, cutting ``left`` if they do not fit."""
     room = max(0, width - width_of(right))
     return pad([*pad(left, room, theme, style), *right], width, theme, style)
 
 
 def beside(blocks: Sequence[tuple[list[Line], int]], height: int, theme: Theme) -> list[Line]:
-    """Place blocks of lines side by side; each block has a given width."""
+    """Place blocks of lines side by side; a block is given with its width."""
     return [
         [
             segment

@@ -11,11 +11,11 @@ from skinnode.model.frames import FieldFrame
 from skinnode.model.layout import Float
 
 TOUCH: Final = 0.35
-"""Minimum depth of the electrodes in a touch, as a fraction of the maximum depth. In a Hertzian contact, the
-depth at the rim is half the depth at the centre."""
+"""Minimum depth of an electrode within a touch, as a fraction of the maximum depth. In a Hertzian contact,
+the rim is half as deep as the centre."""
 SURE: Final = 6.0
-"""Minimum depth of the electrodes in a touch, as a multiple of the standard deviation of the depth. With 100
-electrodes, noise alone exceeds this limit in one of 10 million fields."""
+"""Minimum depth of an electrode within a touch, as a multiple of its standard deviation. With 100 electrodes,
+noise alone exceeds this limit in one of 10 million fields."""
 LEAST_TOUCH_M: Final = 1e-5
 
 
@@ -23,7 +23,7 @@ LEAST_TOUCH_M: Final = 1e-5
 class Touch:
     """One contact on a patch; unknown values are None.
 
-    A touch found as a region of pressed skin has forces only if a stiffness was specified.
+    A touch derived from a region of pressed skin has forces only if a stiffness was specified.
     """
 
     x_m: float
@@ -40,8 +40,8 @@ class Touch:
 def touches_of(field: FieldFrame, rest_m: Float) -> tuple[Touch, ...]:
     """Return the contacts on a patch, strongest first.
 
-    A field computed by the exact inverse may contain no contacts, for example in an old recording. In this
-    case, each connected region of pressed skin is returned as a contact, whose force is known only if a
+    The contacts are those of the field. A field of the exact inverse may have none, for example in an old
+    recording; each connected region of pressed skin then counts as a contact. Its force is known only if a
     stiffness was specified.
 
     Args:
@@ -67,7 +67,7 @@ def touches_of(field: FieldFrame, rest_m: Float) -> tuple[Touch, ...]:
 
 
 def _depth_at(field: FieldFrame, rest_m: Float, place_m: Float) -> float:
-    """Return the depth in m at the electrode closest to a position."""
+    """Return the depth at the electrode closest to a position, m."""
     away = np.hypot(rest_m[..., 0] - place_m[0], rest_m[..., 1] - place_m[1])
     return float(-field.displacement_m[..., 2].flat[int(away.argmin())])
 

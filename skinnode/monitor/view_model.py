@@ -56,9 +56,9 @@ class PatchView:
     """Reason why the newest field is not trusted; empty if the field is trusted or does not exist."""
     precise: bool
     data_share: float | None
-    """Fraction of the maximum depth that comes from data rather than the prior; None without a field."""
+    """Fraction of the maximum depth that comes from the data, not the prior; None without a field."""
     data_faults: tuple[DataFault, ...]
-    """Faulty readings that were excluded when the newest field was computed."""
+    """Faulty readings excluded from the newest field."""
     method: str
     surface: Surface | None
     depth_m: float | None
@@ -93,7 +93,7 @@ class View:
     patches: tuple[PatchView, ...]
     buses: tuple[BusView, ...]
     scans_hz: float
-    """Fields per second of the patch with the highest rate; equal to the SYNC rate if no scan is lost."""
+    """Highest rate of fields among the patches, Hz; equal to the SYNC rate if no scan is lost."""
     fields_hz: float
     """Fields per second, summed over all patches."""
     latency_s: float | None
@@ -120,7 +120,7 @@ class LogLine:
 
 
 class History:
-    """Snapshots of the last few seconds, used to compute views."""
+    """Snapshots of the last few seconds, from which views are computed."""
 
     def __init__(self, hand: HandConfig, *, live: bool = True) -> None:
         self._hand, self._live = hand, live
@@ -130,7 +130,7 @@ class History:
         """Add the newest snapshot and return its view."""
         kept = self._kept
         if kept and kept[-1].t_ns > snapshot.t_ns:
-            kept.clear()  # the clock of a recording may be set back
+            kept.clear()  # in a recording, the clock may be set back
         elif kept and kept[-1].t_ns == snapshot.t_ns:
             kept.pop()
         kept.append(snapshot)
@@ -144,8 +144,8 @@ def view_of(hand: HandConfig, history: Sequence[Snapshot], *, live: bool = True)
 
     Args:
         hand: The hand.
-        history: Snapshots, oldest first; rates are averages since the oldest snapshot.
-        live: Whether the source is a running host; latencies are computed only for a running host.
+        history: Snapshots, oldest first; rates are averages over the whole history.
+        live: Whether the source is a running host, the only kind with latencies.
     """
     now, before = history[-1], history[0]
     elapsed_s = max(1e-3, (now.t_ns - before.t_ns) * 1e-9)
@@ -221,7 +221,7 @@ def _latencies_s(history: Sequence[Snapshot], name: str) -> list[float]:
 
 @functools.lru_cache(maxsize=128)
 def upper_m(layout: LayoutConfig) -> Float:
-    """Return the (U, N, 3) electrode positions at rest according to the hand file, m.
+    """Return the electrode positions (U, N, 3) at rest according to the hand file, m.
 
     The positions stored in the patch may differ.
     """
@@ -240,7 +240,7 @@ def judge_patch(
     missed = stream.assembler.scans_missed - before.assembler.scans_missed
     lossy = [f"{count} {what} lost" for count, what in ((losses, "chunks"), (missed, "scans")) if count > 0]
     if condition is not Condition.OPERATIONAL:
-        lossy = []  # a patch that is not operational loses all frames
+        lossy = []  # the condition already explains these losses
     level: Level = "good"
     if lossy or words:
         level = "note"

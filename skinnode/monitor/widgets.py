@@ -21,9 +21,9 @@ Painter = Callable[[int, int], list[Line]]
 
 
 class Canvas(Widget):
-    """Canvas that draws the lines returned by a painter, and sends only changed lines to the terminal.
+    """Canvas that draws the lines of a painter and sends only changed lines to the terminal.
 
-    Textual's own widgets do not compare lines and would redraw the whole picture on each update.
+    Textual's own widgets would redraw the whole picture on each update.
     """
 
     DEFAULT_CSS = "Canvas { width: 1fr; height: 1fr; }"
@@ -68,7 +68,7 @@ class Canvas(Widget):
 
 
 class Dialog(ModalScreen[bool]):
-    """Text in a box. ``enter`` or ``y`` answers a question with True; any other key answers with False."""
+    """Text in a box. ``enter`` or ``y`` answers a question with True, any other key with False."""
 
     CSS = """
     Dialog { align: center middle; background: $background 40%; }

@@ -1,9 +1,9 @@
-"""Reads and writes a recording's journal, the file that contains everything except the frames.
+"""Reads and writes the journal of a recording, which contains everything except the frames.
 
 The journal is a JSON Lines file next to the log. The first line contains the hand and the offset of the
-host's clock (:class:`Header`). Every other line describes an event that affected how the host decoded the
-frames. In an event, ``at`` is the number of frames previously received on ``bus``, and ``t_ns`` is the time
-of the event on the host's monotonic clock.
+host's clock (:class:`Header`). Every other line is an event that affected how the host decoded the frames:
+``at`` is the number of frames received on ``bus`` before the event, and ``t_ns`` its time on the host's
+monotonic clock.
 
 =============  ==============================================================================
 ``event``      meaning
@@ -41,12 +41,12 @@ FORMAT: Final = "skinnode recording 1"
 SUFFIX: Final = ".jsonl"
 
 COMPLAINTS_KEPT: Final = 100
-"""Maximum number of unreadable lines reported individually; additional lines are only counted."""
+"""Maximum number of unreadable lines reported one by one; any more are only counted."""
 
 _MOST: Final = 2**63 - 1
 _LONGEST_LINE: Final = 2 << 20
-"""Maximum length of a line in bytes, sufficient for an event with the baseline and layout of the largest
-patch. A longer line is read as several lines."""
+"""Maximum length of a line, bytes. An event with the baseline and the layout of the largest patch fits; a
+longer line is split."""
 _OF_PATCHES: Final = ("resumed", "withheld", "polled", "overtaken")
 
 
@@ -68,7 +68,7 @@ class Header:
 
 
 def _without_paths(value: Any) -> Any:
-    """Remove file names; the journal contains the data from the named files instead."""
+    """Remove file names, because the journal contains the data of these files."""
     if isinstance(value, Mapping):
         kept = {key: item for key, item in value.items() if not isinstance(item, Path)}
         return {key: _without_paths(item) for key, item in kept.items()}
@@ -78,7 +78,7 @@ def _without_paths(value: Any) -> Any:
 
 
 def facts_table(facts: NodeFacts) -> dict[str, Any]:
-    """Convert NodeFacts to a JSON object without loss of numerical precision."""
+    """Convert NodeFacts to a JSON object that preserves every number exactly."""
     layout, planned = facts.layout, facts.config.layout.build()
     same = np.array_equal(layout.upper_m, planned.upper_m) and np.array_equal(layout.lower_m, planned.lower_m)
     own = {"upper_m": layout.upper_m.tolist(), "lower_m": layout.lower_m.tolist(), "name": layout.name}

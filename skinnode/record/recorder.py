@@ -1,6 +1,6 @@
 """Records the frames of a running host.
 
-The host's threads only queue entries. A separate thread writes the entries, so that a slow disk delays only
+The host's threads only queue entries, and a separate thread writes them. A slow disk therefore delays only
 the recording.
 """
 
@@ -31,15 +31,15 @@ _log = logging.getLogger(__name__)
 FLUSH_S: Final = 0.25
 """Interval between flushes to the kernel, s.
 
-If this process crashes, the recording lacks at most the last 0.25 s.
+A crash of this process costs the recording at most its last 0.25 s.
 """
 
 SYNC_S: Final = 1.0
-"""Interval between fsync calls, s. After a power failure, the recording lacks about the last second at most.
-Each call blocks the writer thread for about 10 ms."""
+"""Interval between fsync calls, s. A power failure costs the recording about its last second. Each call
+blocks the writer thread for about 10 ms."""
 
 CAPACITY: Final = 50_000
-"""Maximum number of queued batches of frames: several seconds of traffic on four fully loaded buses."""
+"""Maximum number of queued batches of frames, enough for several seconds on four fully loaded buses."""
 
 _ALLOWED: Final = "a folder (created if needed), or a file ending in .log or .blf"
 
@@ -55,11 +55,11 @@ class RecorderStats:
     dropped: int
     """Number of frames not written because the disk was too slow or failed."""
     failure: str | None
-    """One-line reason why recording has stopped; None while recording continues."""
+    """One-line reason why recording stopped; None while it continues."""
 
 
 def name_in(folder: Path, hand: HandConfig, kind: LogFormat, now: datetime.datetime) -> Path:
-    """Return a path in ``folder`` for a recording: the hand's name with the date and time."""
+    """Return a path in ``folder`` for a recording, composed of the hand's name, the date and the time."""
     name = "".join(c if c.isalnum() or c in "-_" else "-" for c in hand.name)
     return folder / f"{name}-{now:%Y%m%d-%H%M%S}.{kind}"
 
@@ -67,8 +67,8 @@ def name_in(folder: Path, hand: HandConfig, kind: LogFormat, now: datetime.datet
 def make_folder(path: Path) -> Path | None:
     """Create the folder ``path`` and its parents; return ``path``, or None if the folder already existed.
 
-    Raises ConfigError if the folder cannot be created. A name with a suffix also raises ConfigError, because
-    such a name is probably a misspelt file name.
+    Raises ConfigError if the folder cannot be created, or if its name has a suffix and is thus probably a
+    misspelt file name.
     """
     if path.is_dir():
         return None
@@ -100,16 +100,16 @@ class Recorder:
             ...
 
     If recording begins before the host starts, a replay reproduces the fields bit for bit. A recording that
-    begins while the host is running (:meth:`Host.tap`) lacks the solvers' initial state. If an exception ends
-    the ``with`` block before the first frame, the empty recording is deleted. If the disk fails, recording
-    ends, a log message reports the failure, and the host continues. If writing an entry raises an exception
-    other than OSError, the entry is lost and counted in ``dropped``.
+    begins later (:meth:`Host.tap`) lacks the initial state of the solvers. If an exception ends the ``with``
+    block before the first frame, the empty recording is deleted. If the disk fails, recording ends with a log
+    message and the host continues. An entry whose writing raises any exception but OSError is lost and
+    counted in ``dropped``.
 
     Args:
         hand: The hand.
-        path: A file name ending in .log or .blf, or a folder, which is created if needed. In a folder, the
-            file is named after the hand, the date and the time. The journal is written next to the file.
-        kind: File format, used if ``path`` is a folder.
+        path: A file name ending in .log or .blf; or a folder, created if needed, for a file named after the
+            hand, the date and the time. The journal is written next to the file.
+        kind: File format if ``path`` is a folder.
 
     Raises:
         ConfigError: The log or journal already exists, or a file or folder cannot be created.
@@ -163,14 +163,14 @@ class Recorder:
         self._put(lambda: self._write_frames(bus, (frame,), sent=True), 1)
 
     def resumed(self, patch: str, solver: ScanSolver, *, anew: bool) -> None:
-        """Record that the host starts or resumes decoding the scans of a patch."""
+        """Record that the host starts or resumes decoding a patch's scans."""
         known = self._solvers.get(patch) is solver
         self._solvers[patch] = solver
         facts: dict[str, Any] = {} if known else {"facts": facts_table(solver.facts)}
         self._event(patch, "resumed", anew=anew, **facts)
 
     def withheld(self, patch: str) -> None:
-        """Record that the host stops decoding the scans of a patch."""
+        """Record that the host stops decoding a patch's scans."""
         self._event(patch, "withheld")
 
     def polled(self, patch: str, t_ns: int) -> None:
@@ -178,7 +178,7 @@ class Recorder:
         self._event(patch, "polled", t_ns=t_ns)
 
     def overtaken(self, patch: str, scan: int, t_receive_ns: int) -> None:
-        """Record that a scan was skipped in favour of a newer scan."""
+        """Record that a scan was skipped in favour of a newer one."""
         self._event(patch, "overtaken", scan=scan, received_ns=t_receive_ns)
 
     def close(self) -> None:
@@ -194,7 +194,7 @@ class Recorder:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
-        # Delete an empty recording; otherwise, a retry would fail because the files exist.
+        # Delete an empty recording, because its files would make a retry fail.
         if error is not None and not self._log.frames:
             self.path.unlink(missing_ok=True)
             self.path.with_suffix(SUFFIX).unlink(missing_ok=True)
@@ -222,7 +222,7 @@ class Recorder:
         self._log.close()
 
     def _turn(self) -> bool:
-        """Write the next entry, if one arrives within a flush interval; return whether to continue."""
+        """Write the next entry if one arrives within a flush interval; return False after the last entry."""
         if self._ended:
             return False
         with suppress(queue.Empty):
@@ -252,7 +252,7 @@ class Recorder:
             self._defects.report("recording", error)
 
     def _flush(self, *, to_disk: bool) -> None:
-        """Flush the journal before the log, so that the journal on disk is never older than the log."""
+        """Flush the journal and then the log, so that the journal on disk is never the older of the two."""
         if self._lost != self._lost_reported:
             lost, self._lost_reported = self._lost - self._lost_reported, self._lost
             self._write_event("", clock.monotonic_ns(), "dropped", frames=lost)
@@ -280,7 +280,7 @@ class Recorder:
 
 
 def channels(hand: HandConfig) -> dict[str, str]:
-    """Return each bus's channel in the log: the bus's name if candump accepts it, otherwise bus0, bus1, …."""
+    """Return the channel of each bus in the log: its name if candump accepts it, otherwise bus0, bus1, …."""
     names = {}
     for number, bus in enumerate(hand.buses):
         plain = bus.name.isascii() and bus.name.isalnum() and not bus.name.isdigit() and len(bus.name) < 16

@@ -1,17 +1,17 @@
-"""Replays a recording and solves its scans with the code that also decodes live frames.
+"""Replays a recording and solves its scans with the code that decodes live frames.
 
-The replay uses the host's dispatcher, assembler, decoder, stream, solver and publisher, but no threads: each
-scan is solved when its last frame is dispatched.
+Dispatcher, assembler, decoder, stream, solver and publisher are those of the host, but run in a single
+thread: each scan is solved when its last frame is dispatched.
 
-Replayed fields are identical to the live fields, bit for bit, if these conditions are met:
+The fields are identical to those of the live run, bit for bit, on these conditions:
 
 - the recording is complete and began before the host started;
 - the software and the processor are the same;
 - no live solve was cut short by its deadline.
 
-Times refer to the recording host's clock and have a resolution of 1 µs, as in log files. If frames are
-missing or damaged, the frame counts in the journal are not usable. Journal events are then ordered by time,
-and the times of later frames determine when incomplete scans time out.
+Times refer to the clock of the recording host, with the 1 µs resolution of log files. If frames are missing
+or damaged, the frame counts in the journal no longer match the log. From then on, the times of the frames
+determine when journal events take effect and when incomplete scans time out.
 """
 
 from __future__ import annotations
@@ -45,14 +45,14 @@ from skinnode.transport.frame_log_reader import FrameLogReader
 LONGEST_SILENCE_S: Final = 60.0
 """Maximum pause between replayed frames, s.
 
-Longer pauses are shortened; they may be due to damaged timestamps.
+Longer pauses are shortened, because they may be due to damaged timestamps.
 """
 
 _ROUNDING_NS: Final = 2_000
 """Maximum rounding error of a log's timestamps, ns."""
 
 _SLICE_S: Final = 0.1
-"""Maximum delay until :meth:`Replay.stop` takes effect, s."""
+"""Maximum delay before :meth:`Replay.stop` takes effect, s."""
 
 
 def _never() -> bool:
@@ -67,13 +67,12 @@ def replay(path: Path | str, *, speed: float | None = None, cancelled: Callable[
         for field in skinnode.record.replay("runs/hand-20260102-030405.log"):
             ...
 
-    The replay solves every scan that was solved live, regardless of ``speed``.
+    At any ``speed``, the replay solves every scan that was solved live.
 
     Args:
         path: File ending in .log or .blf.
-        speed: Replay speed relative to the recording (2 is twice as fast); None replays as fast as possible.
-        cancelled: Function called before each frame; a return value of True has the same effect as
-            :meth:`Replay.stop`.
+        speed: Replay speed relative to the recording: 2 is twice as fast; None replays as fast as possible.
+        cancelled: Function called before each frame; returning True has the effect of :meth:`Replay.stop`.
 
     Raises:
         ConfigError: The recording cannot be read, or ``speed`` is not positive.
@@ -94,16 +93,16 @@ class Replay:
         self.hand, self.started = header.hand, header.started
         self._speed, self._offset_ns = speed, header.wall_minus_mono_ns
         self.log = FrameLogReader(path)
-        """Reader of the log; its attributes ``damaged`` and ``damages`` describe unreadable parts."""
+        """Reader of the log; ``damaged`` and ``damages`` describe its unreadable parts."""
         ends = [event for event in events if event["event"] == "ended"]
         self.ended = bool(ends)
-        """Whether the recording was closed properly; False if the recording process was killed."""
+        """Whether the recording was closed properly, not cut off by the end of its process."""
         self._recorded: int | None = ends[0].get("frames") if ends else None
         self._read = 0
         self._first_ns: int | None = None
         self._journal = path.with_suffix(SUFFIX).name
         self.incomplete: str | None = None
-        """Description of the frames missing from the log; None if no missing frames have been detected."""
+        """Description of the frames missing from the log; None if none are known to be missing."""
         self.dropped = sum(e["frames"] for e in events if e["event"] == "dropped")
         """Number of frames that the recorder could not write."""
         self._now_ns = 0
@@ -120,7 +119,7 @@ class Replay:
             for number, bus in enumerate(self.hand.buses)
         }
         self.strange = 0
-        """Number of frames on channels that do not belong to any bus of the hand."""
+        """Number of frames on channels that belong to no bus of the hand."""
 
     def __iter__(self) -> Iterator[FieldFrame]:
         fields = self._publisher.subscribe(64, None, None)
@@ -161,7 +160,7 @@ class Replay:
 
     @property
     def flaws(self) -> list[str]:
-        """Messages about missing or unreadable parts; complete only after a full iteration."""
+        """Messages about missing or unreadable parts, complete after a full iteration."""
         found = [f"{self.log.path.name} {damage}" for damage in self.log.damages]
         if self.log.damaged > len(found):
             found.append(f"{self.log.damaged - len(found)} more damaged places")
@@ -181,7 +180,7 @@ class Replay:
 
     @property
     def stopped(self) -> bool:
-        """Whether :meth:`stop` has been called or the ``cancelled`` function requests a stop."""
+        """Whether :meth:`stop` has been called or ``cancelled`` has returned True."""
         return self._stopped or self._cancelled()
 
     def health(self, patch: str) -> PatchHealth:
@@ -240,7 +239,7 @@ class _Pace:
 
 
 class _PollerlessDispatcher(Dispatcher):
-    """Dispatcher that does not poll streams after each batch, because the journal determines when to poll."""
+    """Dispatcher that does not poll streams after each batch; the journal determines when to poll."""
 
     def poll_with(self, poller: Callable[[int], None], defects: Defects | None = None) -> None:
         pass
@@ -271,10 +270,10 @@ class _Bus:
             od.heartbeat_cob_id(patch.node_id): self.patches[patch.name].monitor
             for patch in hand.patches_on(config.name)
         }
-        self._stood_by: set[int] = set()  # heartbeat COB-IDs of nodes that the host has set pre-operational
+        self._stood_by: set[int] = set()  # heartbeat COB-IDs of nodes that the host set to pre-operational
 
     def take(self, frame: Any, *, sent: bool, whole: bool) -> None:
-        """Process the next frame of the log; ``whole`` is True if the log has been undamaged so far."""
+        """Process the next frame of the log; ``whole``: whether the log has been undamaged so far."""
         if sent:
             self._sent += 1
             self._dispatcher.count_sent(frame.can_id, frame.data)
@@ -289,7 +288,7 @@ class _Bus:
         self._dispatcher.dispatch((frame,))
         if frame.can_id in self._stood_by:
             monitor = self._of_heartbeat[frame.can_id]
-            if monitor.nmt_state == NmtState.PRE_OPERATIONAL:  # commanded by the host; not a fault
+            if monitor.nmt_state == NmtState.PRE_OPERATIONAL:  # no fault, because the host commanded it
                 monitor.nmt_state = NmtState.OPERATIONAL
         if not whole:
             for heard in self.patches.values():
@@ -297,7 +296,7 @@ class _Bus:
         self._dispatcher.measure(frame.t_ns)
 
     def _on_command(self, data: bytes) -> None:
-        """Process an NMT command that the host sent; on exit, the host sets its nodes pre-operational."""
+        """Process an NMT command from the host, which sets its nodes to pre-operational when it exits."""
         if len(data) != 2:
             return
         cob_id = od.heartbeat_cob_id(data[1])
@@ -335,7 +334,7 @@ class _Bus:
                     stream.resume(solver, stream.withholdings, anew=bool(event.get("anew")))
 
     def _solver(self, event: dict[str, Any]) -> ScanSolver | None:
-        """Return the solver for a journal event; None if the node's NodeFacts are unknown or unusable."""
+        """Return the solver for a journal event; None if the facts about the node are unknown or unusable."""
         name, replay = event["patch"], self._replay
         if "facts" in event:
             self._solvers[name] = None

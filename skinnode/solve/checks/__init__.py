@@ -1,8 +1,8 @@
-"""Tests of the readings for contradictions, and the decision whether to trust a field.
+"""Check frames for contradictory readings, and decide which fields to trust.
 
-``data_check`` checks each field of a tracker. It uses ``reading_model``, the joint distribution of a layout's
+``data_check`` checks each field of a tracker. The checks use ``reading_model``, the joint distribution of a layout's
 readings linearised at rest. ``explanations`` finds the most likely explanation of a frame: either loads or
-wrong readings. Its candidates come from ``greedy_search``, ``wire_tests`` and ``crossed_wires``.
+wrong readings. ``greedy_search``, ``wire_tests`` and ``crossed_wires`` supply the candidates.
 ``fault_list`` decides which readings to leave out of the next frames. ``trust`` decides whether a field and
 each of its wires are trusted.
 """

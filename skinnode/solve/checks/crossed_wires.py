@@ -7,8 +7,7 @@ readings, P is their precision, α = P z, and δ is the change in z. No paramete
 increase of a few nats is significant.
 
 In 108 healthy frames with six kinds of presses (staggered layout, h = 0.5, noise 1e-4), no exchange increased
-the log evidence by more than 2.8 nats. Where two wires were in fact crossed, exchanging them increased it by
-a median of 125 nats for upper wires and 43 nats for lower wires.
+the log evidence by more than 2.8 nats. If two wires were in fact crossed, exchanging them increased the log evidence by a median of 125 nats for upper wires and 43 nats for lower wires.
 """
 
 from __future__ import annotations
@@ -56,8 +55,7 @@ def likeliest(
         p: (m, m) precision of the readings.
         alpha: (m,) P z.
         z: (U, K) changes of the readings since rest, in units of their noise.
-        present: (U, K) mask of the available readings. A reading is exchanged only if both readings are
-            available.
+        present: (U, K) mask of the available readings. Two readings are exchanged only if both are available.
         far: Whether to test all pairs of wires rather than only neighbours. Testing all pairs takes ten times
             as long.
     """
@@ -74,9 +72,9 @@ def likeliest(
 def best_exchange(  # noqa: PLR0913 - a kernel: arrays by name
     p: Float, alpha: Float, z: Float, present: Mask, upper: int, lower: int, reach: int, delta: Float
 ) -> tuple[float, bool, int, int]:
-    """Return the largest gain from an exchange, nats; whether the wires are upper wires; and their numbers.
+    """Return the gain (nats), the layer and the wire numbers of the best exchange of two wires.
 
-    Only wires whose numbers differ by at most ``reach`` are tested. The gain is reduced by ln n, because the
+    The layer is True for upper wires. Only wires whose numbers differ by at most ``reach`` are tested. The gain is reduced by ln n, because the
     best of n pairs is chosen. ``delta`` (max(U, K),) is a work array.
     """
     best, is_upper, one, other, pairs = -math.inf, True, 0, 0, 0
@@ -109,8 +107,7 @@ def _gain(  # noqa: PLR0913 - a kernel: arrays by name
 ) -> float:
     """Return the gain in log evidence from exchanging the ``count`` readings of two wires.
 
-    The readings of the first wire have the indices ``start``, ``start + step``, …. Those of the second wire
-    are offset by ``across``. The function first computes the upper bound −αᵀδ. If the bound is at most
+    The readings of the first wire have the indices ``start``, ``start + step``, …. Adding ``across`` gives the indices for the second wire. The function first computes the upper bound −αᵀδ. If the bound is at most
     ``enough``, it is returned in place of the gain. The gain is −inf if fewer than half of the pairs of
     readings are available.
     """

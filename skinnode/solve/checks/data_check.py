@@ -34,7 +34,7 @@ from skinnode.solve.linalg.cholesky import multiply_vector, solve_positive
 from skinnode.solve.wires.problem import PatchProblem
 
 ROUNDS: Final = 3
-"""Number of groups of readings left out of a frame after which it is not solved again."""
+"""Limit on the groups of readings left out of a frame. Once the limit is reached, the frame is not solved again."""
 WRONG: Final = 0.1
 """Expected relative error of a wrong reading. Not tuned: reducing it to 0.01 would change the cost of a wrong
 reading by only 2 nats."""
@@ -42,11 +42,9 @@ SUSPICIOUS: Final = 5.0
 """Gain in log evidence (nats) from assuming a fault, above which a frame is suspicious. The check examines
 suspicious frames: it searches for the most likely explanation of their readings."""
 OFFSETS: Final = (0, 1, 3, 5)
-"""Prior scales at which single readings are tested: offsets from the index of the best-fitting κ,
-downwards."""
+"""Steps in κ below the best-fitting value at which single readings are tested."""
 CLEAR: Final = -30.0
-"""Log evidence of faults minus that of loads (nats), below which loads clearly explain a frame. The check
-then skips similar frames for a while."""
+"""Log evidence of faults minus that of loads (nats), below which loads clearly explain a frame. Similar frames are then not examined for :data:`EXCUSED_FRAMES` frames."""
 EXCUSED: Final = 10.0
 """Maximum amount (nats) by which the gain of a frame may exceed that of an examined frame, for the two frames
 to count as similar."""
@@ -64,8 +62,7 @@ time, both wires are reported."""
 NOISE_RATIOS: Final = (2.0, 4.0, 8.0, 16.0)
 """Ratios of actual to stated noise that the check tries as explanations of a suspicious frame."""
 COARSE: Final = 0.1
-"""Assumed error of the linearised readings if several upper wires have no solution, as a fraction of the 90 %
-quantile of their changes since rest."""
+"""Assumed error of the linearised readings if several upper wires have no solution, as a fraction of the 90 % quantile of the readings' changes since rest."""
 COARSE_GROUPS: Final = 3
 """Maximum number of groups of readings left out at once if several upper wires have no solution. If the
 search finds more groups, only the first is left out."""
@@ -100,12 +97,11 @@ class DataCheck:
         sigma: Typical relative noise of a reading, for :meth:`prepare`.
         model_std: Standard deviation of the forward model's error, relative to the largest change of a
             reading; 0 if the patch matches its layout exactly.
-        drift: Gain errors that are not faults: ``none``, ``patch`` (one error for the patch) or ``wire`` (one
+        drift: Expected gain errors, which are not reported as faults: ``none``, ``patch`` (one error for the patch) or ``wire`` (one
             for each upper wire).
 
     Attributes:
-        scan: Scan number of the next frame, to be reported with its faults. If None, frames are numbered in
-            the order in which they are checked.
+        scan: Scan number of the next frame, to be reported with its faults. If None, faults are reported with the number of frames checked so far.
     """
 
     def __init__(
@@ -162,7 +158,7 @@ class DataCheck:
     def check(
         self, solved: Solved, solve_without: Callable[[Mask], Solved], until: float = math.inf
     ) -> FieldFrame:
-        """Check the readings of a frame, and return its field with faults and trust.
+        """Check the readings of a frame, and return its field with the faults found and the trust decision.
 
         If readings are found to be wrong, the returned field is that of a new solve without them.
 
@@ -246,10 +242,9 @@ class DataCheck:
         return self._needs_no_explanation(max(self._largest_gains(self._present, best, cost, sigma)))
 
     def _needs_no_explanation(self, gain: float) -> bool:
-        """Return whether a frame is accepted without an examination; ``gain`` is that from assuming a fault.
+        """Return whether a frame is accepted without an examination.
 
-        A frame is accepted if ``gain`` (nats) is small. It is also accepted if loads clearly explained a
-        recent frame with a similar gain and the same suspected reading. If another reading is suspected, the
+        ``gain`` is the gain in log evidence from assuming a fault, nats. A frame is accepted if the gain is small, or if loads clearly explained a recent frame with a similar gain and the same suspected reading. If another reading is suspected, the
         frame is examined, because a reading can become wrong during a press. The frame after a noisy frame is
         always examined.
         """
@@ -382,7 +377,7 @@ class DataCheck:
     def _remove_gain(self, present: Mask, std: float) -> None:
         """Estimate the remaining gain errors with the prior N(0, ``std``²), and subtract them from ``_z``.
 
-        The gain errors from the solver are too small, because its prior attributes part of each error to a
+        The solver underestimates gain errors, because its prior attributes part of each error to a
         displacement of the wire.
         """
         upper, lower = self._z.shape
@@ -465,7 +460,7 @@ class DataCheck:
     def _deviations(self, solved: Solved) -> tuple[Float, Mask]:
         """Return the deviations (U, K) of the readings from the field, in standard deviations.
 
-        The second value is a mask (U, K) of the valid deviations; the others are infinite.
+        Also returns a (U, K) mask of the valid deviations. Invalid deviations are infinite.
         """
         layout = self._problem.layout
         moved = solved.field.displacement_m.reshape(layout.shape[0], -1) / layout.pitch_m

@@ -4,9 +4,7 @@ A frame can be unlikely under the elastic prior for three reasons: some readings
 crossed, or the loads are unusual, such as a contact much narrower than the patch. A greedy search, similar to
 orthogonal matching pursuit, builds an explanation step by step. Each step adds the load or the group of wrong
 readings with the largest gain in log evidence. An explanation with faults is accepted only if its log
-evidence exceeds that of the best explanation by loads alone by more than :data:`MARGIN`. The same applies to
-crossed wires. Their log evidence is that of loads alone after the readings of the two wires have been
-exchanged.
+evidence exceeds that of the best explanation by loads alone by more than :data:`MARGIN`. The same margin applies to crossed wires, whose log evidence is that of loads alone after the readings of the two wires have been exchanged.
 """
 
 from __future__ import annotations
@@ -41,7 +39,7 @@ SCALES: Final = 4
 """Number of prior scales searched for explanations: the best-fitting scale and smaller ones. A wrong reading
 can inflate the best-fitting scale by a factor of up to 2⁴, a narrow contact by up to 2³."""
 STRIDE: Final = 2
-"""Step in log2 κ between these prior scales."""
+"""Step in log2 κ between the prior scales that are searched."""
 HOPELESS: Final = 150.0
 """Log evidence of loads minus that of faults at one prior scale, nats, above which smaller scales are not
 searched for faults. In 163 frames with a fault, the difference was at most 114 nats."""
@@ -71,7 +69,7 @@ class Group:
 
 
 class Explainer:
-    """Search for the most likely explanation of a frame. Each stream needs its own instance.
+    """Finds the most likely explanation of a frame. Each stream needs its own instance.
 
     Args:
         model: Joint distribution of the readings.
@@ -107,7 +105,7 @@ class Explainer:
             cost: Log evidence subtracted for each wrong reading, nats: the logarithm of its expected error
                 divided by the noise.
             sigma: Relative noise of the readings.
-            noisier: Log evidence of the frame for more noise than stated, without additional loads or faults.
+            noisier: Log evidence of the frame, assuming noise above the stated level and no faults.
             whole_wires_only: Whether to search only for wires that contradict the others. Single wrong
                 readings and crossed wires are then skipped.
         """
@@ -206,7 +204,7 @@ class Explainer:
     def _by_wire(  # noqa: PLR0913 - the frame, and what was found in it
         self, z: Float, present: Mask, cost: float, finding: WireFinding, alpha: Float, best: int, tau: float
     ) -> float:
-        """Return the highest log evidence for loads and the faulty wire ``finding``."""
+        """Return the highest log evidence for loads and a fault of the wire in ``finding``."""
         upper, lower = self._model.shape
         wire, choice = finding.wire, math.log(2.0 * (upper + lower))
         rows = (slice(wire, wire + 1), slice(None)) if wire < upper else (slice(None), wire - upper)
@@ -274,7 +272,7 @@ class Explainer:
 
 
 def _scales(best: int) -> range:
-    """Return the indices of the κ to search for explanations, in descending order from ``best``."""
+    """Return the indices of the values of κ to search, in descending order from ``best``."""
     return range(best, max(best - STRIDE * SCALES, -1), -STRIDE)
 
 

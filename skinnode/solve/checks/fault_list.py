@@ -1,7 +1,6 @@
 """Fault list: the faults of a stream, and the readings left out because of them.
 
-A fault is confirmed if it is found in several frames. Its readings are left out until they have agreed with
-the field for long enough.
+A fault is confirmed if it is found in several frames. The readings of a confirmed fault are left out until they have agreed with the field for long enough.
 """
 
 from __future__ import annotations
@@ -100,7 +99,7 @@ class FaultList:
         return tuple(passing)
 
     def follow(self, deviation: Float, known: Mask) -> None:
-        """Update the faults with a new field, and remove those whose readings have agreed for long enough.
+        """Remove the faults whose readings have agreed with the field for long enough.
 
         Args:
             deviation: (U, K) deviations of the readings from the field, in standard deviations.

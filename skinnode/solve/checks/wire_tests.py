@@ -1,4 +1,4 @@
-"""Tests of whole wires: are a wire's readings consistent with the other wires, and is its gain correct?
+"""Tests of whole wires, for readings inconsistent with the other wires and for gain errors.
 
 If the readings of a wire are delayed, or belong to another wire, each single reading may agree with the
 others within its uncertainty. Only a test of all readings of the wire then detects the fault. Let G be the
@@ -82,8 +82,7 @@ class WireFinding:
     wire: int
     """Index of the wire: 0 to U − 1 for upper wires, U to U + K − 1 for lower wires."""
     factor: float
-    """Error common to all readings of the wire, in units of their noise; nan if the more likely fault is that
-    the wire is unrelated to the others."""
+    """Error common to all readings of the wire, in units of their noise; nan if the readings of the wire appear unrelated to those of the other wires."""
 
 
 def least_fitting(  # noqa: PLR0913 - the frame, its tables and scratch

@@ -38,8 +38,7 @@ PULLED_OFF: Final = 0.1
 """Standard deviation of a contact's centre along the surface if pulling loads are left out, in cell widths.
 The measured RMS error on layers of 2 to 8 mm was at most 0.11 cell widths."""
 BEYOND: Final = 1.0
-"""Standard deviation of the loads in the outermost ring of cells, relative to these loads. The ring stands
-for all loads beyond the patch. With a value of 0.5, errors of the force under plates larger than the patch
+"""Standard deviation of the loads in the outermost ring of cells, relative to these loads. The outermost ring represents all loads beyond the patch. With a value of 0.5, errors of the force under plates larger than the patch
 would reach 4.8 standard deviations."""
 
 
@@ -52,7 +51,7 @@ class LoadEstimate:
     rows: Float
     """(m, 3Q) rows of W before multiplication by ``weight``."""
     weight: Float
-    """(m,) factors of the rows."""
+    """(m,) factor of each row."""
     share: Float
     """(Q,) diagonal of D: load variance of each cell, relative to s²."""
     scale2: float
@@ -60,9 +59,9 @@ class LoadEstimate:
 
 
 class ContactFinder:
-    """Search for the contacts on one patch, frame by frame. Each stream needs its own instance.
+    """Finds the contacts on one patch, frame by frame. Each stream needs its own instance.
 
-    The thresholds depend on the contacts of the last frame (:mod:`skinnode.solve.posterior.contact_regions`).
+    The detection thresholds depend on the contacts of the last frame (:mod:`skinnode.solve.posterior.contact_regions`).
 
     Args:
         prior: Elastic prior of the patch.
@@ -199,8 +198,7 @@ def _prepare(  # noqa: PLR0913 - a kernel: loads, field and outputs by name
     """Write pressing loads (Q,), depths (Q,) in m and in standard deviations, and forces (UN, 3) in N.
 
     ``field`` (2, UN, 3) contains the displacement and its standard deviations, m. A depth with an infinite
-    standard deviation is written as 0. Cells without an electrode have no depth; their entries are not
-    written.
+    standard deviation is written as 0. Depths of cells without an electrode are not written.
     """
     for cell in range(press.size):
         press[cell] = -q[cell, 2]

@@ -91,8 +91,7 @@ class ElasticPrior:
 def bonded_response(layout: PatchLayout) -> Float:
     """Return the response (3UN, Q) of a bonded layer to normal loads, pitches per unit load.
 
-    The layer is incompressible and as thick as the electrodes are high. It differs from a half-space more
-    than any other support: around a contact, the surface moves outwards rather than downwards. For loads with
+    The layer is incompressible, and its thickness equals the height of the electrodes. No other support differs more from a half-space: around a contact, the surface moves outwards rather than downwards. For loads with
     a standard deviation of 1, the median standard deviation of the normal displacement is :data:`LAYER_SHARE`
     pitches.
     """

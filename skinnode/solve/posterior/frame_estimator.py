@@ -41,7 +41,7 @@ from skinnode.solve.wires.decode import A_MAX, A_MIN
 from skinnode.solve.wires.problem import PatchProblem
 
 NOISE_LEAST: Final = 1e-6
-"""Minimum relative noise assumed in a solve; also allows for the accuracy of the forward model. With less
+"""Minimum relative noise assumed in a solve; also allows for errors of the forward model. With less
 noise, every solve would end at a root of F = b, which can be the wrong root. On layouts with folds (det J =
 0), wrong roots occur even at a noise of 1e-5."""
 LEFT_OUT: Final = 3
@@ -58,7 +58,7 @@ Mask = NDArray[np.bool_]
 class FrameEstimator:
     """Estimator of the displacement, loads and contacts of one patch, frame by frame.
 
-    It relies on all available readings; :class:`skinnode.Posterior` also detects wrong readings. Each stream
+    This class uses all available readings; :class:`skinnode.Posterior` also detects wrong readings. Each stream
     needs its own instance. The kernels release the GIL; :meth:`warm_up` compiles them.
 
     Args:

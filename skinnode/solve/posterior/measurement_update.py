@@ -14,7 +14,7 @@ Let J = ∂r/∂x, which is block-diagonal over wires. A Gauss-Newton step from 
 S is the innovation covariance, s² J C the cross-covariance and K = s² C Jᵀ S⁻¹ the Kalman gain. The posterior
 covariance at x⁺ is s² C − Vᵀ V, where V = L⁻¹ (s² J C) and L Lᵀ = S (Tarantola, Inverse Problem Theory, 2005,
 section 3.4). No eigenvalue of S is less than 1, so rounding errors do not grow with the condition number of
-J. They are at most ε ‖S‖ standard deviations, where ε is the machine precision. For signals of 10⁶ σ, this is
+J. Rounding errors are at most ε ‖S‖ standard deviations, where ε is the machine precision. For signals of 10⁶ σ, this is
 a thousandth of a standard deviation.
 
 A chord step is a Newton step with the factors of an earlier J. Chord steps converge to the same maximum. At
@@ -23,13 +23,12 @@ J, H and S, a chord step is
 
     δ = e − (s² C Jᵀ; −d Hᵀ) S⁻¹ (J e_x − H e_g)
 
-It requires only two triangular solves.
+A chord step requires only two triangular solves.
 
 If a wire has more equations than unknowns, a QR decomposition of [J H] first reduces them to one equation per
 unknown. No information is lost. The reduction is not possible with geometry errors
 (:mod:`skinnode.solve.posterior.geometry_error`), because each lower wire then has its own nuisances. The
-geometry errors follow the other p nuisances in g. Their part of H is sparse, and only its non-zero elements
-are stored.
+geometry errors follow the other p nuisances in g. For the geometry errors, H is sparse, and only its non-zero elements are stored.
 """
 
 from __future__ import annotations
@@ -319,7 +318,7 @@ def noise_variance(  # noqa: C901 - a kernel: sums as loops
 ) -> None:
     """Write the variance of the estimate due to noise and nuisances into ``out`` (U f,), pitch².
 
-    This is diag(K (I + H d Hᵀ) Kᵀ), where Kᵀ = L⁻ᵀ V has ``m`` rows. V and L are read from ``b``.
+    The variance is diag(K (I + H d Hᵀ) Kᵀ), where Kᵀ = L⁻ᵀ V has ``m`` rows. V and L are read from ``b``.
     """
     n = out.size
     for k in range(m):

@@ -7,7 +7,8 @@ readings, P is their precision, α = P z, and δ is the change in z. No paramete
 increase of a few nats is significant.
 
 In 108 healthy frames with six kinds of presses (staggered layout, h = 0.5, noise 1e-4), no exchange increased
-the log evidence by more than 2.8 nats. If two wires were in fact crossed, exchanging them increased the log evidence by a median of 125 nats for upper wires and 43 nats for lower wires.
+the log evidence by more than 2.8 nats. If two wires were in fact crossed, exchanging them increased the log
+evidence by a median of 125 nats for upper wires and 43 nats for lower wires.
 """
 
 from __future__ import annotations
@@ -74,8 +75,8 @@ def best_exchange(  # noqa: PLR0913 - a kernel: arrays by name
 ) -> tuple[float, bool, int, int]:
     """Return the gain (nats), the layer and the wire numbers of the best exchange of two wires.
 
-    The layer is True for upper wires. Only wires whose numbers differ by at most ``reach`` are tested. The gain is reduced by ln n, because the
-    best of n pairs is chosen. ``delta`` (max(U, K),) is a work array.
+    The layer is True for upper wires. Only wires whose numbers differ by at most ``reach`` are tested. The
+    gain is reduced by ln n, because the best of n pairs is chosen. ``delta`` (max(U, K),) is a work array.
     """
     best, is_upper, one, other, pairs = -math.inf, True, 0, 0, 0
     for apart in range(1, reach + 1):
@@ -107,7 +108,8 @@ def _gain(  # noqa: PLR0913 - a kernel: arrays by name
 ) -> float:
     """Return the gain in log evidence from exchanging the ``count`` readings of two wires.
 
-    The readings of the first wire have the indices ``start``, ``start + step``, …. Adding ``across`` gives the indices for the second wire. The function first computes the upper bound −αᵀδ. If the bound is at most
+    The readings of the first wire have the indices ``start``, ``start + step``, …. Adding ``across`` gives
+    the indices for the second wire. The function first computes the upper bound −αᵀδ. If the bound is at most
     ``enough``, it is returned in place of the gain. The gain is −inf if fewer than half of the pairs of
     readings are available.
     """

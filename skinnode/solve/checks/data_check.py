@@ -34,7 +34,8 @@ from skinnode.solve.linalg.cholesky import multiply_vector, solve_positive
 from skinnode.solve.wires.problem import PatchProblem
 
 ROUNDS: Final = 3
-"""Limit on the groups of readings left out of a frame. Once the limit is reached, the frame is not solved again."""
+"""Limit on the groups of readings left out of a frame. Once the limit is reached, the frame is not solved
+again."""
 WRONG: Final = 0.1
 """Expected relative error of a wrong reading. Not tuned: reducing it to 0.01 would change the cost of a wrong
 reading by only 2 nats."""
@@ -44,7 +45,8 @@ suspicious frames: it searches for the most likely explanation of their readings
 OFFSETS: Final = (0, 1, 3, 5)
 """Steps in κ below the best-fitting value at which single readings are tested."""
 CLEAR: Final = -30.0
-"""Log evidence of faults minus that of loads (nats), below which loads clearly explain a frame. Similar frames are then not examined for :data:`EXCUSED_FRAMES` frames."""
+"""Log evidence of faults minus that of loads (nats), below which loads clearly explain a frame. Similar
+frames are then not examined for :data:`EXCUSED_FRAMES` frames."""
 EXCUSED: Final = 10.0
 """Maximum amount (nats) by which the gain of a frame may exceed that of an examined frame, for the two frames
 to count as similar."""
@@ -62,7 +64,8 @@ time, both wires are reported."""
 NOISE_RATIOS: Final = (2.0, 4.0, 8.0, 16.0)
 """Ratios of actual to stated noise that the check tries as explanations of a suspicious frame."""
 COARSE: Final = 0.1
-"""Assumed error of the linearised readings if several upper wires have no solution, as a fraction of the 90 % quantile of the readings' changes since rest."""
+"""Assumed error of the linearised readings if several upper wires have no solution, as a fraction of the 90 %
+quantile of the readings' changes since rest."""
 COARSE_GROUPS: Final = 3
 """Maximum number of groups of readings left out at once if several upper wires have no solution. If the
 search finds more groups, only the first is left out."""
@@ -97,11 +100,12 @@ class DataCheck:
         sigma: Typical relative noise of a reading, for :meth:`prepare`.
         model_std: Standard deviation of the forward model's error, relative to the largest change of a
             reading; 0 if the patch matches its layout exactly.
-        drift: Expected gain errors, which are not reported as faults: ``none``, ``patch`` (one error for the patch) or ``wire`` (one
-            for each upper wire).
+        drift: Expected gain errors, which are not reported as faults: ``none``, ``patch`` (one error for the
+            patch) or ``wire`` (one for each upper wire).
 
     Attributes:
-        scan: Scan number of the next frame, to be reported with its faults. If None, faults are reported with the number of frames checked so far.
+        scan: Scan number of the next frame, to be reported with its faults. If None, faults are reported with
+            the number of frames checked so far.
     """
 
     def __init__(
@@ -244,9 +248,10 @@ class DataCheck:
     def _needs_no_explanation(self, gain: float) -> bool:
         """Return whether a frame is accepted without an examination.
 
-        ``gain`` is the gain in log evidence from assuming a fault, nats. A frame is accepted if the gain is small, or if loads clearly explained a recent frame with a similar gain and the same suspected reading. If another reading is suspected, the
-        frame is examined, because a reading can become wrong during a press. The frame after a noisy frame is
-        always examined.
+        ``gain`` is the gain in log evidence from assuming a fault, nats. A frame is accepted if the gain is
+        small, or if loads clearly explained a recent frame with a similar gain and the same suspected
+        reading. If another reading is suspected, the frame is examined, because a reading can become wrong
+        during a press. The frame after a noisy frame is always examined.
         """
         excused = (
             self._frame < self._excused_until

@@ -4,7 +4,9 @@ A frame can be unlikely under the elastic prior for three reasons: some readings
 crossed, or the loads are unusual, such as a contact much narrower than the patch. A greedy search, similar to
 orthogonal matching pursuit, builds an explanation step by step. Each step adds the load or the group of wrong
 readings with the largest gain in log evidence. An explanation with faults is accepted only if its log
-evidence exceeds that of the best explanation by loads alone by more than :data:`MARGIN`. The same margin applies to crossed wires, whose log evidence is that of loads alone after the readings of the two wires have been exchanged.
+evidence exceeds that of the best explanation by loads alone by more than :data:`MARGIN`. The same margin
+applies to crossed wires, whose log evidence is that of loads alone after the readings of the two wires have
+been exchanged.
 """
 
 from __future__ import annotations

@@ -1,11 +1,11 @@
 """Greedy search for the loads and the wrong readings that explain a frame.
 
 The search is a form of batch orthogonal matching pursuit. Its dictionary is A = [I B], with one column for
-each of the m readings and one for the readings' response to each of the 4Q loads. The search needs Aᵀ P z and the
-diagonal of the Gram matrix E = Aᵀ P A. Adding a load, or leaving out a reading, is a rank-one update of the
-precision: P' = P − share · v vᵀ. For each update, the search stores the vector Aᵀ v, with which it updates Aᵀ
-P z and the diagonal. Of P' itself, only the block of each wire is computed; the blocks are needed to test
-whether all readings of a wire are wrong.
+each of the m readings and one for the readings' response to each of the 4Q loads. The search needs Aᵀ P z and
+the diagonal of the Gram matrix E = Aᵀ P A. Adding a load, or leaving out a reading, is a rank-one update of
+the precision: P' = P − share · v vᵀ. For each update, the search stores the vector Aᵀ v, with which it
+updates Aᵀ P z and the diagonal. Of P' itself, only the block of each wire is computed; the blocks are needed
+to test whether all readings of a wire are wrong.
 """
 
 from __future__ import annotations
@@ -167,7 +167,7 @@ def _best_group(  # noqa: PLR0913 - a kernel: arrays by name
 def _gram_row(  # noqa: PLR0913 - a kernel: arrays by name
     item: int, p: Float, moved: Float, gram: Float, response_t: Float, row: Float
 ) -> None:
-    """Write row ``item`` of E into ``row`` (m + 4Q,), using the tables ``moved`` and ``gram`` if available."""
+    """Write row ``item`` of E into ``row`` (m + 4Q,), from the tables ``moved`` and ``gram`` if available."""
     m = len(p)
     if item < m:
         for j in range(m):
@@ -201,8 +201,9 @@ def _update(  # noqa: PLR0913 - a kernel: arrays by name
 ) -> None:
     """Update the search vectors for step ``count``, which adds a load or leaves out a reading.
 
-    ``item`` is the index of the load or reading among the columns of A. A load is given its most likely variance (b² − h) / h², where b is its
-    element of Aᵀ P z and h its diagonal element of E. Elements before ``first`` are not updated.
+    ``item`` is the index of the load or reading among the columns of A. A load is given its most likely
+    variance (b² − h) / h², where b is its element of Aᵀ P z and h its diagonal element of E. Elements before
+    ``first`` are not updated.
     """
     row = vectors[count]
     _gram_row(item, p, moved, gram, response_t, row)

@@ -6,10 +6,12 @@ neighbouring peak. Where two areas meet, their peaks stay separate contacts only
 is much smaller than at both peaks, and the difference is significant (topological persistence).
 
 A peak is a contact if its load sum, the χ² of the loads of the same cells, or the sum of the loads over its
-area is significant. The strongest peak is also a contact if the skin there is significantly indented. Such an indentation indicates a touch even if the loads cannot be located.
+area is significant. The strongest peak is also a contact if the skin there is significantly indented. Such an
+indentation indicates a touch even if the loads cannot be located.
 
 Only cells with an electrode are tested. The loads on cells beyond the outermost electrodes are ambiguous,
-because a small load nearby and a large load farther away cause nearly the same displacement. Cells beyond the outermost electrodes are added to the adjacent contact.
+because a small load nearby and a large load farther away cause nearly the same displacement. Cells beyond the
+outermost electrodes are added to the adjacent contact.
 
 The thresholds have hysteresis, so that noise does not make contacts appear and disappear. To split a contact
 in two, or to merge two contacts, the load sum between the peaks must change by a third.
@@ -55,14 +57,16 @@ PART_MOST: Final = 0.6
 reach :data:`PART_SIGNIFICANT`."""
 GAP: Final = 0.5
 """Maximum load sum between two contacts, as a fraction of that at the smaller peak. In
-``tests/solve/test_contact_number.py``, no single body was split with limits from 0.4 to 0.6. With 0.75, plates at the edge of the patch were split. With 0.5, two spheres are separated if they are at least 5 pitches
+``tests/solve/test_contact_number.py``, no single body was split with limits from 0.4 to 0.6. With 0.75,
+plates at the edge of the patch were split. With 0.5, two spheres are separated if they are at least 5 pitches
 apart."""
 GAP_ONE: Final = 0.4
 """Value of :data:`GAP` for two peaks that belonged to one contact in the last frame."""
 GAP_TWO: Final = 0.6
 """Value of :data:`GAP` for two peaks that belonged to two contacts in the last frame."""
 GAP_SIGNIFICANT: Final = 3.0
-"""Minimum difference between the load sum at the smaller of two peaks and the load sum between the peaks, in standard deviations, for the peaks to be separate contacts."""
+"""Minimum difference between the load sum at the smaller of two peaks and the load sum between the peaks, in
+standard deviations, for the peaks to be separate contacts."""
 
 
 RegionScratch = tuple[
@@ -145,7 +149,7 @@ def _block_chi2(  # noqa: PLR0913, C901 - a kernel: loads and their posterior by
 
 @njit_part
 def _box(cell: int, near: Index, own: NDArray[np.bool_], out: Index) -> int:
-    """Write those cells into ``out`` that have an electrode, among a cell and its neighbours; return their number."""
+    """Write the cells with an electrode, among ``cell`` and its neighbours, into ``out``; return how many."""
     count = 0
     for i in near[cell]:
         if i >= 0 and own[i]:

@@ -38,8 +38,9 @@ PULLED_OFF: Final = 0.1
 """Standard deviation of a contact's centre along the surface if pulling loads are left out, in cell widths.
 The measured RMS error on layers of 2 to 8 mm was at most 0.11 cell widths."""
 BEYOND: Final = 1.0
-"""Standard deviation of the loads in the outermost ring of cells, relative to these loads. The outermost ring represents all loads beyond the patch. With a value of 0.5, errors of the force under plates larger than the patch
-would reach 4.8 standard deviations."""
+"""Standard deviation of the loads in the outermost ring of cells, relative to these loads. The outermost ring
+represents all loads beyond the patch. With a value of 0.5, errors of the force under plates larger than the
+patch would reach 4.8 standard deviations."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -61,7 +62,8 @@ class LoadEstimate:
 class ContactFinder:
     """Finds the contacts on one patch, frame by frame. Each stream needs its own instance.
 
-    The detection thresholds depend on the contacts of the last frame (:mod:`skinnode.solve.posterior.contact_regions`).
+    The detection thresholds depend on the contacts of the last frame
+    (:mod:`skinnode.solve.posterior.contact_regions`).
 
     Args:
         prior: Elastic prior of the patch.

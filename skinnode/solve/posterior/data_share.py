@@ -12,7 +12,8 @@ def data_share(std: Float, core: Float, prior_variance: Float) -> Float:
     """Return 1 minus the ratio of the posterior variance to the prior variance; 0 where ``std`` is infinite.
 
     ``std``² exceeds the posterior variance, because it contains :data:`PRIOR_DOUBT` times the part that
-    depends on the prior. ``core``² contains :data:`SMOOTH_SHARE` times the same part. The part that depends on the prior therefore follows from ``std``² − ``core``².
+    depends on the prior. ``core``² contains :data:`SMOOTH_SHARE` times the same part. The part that depends
+    on the prior therefore follows from ``std``² − ``core``².
 
     Args:
         std: (U, f) standard deviations, pitches.

@@ -2,7 +2,8 @@
 
 Each frame passes through these steps:
 
-- Gate: use the equations only of wires whose resistances differ from those at rest by more than the noise.
+- Gate: select the wires whose resistances differ from those at rest by more than the noise. Only the
+  equations of these wires are used.
 - Hold: if the last field explains the whole frame within the noise, keep it.
 - Track: solve from the last field by chord or Gauss-Newton steps. If this fails, anneal from rest
   (``map_estimate``).
@@ -41,9 +42,9 @@ from skinnode.solve.wires.decode import A_MAX, A_MIN
 from skinnode.solve.wires.problem import PatchProblem
 
 NOISE_LEAST: Final = 1e-6
-"""Minimum relative noise assumed in a solve; also allows for errors of the forward model. With less
-noise, every solve would end at a root of F = b, which can be the wrong root. On layouts with folds (det J =
-0), wrong roots occur even at a noise of 1e-5."""
+"""Minimum relative noise assumed in a solve; also allows for errors of the forward model. With less noise,
+every solve would end at a root of F = b, which can be the wrong root. On layouts with folds (det J = 0),
+wrong roots occur even at a noise of 1e-5."""
 LEFT_OUT: Final = 3
 """Maximum number of inconsistent wires left out of a frame. If there are more, all wires of the frame are
 INCONSISTENT."""
@@ -58,8 +59,8 @@ Mask = NDArray[np.bool_]
 class FrameEstimator:
     """Estimator of the displacement, loads and contacts of one patch, frame by frame.
 
-    This class uses all available readings; :class:`skinnode.Posterior` also detects wrong readings. Each stream
-    needs its own instance. The kernels release the GIL; :meth:`warm_up` compiles them.
+    This class uses all available readings; :class:`skinnode.Posterior` also detects wrong readings. Each
+    stream needs its own instance. The kernels release the GIL; :meth:`warm_up` compiles them.
 
     Args:
         layout: The patch, with any number of lower wires.
@@ -69,8 +70,8 @@ class FrameEstimator:
     Attributes:
         layout: The patch.
         options: Options in effect.
-        from_rest_s: Minimum time to solve a touched frame from rest, s. It is 0 if no deadline is set, and
-            before :meth:`warm_up`.
+        from_rest_s: Minimum time to solve a touched frame from rest, s; 0 before :meth:`warm_up` or if no
+            deadline is set.
         noise_estimate: Estimate of the stream's noise, by which the stated noise is scaled; None if the
             stated noise is used as it is.
 
@@ -132,7 +133,7 @@ class FrameEstimator:
         a = 1.0 / (potential * self._problem.gain)
         self.estimate(a, np.ones(self.layout.shape, bool), 1e-4)
         self._seconds = seconds
-        self._estimator.gamma()  # compile its kernel
+        self._estimator.gamma()  # compile the kernel
         if self._contacts is not None:
             self._contacts.warm_up(self._hyper.loads.estimate())
         self._forget()
@@ -215,8 +216,8 @@ class FrameEstimator:
     def covariance_m2(self) -> Float:
         """Return the posterior covariance of the last frame's displacement.
 
-        It does not include the allowance for an inaccurate prior that the standard deviations of the field
-        contain (``PRIOR_DOUBT``).
+        The standard deviations of the field include an allowance for an inaccurate prior (``PRIOR_DOUBT``);
+        this covariance does not.
 
         Returns:
             (3UN, 3UN) covariance, m²; 0 for coordinates that are not free.
@@ -235,7 +236,7 @@ class FrameEstimator:
     def energy(self, moved: Float) -> float:
         """Return uᵀ (s² C)⁻¹ u for a displacement u, with the prior of the last frame.
 
-        This is −2 log of the prior density, up to a constant.
+        The result is −2 log of the prior density, up to a constant.
 
         Args:
             moved: (U, 3N) displacement u, pitches.
@@ -275,7 +276,7 @@ class FrameEstimator:
         return self._model.observe(readings, self._hyper.noise_factor)
 
     def _beyond_prior(self, observation: Observation, deviations: float) -> bool:
-        # the lower limit does not apply to geometry errors: one of a hundred can exceed it by chance
+        # one geometry error in a hundred can exceed the lower limit by chance, so only the others are tested
         count = self._model.fixed if deviations < roots.BELIEVABLE else observation.d.size
         return roots.beyond_prior(self._estimator.g[:count], observation.d[:count], deviations)
 
@@ -307,7 +308,7 @@ class FrameEstimator:
         self._gate.next_frame()
         at_rest = self._estimator.fit(observation, None)
         touched = self._gate.touched(at_rest, observation.count, self._members)
-        # if no wire seems touched, solve with all wires to confirm it
+        # if no wire seems touched, use all wires to make sure
         wanted = touched if self.options.hold and touched.size else self._wires
         seen = readings.usable
         for _ in range(LEFT_OUT + 3):
@@ -357,7 +358,7 @@ class FrameEstimator:
         self._members, self._known, self._seen = members, True, seen
         held = np.ones(len(status), bool)
         held[members] = False
-        held &= seen.any(axis=1)  # without resistances, a wire may have moved
+        held &= seen.any(axis=1)  # a wire without resistances may have moved
         return status, held
 
     def _give_up(self, status: Status) -> tuple[NDArray[np.int64], Mask]:

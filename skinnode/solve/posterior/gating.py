@@ -67,7 +67,7 @@ class Gate:
         Args:
             fit: Misfit of the tested displacement.
             count: (U,) number of usable resistances of each wire.
-            noises: Variance of the residuals' noise, relative to that of one frame; a number or (U,).
+            noises: Noise variance of the residuals, relative to that of a single frame; a number or (U,).
         """
         limit = self._quiet[count]
         return np.asarray(

@@ -1,8 +1,8 @@
 """Geometry errors: the manufacturing errors of a patch, estimated as nuisances.
 
 The resistances at rest (R₀) are measured, so a geometry error θ has no effect on the residuals at rest. Away
-from rest, the effect is θ times the difference between ∂ ln F/∂θ and its value at rest. It grows with the
-depth of a press. Each error is expressed in units of its tolerance, so its prior variance is 1.
+from rest, the effect is θ times the difference between ∂ ln F/∂θ and its value at rest. The effect grows with
+the depth of a press. Each error is expressed in units of its tolerance, so its prior variance is 1.
 
 - Thickness: all upper electrodes are shifted along their normals, in proportion to the clearance.
 - Radius: the mean of F over the rims of electrodes of radius ρ is F + (ρ²/2) ∇²F, where ∇² is the Laplacian
@@ -36,8 +36,8 @@ THICKNESS: Final = 0
 RADIUS: Final = 1
 GAIN: Final = 2
 COMMON: Final = 3
-"""Number of nuisances common to the whole patch: thickness, radius and gain. They are the first elements of
-g."""
+"""Number of nuisances common to the whole patch: thickness, radius and gain. These nuisances are the first
+elements of g."""
 UPPER: Final = 4
 """Number of nuisances of each upper wire: shifts along x, y and z, and gain."""
 LOWER: Final = 3
@@ -45,12 +45,13 @@ LOWER: Final = 3
 EFFECTS: Final = COMMON + UPPER + LOWER
 """Number of geometry nuisances that affect each residual."""
 GAIN_SHARE: Final = math.sqrt(0.5)
-"""Standard deviation of each of the two parts of a gain error, in tolerances. One part is common to all
-wires, as if they shared a converter. The other is independent for each upper wire, as if each had its own."""
+"""Standard deviation of each of the two parts of a gain error, in tolerances. The first part is common to all
+wires and models a shared converter. The second part is independent for each upper wire and models a converter
+per wire."""
 
 
 def nuisances(wires: int, equations: int) -> int:
-    """Return the number of geometry nuisances of a patch with U = ``wires`` and K = ``equations``."""
+    """Return the number of geometry nuisances of a patch with U upper and K lower wires."""
     return COMMON + UPPER * wires + LOWER * equations
 
 

@@ -1,7 +1,7 @@
 """Hyperparameters of the posterior: the scale s of the prior, the expected load locations, and the noise.
 
-They are estimated by maximising the marginal likelihood (evidence) of the frames (MacKay, Neural Computation
-4, 415, 1992).
+All hyperparameters are estimated by maximising the marginal likelihood (evidence) of the frames (MacKay,
+Neural Computation 4, 415, 1992).
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from skinnode.solve.posterior.map_estimate import MapEstimator
 from skinnode.solve.posterior.observation import Observation
 
 SCALE_WORTH: Final = 2.0
-"""Weight of the prior on s², as an equivalent number of parameters. It is small compared with the 100 to 200
-parameters that the data typically determine."""
+"""Weight of the prior on s², as an equivalent number of parameters. The weight is small compared with the 100
+to 200 parameters that the data typically determine."""
 SCALE_REST: Final = 0.005
 """Expected prior scale s, in clearances. The value is typical of presses that indent the layer by a tenth of
 its thickness."""
@@ -93,14 +93,14 @@ class Hyperparameters:
             self._prior.scale2 = self._bounded(self._estimator.guess_scale(observation, members))
 
     def spread_as_seen(self, observation: Observation, members: Index) -> None:
-        """Expect equal loads over the whole patch, with a scale estimated under the old prior."""
+        """Expect equal loads over the whole patch, at a scale estimated from the frame with the old prior."""
         guess = self._fixed or self._bounded(self._estimator.guess_scale(observation, members))
         self._prior.spread(guess)
 
     def adapt(
         self, observation: Observation, observe: Observe, members: Index, *, local: bool
     ) -> Observation:
-        """Estimate the hyperparameters from the field and solve again, until they stop changing.
+        """Estimate the hyperparameters from the field and solve again, until the estimates stop changing.
 
         Args:
             observation: The frame.

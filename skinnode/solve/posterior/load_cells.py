@@ -28,7 +28,7 @@ class LoadCells:
     frame: Float
     """(Q, 3, 3) unit vectors as rows: tangent along the wire, tangent across the wire, outward normal."""
     electrode_frame: Float
-    """(E, 3, 3) unit vectors at the electrodes, in the same order."""
+    """(E, 3, 3) unit vectors at the electrodes, in the order of ``frame``."""
     offset_m: Float
     """(E, Q, 2) offset of each electrode from each cell, along the tangents of the cell, m."""
     height_m: float

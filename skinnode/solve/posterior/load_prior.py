@@ -1,9 +1,9 @@
 """Prior of the loads on a patch, and of the displacement that they cause.
 
 The prior first expects equal loads over the whole patch, with a single scale s². Once loads have been found,
-it expects further loads mainly at the same places (:meth:`LoadPrior.localise`). The skin next to a contact is
-then estimated to move only as far as the loads of the contact require. In tests, this reduced displacement
-errors by a factor of two to three.
+the prior expects loads mainly at the same places (:meth:`LoadPrior.localise`). The skin next to a contact is
+then estimated to move only as far as the loads of the contact require. In tests, expecting loads where they
+were found reduced displacement errors by a factor of two to three.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ LOCAL_SPREAD: Final = 0.7
 value improves the displacement if the rubber behaves like a half-space; otherwise, the standard deviations
 become too small. A value of 1 reduces the benefit of :meth:`LoadPrior.localise` by a quarter."""
 LOCAL_FLOOR: Final = 0.05
-"""Mean square load expected in cells where no load was found, relative to the mean over the patch. It allows
-for light touches near a press."""
+"""Mean square load expected in cells where no load was found, relative to the mean over the patch. A positive
+value allows for light touches near a press."""
 LOCAL_CHANGE: Final = 0.35
 """Fraction of the expected loads that must change location for the prior to be rebuilt. In slow presses,
 displacement errors reached 6 standard deviations with a fraction of 0.5. With 0.25, the prior was rebuilt
@@ -136,7 +136,7 @@ class LoadPrior:
     def roughness(self, displacement: Float) -> float:
         """Return uᵀ C⁻¹ u, pitch², for a displacement u (U f,). The array is overwritten.
 
-        The most likely s² for u is this value divided by the number of coordinates.
+        The most likely s² for u is uᵀ C⁻¹ u divided by the number of coordinates.
         """
         solve_lower_vector(self._root, displacement, displacement.size)
         return float(displacement @ displacement)

@@ -2,7 +2,7 @@
 
 - Chord steps start at the last field and reuse the factors of an earlier frame. A typical solve needs two
   evaluations of F and its Jacobian.
-- A Gauss-Newton step computes new factors at the current field. Chord steps follow it.
+- A Gauss-Newton step computes new factors at the current field, and is followed by chord steps.
 - Annealing starts at rest and assumes a noise of 3 %, which it divides by four in each step until the actual
   noise is reached. At high noise, the posterior has a single maximum, near that of the prior. Following this
   maximum as the noise decreases usually leads to the correct one, even if a press indents the layer by 70 %
@@ -61,17 +61,17 @@ recomputed. Below this limit, the standard deviations are out of date by less th
 HALVINGS: Final = 6
 """Maximum number of times that a Gauss-Newton step is halved."""
 PRIOR_DOUBT: Final = 3.0
-"""Factor on the part of the variance that depends on the prior; allows for the uncertainty of the expected
-loads. In difficult cases (first touches, dents that cannot form on a half-space), displacement errors reached
-7 standard deviations with a factor of 1, and 5.6 with a factor of 2."""
+"""Factor applied to the part of the variance that depends on the prior; allows for the uncertainty of the
+expected loads. In difficult cases (first touches, dents that cannot form on a half-space), displacement
+errors reached 7 standard deviations with a factor of 1, and 5.6 with a factor of 2."""
 SMOOTH_SHARE: Final = 0.25
-"""Factor on the part of the variance that depends on the prior, for the 95 % interval. It is less than 1,
-because the loads of real bodies are smoother than the independent loads of the prior. Measured displacement
-errors correspond to factors of at most 0.13 for spheres and 0.5 for Gaussian dents."""
+"""Factor applied to the part of the variance that depends on the prior, for the 95 % interval. The factor is
+less than 1, because the loads of real bodies are smoother than the independent loads of the prior. Measured
+displacement errors correspond to factors of at most 0.13 for spheres and 0.5 for Gaussian dents."""
 
 
 class MapEstimator:
-    """MAP estimator of one patch. It keeps the displacement, the nuisances and the last factors.
+    """MAP estimator of one patch, with its displacement, nuisances and last factors.
 
     Each stream needs its own instance.
 
@@ -91,10 +91,10 @@ class MapEstimator:
         noise_variance: (U f,) variance of the displacement due to noise and nuisances, pitch².
         members: Wires whose equations are in the factors.
         factors: Serial number of the current factors.
-        evaluations: Number of evaluations of F and its Jacobian, counted per wire. The caller resets it.
-        factorisations: Number of factorisations. The caller resets it.
-        until: Deadline as a value of :func:`skinnode.process.clock.perf_counter`, s. A solve that exceeds it
-            raises TimeoutError.
+        evaluations: Number of evaluations of F and its Jacobian, per wire. The caller resets the counter.
+        factorisations: Number of factorisations. The caller resets the counter.
+        until: Deadline as a value of :func:`skinnode.process.clock.perf_counter`, s. A solve that exceeds the
+            deadline raises TimeoutError.
     """
 
     def __init__(

@@ -14,8 +14,8 @@ Let J = ∂r/∂x, which is block-diagonal over wires. A Gauss-Newton step from 
 S is the innovation covariance, s² J C the cross-covariance and K = s² C Jᵀ S⁻¹ the Kalman gain. The posterior
 covariance at x⁺ is s² C − Vᵀ V, where V = L⁻¹ (s² J C) and L Lᵀ = S (Tarantola, Inverse Problem Theory, 2005,
 section 3.4). No eigenvalue of S is less than 1, so rounding errors do not grow with the condition number of
-J. Rounding errors are at most ε ‖S‖ standard deviations, where ε is the machine precision. For signals of 10⁶ σ, this is
-a thousandth of a standard deviation.
+J. Rounding errors are at most ε ‖S‖ standard deviations, where ε is the machine precision. For signals of 10⁶
+σ, this is a thousandth of a standard deviation.
 
 A chord step is a Newton step with the factors of an earlier J. Chord steps converge to the same maximum. At
 the maximum, the vectors e_x = −s² C Jᵀ (r − H g) − x and e_g = d Hᵀ (r − H g) − g are zero. With the earlier
@@ -28,7 +28,8 @@ A chord step requires only two triangular solves.
 If a wire has more equations than unknowns, a QR decomposition of [J H] first reduces them to one equation per
 unknown. No information is lost. The reduction is not possible with geometry errors
 (:mod:`skinnode.solve.posterior.geometry_error`), because each lower wire then has its own nuisances. The
-geometry errors follow the other p nuisances in g. For the geometry errors, H is sparse, and only its non-zero elements are stored.
+geometry errors follow the other p nuisances in g. For the geometry errors, H is sparse, and only its non-zero
+elements are stored.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Host: configures, starts and supervises nodes; receives, assembles, solves and publishes their scans.
+"""Configure, start and supervise nodes; receive, assemble, solve and publish their scans.
 
 **Data flow.** The module ``lifecycle`` starts and stops the parts of a host; ``host`` is their public
 interface. Each bus has a ``link`` (port, receive queue, reopening) and a ``served_bus``. Each patch has a
@@ -14,18 +14,19 @@ interface. Each bus has a ``link`` (port, receive queue, reopening) and a ``serv
     supervisor -> node_supervision (actions for each supervised node) -> remote_node, baseline_watch
     node_monitor (evidence about a node) -> health (condition) -> health_watch -> events
 
-The module ``sync`` sends SYNC, and ``nmt_master`` sends NMT commands. The module ``containment`` handles
-exceptions, ``retry_pause`` sets the pauses between attempts, and ``tap`` passes frames to recorders.
+Other modules send SYNC (``sync``) and NMT commands (``nmt_master``), contain exceptions (``containment``),
+time the attempts to repeat an operation (``retry_pause``) and pass frames to recorders (``tap``).
 
-**Containment.** Exceptions do not end the host's threads. If an exception is raised while serving a patch,
-the patch is marked faulty, and the exception is recorded as the reason. The scans of a faulty patch are
-withheld, and the patch is brought up again after a pause. The pause before a faulty patch is brought up again
-starts at 0.1 s and doubles after each exception, up to 1 s. A boot-up message from the node ends the pause
-early. After an exception raised while serving a bus, the host either stops serving the bus for 0.1 s to 1 s,
-or closes and reopens the bus interface. If an exception is raised while serving a subscriber, a callback or a
-tap, only the item for that recipient is lost. All exceptions are counted by subject
-(``Host.stats().defects``) and published as events. Each distinct exception message is logged once; see
-:mod:`skinnode.host.containment`.
+**Containment.** An exception never ends a thread of the host. Its effect depends on what it concerns:
+
+- A patch: the patch is marked faulty, with the exception as the reason, and its scans are withheld. After a
+  pause, the patch is brought up again. The pause starts at 0.1 s and doubles with each exception, up to 1 s.
+  A boot-up message from the node ends it early.
+- A bus: the host stops serving the bus for 0.1 s to 1 s, or reopens its interface.
+- A subscriber, a callback or a tap: only the item for this recipient is lost.
+
+Exceptions are counted by subject (``Host.stats().defects``) and published as events. Each distinct message is
+logged once (:mod:`skinnode.host.containment`).
 
 ==========  ==============================  ==============================  ==============================
 thread      calls                           an exception there affects      recovers

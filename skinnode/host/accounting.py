@@ -1,6 +1,7 @@
-"""Check that a host's counters add up: every received frame must have been passed on or counted as lost.
+"""Check that the counters of a host add up, that is, that every frame and scan is accounted for.
 
-The host's counters are read one after another, so their sums agree only if the host is closed or idle.
+The counters of a running host are read one after another, so the sums agree only if the host is idle or
+closed.
 """
 
 from __future__ import annotations
@@ -44,7 +45,7 @@ def discrepancies(stats: HostStats) -> list[str]:
 
 
 def losses_of_bus(bus: BusStats) -> dict[str, str]:
-    """Return a phrase for each nonzero loss or error counter of a bus; the keys are counter names."""
+    """Return a phrase for each nonzero loss or error counter of a bus, by counter name."""
     counts = (
         ("dropped", "frame dropped", "frames dropped"),
         ("kernel_dropped", "frame dropped by the kernel", "frames dropped by the kernel"),
@@ -56,7 +57,7 @@ def losses_of_bus(bus: BusStats) -> dict[str, str]:
 
 
 def losses_of_stream(stream: StreamStats) -> dict[str, str]:
-    """Return a phrase for each nonzero loss counter of a patch; the keys are counter names."""
+    """Return a phrase for each nonzero loss counter of a patch, by counter name."""
     assembler = stream.assembler
     counts = (
         ("scans_torn", "scan torn", "scans torn"),
@@ -70,7 +71,7 @@ def losses_of_stream(stream: StreamStats) -> dict[str, str]:
 
 
 def frames_counted(assembler: AssemblerStats) -> int:
-    """Return the number of frames that a scan assembler has accepted or rejected."""
+    """Return the number of frames that an assembler has accepted or rejected."""
     return (
         assembler.chunks_accepted
         + assembler.summaries_accepted

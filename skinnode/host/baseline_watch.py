@@ -1,4 +1,4 @@
-"""Reread a running node's baseline or error register if the value may have changed."""
+"""Read the baseline or the error register of a running node again if it may have changed."""
 
 from __future__ import annotations
 
@@ -17,26 +17,26 @@ from skinnode.process import clock
 _log = logging.getLogger(__name__)
 
 _DOUBT_NS: Final = 2_000_000_000
-"""Minimum interval (ns) between two reads of a baseline that may have changed without an announcement."""
+"""Minimum interval (ns) between reads of a baseline that may have changed unannounced."""
 
 _REGISTER_NS: Final = 500_000_000
-"""Minimum interval (ns) between two reads of a nonzero error register. A patch must be reported as
-operational within a second after its error ends, even if the emergency message that clears the error is lost.
-Reading the register at this interval adds four SDO frames per second to the bus load.
+"""Minimum interval (ns) between reads of a nonzero error register. With these reads, a patch is operational
+again within a second after its error, even if the EMCY message that clears the error is lost. They cost four
+SDO frames per second.
 """
 
 
 class BaselineWatch:
     """Reader of the baselines and error registers of running nodes. Used only by the supervisor's thread.
 
-    SDO transfers run as jobs on ``pool``; each node has at most one job at a time.
+    SDO transfers run as jobs on ``pool``. A node has at most one job at a time.
     """
 
     def __init__(self, pool: Executor) -> None:
         self._pool = pool
 
     def look(self, node: Supervised, now_ns: int) -> None:
-        """Reread a node's baseline if the node has announced a new baseline or a summary was lost.
+        """Read a node's baseline again if the node has announced a new one or a summary was lost.
 
         After an announcement, scans are withheld until the new baseline has been read.
         """
@@ -65,13 +65,13 @@ class BaselineWatch:
         node.job = self._pool.submit(read)
 
     def _watch_register(self, node: Supervised, now_ns: int) -> None:
-        """Reread a nonzero error register, because the EMCY message that clears the error may be lost."""
+        """Read a nonzero error register again. The EMCY message that clears the error may have been lost."""
         remote = node.remote
         if not remote.monitor.error_register or remote.listen_only or now_ns < node.register_ns:
             return
 
         def read() -> Joined | None:
-            with contextlib.suppress(BusError, ConfigError):  # the register is read again later
+            with contextlib.suppress(BusError, ConfigError):  # a failed read is repeated later
                 remote.renew_register()
             return None
 
@@ -79,13 +79,13 @@ class BaselineWatch:
         node.job = self._pool.submit(read)
 
     def _take_baseline(self, node: Supervised, job: Future[Joined | None], now_ns: int) -> None:
-        if job.exception() is None and job.result() is None:  # no baseline: the job read the error register
+        if job.exception() is None and job.result() is None:  # the job has read only the error register
             return
         remote, stream = node.remote, node.remote.stream
         node.read_ns = now_ns + (LEAST_NS if stream.withholding else _DOUBT_NS)
         try:
             read = job.result()
-        except (BusError, ConfigError) as error:  # a missing node is detected by the heartbeat timeout
+        except (BusError, ConfigError) as error:  # the heartbeat timeout detects a missing node
             stream.doubtful = True
             _log.warning("%s; reading its baseline again", error)
             return
@@ -98,15 +98,15 @@ class BaselineWatch:
         solver = read.solver
         if solver is not None:
             remote.link.call(lambda: stream.resume(solver, read.withholdings, anew=False), remote.defects)
-            node.announced = True  # the announcing summary may have been lost
+            node.announced = True  # the announcement may have been lost
             note_baseline(node)
 
 
 def note_baseline(node: Supervised) -> None:
-    """Record the solver's current baseline; increment the node's baseline count if the baseline is new.
+    """Record the baseline used by the solver, and count it if it is new.
 
-    A new baseline may also be found during bring-up, if an earlier read failed or the baseline changed while
-    the node was absent.
+    Bring-up may also find a new baseline, if an earlier read failed or the baseline changed while the node
+    was absent.
     """
     facts, before = node.remote.facts, node.baseline_ohm
     assert facts is not None  # called only after bring-up

@@ -1,4 +1,4 @@
-"""Call a user's function with each field, on a separate thread so that the host is never delayed."""
+"""Call a user's function with each field, on a thread of its own so that the host is not delayed."""
 
 from __future__ import annotations
 
@@ -17,15 +17,16 @@ from skinnode.process import clock
 _log = logging.getLogger(__name__)
 
 LAST_CALL_S: Final = 1.0
-"""Maximum time (s) to wait for a running call when a callback or the host is closed."""
+"""Time limit (s) for a call in progress when the callback or the host is closed."""
 
 
 class FieldCallback:
     """Callback that passes each field to a user's function until the callback or the host is closed.
 
-    Exceptions raised by the function are counted, and the first one is logged with its traceback; later
-    fields are still delivered. Threads: a dedicated thread calls the user's function; the callback's methods
-    may be called from any thread.
+    Exceptions raised by the function are counted, and the first one is logged with its traceback. Later
+    fields are still delivered.
+
+    Threads: a dedicated thread calls the function. Any thread may call the methods.
     """
 
     def __init__(
@@ -51,7 +52,7 @@ class FieldCallback:
         return self._failed
 
     def close(self) -> None:
-        """Stop calling the user's function, and wait up to a second for a running call.
+        """Stop calling the function. Wait up to a second for a call in progress.
 
         The function itself may call ``close``.
         """
@@ -59,7 +60,7 @@ class FieldCallback:
         self.join()
 
     def join(self) -> None:
-        """Wait up to a second for the function's last call to return; log a warning if it does not."""
+        """Wait up to a second for the last call to return. Log a warning if it does not."""
         if self._thread is threading.current_thread():
             return
         self._thread.join(LAST_CALL_S)
@@ -68,17 +69,17 @@ class FieldCallback:
 
     @property
     def ended(self) -> bool:
-        """Whether the callback has ended and will not call the user's function again."""
+        """Whether the last call of the function has returned."""
         return not self._thread.is_alive()
 
     def _run(self) -> None:
         keep_on(self._turn, self._defects, "waiting for a field")
 
     def _turn(self) -> bool:
-        """Pass the next field to the user's function. Return False if there are no more fields."""
+        """Pass the next field to the function. Return False if there are no more fields."""
         try:
             field = self._fields.take(None)
-        except SkinError as error:  # every subscriber receives the error that stopped the host
+        except SkinError as error:  # the error that stopped the host
             _log.debug("callback %s: %s", _name(self._function), error)
             return False
         if field is None:
@@ -93,17 +94,17 @@ class FieldCallback:
 
 
 class Callbacks:
-    """Callbacks of a host. Exceptions from the host's own code are reported to ``defects``."""
+    """Callbacks of a host. Exceptions outside the users' functions are reported to ``defects``."""
 
     def __init__(self, defects: Defects | None = None) -> None:
         self._defects = defects
         self._all: list[FieldCallback] = []
 
     def add(self, function: Callable[[FieldFrame], object], fields: Subscription) -> FieldCallback:
-        """Start a callback that passes a subscription's fields to ``function``.
+        """Start a callback that passes the fields of a subscription to ``function``.
 
         Raises:
-            TypeError: ``function`` is not callable, or is async.
+            TypeError: if ``function`` is not callable, or is async.
         """
         if not callable(function):
             raise TypeError(f"function: got {function!r}, must be a function that takes a field")
@@ -115,7 +116,7 @@ class Callbacks:
         return callback
 
     def join(self) -> None:
-        """Wait for all callbacks to end. The caller must first end the callbacks' subscriptions."""
+        """Wait for all callbacks to end. Their subscriptions must have been ended before."""
         for callback in self._all:
             callback.join()
 

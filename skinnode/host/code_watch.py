@@ -1,14 +1,13 @@
-"""Check the codes of each scan to detect a stopped converter and faulty parts of the patch.
+"""Check the codes of each scan for a stopped converter and for faulty wires and crossings.
 
-Before a scan is solved, :meth:`CodeWatch.judge` compares the scan's codes with the previous codes in about 5
-µs and returns a :class:`Verdict`. The verdict states:
+Before a scan is solved, :meth:`CodeWatch.judge` compares its codes with the previous ones, which takes about
+5 µs. The resulting :class:`Verdict` says:
 
-- whether the scan's field can be trusted (:mod:`skinnode.host.converter_liveness`),
-- which crossings are frozen and therefore left out of the solve (:mod:`skinnode.host.frozen_parts`),
+- whether the converter's state permits trusting the field (:mod:`skinnode.host.converter_liveness`),
+- which frozen crossings are left out of the solve (:mod:`skinnode.host.frozen_parts`),
 - which wires are open or shorted.
 
-After the fields of all patches have been published, :meth:`CodeWatch.on_scan` searches for noisy and drifting
-wires (:mod:`skinnode.host.wire_windows`).
+Later, :meth:`CodeWatch.on_scan` searches for noisy and drifting wires (:mod:`skinnode.host.wire_windows`).
 """
 
 from __future__ import annotations
@@ -39,23 +38,23 @@ class Verdict:
     """Result of checking the codes of a scan."""
 
     distrust: str = ""
-    """Human-readable reason why the scan's field is not trusted; empty if the field is trusted."""
+    """Human-readable reason not to trust the field of the scan; empty if there is none."""
     faults: tuple[DataFault, ...] = ()
-    """Faults found: frozen patch, frozen wires and crossings, open and shorted wires."""
+    """Frozen patch, wires and crossings, and open and shorted wires."""
     left_out: NDArray[np.bool_] | None = None
-    """(U, K) bool: True for each crossing to be left out of the solve; None if all crossings are used."""
+    """(U, K) mask of the crossings to leave out of the solve; None if there are none."""
 
     def admitted(self, scan: Scan) -> Scan:
-        """Return a copy of the scan in which the crossings left out of the solve are marked as missing."""
+        """Return the scan with the crossings that are left out of the solve marked as missing."""
         if self.left_out is None:
             return scan
         codes = np.where(self.left_out, np.uint32(MISSING), scan.codes)
         return replace(scan, codes=codes, valid=scan.valid & ~self.left_out)
 
     def applied(self, field: FieldFrame) -> FieldFrame:
-        """Return the scan's field with the detected faults added.
+        """Return the field of the scan with the faults added.
 
-        If the patch may be frozen, the returned field is marked as not trusted.
+        If there is a reason for distrust, no wire of the field is trusted.
         """
         if not (self.faults or self.distrust):
             return field
@@ -71,53 +70,53 @@ FAULTLESS: Final = Verdict()
 
 
 class CodeWatch:
-    """Fault detector for the scans of one patch. Owned by the mainline.
+    """Fault detector for the scans of one patch. Used only by the mainline.
 
     Args:
         scale: Scale of the codes.
-        relative_noise: Converter noise stated in the hand file, as a fraction of the resistance.
+        relative_noise: Converter noise stated in the hand file, relative to the resistance.
     """
 
     def __init__(self, scale: CodeScale, relative_noise: float) -> None:
         self._scale, self._relative_noise = scale, relative_noise
         self._windows = WireWindows(scale, relative_noise)
         self._life = ConverterLiveness(scale, relative_noise)
-        self._parts: FrozenParts | None = None  # created at the first scan, which determines the array shape
+        self._parts: FrozenParts | None = None  # the first scan determines the shape
         self._state = code_runs.new_runs((0, 0))
         self._found = np.zeros(8, np.int64)
         code_runs.compile_kernels()
         self._seen_windows = 0
         self._broken: tuple[WireFault, ...] = ()
-        # broken wire (None: the whole patch) -> number of the scan in which the fault was first found
+        # broken wire, or None for the whole patch -> number of the scan in which the fault was found
         self._since: dict[WireFault | None, int] = {}
         self._verdict = FAULTLESS
 
     @property
     def alive(self) -> Alive:
-        """State of the patch's converter as of the newest scan."""
+        """State of the converter at the newest scan."""
         return self._life.alive
 
     @property
     def frozen(self) -> bool:
-        """Whether the patch's converter has stopped."""
+        """Whether the converter has stopped."""
         return self._life.alive is Alive.NO
 
     @property
     def words(self) -> str:
-        """Human-readable reason why the converter may not be running; empty if the converter is running."""
+        """Human-readable reason to doubt that the converter is running; empty if there is none."""
         return self._life.words
 
     @property
     def wires(self) -> tuple[WireFault, ...]:
-        """Faults found so far: open, shorted, noisy and drifting wires."""
+        """Wires that are currently open, shorted, noisy or drifting."""
         return tuple(sorted({*self._broken, *self._windows.wires}))
 
     def judge(self, scan: Scan, number: int | None = None) -> Verdict:
-        """Check the codes of the next scan, before the scan is solved.
+        """Check the codes of the next scan before it is solved.
 
         Args:
             scan: Scan to check.
-            number: Scan number to record in new faults; the scan's own number by default.
+            number: Scan number to record in new faults; by default, that of the scan.
         """
         parts = self._parts
         if parts is None:
@@ -169,9 +168,9 @@ class CodeWatch:
         return Verdict(distrust, (*faults, *parts.faults), parts.left_out)
 
     def on_scan(self, scan: Scan) -> None:
-        """Add a scan to the statistics that reveal noisy and drifting wires.
+        """Add a scan to the search for noisy and drifting wires.
 
-        Call :meth:`judge` with the same scan first.
+        :meth:`judge` must have been called with the scan before.
         """
         if scan.complete and not scan.flags & _CHANGED_ONLY:
             self._windows.on_scan(scan)

@@ -1,6 +1,6 @@
-"""Define the health of patches and buses, and derive a patch's condition from evidence.
+"""Define the health of patches and buses, and derive the condition of a patch.
 
-Evidence about a node is collected on the mainline by :class:`~skinnode.host.node_monitor.NodeMonitor`.
+The evidence for the condition comes from :class:`~skinnode.host.node_monitor.NodeMonitor`.
 """
 
 from __future__ import annotations
@@ -21,17 +21,17 @@ from skinnode.transport.bus_state import BusState
 _log = logging.getLogger(__name__)
 
 HEARTBEATS_MISSED: Final = 3
-"""Number of heartbeat periods without a heartbeat after which a node is declared lost. CiA 301 does not
-specify this number. The value tolerates two missing heartbeats: one delayed by a burst of frames and one
-destroyed by a bus error.
+"""Number of heartbeat periods without a heartbeat after which a node counts as lost. CiA 301 leaves this
+number open. Three periods tolerate one heartbeat delayed by a burst of frames and one destroyed by a bus
+error.
 """
 
 SCANS_MISSED: Final = 3
-"""Number of SYNC periods without a scan after which a patch is declared stale."""
+"""Number of SYNC periods without a scan after which a patch counts as stale."""
 
 SYNCS_MISSED: Final = 5
-"""Number of SYNC periods without a SYNC message after which missing SYNC is reported on a bus that another
-master runs. By then, the patches on the bus are already stale (:data:`SCANS_MISSED`).
+"""Number of SYNC periods after which a missing SYNC is reported on a bus that another master runs. By then,
+the patches are stale (:data:`SCANS_MISSED`).
 """
 
 
@@ -40,93 +40,91 @@ class Condition(enum.StrEnum):
 
     NEVER_SEEN = "never seen"
     BOOTING = "booting"
-    """The node is sending frames but is not operational yet."""
+    """The node sends frames but is not operational yet."""
     OPERATIONAL = "operational"
     STALE = "stale"
-    """The node is operational according to its heartbeat, but no scans arrive, or all scans are withheld."""
+    """The heartbeat reports operational, but no scans arrive or all scans are withheld."""
     RESTARTING = "restarting"
-    """The node restarts repeatedly without a command: see :data:`~skinnode.host.node_monitor.LOOP_RESTARTS`.
-    The condition ends when the node is operational again and has not restarted for 0.5 s.
+    """The node keeps restarting without a command; see :data:`~skinnode.host.node_monitor.LOOP_RESTARTS`. The
+    condition ends when the node is operational and has not restarted for 0.5 s.
     """
     FROZEN = "frozen"
-    """Scans arrive, but the patch's converter has stopped: see :mod:`skinnode.host.converter_liveness`."""
+    """Scans arrive, but the converter has stopped; see :mod:`skinnode.host.converter_liveness`."""
     FAULTY = "faulty"
-    """The node's error register is not zero, or serving the patch raised an exception
-    (:attr:`PatchHealth.defect`)."""
+    """The node's error register is not zero, or serving the patch has raised an exception
+    (:attr:`PatchHealth.defect`).
+    """
     REFUSED = "refused"
-    """The node responds, but does not match the hand file or does not keep its configuration."""
+    """The node responds, but it does not match the hand file or does not keep its configuration."""
     LOST = "lost"
     """The node's heartbeat has stopped."""
 
 
 @dataclass(frozen=True, slots=True)
 class PatchHealth:
-    """Snapshot of a patch's health.
+    """Snapshot of the health of a patch.
 
-    The age of the newest heartbeat or scan is None until a heartbeat or scan has been received.
+    ``heartbeat_age_s`` and ``scan_age_s`` are the ages of the newest heartbeat and scan; None before the
+    first one.
     """
 
     patch: str
     node_id: int
     condition: Condition
     nmt_state: int | None
-    """NMT state from the newest heartbeat: 5 operational, 127 pre-operational, 4 stopped, 0 just booted."""
+    """NMT state in the newest heartbeat: 0 booted, 4 stopped, 5 operational, 127 pre-operational."""
     heartbeat_age_s: float | None
     scan_age_s: float | None
     boot_ups: int
     emergencies: int
-    """Number of EMCY messages that have reported an error since the host started."""
+    """Number of EMCY messages with an error since the host started."""
     last_emergency: int | None
-    """Error code of the newest EMCY message that reported an error; None before the first such message."""
+    """Error code of the newest EMCY message with an error; None before the first one."""
     emergency_text: str
-    """Description of the newest EMCY message that reported an error; empty before the first such message."""
+    """Description of the newest EMCY message with an error; empty before the first one."""
     error_register: int
     rejoins: int = 0
-    """Number of times the node has reappeared and been brought up again since the host started."""
+    """Number of times the node has been brought up again since the host started."""
     refusal: str | None = None
-    """Reason why the host does not use a node that responds: wrong identity or layout, or configuration not
-    kept.
+    """Reason why a responding node is not used: wrong identity or layout, or a configuration that it does not
+    keep.
     """
     restarts_in_a_loop: bool = False
-    """Whether the node has restarted three times within ten seconds without a command, and the last restart
-    was less than 5 s ago.
+    """Whether the node has restarted three times in ten seconds without a command, most recently less than
+    5 s ago.
     """
     duplicate_id: bool = False
-    """Whether two nodes appear to share the node-ID, because heartbeats arrive more often than a single node
-    would send them.
-    """
+    """Whether two nodes seem to share the node-ID: heartbeats arrive more often than one node sends them."""
     conflicts: int = 0
-    """Number of frames that contradict other frames of the same scan. Possible causes are a wrong counter in
-    the node and two nodes with the same node-ID.
+    """Number of frames that contradict another frame of the same scan. The cause may be a wrong counter in
+    the node, or two nodes with the same node-ID.
     """
     wires: tuple[WireFault, ...] = ()
-    """Wire faults: open, shorted, noisy and drifting wires."""
+    """Open, shorted, noisy and drifting wires."""
     alive: Alive = Alive.CANNOT_TELL
-    """Whether the patch's converter is running. If the value is ``no``, the condition is ``frozen``."""
+    """Whether the converter is running. If it is not, the condition is ``frozen`` or a more serious one."""
     life: str = ""
-    """Human-readable reason why the converter may not be running; empty if the converter is running."""
+    """Human-readable reason to doubt that the converter is running; empty if there is none."""
     faults: tuple[DataFault, ...] = ()
-    """Faults found in the newest field's data; each fault states the affected part, the first scan and the
-    certainty.
-    """
+    """Faults found in the data of the newest field, each with part, first scan and certainty."""
     defect: str | None = None
-    """Host operation that failed most recently for this patch, with its exception; reset to None by the next
+    """Host operation that last raised an exception for this patch, and the exception; None after the next
     bring-up.
     """
     slow_overruns: int = 0
-    """Number of EMCY messages with code 0x8110 that report skipped scans because the node's computer or the
-    bus was too slow.
+    """Number of EMCY messages (code 0x8110) about scans that the node skipped because its computer or the bus
+    was too slow.
     """
     baselines: int = 0
-    """Number of times the host has read a changed baseline, for example after a tare."""
+    """Number of new baselines that the host has read, for example after a tare."""
     complaint: str | None = None
-    """Reason why the last bring-up failed; None if that bring-up succeeded."""
+    """Reason why the last bring-up failed; None if it succeeded."""
     withheld: bool = False
-    """Whether scans are withheld because the node is being brought up or its baseline is being read."""
+    """Whether the host withholds scans while it brings up the node or reads its baseline."""
 
     @property
     def reason(self) -> str:
-        """Reason why the patch is not operational or may not be converting; empty if there is none."""
+        """Reason for the condition or for doubts about the converter, as text; empty if there is none."""
         match self.condition:
             case Condition.OPERATIONAL:
                 return self.life
@@ -170,17 +168,17 @@ class PatchHealth:
 
 
 def faults_of(field: FieldFrame | None) -> tuple[DataFault, ...]:
-    """Return the faults in a field's data; an empty tuple if there is no field."""
+    """Return the faults in the data of a field; an empty tuple without a field."""
     return () if field is None else field.faults
 
 
 @dataclass(frozen=True, slots=True)
 class BusHealth:
-    """Snapshot of a bus's health. All counters start at 0 when the host starts."""
+    """Snapshot of the health of a bus. The counters start at 0 when the host starts."""
 
     bus: str
     away: str | None
-    """Reason why the interface is unavailable; None while the interface works."""
+    """Reason why the bus is unavailable; None while it is available."""
     load: float
     """Bus load over the last second, as a fraction of the capacity."""
     error_frames: int
@@ -188,31 +186,29 @@ class BusHealth:
     outages: int
     kernel_dropped: int
     dropped: int
-    """Number of frames dropped because the host's receive queue was full."""
+    """Number of frames dropped by a full receive queue of the host."""
     malformed: int
     foreign: int
-    """Number of frames with a COB-ID that the host does not expect; ``foreign_ids`` lists these COB-IDs."""
+    """Number of frames with an unexpected COB-ID; ``foreign_ids`` lists these COB-IDs."""
     foreign_ids: tuple[int, ...]
     other_syncs: int
-    """Number of SYNC messages from another producer on a bus whose master is the host."""
+    """Number of SYNC messages from another producer, on a bus where the host is the master."""
     other_masters: int
-    """Number of received frames that only the host should send: NMT commands, SDO requests to the hand's
-    nodes, and heartbeats with the host's node-ID.
+    """Number of NMT commands, SDO requests to the hand's nodes, and heartbeats with the host's node-ID that
+    came from other senders.
     """
     controller: BusState | None = None
-    """Most recently reported state of the CAN controller; None if no state has been reported."""
+    """Last reported state of the CAN controller; None before the first report."""
     no_sync: bool = False
-    """Whether another master runs the bus and no SYNC message has arrived for :data:`SYNCS_MISSED` SYNC
-    periods.
-    """
+    """Whether another master runs the bus but no SYNC has arrived for :data:`SYNCS_MISSED` SYNC periods."""
 
 
 @dataclass(frozen=True, slots=True)
 class Evidence:
-    """Evidence that determines a patch's condition.
+    """Evidence for the condition of a patch.
 
-    The fields ``late_heartbeats`` and ``late_scans`` state the age of the newest heartbeat and scan in
-    heartbeat periods and scan periods; None if no heartbeat or scan has been received.
+    ``late_heartbeats`` and ``late_scans`` are the ages of the newest heartbeat and scan, in heartbeat periods
+    and scan periods; None before the first one.
     """
 
     nmt_state: int | None

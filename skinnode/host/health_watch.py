@@ -1,4 +1,4 @@
-"""Monitor the health of a running host and publish changes as events."""
+"""Watch the health of a running host, and publish changes as events."""
 
 from __future__ import annotations
 
@@ -14,9 +14,7 @@ from skinnode.process import clock
 from skinnode.text.words import counted
 
 _CHECK_S: Final = 0.05
-"""Interval (s) between health checks. A change that lasts for less than this interval may show only in the
-counters.
-"""
+"""Interval (s) between health checks. A shorter change may appear only in the counters."""
 
 _QUIET_NS: Final = 1_000_000_000
 """Minimum interval (ns) between events for the same counter."""
@@ -29,9 +27,7 @@ _PATCH_COUNTERS: Final = {
     "baselines": ("new baseline in use", "new baselines in use"),
     "conflicts": ("conflict", ""),
 }
-"""Counters of :class:`PatchHealth`, each with the noun used in event texts: singular, and plural if
-irregular.
-"""
+"""Counters of :class:`PatchHealth`, with the singular and any irregular plural for event texts."""
 _BUS_COUNTERS: Final = {
     "bus_offs": ("bus-off", ""),
     "error_frames": ("error frame", ""),
@@ -43,9 +39,7 @@ _BUS_COUNTERS: Final = {
     "other_syncs": ("SYNC of another producer", "SYNCs of another producer"),
     "other_masters": ("command of another master", "commands of another master"),
 }
-"""Counters of :class:`BusHealth`, each with the noun used in event texts: singular, and plural if
-irregular.
-"""
+"""Counters of :class:`BusHealth`, with the singular and any irregular plural for event texts."""
 
 
 def _is_frozen_part(fault: DataFault) -> bool:
@@ -53,9 +47,9 @@ def _is_frozen_part(fault: DataFault) -> bool:
 
 
 class HealthWatch:
-    """Monitor that checks the health of all patches and buses, and publishes changes as events.
+    """Publisher of the changes in the health of all patches and buses.
 
-    Threads: a dedicated thread runs the health checks, from construction until :meth:`close`.
+    Threads: a dedicated thread checks the health, from construction until :meth:`close`.
     """
 
     def __init__(
@@ -71,14 +65,14 @@ class HealthWatch:
         self._all_defects = all_defects
         self._ended = False
         self._patch_before, self._bus_before = dict(patches()), dict(buses())
-        # (subject, counter) -> time of the last event and the counter's value at that time
+        # (subject, counter) -> time and counter value of the last event
         self._reported: dict[tuple[str, str], tuple[int, int]] = {}
         self._stop = clock.event()
         self._thread = clock.thread(target=self._run, name="health")
         self._thread.start()
 
     def close(self) -> None:
-        """Run a final health check, then end and join the thread."""
+        """Check the health once more, then end and join the thread."""
         self._stop.set()
         self._thread.join()
 
@@ -94,10 +88,9 @@ class HealthWatch:
         keep_on(self._turn, self._defects, "watching the health")
 
     def _turn(self) -> bool:
-        """Wait for the check interval, then check the health. Return False after the last check.
+        """Wait for the next check and carry it out. Return False after the last check.
 
-        If a check raises an exception, the check is repeated. An event may therefore be published twice but
-        is never missed.
+        A check that raises an exception is repeated. This may publish an event twice but misses none.
         """
         if self._ended:
             return False
@@ -150,7 +143,7 @@ class HealthWatch:
         self._compare_counters(name, before, now, _PATCH_COUNTERS)
 
     def _compare_frozen_parts(self, name: str, before: PatchHealth, now: PatchHealth) -> None:
-        """Publish an event when a frozen wire or crossing is left out of the solve or used again."""
+        """Publish which frozen wires and crossings have been left out of the solve or used again."""
         was, are = (
             {each.place: each for each in health.faults if _is_frozen_part(each)} for health in (before, now)
         )

@@ -1,4 +1,4 @@
-"""Start a host's components in order, and shut them down in reverse order."""
+"""Start the parts of a host in order, and shut them down in reverse order."""
 
 from __future__ import annotations
 
@@ -39,26 +39,28 @@ from skinnode.transport import CanPort
 _log = logging.getLogger(__name__)
 
 LAST_SCAN_S: Final = 0.5
-"""Maximum time (s) to wait for the last scans when a host closes."""
+"""Time limit (s) for the last scans when a host closes."""
 
 _POLL_S: Final = 0.005
 
 
 def never() -> bool:
-    """Return False; default for :attr:`StartOptions.cancelled`."""
+    """Return False; default of :attr:`StartOptions.cancelled`."""
     return False
 
 
 @dataclass(frozen=True, slots=True)
 class StartOptions:
-    """Start options of a host. Raises ValueError if the deadline is negative, infinite or not a number."""
+    """Options for starting a host.
+
+    Raises:
+        ValueError: if ``boot_deadline_s`` is negative, infinite or not a number.
+    """
 
     boot_deadline_s: float = BOOT_DEADLINE_S
-    """Maximum time (s) to wait for a node's first response."""
+    """Time limit (s) for a node's first response."""
     cancelled: Callable[[], bool] = never
-    """Function called repeatedly during bring-up; if it returns True, bring-up stops and raises
-    BringUpCancelled.
-    """
+    """Function polled during bring-up. If it returns True, bring-up raises BringUpCancelled."""
     tap: HostTap | None = None
     """Recorder of the traffic, including bring-up; None for no recording."""
     open_port: Callable[[BusConfig], CanPort] = CanPort
@@ -73,7 +75,7 @@ class StartOptions:
 
 @dataclass(frozen=True, slots=True)
 class HostParts:
-    """Components of a running host, created and shut down by :func:`running_parts`."""
+    """Parts of a running host; see :func:`running_parts`."""
 
     hand: HandConfig
     buses: Mapping[str, ServedBus]
@@ -85,23 +87,23 @@ class HostParts:
     callbacks: Callbacks
     events: Events
     defects: Defects
-    """Collector of exceptions that do not concern a particular bus or patch."""
+    """Collector of the exceptions that concern no single bus or patch."""
 
 
 @contextlib.contextmanager
 def running_parts(hand: HandConfig, options: StartOptions) -> Iterator[HostParts]:
-    """Start a host's components, and shut them down when the ``with`` block exits.
+    """Start the parts of a host. Shut them down when the ``with`` block exits.
 
-    The shutdown follows this order: stop SYNC, wait for scans in progress, stop configuring nodes, make the
-    nodes pre-operational, end the mainline, discard queued scans, end the workers, close the interfaces, and
-    end subscribers' loops.
+    Order of the shutdown: stop SYNC, wait for the scans in progress, stop configuring nodes, make the nodes
+    pre-operational, end the mainline, discard queued scans, end the workers, close the interfaces, and end
+    the subscriptions.
 
     Raises:
         SkinError: see :meth:`skinnode.host.Host.from_config`.
     """
     check_plan(hand)
     check_files(hand)
-    load_kernels()  # compile the bus load kernels now; compiling later would delay the mainline
+    load_kernels()  # compile the bus load kernels now, not later on the mainline
     defects = Defects("host")
     publisher = Publisher(tuple(patch.name for patch in hand.patches), defects)
     callbacks = Callbacks(defects)
@@ -121,7 +123,7 @@ def running_parts(hand: HandConfig, options: StartOptions) -> Iterator[HostParts
             _tap_all(ContainedTap(options.tap, defects), buses.values(), nodes)
         for node in nodes:
             stack.callback(node.stream.close)
-        # All handlers are set, so frames may now be dispatched.
+        # All handlers are registered: frames may now be dispatched.
         stack.enter_context(Mainline([bus.link for bus in buses.values()], defects))
         ready = _brought_up(hand, nodes, options, stack)
         supervisor = Supervisor(nodes, list(ready), hand.bring_up.heartbeat_s, defects)
@@ -160,7 +162,7 @@ def _tap_all(tap: ContainedTap, buses: Iterable[ServedBus], nodes: Iterable[Remo
 def _brought_up(
     hand: HandConfig, nodes: Sequence[RemoteNode], options: StartOptions, stack: contextlib.ExitStack
 ) -> dict[RemoteNode, ScanSolver]:
-    """Configure and start the nodes; closing ``stack`` makes the nodes pre-operational again."""
+    """Configure and start the nodes. Closing ``stack`` makes them pre-operational again."""
     for patch in hand.patches:
         go_on_unless(options.cancelled)
         check_solvable(patch, hand.solver)
@@ -171,7 +173,7 @@ def _brought_up(
         start_all(ready)
     except BusError:
         for node in nodes:
-            if node.link.failure is not None:  # the nodes do not respond because the bus has failed
+            if node.link.failure is not None:  # the bus has failed, so the nodes cannot respond
                 raise node.link.failure from node.link.failure.__cause__
         raise
     return ready
@@ -183,7 +185,7 @@ def _sync(
     nodes: Sequence[RemoteNode],
     stack: contextlib.ExitStack,
 ) -> SyncProducer | None:
-    """Send SYNC on all buses whose master is the host; closing ``stack`` stops SYNC."""
+    """Send SYNC on the buses whose master is the host. Closing ``stack`` stops it."""
     own = [bus for bus in buses.values() if bus.link.config.role == "master"]
     if not own:
         return None
@@ -197,11 +199,11 @@ def _sync(
 
 
 def _logged_already(error: Exception) -> None:
-    """Ignore an exception on a bus; the health watch publishes the exception as an event."""
+    """Ignore an exception on a bus. It is logged, and the health watch publishes it as an event."""
 
 
 def _let_scans_end(streams: Sequence[tuple[PatchStream, Ticks]], period_s: float) -> None:
-    """Wait for the scans started by the last SYNC, so that shutdown does not interrupt them."""
+    """Wait for the scans of the last SYNC, so that the shutdown does not interrupt them."""
     end_s = clock.monotonic() + min(1.5 * period_s, LAST_SCAN_S)
     while not all(stream.settled(ticks.newest) for stream, ticks in streams):
         if clock.monotonic() > end_s:

@@ -26,22 +26,19 @@ _REOPEN_S: Final = 0.1
 
 
 class BusLink(Dispatcher):
-    """Connection to a bus; open from construction until :meth:`close` or the end of a ``with`` block.
+    """Connection to a bus, open from construction until :meth:`close` or the end of a ``with`` block.
 
-    If a handler, poller, listener or job raises an exception, only the current frame or call is lost.
-    If the dispatcher itself raises an exception, dispatching is paused for this bus, and received frames wait
-    in the queue. If the interface fails after it has been opened, a thread repeatedly tries to reopen it.
+    An exception in a handler, poller, listener or job costs only the current frame or call. An exception in
+    the dispatcher itself pauses the dispatching for this bus, and received frames wait in the queue. If the
+    interface fails, a separate thread tries repeatedly to reopen it.
 
-    Threads: :meth:`send`, :meth:`ask_remote`, :meth:`call` and :meth:`stats` may be called from any thread.
-    The other methods may be called only by a :class:`~skinnode.host.mainline.Mainline`. A separate thread
-    reopens the interface.
+    Threads: any thread may call :meth:`send`, :meth:`ask_remote`, :meth:`call` and :meth:`stats`. The other
+    methods are reserved for the :class:`~skinnode.host.mainline.Mainline`.
 
     Args:
         config: Configuration of the bus.
-        handlers: Handlers by COB-ID; each is called on the mainline with the data frames that have its
-            COB-ID.
-        on_defect: Function called with each exception whose message has not occurred before, on the thread
-            that raised the exception.
+        handlers: Handlers of the data frames, by COB-ID. The mainline calls them.
+        on_defect: Function called with each exception that has a new message, on the thread that raised it.
         open_port: Function that opens the interface.
 
     Raises:
@@ -57,12 +54,12 @@ class BusLink(Dispatcher):
     ) -> None:
         super().__init__(config, handlers, clock.monotonic_ns())
         self.defects = Defects(config.name, on_defect)
-        """Collector of exceptions raised while serving the bus itself rather than one of its patches."""
+        """Collector of the exceptions that concern the bus rather than one of its patches."""
         self._sent_listeners: tuple[Callable[[Frame], None], ...] = ()
         self._jobs: deque[tuple[Callable[[], object], Defects]] = deque()
         self.failure: BusError | None = None
         """Error that made the bus unavailable; None while the bus is available."""
-        self._due_s = 0.0  # time after which a reopened interface is considered to be working
+        self._due_s = 0.0  # time at which a reopened interface counts as working
         self._outages = 0
         self.t_dispatched_ns = 0
         """Monotonic time (ns) up to which all received frames have been dispatched."""
@@ -88,7 +85,7 @@ class BusLink(Dispatcher):
         """
         t_ns = clock.monotonic_ns()
         self._port.send(can_id, data)
-        try:  # the frame has already been sent: hide listeners' exceptions from the caller
+        try:  # the frame has been sent: a listener must not fail the call
             if can_id != SYNC_COB_ID:
                 self.intake.asked(t_ns)
             self.count_sent(can_id, data)
@@ -107,9 +104,9 @@ class BusLink(Dispatcher):
 
         Args:
             node_id: Node-ID of the node.
-            on_answer: Function called on the mainline with the monotonic time (ns) of each SDO response.
-            defects: Collector of the response handler's exceptions, as in :meth:`handle`. If ``defects`` is
-                given, unexpected exceptions during a transfer are reported to the bus's collector.
+            on_answer: Function called with the monotonic time (ns) of each SDO response, on the mainline.
+            defects: Collector of the exceptions of the response handler; see :meth:`handle`. If given,
+                unexpected exceptions during a transfer are reported to the collector of the bus.
         """
 
         def on_response(data: bytes, t_ns: int) -> None:
@@ -138,7 +135,7 @@ class BusLink(Dispatcher):
             listener(Frame(can_id, b"", t_ns, remote=True))
 
     def listen_to_sent(self, listener: Callable[[Frame], None]) -> None:
-        """Pass every sent frame and its send time to ``listener``, on the sending thread."""
+        """Pass every sent frame to ``listener``, on the sending thread."""
         self._sent_listeners = (*self._sent_listeners, listener)
 
     def unlisten_to_sent(self, listener: Callable[[Frame], None]) -> None:
@@ -146,11 +143,11 @@ class BusLink(Dispatcher):
         self._sent_listeners = tuple(each for each in self._sent_listeners if each is not listener)
 
     def call(self, job: Callable[[], object], defects: Defects | None = None) -> None:
-        """Run ``job`` on the mainline, before any frame received later is dispatched. Any thread.
+        """Run ``job`` on the mainline, before the frames that arrive later are dispatched. Any thread.
 
         Args:
             job: Function to run.
-            defects: Collector of the job's exceptions; the bus's collector by default.
+            defects: Collector of the job's exceptions; by default, that of the bus.
         """
         self._jobs.append((job, self.defects if defects is None else defects))
 
@@ -186,15 +183,15 @@ class BusLink(Dispatcher):
     # --- called by the mainline
 
     def expect(self, what: str, times_ns: tuple[int, ...]) -> None:
-        """Predict the arrival times of a group of frames; see :meth:`Intake.expect`."""
+        """Announce the predicted arrival times of frames; see :meth:`Intake.expect`."""
         self.intake.expect(what, times_ns)
 
     def begin(self, resume: Callable[[], None]) -> None:
-        """Prepare for the first :meth:`turn`. ``resume`` must restart reception on a reopened interface."""
+        """Prepare for the first :meth:`turn`. ``resume`` restarts reception on a reopened interface."""
         self._resume = resume
 
     def turn(self) -> None:
-        """Pass the frames received since the previous call to their handlers."""
+        """Dispatch the frames received since the previous call."""
         if self._rests:
             self._rest()
             return
@@ -211,7 +208,7 @@ class BusLink(Dispatcher):
             self.defects.report("dispatching frames", error)
 
     def measure_load(self) -> None:
-        """Compute the bus load if a summing interval has passed. Never raises."""
+        """Update the bus load if the update is due. Never raises."""
         try:
             if not self._rests and self.t_dispatched_ns * 1e-9 >= self._load_due_s:
                 self.measure(self.t_dispatched_ns)
@@ -220,13 +217,13 @@ class BusLink(Dispatcher):
             self.defects.report("measuring the load", error)
 
     def end(self) -> None:
-        """Stop trying to reopen the interface. Call after the last :meth:`turn`."""
+        """Stop reopening the interface. Call after the last :meth:`turn`."""
         self._stop.set()
         if self._reopening is not None:
             self._reopening.join()
 
     def _dispatch_received(self) -> bool:
-        """Dispatch one batch of frames. Return whether any frame was received."""
+        """Dispatch one batch of frames. Return whether it contained any."""
         seen_ns = self.intake.seen_ns  # read first: the batch contains all frames up to this time
         batch = self.intake.take()
         while self._jobs:
@@ -235,8 +232,8 @@ class BusLink(Dispatcher):
                 job()
             except Exception as error:
                 owner.report("a job on the mainline", error)
-        # While frames wait in the queue or the interface, pollers receive the time of the newest dispatched
-        # frame. With the current time, a delay in the host would make nodes appear late.
+        # While frames are waiting, the pollers get the time of the newest dispatched frame. If they got the
+        # current time, a delay in the host would make nodes appear late.
         if batch:
             self.dispatch(batch)
             self.t_dispatched_ns = batch[-1].t_ns
@@ -248,7 +245,7 @@ class BusLink(Dispatcher):
         return bool(batch)
 
     def _rest(self) -> None:
-        """Resume dispatching after a pause, or restart the reopening thread if the thread failed to start."""
+        """Resume dispatching after the pause, or restart a reopening thread that failed to start."""
         if not self._opening:
             self._rests = clock.monotonic() < self._rest_end_s
         elif (
@@ -257,7 +254,7 @@ class BusLink(Dispatcher):
             self._begin_reopening()
 
     def _go_away(self, error: Exception) -> None:
-        """Mark the bus as unavailable and start reopening its interface."""
+        """Mark the bus as unavailable, and start reopening its interface."""
         self._rests = self._opening = True
         if not isinstance(error, BusError):
             self.defects.report("receiving", error)
@@ -269,16 +266,16 @@ class BusLink(Dispatcher):
         self._begin_reopening()
 
     def _begin_reopening(self) -> None:
-        """Start a separate thread to reopen the interface, because reopening may block."""
+        """Reopen the interface on a separate thread, because reopening may block."""
         if self._stop.is_set():
             return
         name = f"reopen {self.config.name}"
         thread = clock.thread(target=self._reopen, name=name)
         thread.start()
-        self._reopening = thread  # set after start(): a thread that was not started cannot be joined
+        self._reopening = thread  # after start(), because only a started thread can be joined
 
     def _reopen(self) -> None:
-        """Try repeatedly to reopen the interface.
+        """Try to reopen the interface until it succeeds.
 
         Unexpected exceptions lengthen the pauses between attempts.
         """

@@ -1,4 +1,4 @@
-"""Process a node's heartbeats and emergency messages, and derive the health of its patch."""
+"""Evaluate the heartbeats and EMCY messages of a node, and derive the health of its patch."""
 
 from __future__ import annotations
 
@@ -25,37 +25,34 @@ from skinnode.host.health import (
 _log = logging.getLogger(__name__)
 
 RESTART_MEMORY_NS: Final = 5_000_000_000
-"""Time (ns) for which a restart loop is still reported after the last restart."""
+"""Time (ns) for which a restart loop is reported after its last restart."""
 
 SETTLED_NS: Final = 500_000_000
-"""Time (ns) for which the condition of a node remains *restarting* after the last restart in a loop, even if
-the node is operational again.
+"""Minimum time (ns) after the last restart in a loop for which the condition stays *restarting*, even if the
+node is operational.
 """
 
 LOOP_RESTARTS: Final = 3
 LOOP_NS: Final = 10_000_000_000
-"""A node is in a restart loop if it has restarted at least ``LOOP_RESTARTS`` times without a command within
-``LOOP_NS`` (ns).
-"""
+"""Definition of a restart loop: ``LOOP_RESTARTS`` restarts without a command within ``LOOP_NS`` (ns)."""
 
 BEATS: Final = 12
 BEATS_TOO_OFTEN: Final = 0.7
-"""Test for two nodes with the same node-ID: ``BEATS`` heartbeats arrive in less than ``BEATS_TOO_OFTEN``
-times the expected time. Two nodes send twice as many heartbeats as one, and therefore need only half of the
-expected time.
+"""Test for two nodes with the same node-ID: ``BEATS`` heartbeats take less than ``BEATS_TOO_OFTEN`` times the
+time that one node needs. Two nodes need half of that time.
 """
 
 
 class NodeMonitor:
-    """Collector of evidence about one node.
+    """Collector of the evidence about one node.
 
-    Only :meth:`health` may be called from any thread; all other methods may be called only from the mainline.
+    Threads: any thread may call :meth:`health`. The other methods are for the mainline only.
 
     Args:
         patch: Name of the patch.
         node_id: Node-ID of the patch's node.
         on_reject: Function called with each malformed heartbeat or EMCY message.
-        watch: Fault detector for the codes of the patch.
+        watch: Fault detector for the patch's codes.
     """
 
     def __init__(
@@ -78,15 +75,14 @@ class NodeMonitor:
         self._registers_said = 0
         self._last_emergency: tuple[int, bytes] | None = None  # error code, other bytes
         self.running = False
-        """Whether the node has been started; from then on, boot-up messages are counted as spontaneous
-        restarts.
+        """Whether the host has started the node. From then on, a boot-up message means a restart without a
+        command.
         """
         self.rejoins = self.baselines = 0
         self.refusal: str | None = None
         self.defect: str | None = None
         self.complaint: str | None = None
-        """Reason why the last bring-up failed. The supervisor sets this attribute, ``refusal`` and
-        ``defect``.
+        """Reason why the last bring-up failed. Like ``refusal`` and ``defect``, it is set by the supervisor.
         """
 
     @property
@@ -105,14 +101,14 @@ class NodeMonitor:
         return self._t_scan_ns
 
     def on_heartbeat(self, data: bytes, t_ns: int) -> None:
-        """Process a heartbeat or boot-up message. Messages that are not one byte long are rejected."""
+        """Process a heartbeat or boot-up message. It must be one byte long."""
         if len(data) != 1:
             self.on_reject(CodecError(heartbeat_cob_id(self.node_id), data, "1 byte (heartbeat)"))
             return
         state = data[0] & STATE_MASK  # bit 7 is the toggle bit of node guarding
         if state == NmtState.INITIALISING:
             self._boot_ups += 1
-            self._on_register(0)  # a reset clears the register; persistent errors are reported again
+            self._on_register(0)  # a reset clears the register; the node reports persisting errors again
             if self.running:
                 self._restarts.append(t_ns)
                 _log.warning("node %d (%s) restarted without a command", self.node_id, self.patch)
@@ -124,8 +120,8 @@ class NodeMonitor:
     def on_emergency(self, data: bytes, t_ns: int) -> None:
         """Process an EMCY message.
 
-        The message contains an error code (u16), the error register (u8) and five manufacturer-specific
-        bytes. Error code 0 reports that all errors have been cleared.
+        The message holds the error code (u16), the error register (u8) and five manufacturer-specific bytes.
+        Error code 0 means that no error is left.
         """
         if len(data) != 8:
             self.on_reject(CodecError(emcy_cob_id(self.node_id), data, "8 bytes (EMCY)"))
@@ -139,16 +135,16 @@ class NodeMonitor:
 
     @property
     def error_register(self) -> int:
-        """Most recently reported error register of the node."""
+        """Error register of the node, as last reported."""
         return self._error_register
 
     @property
     def registers_said(self) -> int:
-        """Number of messages received that report the node's error register."""
+        """Number of times the error register has been reported."""
         return self._registers_said
 
     def on_register_read(self, register: int, said: int) -> None:
-        """Store an error register read by SDO, unless an EMCY message has reported a newer value.
+        """Store an error register read by SDO, unless it has been reported anew since the request.
 
         Args:
             register: Value of the error register.
@@ -162,7 +158,7 @@ class NodeMonitor:
         self._registers_said += 1
 
     def said_since(self, state: int, t_ns: int) -> bool:
-        """Return whether the newest heartbeat arrived after ``t_ns`` and reported the NMT state ``state``."""
+        """Return whether the newest heartbeat arrived after ``t_ns`` and reports NMT state ``state``."""
         heard_ns = self._t_heartbeat_ns
         return heard_ns is not None and heard_ns > t_ns and self.nmt_state == state
 
@@ -182,11 +178,11 @@ class NodeMonitor:
 
         Args:
             now_ns: Current monotonic time, ns.
-            heartbeat_s: Heartbeat period of the node, s.
+            heartbeat_s: Heartbeat period, s.
             scan_s: Scan period, s.
-            conflicts: Number of frames that contradict other frames of the same scan.
-            t_passed_ns: Monotonic arrival time (ns) of the newest scan that was not withheld. 0 before the
-                first such scan; None if scans are never withheld.
+            conflicts: Number of frames that contradict another frame of the same scan.
+            t_passed_ns: Monotonic arrival time (ns) of the newest scan that was not withheld; 0 if there is
+                none. None if scans are never withheld.
         """
 
         def age_s(t_ns: int | None) -> float | None:
@@ -244,9 +240,9 @@ class NodeMonitor:
         )
 
     def _emergency_text(self, code: int, detail: bytes) -> str:
-        """Return a description of an emergency message.
+        """Return the description of an EMCY message.
 
-        skinnode's error texts are not used for a refused node, which may be a different type of device.
+        A refused node may be another type of device, so skinnode's own error texts do not apply to it.
         """
         return error_text(code, detail, ours=self.refusal is None)
 
@@ -257,7 +253,7 @@ class NodeMonitor:
         return restarts[-1] - restarts[0] < LOOP_NS
 
     def _beats_too_often(self, now_ns: int, heartbeat_s: float) -> bool:
-        """Return whether heartbeats arrive so often that two nodes must have the same node-ID."""
+        """Return whether heartbeats arrive too often for a single node."""
         beats, period_ns = list(self._beats), heartbeat_s * 1e9
         if len(beats) < BEATS or now_ns - beats[-1] > HEARTBEATS_MISSED * period_ns:
             return False

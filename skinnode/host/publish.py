@@ -1,4 +1,4 @@
-"""Pass fields from the worker threads to the subscribers' bounded queues."""
+"""Pass fields from the worker threads to the bounded queues of the subscribers."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def check_timeout(timeout_s: float | None) -> None:
     """Check a timeout.
 
     Raises:
-        ValueError: if the timeout is negative, is not a number, or exceeds the operating system's limit.
+        ValueError: if the timeout is negative, not a number, or above the limit of the operating system.
     """
     if timeout_s is not None and not 0 <= timeout_s <= threading.TIMEOUT_MAX:
         raise ValueError(f"timeout_s: got {timeout_s!r}, must be from 0 to {threading.TIMEOUT_MAX:.0f}")
@@ -39,36 +39,34 @@ def check_capacity(capacity: int) -> None:
 
 
 class Subscription:
-    """Subscription to fields.
+    """Subscription to fields. Read it with ``for``, ``async for`` or :meth:`get`.
 
-    Read the fields in order of publication with ``for``, ``async for`` or :meth:`get`.
-
-    If the subscription's queue is full, its oldest field is dropped and counted in ``dropped``. The
-    subscription ends when :meth:`close` is called, a ``with`` block exits, or the last reference to the
-    subscription is deleted. Any thread or event loop may read the subscription.
+    Fields are delivered in the order of publication. A full queue drops its oldest field; ``dropped`` counts
+    these fields. A subscription accepts fields until it is closed, its ``with`` block exits or the last
+    reference to it is deleted. Any thread or event loop may read it.
     """
 
     def __init__(self, capacity: int, timeout_s: float | None, patches: frozenset[str]) -> None:
         self._queue: DropOldestQueue[FieldFrame] = DropOldestQueue(capacity)
         self._timeout_s = timeout_s
         self._subscribed = patches
-        # Each patch has its own counter, so no two workers write the same counter at the same time.
+        # One counter per patch, because only one worker at a time publishes the fields of a patch.
         self._dropped = dict.fromkeys([*patches, ""], 0)
-        self._wakers: dict[object, Callable[[], object]] = {}  # one wake-up function per waiting event loop
+        self._wakers: dict[object, Callable[[], object]] = {}  # one wake-up function per waiting task
 
     @property
     def dropped(self) -> int:
-        """Number of fields lost because this subscriber was too slow."""
+        """Number of fields lost because the subscriber was too slow."""
         return sum(self._dropped.values())
 
     def get(self, timeout_s: float | None = None) -> FieldFrame | None:
         """Wait for the next field and return it.
 
         Args:
-            timeout_s: Maximum time (s) to wait for a field; None for no limit.
+            timeout_s: Time limit (s); None for no limit.
 
         Returns:
-            Next field; None if no field arrived before the timeout or the host has closed.
+            Next field; None on timeout or once the host has closed.
 
         Raises:
             SkinError: the error that stopped the host, if any.
@@ -79,10 +77,10 @@ class Subscription:
             return None
 
     def take(self, timeout_s: float | None) -> FieldFrame | None:
-        """Return the next field, or None if the host has closed.
+        """Return the next field; None once the host has closed.
 
         Raises:
-            queue.Empty: if no field arrived within ``timeout_s``.
+            queue.Empty: if no field arrives within ``timeout_s``.
             SkinError: the error that stopped the host, if any.
         """
         check_timeout(timeout_s)
@@ -102,25 +100,25 @@ class Subscription:
         try:
             async with limit:
                 while True:
-                    await asyncio.sleep(0)  # yield to other tasks even if fields arrive continuously
+                    await asyncio.sleep(0)  # let other tasks run even if a field is always waiting
                     arrived.clear()
                     try:
                         return self._open(self._queue.get(0.0))
                     except queue.Empty:
                         await arrived.wait()
         except TimeoutError:
-            if not limit.expired():  # a TimeoutError stopped the host; the wait itself has not timed out
+            if not limit.expired():  # not a timeout here: the error that stopped the host
                 raise
             raise queue.Empty from None
         finally:
             del self._wakers[key]
 
     def close(self) -> None:
-        """Stop accepting fields. Queued fields are discarded."""
+        """Stop accepting fields."""
         self._subscribed = frozenset()
 
     def end(self) -> None:
-        """Stop accepting fields; the reader's loop ends after the last queued field. Any thread."""
+        """Stop accepting fields, and end the reader's loop after the last queued field. Any thread."""
         self.close()
         self.offer(End(), "")
 
@@ -128,7 +126,7 @@ class Subscription:
         """Yield fields until the host closes.
 
         Raises:
-            TimeoutError: if no field arrived within the subscription's timeout.
+            TimeoutError: if no field arrives within the timeout of the subscription.
             SkinError: the error that stopped the host, if any.
         """
         while True:
@@ -163,9 +161,9 @@ class Subscription:
         self.close()
 
     def offer(self, item: FieldFrame | End, patch: str) -> None:
-        """Queue an end marker or a field of a subscribed patch; ignore the fields of other patches.
+        """Queue an end marker, or a field if its patch is subscribed. Any thread.
 
-        Never blocks. Any thread.
+        Never blocks.
         """
         if patch and patch not in self._subscribed:
             return
@@ -175,7 +173,7 @@ class Subscription:
     def _open(self, item: FieldFrame | End) -> FieldFrame | None:
         if isinstance(item, FieldFrame):
             return item
-        self._wake()  # wake the other readers: every reader must receive the end marker
+        self._wake()  # every reader must get the end marker
         if item.error is not None:
             raise item.error
         return None
@@ -186,13 +184,12 @@ class Subscription:
 
 
 class Publisher:
-    """All subscriptions of a host, and the newest field of each patch.
+    """Subscriptions of a host, and the newest field of each patch.
 
-    Exceptions raised while passing a field to a subscriber are reported to ``defects``; only that subscriber
-    loses the field.
+    An exception on passing a field to a subscriber is reported to ``defects`` and costs only that subscriber
+    the field.
 
-    Threads: only worker threads may publish fields, and only one worker per patch at a time. All other
-        methods may be called from any thread.
+    Threads: only workers may publish, one at a time per patch. Any thread may call the other methods.
     """
 
     def __init__(self, patches: tuple[str, ...], defects: Defects | None = None) -> None:
@@ -207,7 +204,7 @@ class Publisher:
         """Create a subscription to the fields of one patch, or of all patches if ``patch`` is None.
 
         Raises:
-            ValueError: if the capacity is below 1, the timeout is out of range, or there is no such patch.
+            ValueError: if ``capacity`` or ``timeout_s`` is out of range, or there is no such patch.
         """
         check_capacity(capacity)
         check_timeout(timeout_s)
@@ -216,7 +213,7 @@ class Publisher:
         chosen = self._patches if patch is None else frozenset([patch])
         subscription = Subscription(capacity, timeout_s, chosen)
         key = next(self._keys)
-        # No lock is needed, because setting and removing a dict item are atomic, and readers copy the dict.
+        # No lock: setting and removing an item of a dict are atomic, and readers copy the dict.
         forget = self._subscriptions
         self._subscriptions[key] = weakref.ref(subscription, lambda _: forget.pop(key, None))
         if self._last is not None:
@@ -224,7 +221,7 @@ class Publisher:
         return subscription
 
     def latest(self, patch: str) -> FieldFrame | None:
-        """Return a patch's newest field, or None if no field has been published yet.
+        """Return a patch's newest field; None before the first field.
 
         Raises:
             ValueError: if there is no such patch.
@@ -234,25 +231,25 @@ class Publisher:
         return self._latest.get(patch)
 
     def publish(self, field: FieldFrame, patch: str) -> None:
-        """Pass a field to its subscribers.
+        """Pass a field to its subscribers. Never blocks.
 
-        Only the worker that is processing the patch may call this method. Never blocks.
+        Reserved for the worker that is processing the patch.
         """
         self._latest[patch] = field
         self._offer(field, patch)
 
     @property
     def failure(self) -> SkinError | None:
-        """Error that stopped the host; None if the host is running or was closed normally."""
+        """Error that stopped the host; None if the host is running or has been closed."""
         return None if self._last is None else self._last.error
 
     def fail(self, error: SkinError) -> None:
-        """Raise ``error`` in every subscription after its queued fields, because the host has failed."""
+        """Stop the host: every subscription raises ``error`` after its queued fields."""
         self._last = self._last or End(error)
         self._offer(self._last, "")
 
     def end(self) -> None:
-        """End every subscription after its queued fields. Call when the host closes."""
+        """End every subscription after its queued fields, because the host closes."""
         self._last = self._last or End()
         self._offer(self._last, "")
 

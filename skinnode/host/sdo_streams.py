@@ -1,4 +1,4 @@
-"""Transfer SDO data with canopen 2.4's streams, modified to recover from lost frames.
+"""Adapt the SDO streams of canopen 2.4 so that transfers recover from lost frames.
 
 ==================  =========================================================  ==============================
 stream              canopen 2.4.1                                              here
@@ -35,23 +35,19 @@ from skinnode.canopen.sdo import ABORT
 from skinnode.process import clock
 
 _QUIET_S: Final = 0.02
-"""Required quiet time (s) after an abort: if no response arrives for this time, the aborted transfer is
-considered finished.
-"""
+"""Time (s) without a response after which an aborted transfer counts as finished."""
 
 _SETTLE_S: Final = 0.1
-"""Maximum time (s) to wait for responses to cease after an abort. The wait is limited because another SDO
-client may keep the node busy.
-"""
+"""Time limit (s) for responses to cease after an abort. Another SDO client may keep the node responding."""
 
 _RETRANSMISSIONS: Final = 20
-"""Maximum number of retransmitted blocks in one transfer. If a node requests more retransmissions, the
-transfer fails, because the node probably rejects every block.
+"""Maximum number of retransmissions in one transfer. A node that requests more probably rejects every block,
+so the transfer fails.
 """
 
 
 class Client(SdoClient):
-    """canopen SDO client for node ``node_id``, without an object dictionary."""
+    """SDO client of the canopen package for node ``node_id``, without an object dictionary."""
 
     def __init__(self, network: canopen.Network, node_id: int) -> None:
         empty: Any = ObjectDictionary  # canopen's constructor has no type annotations
@@ -62,17 +58,17 @@ class Client(SdoClient):
         self._abort_code: int = AbortCode.TIMED_OUT
 
     def abort(self, abort_code: int = AbortCode.TIMED_OUT) -> None:
-        """Store the abort code; :meth:`give_up` sends the abort message."""
+        """Store the abort code. :meth:`give_up` sends it."""
         self._abort_code = abort_code
 
     def request_response(self, sdo_request: bytes) -> bytes:
         """Send an SDO request and return the response.
 
-        If the request starts a transfer, responses for other objects are skipped: a slow node may still be
-        responding to the previous transfer.
+        A slow node may still be responding to the previous transfer. After a request that begins a transfer,
+        responses for other objects are therefore skipped, unless nothing else arrives.
 
         Raises:
-            SdoError: if no response arrives before the timeout, or the response is an abort.
+            SdoError: if no response arrives in time, or the response is an abort.
         """
         begins = sdo_request[0] >> 5 in (1, 2) or (sdo_request[0] >> 5, sdo_request[0] & 1) in (
             (5, 0),
@@ -98,7 +94,7 @@ class Client(SdoClient):
             late = response
 
     def give_up(self, index: int, subindex: int) -> None:
-        """Abort the current transfer of an object, and discard late responses.
+        """Abort the transfer of an object, and discard late responses.
 
         Raises:
             BusError: if the abort message cannot be sent.
@@ -114,23 +110,23 @@ class Client(SdoClient):
 class BlockUpload(BlockUploadStream):
     """Block upload that tolerates late segments.
 
-    canopen 2.4 requests a late segment twice and drops the first response, so the CRC is wrong after any
-    pause longer than canopen's timeout. An out-of-order segment, in contrast, is requested only once. This
-    class therefore presents a late segment to canopen as an out-of-order segment.
+    canopen 2.4 requests a late segment twice and drops the first response. After a pause longer than
+    canopen's timeout, the CRC is therefore wrong. A segment with a wrong sequence number is requested only
+    once, so this class turns a late segment into one of those.
     """
 
     def read(self, size: int = -1) -> bytes:
-        """Read one segment of the upload; overrides canopen's method."""
+        """Read one segment. Overrides canopen's method."""
         if size >= 0 and not self._done:
             try:
                 response = self.sdo_client.read_response()
             except SdoCommunicationError:
-                response = bytes(8)  # sequence number 0 is never valid
+                response = bytes(8)  # sequence number 0 is invalid
             self.sdo_client.responses.queue.appendleft(response)
         return bytes(super().read(size))  # type: ignore[no-untyped-call]  # canopen is not typed
 
     def abort(self, abort_code: int) -> None:
-        """Store the abort code. canopen calls this method if the node does not end the transfer."""
+        """Store the abort code. canopen calls this method if the end of the transfer does not arrive."""
         self._error = True
         self.sdo_client.abort(abort_code)
 
@@ -139,7 +135,7 @@ class Download(WritableStream):
     """Expedited or segmented SDO download."""
 
     def close(self) -> None:
-        """Close the stream without sending a frame: the final segment is already marked as the last."""
+        """Close the stream without sending a frame. The last segment has already been marked as such."""
         io.RawIOBase.close(self)
 
 
@@ -153,7 +149,7 @@ class BlockDownload(BlockDownloadStream):
         self._left = _RETRANSMISSIONS
 
     def close(self) -> None:
-        """Close the stream without sending a frame, because a failed transfer has already been aborted."""
+        """Close the stream without sending a frame. A failed transfer has already been aborted."""
         io.RawIOBase.close(self)
 
     def finish(self) -> None:
@@ -165,7 +161,7 @@ class BlockDownload(BlockDownloadStream):
         super().close()  # type: ignore[no-untyped-call]
 
     def _retransmit(self, ackseq: int, blksize: int) -> None:
-        """Retransmit the segments of the current block after segment number ``ackseq``."""
+        """Retransmit the segments of the current block that follow segment ``ackseq``."""
         self._left -= 1
         if self._left < 0:
             raise SdoCommunicationError("the node does not acknowledge any segment")

@@ -1,4 +1,4 @@
-"""Configure all nodes of a hand in parallel, and make them operational."""
+"""Configure the nodes of a hand in parallel and make them operational."""
 
 from __future__ import annotations
 
@@ -19,27 +19,27 @@ from skinnode.process import clock
 from skinnode.text.words import known
 
 BRING_UP_THREADS: Final = 16
-"""Maximum number of nodes configured in parallel; with more nodes, the bus would be the bottleneck."""
+"""Maximum number of nodes configured in parallel. With more, the bus becomes the bottleneck."""
 
 _BRING_UPS: Final = 3
-"""Maximum number of attempts to configure a node. The configuration is repeated after an unexpected
-exception, or if the node boots during its configuration, for example because LSS has set its node-ID.
+"""Maximum number of attempts to configure a node. An attempt is repeated after an unexpected exception or a
+boot-up of the node. The node boots, for example, when LSS has set its node-ID.
 """
 
 _START_AGAIN_NAPS: Final = 50
-"""Number of polling intervals (a quarter of a second in total) after which an unconfirmed start command is
-repeated, because the command may have been lost.
+"""Number of polling intervals (0.25 s in total) between repetitions of the start command. NMT commands are
+unconfirmed and may be lost.
 """
 
 _POLL_S: Final = 0.005
 
 
 class BringUpCancelled(SkinError):
-    """Exception raised when the caller cancels bring-up."""
+    """Raised when the caller cancels bring-up."""
 
 
 class _Defective(NodeError):
-    """Error: the last attempt to configure a node raised an unexpected exception."""
+    """Raised if the last attempt to configure a node ended with an unexpected exception."""
 
 
 def go_on_unless(cancelled: Callable[[], bool]) -> None:
@@ -53,16 +53,16 @@ def configure_all(
 ) -> dict[RemoteNode, ScanSolver]:
     """Configure all nodes in parallel.
 
-    The first failure stops the configuration of the other nodes at their next transfer.
+    The first failure stops the other configurations at their next transfer.
 
     Args:
         nodes: Nodes to configure.
-        missing: ``wait`` if nodes that do not respond may join later; ``refuse`` if all nodes must respond.
-        deadline_s: Maximum time (s) to wait for a node's first response.
-        cancelled: Function called repeatedly during configuration; if it returns True, configuration stops.
+        missing: ``wait`` if a silent node may join later, ``refuse`` if every node must respond.
+        deadline_s: Time limit (s) for a node's first response.
+        cancelled: Function polled during configuration. If it returns True, configuration stops.
 
     Returns:
-        Nodes that responded, each with the solver for its scans.
+        Solvers of the configured nodes, by node.
 
     Raises:
         NodeTimeout: if a node does not respond and ``missing`` is ``refuse``.
@@ -73,7 +73,7 @@ def configure_all(
 
 
 class _Start:
-    """Parallel configuration of nodes on a pool of threads."""
+    """Configuration of several nodes on a pool of threads."""
 
     def __init__(
         self, nodes: Sequence[RemoteNode], missing: Missing, deadline_s: float, cancelled: Callable[[], bool]
@@ -84,13 +84,13 @@ class _Start:
         self._answered: list[PatchConfig] = []
 
     def run(self) -> dict[RemoteNode, ScanSolver]:
-        """Configure the nodes, and return the responding nodes, each with its solver."""
+        """Configure the nodes. Return the solver of each configured node."""
         threads = min(len(self._nodes), BRING_UP_THREADS)
         with clock.pool(threads, "bring-up") as pool:
             try:
                 jobs = {node: pool.submit(self._configure, node) for node in self._nodes}
                 self._wait_for(jobs)
-            finally:  # stop jobs still running after the first failure or Ctrl-C
+            finally:  # after a failure or Ctrl-C, stop the other jobs
                 self._over.set()
                 pool.shutdown(cancel_futures=True)
         solvers = {node: self._result(node, job) for node, job in jobs.items()}
@@ -128,7 +128,7 @@ class _Start:
         return self._waits and (silent or isinstance(failure, _Defective))
 
     def _wait_for(self, jobs: dict[RemoteNode, Future[ScanSolver]]) -> None:
-        """Wait until all jobs have ended or one job has failed with an error that prevents the start."""
+        """Wait until all jobs have ended, or one has failed in a way that prevents the start."""
         ended: SimpleQueue[RemoteNode] = clock.simple_queue()
 
         def put_when_done(node: RemoteNode) -> Callable[[Future[ScanSolver]], None]:
@@ -143,9 +143,9 @@ class _Start:
                 break
 
     def _result(self, node: RemoteNode, job: Future[ScanSolver]) -> ScanSolver | None:
-        """Return a node's solver, or None if the node may join later.
+        """Return the solver of a node; None if the node may join later.
 
-        Raise any error that prevents the start.
+        Raises the error if it prevents the start.
         """
         failure = None if job.cancelled() else job.exception()
         if job.cancelled() or isinstance(failure, Abandoned):
@@ -160,13 +160,13 @@ class _Start:
 
 
 def start_all(ready: dict[RemoteNode, ScanSolver]) -> None:
-    """Start the nodes whose master is the host, and wait until their heartbeats report operational.
+    """Start the nodes whose NMT master is the host, and wait until their heartbeats report operational.
 
-    The deadline is measured in polling intervals, so that time during which the computer is suspended is not
-    included.
+    The time limit is counted in polling intervals, so that it excludes any time for which the computer is
+    suspended.
 
     Raises:
-        NodeTimeout: if a node does not become operational before the deadline.
+        NodeTimeout: if a node does not report operational in time.
     """
     t_start_ns = clock.monotonic_ns()
     for node, solver in ready.items():
@@ -189,7 +189,7 @@ def start_all(ready: dict[RemoteNode, ScanSolver]) -> None:
 
 
 def _listen(node: RemoteNode, deadline_s: float, abandoned: Callable[[], bool]) -> None:
-    """Wait for a frame from a node to which the host must not send; raise NodeTimeout after the deadline."""
+    """Wait for a frame from a node to which the host must not send. Raise NodeTimeout if none arrives."""
     end_s = clock.monotonic() + deadline_s
     while not node.heard:
         if abandoned():
@@ -208,8 +208,8 @@ def _silence(
 ) -> BusError:
     """Return the error for a node that does not respond.
 
-    If no node on the bus responds, the error names the bus instead, because the cause is probably its cable,
-    supply or bit rate.
+    If no node on the bus responds, the cause is probably the cable, the supply or the bit rate, so the error
+    names the bus.
     """
     bus, patch = node.bus, node.patch
     on_bus = [other.patch for other in nodes if other.bus is bus]

@@ -1,4 +1,4 @@
-"""Define the state that the supervisor stores for each node."""
+"""Define the state that the supervisor keeps for each node."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from skinnode.model.layout import Float
 from skinnode.process import clock
 
 JOIN_DEADLINE_S: Final = 1.0
-"""Maximum time (s) to wait for the SDO response or the tare of a node that has already sent a frame."""
+"""Time limit (s) for the first SDO response, and for the tare, of a node that has sent a frame."""
 
 LEAST_NS: Final = 300_000_000
-"""Minimum time (ns) between two bring-ups of a node that restarts in a loop."""
+"""Minimum time (ns) between successive bring-ups of a node, in case it restarts in a loop."""
 
 
 class Phase(enum.StrEnum):
@@ -32,7 +32,7 @@ class Phase(enum.StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class NodeStats:
-    """Bring-up statistics of a node."""
+    """Bring-up counters of a node."""
 
     phase: Phase
     rejoins: int
@@ -40,14 +40,14 @@ class NodeStats:
     failures: int
     """Number of failed bring-ups since the host finished starting."""
     baselines: int
-    """Number of times the solver has switched to a new baseline."""
+    """Number of new baselines used by the solver."""
     complaint: str | None
-    """Reason why the last bring-up failed; None if that bring-up succeeded."""
+    """Reason why the last bring-up failed; None if it succeeded."""
 
 
 @dataclass(frozen=True, slots=True)
 class Joined:
-    """Result of a job that brought up a node or read its baseline."""
+    """Result of a job that has brought up a node or read its baseline."""
 
     solver: ScanSolver | None
     withholdings: int
@@ -61,36 +61,34 @@ class Supervised:
     phase: Phase
     since_ns: int
     read_ns: int
-    """Earliest monotonic time (ns) at which to read the node's baseline again."""
+    """Earliest monotonic time (ns) for the next read of the baseline."""
     job: Future[Joined | None] | None = None
-    """Running job that communicates with the node. The job's result is None if the job reads only the error
-    register.
-    """
+    """Job in progress with the node. A job that reads only the error register returns None."""
     searching: Future[bool] | None = None
     abandon: threading.Event = field(default_factory=clock.event)
     """Event that aborts the running job."""
     pause: Pause = field(default_factory=Pause)
     not_before_ns: int = 0
-    """Monotonic time (ns) at which the pause after a failed bring-up or an unexpected exception ends."""
+    """End (monotonic time, ns) of the pause after a failed bring-up or an unexpected exception."""
     was_silent: bool = True
-    """Whether the pause ends at the node's next frame, because the node did not respond or was refused."""
+    """Whether the next frame from the node ends the pause, because the node was silent or refused."""
     begun_ns: int = 0
-    """Monotonic time (ns) at which the most recent bring-up started."""
+    """Start (monotonic time, ns) of the last bring-up."""
     defects: int = 0
-    """Number of the node's unexpected exceptions that the supervisor has already handled."""
+    """Number of unexpected exceptions that the supervisor has already handled."""
     upset: bool = False
-    """Whether the node's state is unknown because supervising the node raised an exception."""
+    """Whether supervising the node has raised an exception, so that its state is unknown."""
     probe_ns: int = 0
     search_ns: int = 0
     register_ns: int = 0
     mute_ns: int = 0
     unconfigured: bool = False
-    """Whether a job has detected that the node lost its configuration."""
+    """Whether a job has found that the node has lost its configuration."""
     rejoins: int = 0
     failures: int = 0
     baseline_ohm: Float | None = None
-    """(U, K) ohm: baseline used to solve the node's scans; None before the first bring-up."""
+    """Baseline used by the solver, (U, K), ohm; None before the first bring-up."""
     announced: bool = False
-    """Whether the node has announced a new baseline that the solver does not use yet."""
+    """Whether the node has announced a baseline that the solver does not use yet."""
     baselines: int = 0
     complaint: str | None = None

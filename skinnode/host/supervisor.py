@@ -1,10 +1,12 @@
 """Keep the nodes of a running hand operational.
 
-A node that reappears or appears late is configured and started; a changed baseline is read again. Nodes are
-supervised independently of each other. Fifty times a second, the supervisor's thread evaluates the data
-collected by the mainline and decides what to do. Operations that wait for a node (configuration, reading a
-baseline) run as jobs on a thread pool, with one job per node at a time. The supervisor's thread fetches the
-results of finished jobs, so no other thread accesses its state.
+A node that appears late or reappears is configured and started. A changed baseline is read again. The
+supervision of one node does not depend on the others.
+
+Fifty times a second, the supervisor's thread evaluates what the mainline has learned about each node, and
+decides what to do. Anything that waits for a node, such as its configuration, runs as a job on a thread pool.
+A node has at most one job at a time. The supervisor's thread also collects the results of the jobs, so that
+its state belongs to one thread.
 
 =========  ========================================  =========================================
 phase      meaning                                   next phase
@@ -16,11 +18,11 @@ RUNNING    the node's scans are solved               JOINING if it boots or leav
                                                      AWAITED if heartbeats are missing
 =========  ========================================  =========================================
 
-A defect is an exception raised while serving a patch in phase STARTING or RUNNING, or while configuring its
-node. After a defect, the patch is marked faulty: its scans are withheld, and its node stays in phase AWAITED
-for a pause. The pause starts at 0.1 s and doubles with each defect, up to 1 s. The same pause follows a
-failed configuration. A boot-up message from the node ends the pause. If the node did not respond or was
-refused, any frame from the node ends the pause.
+A defect is an unexpected exception raised while configuring a node, or while serving its patch in phase
+STARTING or RUNNING. The patch is then faulty: its scans are withheld, and its node stays in phase AWAITED for
+a pause. The pause starts at 0.1 s and doubles with each defect, up to 1 s. A failed configuration is followed
+by the same kind of pause. A boot-up message from the node ends the pause early. If the node was silent or
+refused, any frame from it ends the pause.
 """
 
 from __future__ import annotations
@@ -42,25 +44,24 @@ from skinnode.process import clock
 _log = logging.getLogger(__name__)
 
 THREADS: Final = 8
-"""Maximum number of nodes configured in parallel after the start; with more nodes, the bus would be the
-bottleneck.
-"""
+"""Maximum number of jobs in parallel, one per node. With more, the bus becomes the bottleneck."""
 
 _TURN_S: Final = 0.02
 """Interval (s) between checks of all nodes."""
 
 
 class Supervisor:
-    """Supervisor of all nodes; runs from construction until :meth:`close`.
+    """Supervisor of all nodes, running from construction until :meth:`close`.
 
-    The supervisor also sends the host's heartbeats. Threads: one thread makes all decisions; a pool runs the
-    jobs that wait for nodes; any thread may call :meth:`stats`.
+    The supervisor also sends the host's heartbeats.
+
+    Threads: one thread makes all decisions, and a pool runs the jobs. Any thread may call :meth:`stats`.
 
     Args:
         nodes: All nodes of the hand.
-        running: Nodes that are already running.
-        heartbeat_s: Period of the host's heartbeat, s.
-        defects: Collector of exceptions that do not concern a particular patch.
+        running: Nodes that are running already.
+        heartbeat_s: Heartbeat period of the host, s.
+        defects: Collector of the exceptions that concern no single patch.
     """
 
     def __init__(
@@ -96,7 +97,7 @@ class Supervisor:
         self._thread.start()
 
     def stats(self) -> dict[str, NodeStats]:
-        """Return the statistics of each node, by patch name."""
+        """Return the bring-up counters of each node, by patch name."""
         return {
             node.remote.patch.name: NodeStats(
                 node.phase, node.rejoins, node.failures, node.baselines, node.complaint
@@ -144,10 +145,10 @@ class Supervisor:
         self._beat_ns = max(self._beat_ns + self._heartbeat_ns, now_ns)
         for link in self._links.values():
             node_id = link.config.heartbeat_node_id
-            assert node_id is not None  # the dictionary contains only buses on which the host has a node-ID
+            assert node_id is not None  # only buses with a node-ID of the host are in the dict
             try:
                 link.send(od.heartbeat_cob_id(node_id), bytes([NmtState.OPERATIONAL]))
-            except BusError:  # nodes report a missing heartbeat themselves
+            except BusError:  # the nodes notice a missing heartbeat themselves
                 continue
             except Exception as error:
                 link.defects.report("sending a heartbeat", error)

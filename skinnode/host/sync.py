@@ -1,4 +1,4 @@
-"""Produce SYNC messages with a counter at a drift-free rate, or follow another producer's SYNC."""
+"""Produce SYNC with a counter and without drift, or follow the SYNC of another producer."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from skinnode.process import clock
 
 
 class Tick(NamedTuple):
-    """Number and monotonic time of one SYNC message."""
+    """Number and monotonic time (ns) of one SYNC."""
 
     number: int
     t_ns: int
@@ -22,58 +22,58 @@ class Tick(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class SyncStats:
-    """Counters of sent and received SYNC messages."""
+    """Counters of SYNC messages."""
 
     sent: int
     missed: int
-    """Number of SYNC periods skipped because the sending thread was not scheduled in time."""
+    """Number of SYNC periods skipped because the sending thread ran too late."""
     failed: int
     """Number of SYNC messages that could not be sent on a bus."""
     latest_ns: int
-    """Maximum delay (ns) of a SYNC message relative to its due time."""
+    """Largest delay (ns) of a SYNC message after its due time."""
     received: int = 0
-    """Number of SYNC messages from other producers, on buses that another master runs."""
+    """Number of SYNC messages received on buses that another master runs."""
     irregular: int = 0
-    """Number of received SYNC messages whose counter is missing or does not follow the previous counter. A
-    missing or unexpected counter indicates a lost SYNC or a second producer.
+    """Number of received SYNC messages whose counter is missing, invalid or out of sequence. A lost SYNC or a
+    second producer may be the cause.
     """
 
 
 class Ticks:
-    """Table of SYNC times: the newest SYNC for each counter value.
+    """Newest SYNC for each counter value.
 
-    Threads: the thread that sends or follows SYNC writes the table, and the mainline reads it.
+    Threads: the thread that sends or follows SYNC writes; the mainline reads.
     """
 
     def __init__(self, counter_overflow: int) -> None:
         self.counter_overflow = counter_overflow
         self._ticks: list[Tick | None] = [None] * (counter_overflow + 1)
         self.newest = 0
-        """Number of the newest SYNC; 0 before the first SYNC."""
+        """Number of the newest SYNC; 0 before the first one."""
 
     def note(self, number: int, t_ns: int) -> int:
-        """Store the time of SYNC ``number``. Return the SYNC's counter (1 to ``counter_overflow``)."""
+        """Store the time of SYNC ``number``. Return its counter (1 to ``counter_overflow``)."""
         counter = (number - 1) % self.counter_overflow + 1
         self._ticks[counter] = Tick(number, t_ns)
         self.newest = number
         return counter
 
     def find(self, counter: int) -> Tick | None:
-        """Return the newest SYNC with this counter value, or None if no SYNC has had this value."""
+        """Return the newest SYNC with this counter value; None if there has been none."""
         return self._ticks[counter] if 0 < counter <= self.counter_overflow else None
 
 
 class SyncFollower:
-    """Follower that stores another producer's SYNC messages in ``ticks``. Mainline only."""
+    """Follower of another producer's SYNC, which it stores in ``ticks``. Mainline only."""
 
     def __init__(self, ticks: Ticks) -> None:
         self._ticks = ticks
         self.received = self.irregular = 0
         self.t_newest_ns = 0
-        """Monotonic time (ns) of the newest SYNC; 0 before the first SYNC."""
+        """Monotonic time (ns) of the newest SYNC; 0 before the first one."""
 
     def on_sync(self, data: bytes, t_ns: int) -> None:
-        """Process a received SYNC. A SYNC whose counter is missing or out of range is only counted."""
+        """Process a received SYNC. A SYNC without a valid counter is only counted."""
         self.received += 1
         self.t_newest_ns = t_ns
         overflow = self._ticks.counter_overflow
@@ -95,20 +95,19 @@ Send = Callable[[int, bytes], None]
 
 
 class SyncProducer:
-    """Producer that sends SYNC on all buses, at the same instant or staggered, until :meth:`close`.
+    """Producer of SYNC on one or more buses, simultaneous or staggered, until :meth:`close`.
 
     The counter runs from 1 to its overflow value (CiA 301, 0x1019). SYNC number n + 1 is due n periods after
-    the first SYNC. If the thread is a whole period late, that period is skipped, so that two SYNC messages
-    are never sent in quick succession. A SYNC that has been sent on one bus is always sent on the other buses
-    too.
+    the first SYNC. A thread that is a whole period late skips that period, so that two SYNC messages are
+    never sent in quick succession. A SYNC that has been sent on one bus is sent on the others too.
 
     Threads: a dedicated thread sends the SYNC messages.
 
     Args:
-        buses: For each bus, the function that sends frames and the table of SYNC times.
+        buses: For each bus, the function that sends frames, and the SYNC times.
         period_s: SYNC period, s.
-        stagger_s: Delay (s) between the SYNC messages on successive buses.
-        defects: For each bus, the collector of exceptions raised while sending on that bus.
+        stagger_s: Delay (s) of the SYNC from one bus to the next.
+        defects: For each bus, the collector of exceptions.
     """
 
     def __init__(
@@ -158,7 +157,7 @@ class SyncProducer:
         for i in range(len(self._buses)):
             try:
                 self._send(i, due_ns + i * self._stagger_ns, now_ns)
-            except BusError:  # the bus may recover; the assembler counts lost scans
+            except BusError:  # the bus may recover; the assembler counts the missed scans
                 self._failed += 1
             except Exception as error:
                 self._failed += 1
@@ -175,7 +174,7 @@ class SyncProducer:
             self._wait(due_ns)
             now_ns = clock.monotonic_ns()
         self._latest_ns = max(self._latest_ns, now_ns - due_ns)
-        # store the SYNC time before sending: scans look it up as soon as they arrive
+        # store the time before sending, because a scan that arrives needs it
         payload = bytes([ticks.note(self._number, now_ns)])
         send(SYNC_COB_ID, payload)
 

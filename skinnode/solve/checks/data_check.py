@@ -59,8 +59,8 @@ subsequent frame suspicious; a press rarely does."""
 EXAMINATION_S: Final = 3e-3
 """Assumed duration of the first examination, s. Later examinations are timed."""
 CROSSED_FRAMES: Final = 5
-"""Number of frames for which a crossed pair is remembered. If either of its wires is found again within this
-time, both wires are reported."""
+"""Number of frames for which a crossed pair is remembered. If either of its wires is found to be faulty again
+within this time, both wires are reported."""
 NOISE_RATIOS: Final = (2.0, 4.0, 8.0, 16.0)
 """Ratios of actual to stated noise that the check tries as explanations of a suspicious frame."""
 COARSE: Final = 0.1

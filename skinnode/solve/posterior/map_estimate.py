@@ -57,7 +57,7 @@ FLAT_STEPS: Final = 4
 """Number of factorisations over which the decrease in −2 log posterior is measured."""
 EFFECT_STEP: Final = 0.2
 """Relative change in the effects of the geometry errors (root sum of squares) above which the factors are
-recomputed. Below this limit, the standard deviations are out of date by less than 20 %."""
+recomputed. Below this limit, the standard deviations change by less than 20 %."""
 HALVINGS: Final = 6
 """Maximum number of times that a Gauss-Newton step is halved."""
 PRIOR_DOUBT: Final = 3.0

@@ -1,8 +1,7 @@
-"""Corrector for a path tracker: solves wires at given path positions, and logs the solver steps.
+"""Corrector of a path tracker: solves wires at given positions on the path, and logs each call.
 
-A path position is a sample number, counted from 0; −1 is the patch at rest. Between two samples, ``a`` is
-interpolated linearly. In tests, interpolating 1/a or log a instead did not significantly change the number of
-wires that were solved.
+A path position is a sample number, counted from 0; the patch at rest is at −1. Between samples, ``a``
+(R · gain) is interpolated linearly. Interpolating 1/a or log a instead solves about as many wires.
 """
 
 from __future__ import annotations
@@ -21,15 +20,15 @@ from skinnode.solve.wires.patch_solver import PatchSolver
 from skinnode.solve.wires.problem import PatchProblem
 
 REST: Final = -1.0
-"""Path position of the undeformed patch; the samples are at 0, 1, 2, …"""
+"""Path position of the patch at rest; the samples are at 0, 1, 2, …"""
 
 
 @dataclass(frozen=True, slots=True)
 class Accuracy:
-    """Stopping criteria of a correction.
+    """Stopping criteria of a solve.
 
     Args:
-        tolerance: Tolerance of r, and of x in pitches.
+        tolerance: Tolerance, for r and for x in pitches.
         max_steps: Maximum number of operator steps.
     """
 
@@ -39,20 +38,20 @@ class Accuracy:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PathLog:
-    """Solver steps and evaluations of each of S corrector calls; NaN or 0 for wires that a call skipped."""
+    """Log of S corrector calls. For a wire that a call did not solve, floats are NaN and counts are 0."""
 
     position: Float
-    """(S, U) position on the path."""
+    """(S, U) path positions."""
     steps: Index
-    """(S, U) operator steps."""
+    """(S, U) numbers of operator steps."""
     evaluations: Index
-    """(S, U) evaluations of F and J."""
+    """(S, U) numbers of evaluations of F and J."""
     optimality: Float
     """(S, U) first-order optimality ‖Jᵀr‖∞ at the end of the call."""
 
 
 class Corrector:
-    """Solver for a patch's wires at positions on a path; each path needs its own instance.
+    """Solver for the wires of a patch at positions on a path; each path needs its own instance.
 
     Args:
         problem: The patch.
@@ -60,8 +59,8 @@ class Corrector:
         operator: Operator code.
 
     Attributes:
-        solver: Solver with the position ``x`` of every wire and the report of the last call.
-        samples: Number of samples, T.
+        solver: Solver, which contains the positions of the wires and the report of the last call.
+        samples: Number T of samples.
     """
 
     def __init__(self, problem: PatchProblem, a: Float, operator: int) -> None:
@@ -87,11 +86,11 @@ class Corrector:
         return PathLog(np.array(position), np.array(steps), np.array(evaluations), np.array(optimality))
 
     def sample_a(self, sample: int) -> Float:
-        """Return R · gain (U, K) of a sample; do not write to the array."""
+        """Return R · gain (U, K) of a sample, as an array that must not be modified."""
         return np.asarray(self._knots[sample + 1])
 
     def log_start(self, wires_: NDArray[np.bool_], evaluations: Index) -> None:
-        """Log the ``evaluations`` (U,) needed to find starting points for the given wires (U,)."""
+        """Log the numbers of evaluations (U,) that the starting points of the wires in the mask (U,) took."""
         nothing = np.full(len(evaluations), math.nan)
         self._rows.append((np.where(wires_, self.last, nothing), evaluations, evaluations, nothing))
 
@@ -114,14 +113,14 @@ class Corrector:
         tasks: int = 0,
         operator: int | None = None,
     ) -> None:
-        """Solve wires from their current positions; store the result in ``solver``, and log the solver steps.
+        """Solve wires, starting at their current positions; update :attr:`solver` and the log.
 
         Args:
-            todo: (U,) LEAVE, SOLVE or PREDICT per wire (:mod:`skinnode.solve.wires.arrays`).
+            todo: (U,) action for each wire: LEAVE, SOLVE or PREDICT (:mod:`skinnode.solve.wires.arrays`).
             position: (U,) path position of each wire, or one sample for all wires.
             accuracy: Stopping criteria.
-            tasks: Additional tasks, combined with bitwise or.
-            operator: Operator code; the default is the corrector's operator.
+            tasks: Additional tasks, combined with bitwise OR.
+            operator: Operator code; default: the operator of this corrector.
         """
         solver = self.solver
         solver.solve(

@@ -1,9 +1,9 @@
 """Path following as in the paper: solves a recorded press sample by sample, up to the last sample.
 
-The path is the solution of H(X, t) = F(X) − ρ / R(t) = 0, where X(0) is the grid at rest. Each sample is
-solved from the solution of the previous sample (Lahaye; Xu et al. 2018, section 3.2). Step control
-(:mod:`skinnode.solve.paths.step_control`) chooses the samples, their tolerance and any points between
-samples.
+The path X(t) is the solution of H(X, t) = F(X) − ρ / R(t) = 0; X(0) is the grid at rest. The solution of each
+sample is the starting point for the next (Lahaye; Xu et al. 2018, section 3.2). Step control
+(:mod:`skinnode.solve.paths.step_control`) chooses which samples to solve, to what tolerance, and whether to
+solve points between samples.
 """
 
 from __future__ import annotations
@@ -36,15 +36,15 @@ from skinnode.solve.posterior.frame_estimator import FrameEstimator
 from skinnode.solve.wires.problem import PatchProblem
 
 SELECTION: Final = Accuracy(tolerance=1e-12, max_steps=100)
-"""Accuracy of a solve that starts from the posterior.
+"""Accuracy of a solve that starts at the posterior estimate.
 
-The tolerance is that of the paper for the last sample; the maximum number of steps is that of the paper for
-all earlier samples.
+The tolerance is the paper's for the last sample. The maximum number of steps is the paper's for all earlier
+samples.
 """
 STARTS: Final = 12
-"""Number of random starting points in the search for other roots of F = b.
+"""Number of starting points in the search for other roots of F = b.
 
-The starting points are drawn from the posterior with a fixed random seed.
+The starting points are random samples of the posterior; the random seed is fixed.
 """
 
 
@@ -52,39 +52,37 @@ The starting points are drawn from the posterior with a fixed random seed.
 class PathResult:
     """Solution at the end of a path, and a log of the solver calls on the path.
 
-    Row s of ``position``, ``steps``, ``evaluations`` and ``optimality`` belongs to solver call number s. If
-    the call skipped a wire, the position and the optimality of this wire are NaN. Calls after the first solve
-    of the last sample are second attempts and checks.
+    The log consists of ``position``, ``steps``, ``evaluations`` and ``optimality``, with one row per solver
+    call. For a wire that a call did not solve, the position and the optimality are NaN. Calls after the first
+    solve of the last sample are second attempts and checks.
     """
 
     upper_m: Float
-    """(U, N, 3) electrodes at the last sample, metres."""
+    """(U, N, 3) positions of the electrodes at the last sample, metres."""
     displacement_m: Float
-    """(U, N, 3) displacement from the rest position, metres."""
+    """(U, N, 3) displacements of the electrodes at the last sample, metres."""
     status: tuple[Status, ...]
     """Status of each upper wire."""
     error_estimate_m: Float
-    """(U,) largest coordinate error due to tolerance and rounding, in metres; inf if unknown.
-
-    Assumes exact samples.
-    """
+    """(U,) estimate of the largest coordinate error due to the tolerance and to rounding, metres; inf if
+    unknown. Errors of the samples are not included."""
     residual: Float
     """(U,) RMS of the relative residual F/b − 1 at the last sample."""
     cycle: int | None
-    """Number of samples from one solve to the next in periodic step control; None in all other cases."""
+    """Cycle of periodic step control: number of samples from one solve to the next; None if there is none."""
     searched: int
-    """Number of initial rows of the log that belong to the search for the cycle."""
+    """Number of rows at the start of the log that belong to the search for the cycle."""
     position: Float
-    """(S, U) sample numbers, counted from 0; 1.5 is halfway between samples 1 and 2, and −1 is the patch at
-    rest."""
+    """(S, U) path positions: sample numbers, counted from 0. The position 1.5 is halfway between samples 1
+    and 2; −1 is the patch at rest."""
     steps: NDArray[np.int64]
-    """(S, U) number of operator steps; 0 if the sample was skipped."""
+    """(S, U) numbers of operator steps; 0 if the sample was skipped."""
     evaluations: NDArray[np.int64]
-    """(S, U) evaluations of F and J."""
+    """(S, U) numbers of evaluations of F and J."""
     optimality: Float
-    """(S, U) first-order optimality ‖Jᵀr‖∞ of the dimensionless problem at the end of the call."""
+    """(S, U) first-order optimality ‖Jᵀr‖∞ of the dimensionless equations at the end of the call."""
     stats: SolveStats
-    """Solver steps, evaluations and computing time of the path, including the search for a cycle."""
+    """Steps, evaluations and computing time of the whole path, including the search for a cycle."""
 
 
 def solve_path(
@@ -97,26 +95,27 @@ def solve_path(
 ) -> PathResult:
     """Follow a press from the rest position to its last sample.
 
-    F = b has several roots, separated by folds (det J = 0). A wire is ILL_CONDITIONED instead of CONVERGED if
-    its root may be wrong, for one of four reasons:
+    F = b has several roots, separated by folds (det J = 0). If a root may be wrong, the status of the wire is
+    ILL_CONDITIONED instead of CONVERGED. There are four reasons for such a doubt:
 
-    - the determinant of its Jacobian changed sign on the path;
-    - an electrode crossed the lower layer;
+    - the determinant of the Jacobian changed sign on the path;
+    - an electrode moved farther than its distance at rest from the nearest lower electrode;
     - an equally smooth root exists on the other side of a nearby fold;
-    - the path ended smoothly at a different root, which is then reported instead.
+    - a smooth path ended at a different root, which is then reported instead.
 
-    The skin itself can cross a fold. A root across a fold is therefore accepted if both the path and the
-    posterior of the patch lead to this root.
+    The skin itself can cross a fold. A root across a fold is therefore accepted if the path and the posterior
+    of the patch both lead to it.
 
     Args:
         layout: The patch, with at least as many lower wires as unknowns per wire (K ≥ 3N).
         samples_ohm: (T, U, K) resistances, ohm, in time order; the last sample is the frame to solve.
         operator: ``dogleg``, ``levenberg_marquardt`` or ``gauss_newton``.
-        schedule: Step control: ``Uniform()`` by default, ``Periodic()`` or ``Adaptive()``.
-        baseline_ohm: (U, K) resistances measured at rest, ohm; if given, resistivity and gain cancel.
+        schedule: Step control: ``Uniform()`` (default), ``Periodic()`` or ``Adaptive()``.
+        baseline_ohm: (U, K) resistances measured at rest, ohm. If given, errors of resistivity and gain
+            cancel.
 
     Returns:
-        Positions at the last sample, a status for each wire, and the log of the solver calls.
+        Positions at the last sample, the status of each wire, and the log of the solver calls.
 
     Raises:
         ValueError: If a shape is wrong, a value is not positive and finite, or the operator is unknown.
@@ -166,7 +165,7 @@ def solve_path(
 def _ask_posterior(
     tracker: PathTracker, layout: PatchLayout, last_ohm: Float, baseline_ohm: ArrayLike | None
 ) -> PatchEstimate | None:
-    """Select roots with the posterior; return its estimate of the patch, or None if it is not trusted."""
+    """Select roots with the posterior; return the posterior estimate, or None if it is not trusted."""
     options = PosteriorOptions(
         relative_noise=roots.REFEREE_NOISE, baseline_ohm=baseline_ohm, hold=False, contacts=False,
         follow_noise=False,

@@ -1,9 +1,9 @@
-"""Path tracker: stores each wire's position along a press and moves it with a predictor and a corrector.
+"""Path tracker: follows each wire along a press with a predictor and a corrector.
 
-Lahaye's method solves each sample for all wires (:meth:`PathTracker.solve`). Adaptive step control moves each
-wire in steps of its own (:meth:`PathTracker.step`). The schedule (:mod:`skinnode.solve.paths.step_control`)
-chooses one of these two modes. Roots at the last sample are checked by
-:mod:`skinnode.solve.paths.root_selection`.
+The schedule (:mod:`skinnode.solve.paths.step_control`) uses one of two modes. With Lahaye's method, all wires
+are solved at the same sample (:meth:`PathTracker.solve`). With adaptive step control, each wire has its own
+path position (:meth:`PathTracker.step`). :mod:`skinnode.solve.paths.root_selection` checks the roots at the
+last sample.
 """
 
 from __future__ import annotations
@@ -29,14 +29,14 @@ from skinnode.solve.wires.problem import PatchProblem
 
 @dataclass(slots=True, eq=False)
 class PathEnd:
-    """Outcome of each wire at the last sample."""
+    """Outcome of the solve of the last sample."""
 
     status: Index
     """(U,) status codes."""
     residual: Float
     """(U,) RMS of F/b − 1."""
     error_estimate: Float
-    """(U,) largest coordinate error due to tolerance and rounding, pitches."""
+    """(U,) estimate of the largest coordinate error due to the tolerance and to rounding, pitches."""
     inverse: Float
     """(U, n, K) ∂x/∂r."""
     side: Index
@@ -44,28 +44,28 @@ class PathEnd:
 
     @property
     def converged(self) -> Mask:
-        """(U,) mask of the wires whose status is CONVERGED."""
+        """(U,) mask of the CONVERGED wires."""
         return np.asarray(self.status == op.CONVERGED)
 
     def copy(self) -> PathEnd:
-        """Return a copy of this outcome, including all arrays."""
+        """Return a deep copy."""
         return PathEnd(
             self.status.copy(), self.residual.copy(), self.error_estimate.copy(), self.inverse.copy(),
             self.side.copy(),
         )  # fmt: skip
 
     def restore(self, wires_: Mask, earlier: PathEnd) -> None:
-        """Restore the outcome of the given wires (U,) from an earlier copy."""
+        """Copy the outcome of the wires in the mask (U,) from ``earlier``."""
         for name in ("status", "residual", "error_estimate", "inverse", "side"):
             getattr(self, name)[wires_] = getattr(earlier, name)[wires_]
 
     def doubt(self, wires_: Mask) -> None:
-        """Change the status of the given wires (U,) from CONVERGED to ILL_CONDITIONED."""
+        """Change the status of the wires in the mask (U,) from CONVERGED to ILL_CONDITIONED."""
         self.status[wires_ & (self.status == op.CONVERGED)] = op.ILL_CONDITIONED
 
 
 class PathTracker:
-    """Tracker that follows the wires along the samples of one press; each press needs its own instance.
+    """Tracker of the wires along the samples of one press; each press needs its own instance.
 
     Args:
         problem: The patch.
@@ -74,11 +74,12 @@ class PathTracker:
 
     Attributes:
         end: Outcome at the last sample, after :meth:`finish`.
-        cycle: Number of samples from one solve to the next in periodic step control; None in all other cases.
-        searched: Number of initial rows of the log that belong to the search for the cycle.
-        second_tries: Whether a wire may be solved again after the end of its path; if not, only its status
-            may change.
-        stumbled: (U,) mask of the wires for which at least one step failed and was undone.
+        cycle: Cycle of periodic step control: number of samples from one solve to the next; None if there is
+            none.
+        searched: Number of rows at the start of the log that belong to the search for the cycle.
+        second_tries: Whether the last sample may be solved again after the end of the path. If False, only
+            the status of a wire may change.
+        stumbled: (U,) mask of the wires with a step that failed and was undone.
         reached: (U,) mask of the wires whose path ended at a root.
     """
 
@@ -108,7 +109,7 @@ class PathTracker:
 
     @property
     def smoothness(self) -> Smoothness:
-        """Smoothness model of the patch, created on first use because most paths do not need it."""
+        """Smoothness model of the patch, created on first use; most paths do not need it."""
         if self._smoothness is None:
             self._smoothness = Smoothness(self.problem)
         return self._smoothness
@@ -128,22 +129,25 @@ class PathTracker:
         self._points = self._at_rest()
 
     def _at_rest(self) -> list[tuple[Float, Float]]:
-        """Return the first two points of a path; both are the rest position, so that the secant is zero."""
+        """Return the first two points of a path: the rest position twice, so the first secant is zero."""
         return [(self.problem.rest.copy(), self.problem.a_rest)] * 2
 
     # -- sample by sample, as in the paper -------------------------------------------------------------
 
     def extrapolate(self, sample: int) -> None:
-        """Move every wire along the secant to its predicted position, by at most the trust radius."""
+        """Move every wire along its secant to the position predicted for ``sample``.
+
+        No coordinate moves farther than the trust radius.
+        """
         (x_before, a_before), (x, a) = self._points[-2:]
         a_next = self.corrector.sample_a(sample)
         secant(x_before, a_before, x, a, a_next, self.problem.step_limit, self.solver.x)
 
     def solve(self, sample: int, accuracy: Accuracy) -> Index:
-        """Solve a sample, starting from the wires' current positions.
+        """Solve a sample for all wires, starting at their current positions.
 
         Returns:
-            (U,) numbers of steps; 0 if the first-order optimality was already below the tolerance.
+            (U,) numbers of steps; 0 if the first-order optimality was below the tolerance at the start.
         """
         self.corrector.correct(self._everywhere, float(sample), accuracy, tasks=wires.SKIP)
         self._points.append((self.solver.x.copy(), self.corrector.sample_a(sample)))
@@ -153,7 +157,7 @@ class PathTracker:
         return np.asarray(self.solver.report[:, wires.STEPS].copy())
 
     def finish(self, accuracy: Accuracy, todo: Mask | None = None) -> None:
-        """Solve the last sample to the final accuracy, for the wires in ``todo`` (U,), by default all."""
+        """Solve the last sample to the final accuracy, for all wires or for the wires in ``todo`` (U,)."""
         todo = np.ones(self.wires, bool) if todo is None else todo
         self.take(todo, accuracy)
         self._arrive(todo)
@@ -161,10 +165,10 @@ class PathTracker:
         self.end.doubt(self._crossed)
 
     def walk(self, todo: Mask, samples: list[int], accuracy: Accuracy) -> None:
-        """Follow the given wires (U,) from rest along ``samples``, and store where their paths end.
+        """Follow the wires in ``todo`` (U,) from rest along ``samples``, and store the ends of their paths.
 
-        ``samples`` is in time order and includes the last sample of the press. The method does not change the
-        positions of the wires or :attr:`end`.
+        ``samples`` contains sample numbers in time order and includes the last sample of the press. The
+        positions of the wires and :attr:`end` do not change.
         """
         x = self.solver.x.copy()
         call = np.where(todo, wires.SOLVE, wires.LEAVE).astype(np.uint8)
@@ -179,7 +183,7 @@ class PathTracker:
         self.solver.x[:] = x
 
     def _arrive(self, todo: Mask) -> None:
-        """Store the end of the path for the wires in ``todo`` (U,), after the last sample has been solved."""
+        """Store the current positions of the wires in ``todo`` (U,) as the ends of their paths."""
         self._path_end[todo] = self.solver.x[todo]
         residual = self.solver.measure[:, wires.RESIDUAL]
         self.reached[todo] = (residual <= roots.ROOT_RESIDUAL)[todo]
@@ -187,16 +191,16 @@ class PathTracker:
     # -- wire by wire ----------------------------------------------------------------------------------
 
     def predict(self, position: Float) -> Float:
-        """Predict x (U, n) in pitches at ``position`` (U,) from the last converged solve of each wire."""
+        """Predict x (U, n), pitches, at ``position`` (U,) from the last converged solve of each wire."""
         solver = self.solver
         return euler(solver.x, solver.inverse, solver.a_solved, self.corrector.a_at(position))
 
     def step(self, todo: Mask, position: Float, accuracy: Accuracy) -> Mask:
-        """Advance the wires in ``todo`` (U,) to their ``position`` (U,): predict, then correct.
+        """Move the wires in ``todo`` (U,) to their path positions (U,): predict, then correct.
 
         Returns:
-            (U,) mask of the wires that reached a root on the rest position's branch. The positions of all
-            other wires are left unchanged.
+            (U,) mask of the wires that reached a root on the branch of the rest position. The positions of
+            all other wires do not change.
         """
         solver = self.solver
         before = solver.x.copy(), solver.inverse.copy(), solver.a_solved.copy()
@@ -220,7 +224,12 @@ class PathTracker:
     ) -> None:
         """Solve the last sample for the wires in ``todo`` (U,), and store the outcome in :attr:`end`.
 
-        A root across a fold is ILL_CONDITIONED, except for the wires in the mask (U,) returned by ``also``.
+        Args:
+            todo: (U,) mask of the wires to solve.
+            accuracy: Stopping criteria.
+            operator: Operator code; default: the operator of this tracker.
+            also: Function that returns a mask (U,) of the wires whose roots are accepted even across a fold;
+                for all other wires, such a root is ILL_CONDITIONED.
         """
         call = np.where(todo, wires.SOLVE, wires.LEAVE).astype(np.uint8)
         self.corrector.correct(call, self.corrector.last, accuracy, tasks=wires.COVARIANCE, operator=operator)
@@ -239,24 +248,24 @@ class PathTracker:
         self.corrector.correct(call, self.corrector.last, accuracy, operator=op.LEVENBERG_MARQUARDT)
 
     def on_branch(self) -> Mask:
-        """Return a mask (U,) of the wires whose last solve reached a root on the rest position's branch."""
+        """Return a mask (U,) of the wires whose last solve found a root on the rest position's branch."""
         report = self.solver.report
         return roots.on_rest_branch(
             report[:, wires.STATUS], report[:, wires.BRANCH], self._rest_branch, self.out_of_reach()
         )
 
     def at_path_end(self) -> Mask:
-        """Return a mask (U,) of the wires that are at the end of their path and within reach."""
+        """Return a mask (U,) of the wires at the end of their path, if their displacement is plausible."""
         apart = roots.distance(self.solver.x, self._path_end)
         size = roots.distance(self._path_end, self.problem.rest)
         return np.asarray((apart <= roots.SAME_ROOT * size) & ~self.out_of_reach())
 
     def led_elsewhere(self) -> Mask:
-        """Return a mask (U,) of the wires that are no longer at the root to which a smooth path led.
+        """Return a mask (U,) of the wires that are no longer at the root at the end of their smooth path.
 
-        A path is smooth if the secant through any two successive solutions predicts the next solution, and if
-        the first solution is close to the rest position (:data:`skinnode.solve.roots.SMOOTH_PATH`). For a
-        long path, only the second half is tested.
+        A path is smooth if each solution is close to the position predicted by the secant through the two
+        previous ones, and the first solution is close to the rest position
+        (:data:`skinnode.solve.roots.SMOOTH_PATH`). For a long path, only the second half is tested.
         """
         size = roots.distance(self._path_end, self.problem.rest)
         elsewhere = roots.distance(self.solver.x, self._path_end) > roots.SAME_ROOT * size
@@ -274,7 +283,7 @@ class PathTracker:
         return elsewhere
 
     def return_to_path_end(self, todo: Mask, accuracy: Accuracy) -> None:
-        """Move the given wires (U,) back to the end of their path, with a status other than CONVERGED."""
+        """Move the wires in ``todo`` (U,) back to the end of their path; none of them stays CONVERGED."""
         self.solver.x[todo] = self._path_end[todo]
         self.take(todo, accuracy)
         self.end.doubt(todo)

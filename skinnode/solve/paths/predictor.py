@@ -1,4 +1,4 @@
-"""Predictors for a path tracker: estimate the next point on a path from the points already solved."""
+"""Predictors of a path tracker: estimates of the next point on a path from the points already solved."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from skinnode.compiled.jit import njit
 from skinnode.model.layout import Float
 
 SQUARE_FLOOR: Final = 1e-300
-"""Lower limit of squared changes, so that no division is by zero."""
+"""Lower limit of divisors, to prevent division by zero."""
 
 
 def euler(x: Float, inverse: Float, a_solved: Float, a: Float) -> Float:
@@ -36,18 +36,18 @@ def secant(  # noqa: PLR0913 - a kernel: two points, the next resistances, the l
 ) -> None:
     """Predict positions along the secant through the last two solved points.
 
-    The step from ``x_before`` to ``x`` is multiplied by the ratio of two relative changes in ``a``: the next
-    change, projected onto the last change, and the last change itself. A wire whose prediction is not finite
-    stays at ``x``.
+    The predicted step is a multiple of the last step. The factor is the next relative change in ``a``,
+    projected onto the last relative change and divided by it. A coordinate whose prediction is not finite
+    stays at its value in ``x``.
 
     Args:
-        x_before: (U, n) position at the second-to-last point, pitches.
+        x_before: (U, n) positions at the second-to-last point, pitches.
         a_before: (U, K) R · gain at ``x_before``.
-        x: (U, n) position at the last point, pitches.
+        x: (U, n) positions at the last point, pitches.
         a: (U, K) R · gain at ``x``.
         a_next: (U, K) R · gain at the next point.
-        reach: Largest allowed change in a coordinate, pitches.
-        out: (U, n) predicted positions, pitches.
+        reach: Maximum change in a coordinate, pitches.
+        out: (U, n) output: predicted positions, pitches.
     """
     for u in range(x.shape[0]):
         along, square, longest = 0.0, SQUARE_FLOOR, reach

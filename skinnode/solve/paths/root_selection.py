@@ -1,8 +1,8 @@
-"""Root selection at the last sample of a path: second attempts, and rules for accepting a root.
+"""Root selection at the last sample of a path: second attempts, and tests that accept or reject a root.
 
-The thresholds are defined in :mod:`skinnode.solve.roots`. A fold is a surface where det J = 0, and the twin
-of a root is the other root near the same fold. All functions change :attr:`PathTracker.end` and the solver's
-positions in place. A wire with a rejected root gets the status ILL_CONDITIONED.
+A fold is a surface where det J = 0. The twin of a root is the root on the other side of a nearby fold.
+:mod:`skinnode.solve.roots` defines the thresholds. The functions modify :attr:`PathTracker.end` and the
+positions in the solver. A wire whose root is rejected becomes ILL_CONDITIONED.
 """
 
 from __future__ import annotations
@@ -24,18 +24,17 @@ from skinnode.solve.starts import guided_start, near_twin
 from skinnode.solve.wires import arrays as wires
 
 GUIDED_STEPS: Final = 100
-"""Maximum number of steps of a solve that starts at the smoothest displacement (:func:`guide`). A solve that
-starts near a root takes 1 to 20 steps; no other solve converges."""
-TWIN: Final = Accuracy(tolerance=1e-9, max_steps=30)
-"""Accuracy of roots that are only compared with other roots.
+"""Maximum number of steps of a solve that starts at the smoothest displacement (:func:`guide`).
 
-Distinct roots differ by much more than the tolerance.
+Starts near a root take 1 to 20 steps. Other starts do not converge.
 """
+TWIN: Final = Accuracy(tolerance=1e-9, max_steps=30)
+"""Accuracy of roots that are only compared with other roots, which differ by much more than the tolerance."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PatchEstimate:
-    """Estimate of the whole patch, used to check roots."""
+    """Estimate of the whole patch, for checking roots."""
 
     x: Float
     """(U, n) positions, pitches."""
@@ -43,24 +42,25 @@ class PatchEstimate:
     """(U, n) standard deviations, pitches."""
 
     def agrees(self, x: Float) -> Mask:
-        """Return a mask (U,) of the wires whose position (U, n), in pitches, is confirmed by the estimate."""
+        """Return a mask (U,) of the wires whose positions (U, n), in pitches, the estimate confirms."""
         return roots.agrees(np.abs(x - self.x), roots.AGREE * self.std)
 
 
 def doubtful(tracker: PathTracker) -> Mask:
-    """Return a mask (U,) of wires that have no root, have an implausibly rough root, or had a step undone."""
+    """Return a mask (U,) of the wires that have no root, a root too rough for a press, or an undone step."""
     return np.asarray(~tracker.end.converged | _rough(tracker) | tracker.stumbled)
 
 
 def guide(tracker: PathTracker, todo: Mask, accuracy: Accuracy) -> None:
-    """Solve the last sample from the smoothest displacement that explains it; keep the smoother root.
+    """Solve the last sample again, starting at the smoothest displacement that explains it.
 
-    If the new root is across a fold, :func:`guide` also solves for its twin on the side of the rest position.
-    If neither solve finds a root for a wire, the wire's status is not CONVERGED.
+    If the new root is across a fold, its twin on the side of the rest position is used instead. Of the old
+    and the new root of a wire, the smoother one is kept. If no new root is found, the wire is not CONVERGED,
+    even if it was before.
 
     Args:
         tracker: Tracker at the end of its path.
-        todo: (U,) wires to solve again.
+        todo: (U,) mask of the wires to solve again.
         accuracy: Accuracy at the last sample.
     """
     if not todo.any():
@@ -89,7 +89,7 @@ def guide(tracker: PathTracker, todo: Mask, accuracy: Accuracy) -> None:
 
 
 def doubt_rough(tracker: PathTracker, accuracy: Accuracy) -> None:
-    """Reject each rough root if :func:`guide` finds a smoother root; the positions stay unchanged."""
+    """Reject each rough root for which :func:`guide` finds another root or none; do not move the wires."""
     end = tracker.end
     todo = _rough(tracker) & end.converged
     x, kept = tracker.solver.x.copy(), end.copy()
@@ -105,9 +105,9 @@ def doubt_rough(tracker: PathTracker, accuracy: Accuracy) -> None:
 def compare_with_estimate(tracker: PathTracker, estimate: PatchEstimate, accuracy: Accuracy) -> None:
     """Compare every root with an estimate of the whole patch.
 
-    If a wire has no root, or its root contradicts the estimate, it is solved again, starting from the
-    estimate. A new root across a fold is accepted only if the path led to the same root; the skin itself can
-    cross a fold.
+    A wire that has no root, or whose root contradicts the estimate, is solved again, starting at the
+    estimate. A new root across a fold is accepted only if the path led to the same root, because the skin
+    itself can cross a fold.
     """
     solver, end = tracker.solver, tracker.end
     todo = ~(estimate.agrees(solver.x) & end.converged)
@@ -133,17 +133,17 @@ def keep_likeliest(
     unlikely: Float,
     accuracy: Accuracy,
 ) -> None:
-    """Search for other roots, starting from twin roots and from ``starts``; keep the likeliest root.
+    """Search for other roots of each wire, and keep the likeliest.
 
-    A wire remains CONVERGED only if the energy of each other root differs from the likeliest by at least
-    ``unlikely``.
+    The search starts at the twins of the present roots, and at ``starts``. A wire stays CONVERGED only if the
+    energy of every other root is higher by at least ``unlikely``.
 
     Args:
         tracker: Tracker at the end of its path.
         starts: (S, U, n) starting positions, pitches.
-        energy: Function that returns −2 log of the density of a displacement field (U, n) in pitches, up to a
-            constant.
-        unlikely: (U,) minimum energy difference at which the less likely root is excluded.
+        energy: Function that returns the energy of a displacement field (U, n) in pitches: −2 log of its
+            probability density, up to a constant.
+        unlikely: (U,) minimum energy difference between the likeliest root and any other root.
         accuracy: Accuracy of the root that is kept.
     """
     solver, end, rest = tracker.solver, tracker.end, tracker.problem.rest
@@ -179,7 +179,7 @@ def keep_likeliest(
 def doubt_twins(tracker: PathTracker, estimate: PatchEstimate | None) -> None:
     """Reject roots that have an equally smooth twin across a fold.
 
-    If an ``estimate`` of the patch is given, a twin that the estimate does not confirm is ignored.
+    If an ``estimate`` of the patch is given, only twins that it confirms count.
     """
     layout = tracker.problem.layout
     if layout.shape[1] != layout.unknowns:
@@ -201,15 +201,14 @@ def doubt_twins(tracker: PathTracker, estimate: PatchEstimate | None) -> None:
 
 
 def heed_samples(tracker: PathTracker, accuracy: Accuracy) -> None:
-    """Reject roots that differ from the end of a smooth path; move their wires back to that end.
+    """Reject roots that differ from the end of a smooth path, and move these wires back to the path's end.
 
-    If the skin itself crosses a fold, a root on the near side of the fold can be smoother and likelier than
-    the true root. :func:`guide` and the posterior both find the wrong root in this case; only the path leads
-    to the true root. If the posterior is wrong on one wire, the roots of all other wires that moved away from
-    the end of their paths are rejected too.
+    If the skin itself has crossed a fold, a wrong root on the near side can be smoother and likelier than the
+    correct root. Then :func:`guide` and the posterior find the wrong root, and only the path leads to the
+    correct one. If this happens to any wire, every other root away from the end of its path is rejected too.
     """
     if not tracker.second_tries:
-        return  # without second tries, every wire is already at the end of its path
+        return  # every wire is already at the end of its path
     todo = tracker.led_elsewhere()
     if todo.any():
         moved = ~tracker.at_path_end()
@@ -218,7 +217,7 @@ def heed_samples(tracker: PathTracker, accuracy: Accuracy) -> None:
 
 
 def _twins(tracker: PathTracker) -> Float:
-    """Return estimates (U, n) of the roots across the nearest folds; NaN for wires that are not CONVERGED."""
+    """Return estimated positions (U, n) of the twins of all roots; NaN for wires that are not CONVERGED."""
     x, end, last_a = tracker.solver.x, tracker.end, tracker.last_a
     twins = np.full_like(x, math.nan)
     for u in np.flatnonzero(end.converged).tolist():

@@ -1,4 +1,4 @@
-"""Step control: chooses which points on a path to solve, and to what tolerance.
+"""Step control: schedules that choose which points on a path to solve, and to what tolerance.
 
 A schedule moves a :class:`skinnode.solve.paths.path_tracker.PathTracker` from the rest position to the last
 sample.
@@ -22,58 +22,56 @@ from skinnode.solve.paths.root_selection import doubt_rough, doubtful, guide
 from skinnode.solve.roots import Mask
 
 RELAXED_TOLERANCES: Final = (1e-6, 1e-5, 1e-4, 1e-3)
-"""Tolerances for intermediate samples in figure 10 of the paper, in increasing order."""
+"""Tolerances of intermediate samples in figure 10 of the paper, in increasing order."""
 MISS: Final = 0.2
-"""Target distance between predicted and corrected point, as a multiple of the initial trust radius."""
+"""Target distance between the predicted and the corrected point, relative to the initial trust radius."""
 SHRINK: Final = 0.5
 GROW: Final = 4.0
-"""Maximum ratio of successive step lengths (Allgower & Georg 1990, section 6.1, use 2 to 4)."""
+"""Maximum ratio of successive step lengths. Allgower & Georg (1990, section 6.1) use 2 to 4."""
 SHORTEST: Final = 1 / 64
-"""Minimum step length as a fraction of the path. Near a fold, steps are halved until they reach this
-minimum."""
+"""Minimum step length, as a fraction of the path. At a fold, steps are halved down to this length."""
 ADAPTIVE_POINT: Final = Accuracy(tolerance=1e-9, max_steps=6)
 """Accuracy of an intermediate point.
 
-With a tolerance below √eps, ∂X/∂R at the root is accurate enough for the next prediction. Newton's method
-reaches a tolerance of 1e-9 in 5 steps if its first contraction ratio is 1/2.
+A tolerance below √eps makes ∂X/∂R accurate enough for the next prediction. Newton's method reaches 1e-9 in 5
+steps if its first contraction ratio is 1/2.
 """
 
 ADAPTIVE_WALK: Final = Accuracy(tolerance=1e-9, max_steps=100)
-"""Accuracy of the samples on a path that is followed again to check its end.
+"""Accuracy of the samples when a path is followed again to check its end.
 
 The maximum number of steps is that of the paper.
 """
 
 
 class Schedule(Protocol):
-    """Protocol of step control: any object that can move a path tracker to the end of its path."""
+    """Interface of a schedule: an object that moves a path tracker to the end of its path."""
 
     def follow(self, tracker: PathTracker) -> None:
-        """Move ``tracker`` from the rest position to its last sample, and call its ``finish`` method."""
+        """Move ``tracker`` from rest to its last sample, and call ``tracker.finish``."""
         ...
 
 
 @dataclass(frozen=True)
 class Uniform:
-    """Schedule that solves ``steps`` evenly spaced samples, always including the last.
+    """Schedule that solves ``steps`` evenly spaced samples, including the last.
 
-    The default tolerances and step limits follow the paper's protocol (section 4).
+    The default tolerances and step limits are those of the paper (section 4).
 
     Args:
-        steps: Number of samples to solve; by default, or if there are fewer samples, all samples are solved.
-        plain: Whether to start each sample at the last solution, as the paper does (Lahaye), and to leave
-            each wire at the outcome of the last sample. If False, each sample starts on the secant through
-            the last two solutions, and a wire without a plausible root at the last sample is solved again,
-            starting from the smoothest displacement. In tests with presses of 50 %, starting on the secant
-            reduced the number of unsolved wires from 7 of 197 to 0, and the number of evaluations per sample
-            from 4 to 2.9.
-        intermediate_tolerance: Tolerance of r, and of x in pitches, at all samples except the last.
+        steps: Number of samples to solve; default: all. If there are fewer samples, all of them are solved.
+        plain: If True, each sample starts at the last solution, as in the paper (Lahaye), and the positions
+            found at the last sample are final. If False (default), each sample starts on the secant through
+            the last two solutions, and wires without a plausible root at the last sample are solved again
+            from the smoothest displacement. In tests with presses of 50 %, the secant reduced the number of
+            unsolved wires from 7 of 197 to 0, and the number of evaluations per sample from 4 to 2.9.
+        intermediate_tolerance: Tolerance at all samples except the last, for r and for x in pitches.
         final_tolerance: Tolerance at the last sample.
-        intermediate_steps: Maximum operator steps at all samples except the last.
-        final_steps: Maximum operator steps at the last sample.
+        intermediate_steps: Maximum number of operator steps at each sample except the last.
+        final_steps: Maximum number of operator steps at the last sample.
 
     Raises:
-        ValueError: If a tolerance is not positive and finite or a count is not an integer of at least 1.
+        ValueError: If a tolerance is not positive and finite, or a count is not an integer of at least 1.
     """
 
     steps: int | None = None
@@ -89,7 +87,7 @@ class Uniform:
         _require(self, "intermediate_tolerance", "final_tolerance", "intermediate_steps", "final_steps")
 
     def follow(self, tracker: PathTracker) -> None:
-        """Solve each chosen sample from the solution of the previous chosen sample."""
+        """Solve the chosen samples in time order, then check the roots at the last sample."""
         count = tracker.samples if self.steps is None else min(self.steps, tracker.samples)
         accuracy = Accuracy(self.intermediate_tolerance, self.intermediate_steps)
         for part in range(1, count):
@@ -104,32 +102,31 @@ class Uniform:
 class Periodic:
     """Schedule that solves one sample per cycle of T samples (section 5.2 of the paper).
 
-    The other samples of a cycle are skipped, because the last solution satisfies their equations within the
-    tolerance.
+    The other samples are skipped, because the last solution satisfies their equations within the tolerance.
+    The last sample is always solved.
 
-    The cycle is determined from the samples themselves. The path is followed from the rest position with a
-    tolerance of 1e-6, then 1e-5, and so on. Samples are skipped while their first-order optimality is below
-    the tolerance. T is the median number of samples from one solve to the next, for the wire that is solved
-    most often. If T is at least 2, the path restarts from rest and solves every T-th sample with the same
-    tolerance. The last sample is always solved. A cycle must have at least two samples and occur at least
-    twice. If no tolerance yields a cycle, every sample is solved with a tolerance of 1e-6.
+    If the cycle is not given, it is found by a search. The search follows the path from the rest position
+    with a tolerance of 1e-6, then 1e-5, 1e-4 and 1e-3, and skips samples whose first-order optimality is
+    below the tolerance. T is the median number of samples from one solve to the next, for the wire with the
+    smallest median. The search ends at the first tolerance for which T is at least 2; the path then restarts
+    from rest and is solved with this cycle and tolerance. If no tolerance yields a cycle, every sample is
+    solved with a tolerance of 1e-6.
 
-    The tolerances of this class and of the paper are not directly comparable. The paper solves an unscaled
-    problem, in which ‖Jᵀr‖∞ is larger by a factor of F² than here, where r = a F − 1 and lengths are in
-    pitches. The value of F depends on the unit of length, which the paper does not state.
+    The tolerances cannot be compared directly with those of the paper. The paper does not scale its
+    equations, and its ‖Jᵀr‖∞ is larger by a factor of F² than the one used here, with r = a F − 1 and lengths
+    in pitches. The value of F depends on the unit of length, which the paper does not state.
 
     Args:
         cycle: Cycle T in samples, if known from an earlier press of the same size and rate; None to search
             for the cycle.
-        plain: As in :class:`Uniform`. The search for the cycle always starts each sample at the last solution
-            (``plain=True``).
+        plain: As in :class:`Uniform`. The search for the cycle always uses ``plain=True``.
         intermediate_tolerance: Tolerance if ``cycle`` is given; the default is the paper's 1e-4.
         final_tolerance: Tolerance at the last sample.
-        intermediate_steps: Maximum operator steps at all samples except the last.
-        final_steps: Maximum operator steps at the last sample.
+        intermediate_steps: Maximum number of operator steps at each sample except the last.
+        final_steps: Maximum number of operator steps at the last sample.
 
     Raises:
-        ValueError: If a tolerance is not positive and finite or a count is not an integer of at least 1.
+        ValueError: If a tolerance is not positive and finite, or a count is not an integer of at least 1.
     """
 
     cycle: int | None = None
@@ -145,7 +142,7 @@ class Periodic:
         _require(self, "intermediate_tolerance", "final_tolerance", "intermediate_steps", "final_steps")
 
     def follow(self, tracker: PathTracker) -> None:
-        """Find the cycle, return to the rest position, and solve the last sample of each cycle."""
+        """Find the cycle unless it is given, then solve the last sample of each cycle, starting at rest."""
         tracker.cycle, tolerance = self.cycle, self.intermediate_tolerance
         if tracker.cycle is None:
             tracker.cycle, tolerance = self._search(tracker)
@@ -160,27 +157,27 @@ class Periodic:
         _finish(tracker, self)
 
     def _search(self, tracker: PathTracker) -> tuple[int | None, float]:
-        """Return the cycle (None if the solves have no period) and the tolerance for which it was found."""
+        """Return the cycle and the tolerance for which it was found; without a cycle, None and 1e-6."""
         for tolerance in RELAXED_TOLERANCES:
             tracker.restart()
             accuracy = Accuracy(tolerance, self.intermediate_steps)
             solved = [tracker.solve(sample, accuracy) > 0 for sample in range(tracker.samples - 1)]
             cycle = shortest_cycle(np.array(solved).reshape(-1, tracker.wires))
             if cycle is None:
-                break  # with a larger tolerance, there would be even fewer solves
+                break  # a larger tolerance would skip even more samples
             if cycle > 1:
                 return cycle, tolerance
         return None, RELAXED_TOLERANCES[0]
 
 
 def shortest_cycle(solved: NDArray[np.bool_]) -> int | None:
-    """Return the median number of samples from one solve to the next, for the wire that is solved most often.
+    """Return the shortest cycle of any wire: its median number of samples from one solve to the next.
 
     Args:
-        solved: (T, U) bool, True where a wire was solved at a sample.
+        solved: (T, U) bool, True if the wire was solved at the sample.
 
     Returns:
-        The cycle, in samples; None if no wire was solved at least three times.
+        Cycle in samples; None if no wire was solved at least three times.
     """
     cycles = [
         np.median(gaps) for gaps in (np.diff(np.flatnonzero(wire)) for wire in solved.T) if gaps.size > 1
@@ -190,32 +187,31 @@ def shortest_cycle(solved: NDArray[np.bool_]) -> int | None:
 
 @dataclass(frozen=True)
 class Adaptive:
-    """Schedule that minimises the number of points solved per wire; interpolates R between samples.
+    """Schedule with an adaptive step length per wire, which needs the fewest points; interpolates R.
 
-    Each wire has its own step length. Each step starts with an Euler step along ∂X/∂R, computed from the
-    factors of the last Jacobian; operator steps then correct the position. The next step length is chosen to
-    maintain the contraction ratio of Newton's method. The error of an Euler step grows with the square of its
-    length (Deuflhard 2004, section 5.1.3), and F is smooth on the scale of the clearance between the layers.
-    A step that does not reach a root on the branch of the rest position is undone and halved.
+    Each step consists of an Euler step along ∂X/∂R, with the factors of the last Jacobian, and of operator
+    steps that correct the position. The step length keeps the distance between the predicted and the
+    corrected point constant, so that Newton's method contracts equally well in every step. The error of an
+    Euler step is proportional to the square of its length (Deuflhard 2004, section 5.1.3). A step that does
+    not reach a root on the branch of the rest position is undone, and the next step is half as long.
 
-    The interpolated resistances do not belong to a real deformation, so the path can reach a fold (det J = 0)
-    even if the press does not. If a wire cannot pass such a fold, or if its root is implausibly rough, the
-    wire is solved again by Levenberg-Marquardt, starting from the smoothest displacement that explains the
-    last sample (:func:`skinnode.solve.starts.guided_start`). If Levenberg-Marquardt finds a second root, the
-    smoother root is kept.
+    Interpolated resistances do not belong to a deformation of the skin, so the path can reach a fold (det J =
+    0) even if the press does not. If a wire cannot pass a fold, or its root is too rough for a press, it is
+    solved again by Levenberg-Marquardt, starting at the smoothest displacement that explains the last sample
+    (:func:`skinnode.solve.starts.guided_start`). The smoother of the two roots is kept.
 
-    The path leads from the patch at rest to the frame to solve, so one sample is enough. If there are more
-    samples, each wire with a doubtful root is also followed sample by sample, and so is each wire that moved
-    far enough to have crossed a fold. After a fold has been crossed, the smoother root can be wrong, and only
-    the samples show this.
+    One sample is enough, because the path starts at rest and ends at the last sample. If there are more
+    samples, the wires with doubtful roots are also followed sample by sample, as are the wires that moved far
+    enough to have crossed a fold. Across a fold, the smoother root can be wrong, and only the samples show
+    it.
 
     Args:
         points: Maximum number of path points to attempt per wire.
-        final_tolerance: Tolerance of r, and of x in pitches, at the last sample.
-        final_steps: Maximum operator steps at the last sample.
+        final_tolerance: Tolerance at the last sample, for r and for x in pitches.
+        final_steps: Maximum number of operator steps at the last sample.
 
     Raises:
-        ValueError: If a tolerance is not positive and finite or a count is not an integer of at least 1.
+        ValueError: If a tolerance is not positive and finite, or a count is not an integer of at least 1.
     """
 
     points: int = 50
@@ -227,7 +223,7 @@ class Adaptive:
         _require(self, "final_tolerance", "final_steps")
 
     def follow(self, tracker: PathTracker) -> None:
-        """Advance all wires to the last sample, solve the last sample, and solve doubtful wires again."""
+        """Advance all wires to the last sample and solve it; make further attempts for doubtful wires."""
         end = tracker.samples - 1.0
         reach = tracker.problem.step_limit
         position = np.full(tracker.wires, REST)
@@ -258,7 +254,7 @@ class Adaptive:
 
 
 def _finish(tracker: PathTracker, how: Uniform | Periodic) -> None:
-    """Solve the last sample, then check doubtful roots."""
+    """Solve the last sample; reject doubtful roots if ``how.plain``, otherwise solve these wires again."""
     accuracy = Accuracy(how.final_tolerance, how.final_steps)
     if not how.plain:
         tracker.extrapolate(tracker.samples - 1)
@@ -284,7 +280,7 @@ def _require_count(name: str, value: int) -> None:
 
 
 def _require(options: object, *names: str) -> None:
-    """Raise ValueError if a tolerance is not positive, or a number of steps is less than 1."""
+    """Raise ValueError if a tolerance is not positive and finite, or a number of steps is less than 1."""
     for name in names:
         value = getattr(options, name)
         if name.endswith("steps"):

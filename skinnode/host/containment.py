@@ -1,8 +1,8 @@
-"""Contain exceptions in the host's threads.
+"""Contain exceptions in the threads of the host.
 
-Exceptions are recorded in :class:`Defects`; each patch and each bus has its own record. An exception that
-concerns one patch, bus or subscriber does not affect the others. The failed operation is retried. The table
-in :mod:`skinnode.host` lists the effects of an exception in each thread.
+An exception that concerns one patch, bus or subscriber does not affect the others, and the failed operation
+is retried. Each patch and each bus has its own record of exceptions, :class:`Defects`. The table in
+:mod:`skinnode.host` lists the effect of an exception in each thread.
 """
 
 from __future__ import annotations
@@ -21,36 +21,36 @@ _log = logging.getLogger(__name__)
 
 _BRIEF_S: Final = 0.001
 _LONGEST_BRIEF_S: Final = 0.02
-"""First and longest pause (s) after an exception in a loop that serves several patches or buses. The pauses
-are short because a failure of one patch or bus must not delay the others.
+"""First and longest pause (s) after an exception in a loop. The pauses are short, because a loop may serve
+several patches or buses.
 """
 
 _COMPLAINTS: Final = 64
-"""Maximum number of logged messages that a record remembers. After this number of distinct messages, an
-earlier message may be logged again.
+"""Maximum number of messages that a record remembers as logged. When it is full, it forgets them all and may
+log them again.
 """
 
 
 def one_line(error: BaseException | None) -> str:
-    """Return an exception's type and message as one line."""
+    """Return the type and the message of an exception on one line."""
     text = " ".join(str(error).split())
     return f"{type(error).__name__}: {text}" if text else type(error).__name__
 
 
 @dataclass(frozen=True, slots=True)
 class DefectStats:
-    """Statistics of the exceptions in a :class:`Defects` record."""
+    """Summary of a :class:`Defects` record."""
 
     count: int
     newest: str | None
-    """Operation that failed most recently and its exception, in one line; None before the first exception."""
+    """Last operation that raised an exception, and the exception, on one line; None if there is none."""
 
 
 class Defects:
-    """Thread-safe record of the exceptions that concern ``subject``, for example a patch or a bus.
+    """Record of the exceptions that concern ``subject``, such as a patch or a bus. Thread-safe.
 
-    The first exception with a given message is passed to ``on_new``, logged as one line at level WARNING, and
-    logged with its traceback at level DEBUG.
+    An exception with a new message is logged on one line at level WARNING, logged with its traceback at level
+    DEBUG, and passed to ``on_new``.
     """
 
     def __init__(self, subject: str, on_new: Callable[[SkinError], object] = lambda error: None) -> None:
@@ -67,15 +67,15 @@ class Defects:
 
     @property
     def newest(self) -> str | None:
-        """Operation that failed most recently and its exception, in one line; None if nothing has failed."""
+        """Last operation that raised an exception, and the exception, on one line; None if there is none."""
         return self._newest
 
     def stats(self) -> DefectStats:
-        """Return the statistics of the exceptions reported so far."""
+        """Return the number of exceptions reported so far, and the newest one."""
         return DefectStats(self._count, self._newest)
 
     def report(self, doing: str, error: Exception) -> None:
-        """Count and log ``error``, which was raised by the operation ``doing``. Never raises."""
+        """Count and log ``error``, raised by the operation ``doing``. Never raises."""
         text = f"{doing}: {one_line(error)}"
         with self._lock:
             self._count += 1
@@ -86,7 +86,7 @@ class Defects:
             self._logged.add(text)
         if known:
             return
-        with contextlib.suppress(Exception):  # the application's log handlers may raise exceptions
+        with contextlib.suppress(Exception):  # a log handler of the application may raise
             _log.warning("%s: %s; retrying", self.subject, text)
             _log.debug("%s: %s", self.subject, text, exc_info=error)
         failure = SkinError(f"{self.subject}: {text}")
@@ -96,9 +96,9 @@ class Defects:
 
 
 def keep_on(turn: Callable[[], bool], defects: Defects, doing: str) -> None:
-    """Call ``turn`` repeatedly until it returns False.
+    """Call ``turn`` until it returns False.
 
-    After a call that raises an exception, the function pauses for 1 to 20 ms.
+    An exception is reported to ``defects``. The next call follows after a pause of 1 to 20 ms.
     """
     pause = Pause(_BRIEF_S, _LONGEST_BRIEF_S)
     while True:

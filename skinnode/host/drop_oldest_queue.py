@@ -1,7 +1,7 @@
-"""Provide a bounded queue that drops its oldest items if the reader is slow, so that the writer never waits.
+"""Provide a bounded queue that never blocks the writer: a full queue drops its oldest items.
 
-The standard library has no such queue: a full ``queue.Queue`` blocks or rejects a new item;
-``collections.deque(maxlen=…)`` drops items without counting them, and its reader cannot wait for an item.
+The standard library has no such queue. A full ``queue.Queue`` blocks or rejects the new item.
+``collections.deque(maxlen=…)`` does not count the items it drops, and a reader cannot wait for an item.
 """
 
 from __future__ import annotations
@@ -18,18 +18,15 @@ T = TypeVar("T")
 
 @dataclass(frozen=True, slots=True)
 class End:
-    """End marker, appended to a queue when the host closes or is stopped by ``error``."""
+    """End marker of a queue, with the error that stopped the host, if any."""
 
     error: SkinError | None = None
 
 
 class DropOldestQueue(Generic[T]):
-    """Queue of up to ``capacity`` items; the end of the stream is marked by an :class:`End`.
+    """Queue of at most ``capacity`` items, ended by an :class:`End`. Thread-safe. Writing never blocks.
 
-    Thread-safe; writing never blocks.
-
-    The end marker is never dropped, and every reader receives the marker because :meth:`get` does not remove
-    it.
+    The end marker is never dropped. :meth:`get` does not remove it, so every reader gets it.
     """
 
     def __init__(self, capacity: int) -> None:
@@ -37,7 +34,7 @@ class DropOldestQueue(Generic[T]):
         self._capacity = capacity
 
     def put(self, item: T | End) -> int:
-        """Append an item to the queue, and drop the oldest items if the capacity is exceeded.
+        """Append an item. Drop the oldest items beyond the capacity.
 
         Returns:
             Number of items dropped.
@@ -47,24 +44,24 @@ class DropOldestQueue(Generic[T]):
         while self._items.qsize() > self._capacity:
             try:
                 oldest = self._items.get_nowait()
-            except queue.Empty:  # another thread has already removed the oldest item
+            except queue.Empty:  # another thread has emptied the queue
                 break
             if isinstance(oldest, End):
                 end = oldest
             else:
                 dropped += 1
-        if end is not None:  # the queue may temporarily exceed its capacity by one item
+        if end is not None:  # the queue may exceed its capacity by this one item
             self._items.put(end)
         return dropped
 
     def get(self, timeout_s: float | None = None) -> T | End:
-        """Remove and return the oldest item; an end marker is returned but not removed.
+        """Remove and return the oldest item. An end marker is returned but not removed.
 
         Args:
-            timeout_s: Maximum time (s) to wait for an item; None for no limit, 0 to return immediately.
+            timeout_s: Time limit (s); None for no limit, 0 to return at once.
 
         Raises:
-            queue.Empty: if no item arrived before the timeout.
+            queue.Empty: if no item arrives in time.
         """
         item = self._items.get(timeout=timeout_s)
         if isinstance(item, End):

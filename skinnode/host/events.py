@@ -1,4 +1,4 @@
-"""Publish changes in a hand's health as events to subscribers and in the log."""
+"""Publish changes in the health of a hand as events, to subscribers and to the log."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from skinnode.process import clock
 _log = logging.getLogger(__name__)
 
 CAPACITY_EVENTS: Final = 1024
-"""Default capacity of a subscriber's event queue; when the queue is full, the oldest event is dropped."""
+"""Default length of a subscriber's queue, in events."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,23 +27,23 @@ class HealthEvent:
     t_ns: int
     """Monotonic time of the change, ns."""
     subject: str
-    """Subject of the event: name of a patch or bus, or ``host``."""
+    """Name of a patch or bus, or ``host``."""
     what: str
-    """Type of the event: a new condition, the name of the counter of :class:`PatchHealth` or
-    :class:`BusHealth` that has increased, or ``defects``.
+    """Type of the change: for example a new condition, the name of an increased counter of
+    :class:`PatchHealth` or :class:`BusHealth`, or ``defects``.
     """
     text: str
-    """Human-readable description of the change; does not include the subject's name."""
+    """Human-readable description of the change, without the subject."""
 
     def __str__(self) -> str:
         return f"{self.subject}: {self.text}"
 
 
 class EventSubscription:
-    """Subscription to a running host's events.
+    """Subscription to the events of a running host. Read it with ``for`` or :meth:`get`.
 
-    Iterate over the subscription until the host closes, or use :meth:`get`. If the subscription's queue is
-    full, the oldest event is dropped and counted in ``dropped``. Any thread may read.
+    The iteration ends when the host closes. A full queue drops its oldest event; ``dropped`` counts these
+    events. Any thread may read.
     """
 
     def __init__(self, capacity: int) -> None:
@@ -51,13 +51,13 @@ class EventSubscription:
         self.dropped = 0
 
     def get(self, timeout_s: float | None = None) -> HealthEvent | None:
-        """Wait for the next event and return it; return None on timeout or if the host closes.
+        """Wait for the next event and return it.
 
         Args:
-            timeout_s: Maximum time (s) to wait for an event; None for no limit.
+            timeout_s: Time limit (s); None for no limit.
 
         Returns:
-            Next event; None if no event occurred before the timeout or the host has closed.
+            Next event; None on timeout or once the host has closed.
         """
         try:
             event = self._queue.get(timeout_s)
@@ -75,12 +75,12 @@ class EventSubscription:
 
 
 class Events:
-    """All subscriptions to a host's events. Only one thread may publish; any thread may subscribe."""
+    """Subscriptions to the events of a host. One thread may publish; any thread may subscribe."""
 
     def __init__(self, defects: Defects | None = None) -> None:
         self._defects = Defects("host") if defects is None else defects
         self._subscriptions: weakref.WeakSet[EventSubscription] = weakref.WeakSet()
-        self._lock = clock.lock()  # guards the set of subscriptions against changes while it is copied
+        self._lock = clock.lock()  # protects the set of subscriptions while it is copied
         self._ended = False
 
     def subscribe(self, capacity: int) -> EventSubscription:
@@ -106,7 +106,7 @@ class Events:
         self._offer(event)
 
     def end(self) -> None:
-        """End all subscriptions when the host closes."""
+        """End all subscriptions, because the host closes."""
         self._ended = True
         self._offer(End())
 

@@ -1,4 +1,4 @@
-"""Check that the EDS and baseline files named in a hand file match the patches."""
+"""Check the EDS and baseline files named in a hand file against its patches."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def load_baseline(path: Path, profile: PatchProfile) -> Float:
     """Read a patch's baseline from a text file.
 
     Returns:
-        (U, K) ohm: resistances at rest, rounded to REAL32.
+        Resistances at rest, (U, K), ohm, rounded to REAL32.
 
     Raises:
         ConfigError: if the file is not a table of U × K positive numbers.
@@ -68,16 +68,15 @@ def _ohm(word: str, key: str, allowed: str, where: str) -> float:
 
 
 def check_eds(path: Path, profile: PatchProfile) -> None:
-    """Check that an EDS file matches a patch's wire format.
+    """Check an EDS file against the PDO format of a patch.
 
-    The summary may be described with or without the check over the codes.
+    The file may describe the summary with or without the check over the codes.
 
     Raises:
         ConfigError: if the file cannot be read.
-        ProfileError: if the file is not an EDS file, an object is missing, or an object differs from the wire
-        format.
+        ProfileError: if the file is not an EDS file, or an object is missing or differs from the PDO format.
     """
-    from canopen.objectdictionary.eds import import_eds  # accepts any file name
+    from canopen.objectdictionary.eds import import_eds  # this function accepts any file name
 
     data = read_input("EDS", path, MOST_EDS_BYTES)
     try:
@@ -88,7 +87,7 @@ def check_eds(path: Path, profile: PatchProfile) -> None:
     check_form(text, str(path))
     try:
         described = import_eds(io.StringIO(text), None)  # type: ignore[no-untyped-call]
-    except Exception as error:  # the EDS parser in canopen may raise any exception
+    except Exception as error:  # canopen's parser may raise any exception
         raise no_eds(error, str(path), text) from None
     checked = described.get_variable(od.SUMMARY, od.SUMMARY_CHECK) is not None
     for item in replace(profile, checked=checked).objects():

@@ -1,7 +1,7 @@
-"""Determine a hand's limitations: results that its hand file, layouts and noise make impossible.
+"""Determine the limitations of a hand: results that its hand file, its layouts or its noise rule out.
 
-A limitation is not an error. ``skinnode hand check`` lists the limitations, so that users do not expect
-results that the hand cannot deliver.
+A limitation is not an error. ``skinnode hand check`` lists the limitations, to keep users from expecting more
+than the hand can deliver.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ from skinnode.solve.tracker import choose_method
 from skinnode.solve.wires.problem import PatchProblem
 
 BY_PRIOR: Final = 0.3
-"""Standard deviation (fraction of the clearance) above which resistances alone are considered insufficient to
-determine displacements. Few presses indent the layer by more than this fraction.
+"""Standard deviation (fraction of the clearance) above which the resistances alone do not determine the
+displacements well enough. Few presses are deeper than this fraction.
 """
 
 
@@ -35,21 +35,21 @@ _BY_PRIOR: Final = (
 
 @dataclass(frozen=True, slots=True)
 class Limitation:
-    """Limitation: a result that some patches of a hand cannot provide."""
+    """Result that some patches of a hand cannot provide."""
 
     patches: tuple[str, ...]
     """Names of the patches."""
     key: str
-    """Key in the hand file whose value could be changed to remove the limitation."""
+    """Key in the hand file that removes the limitation when changed."""
     text: str
-    """Description of the missing result and of the reason for its absence."""
+    """Missing result, and the reason why it is missing."""
 
 
 def limitations(hand: HandConfig) -> list[Limitation]:
-    """Return a hand's limitations; patches with the same limitation share an entry.
+    """Return the limitations of a hand. Patches with the same limitation share an entry.
 
-    The function compiles no kernels; the solver's deadline is checked only if the kernels have been compiled
-    before.
+    The function compiles no kernels. It checks the deadline of the solver only if the kernels are compiled
+    already.
     """
     patches: dict[tuple[str, str], list[str]] = {}
     for patch in hand.patches:
@@ -59,7 +59,7 @@ def limitations(hand: HandConfig) -> list[Limitation]:
 
 
 def _of_results(patch: PatchConfig, solver: SolverConfig) -> Iterator[tuple[str, str]]:
-    """Yield the key and description of each result that the solver cannot compute for a patch."""
+    """Yield the key and text of each limitation of the solver for a patch."""
     layout = patch.layout.build()
     noise = math.hypot(patch.relative_noise, CodeScale(patch.code_bits).relative_std)
     options = tracker_options(patch, solver, relative_noise=noise)
@@ -116,7 +116,7 @@ def _of_deadline(layout: PatchLayout, options: TrackerOptions, deadline_us: int)
 
 
 def _of_place(patch: PatchConfig, hand: HandConfig) -> Iterator[tuple[str, str]]:
-    """Yield the key and description of each coordinate frame unavailable for a patch's contacts."""
+    """Yield the key and text of each missing pose that limits the coordinate frames of a patch's contacts."""
     if "pose" not in patch.model_fields_set:
         yield "patches.pose", "no pose: contacts are in the patch's own coordinate frame"
     if patch.link is not None and patch.link not in [link.name for link in hand.links]:

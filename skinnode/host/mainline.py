@@ -1,4 +1,4 @@
-"""Run the mainline: one thread that dispatches the frames received on all buses."""
+"""Run the mainline, the thread that dispatches the frames of all buses."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from skinnode.process import clock
 from skinnode.transport import Receiver
 
 _WAIT_S: Final = 0.02
-"""Maximum time (s) to wait for a frame before calling the pollers."""
+"""Maximum wait (s) for a frame before the pollers are called."""
 
 
 class Mainline:
@@ -22,13 +22,12 @@ class Mainline:
 
     A failure on one bus does not affect the others.
 
-    Threads: a single thread serves all buses. Frames arrive on all buses at about the same time, and waking a
-        second thread would take as long as handling twenty frames.
+    Threads: one thread serves all buses. Their frames arrive at about the same time, and waking another
+    thread would take as long as handling twenty frames.
 
     Args:
         links: Connections to the buses.
-        defects: Collector of exceptions that do not concern a particular bus; the first bus's collector by
-            default.
+        defects: Collector of the exceptions that concern no single bus; by default, that of the first bus.
     """
 
     def __init__(self, links: Sequence[BusLink], defects: Defects | None = None) -> None:
@@ -45,9 +44,9 @@ class Mainline:
         self._thread.start()
 
     def stop(self) -> None:
-        """End and join all threads of the mainline.
+        """End and join the threads of the mainline.
 
-        Frames can still be sent after the mainline has stopped.
+        Frames can still be sent afterwards.
         """
         self._stop.set()
         self._thread.join()

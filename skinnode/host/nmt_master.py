@@ -9,13 +9,13 @@ from skinnode.canopen.nmt import NmtCommand, encode
 
 
 def start(send: Callable[[int, bytes], None], node_id: int) -> None:
-    """Command a node to enter the NMT state *operational*."""
+    """Command a node to become operational."""
     send(NMT_COB_ID, encode(NmtCommand.START, node_id))
 
 
 def stand_by(send: Callable[[int, bytes], None], node_id: int) -> None:
     """Command a node to become pre-operational.
 
-    In this state, a node sends only heartbeats, EMCY messages and SDO responses.
+    A pre-operational node sends heartbeats, EMCY messages and SDO responses, but no PDOs.
     """
     send(NMT_COB_ID, encode(NmtCommand.ENTER_PRE_OPERATIONAL, node_id))

@@ -1,4 +1,4 @@
-"""Define the parameters of a patch that are known after its node has been configured."""
+"""Define what the host knows about a patch once its node has been configured."""
 
 from __future__ import annotations
 
@@ -12,23 +12,23 @@ from skinnode.protocol.profile import PatchProfile
 
 @dataclass(frozen=True, slots=True, eq=False)
 class NodeFacts:
-    """Parameters of a patch, collected during the configuration of its node."""
+    """Facts about a patch, collected during the configuration of its node."""
 
     config: PatchConfig
     layout: PatchLayout
     profile: PatchProfile
     scale: CodeScale
     baseline_ohm: Float
-    """(U, K) ohm: resistances at rest, to which the codes in the node's scans are relative."""
+    """Resistances at rest, (U, K), ohm. The codes of the scans are relative to them."""
     serial: int | None
-    """Serial number of the node; None if the host is not allowed to read the serial number."""
+    """Serial number of the node; None if the host must not read it."""
     heartbeat_s: float
     """Heartbeat period of the node, s."""
     checked: bool = False
-    """Whether the node sends a check over all codes with every scan; False if the node's revision number
-    could not be read.
+    """Whether the summary of each scan contains a check over all codes; False if the revision number of the
+    node is unknown.
     """
 
     def with_baseline(self, baseline_ohm: Float) -> NodeFacts:
-        """Return a copy with a different baseline, for example after a tare."""
+        """Return a copy with another baseline."""
         return replace(self, baseline_ohm=baseline_ohm)

@@ -1,7 +1,6 @@
-"""Detect other masters on a bus from frames that only a master sends.
+"""Detect other masters on a bus by the frames that only a master sends.
 
-The host does not receive its own frames. A received SYNC message or NMT command, for example, therefore comes
-from another master.
+The host does not receive its own frames, so a received NMT command, for example, comes from another master.
 """
 
 from __future__ import annotations
@@ -17,8 +16,7 @@ from skinnode.config import BusConfig
 _log = logging.getLogger(__name__)
 
 QUIET_NS: Final = 10_000_000_000
-"""Time (ns) after which a frame from another master is logged again if no frame of the same type has arrived
-in between.
+"""Time (ns) without frames of one type from another master after which the next such frame is logged again.
 """
 
 SYNC, NMT, SDO, HEARTBEAT = "SYNC", "NMT commands", "SDO requests to the hand's nodes", "the host's heartbeat"
@@ -26,26 +24,24 @@ SYNC, NMT, SDO, HEARTBEAT = "SYNC", "NMT commands", "SDO requests to the hand's 
 
 @dataclass(frozen=True, slots=True)
 class OtherMasterStats:
-    """Counters of master-only frames, such as SYNC and SDO requests, received from other senders.
+    """Counters of the frames received from other masters.
 
-    On a bus that another master runs, SYNC and NMT commands are not counted, so ``syncs`` and
-    ``nmt_commands`` stay 0.
+    On a bus that another master runs, SYNC and NMT commands are legitimate: ``syncs`` and ``nmt_commands``
+    stay 0.
     """
 
     syncs: int
     nmt_commands: int
     sdo_requests: int
-    """Number of SDO requests to the hand's nodes from other senders, such as a second host or a service
-    tool.
-    """
+    """Number of SDO requests to the hand's nodes, for example from a second host or a service tool."""
     heartbeats: int
-    """Number of heartbeats with the host's node-ID."""
+    """Number of heartbeats with the node-ID of the host."""
     last_ns: int | None
-    """Monotonic time (ns) of the newest frame from another master; None before the first such frame."""
+    """Monotonic time (ns) of the newest frame from another master; None before the first one."""
 
 
 class OtherMasters:
-    """Counter of other masters' frames on one bus. The first frame of each type is logged. Mainline only."""
+    """Detector of other masters on one bus. It logs the first frame of each type. Mainline only."""
 
     def __init__(self, bus: BusConfig) -> None:
         self._bus = bus
@@ -53,9 +49,9 @@ class OtherMasters:
         self._last_ns: dict[str, int] = {}
 
     def handlers(self, node_ids: list[int]) -> dict[int, Callable[[bytes, int], None]]:
-        """Return handlers, by COB-ID, that count the frames of other masters.
+        """Return the handlers that count the frames of other masters, by COB-ID.
 
-        If another master runs the bus, SYNC and NMT commands are legitimate and have no handler.
+        On a bus that another master runs, there is no handler for SYNC and NMT commands.
 
         Args:
             node_ids: Node-IDs of the hand's nodes on this bus.

@@ -1,6 +1,6 @@
-"""Register a host's handlers for the frames on a bus, by COB-ID.
+"""Register the handlers of a host for the frames on a bus.
 
-The functions in this module do not send frames, block or start threads, so a replay can also use them for
+The functions of this module send no frames, start no threads and never block, so a replay can use them for
 recorded frames.
 """
 
@@ -25,14 +25,14 @@ from skinnode.protocol.profile import PatchProfile
 from skinnode.protocol.scan import Scan
 
 LEAST_GRACE_NS: Final = 5_000_000
-"""Minimum time (ns) to wait for a scan's summary after its last chunk. The host waits at least half a SYNC
-period, because the chunks of all patches have a higher priority on the bus than the summary.
+"""Minimum time (ns) to wait for the summary of a scan after its last chunk. The host also waits at least half
+a SYNC period, because the chunks of all patches take precedence on the bus.
 """
 
 
 @dataclass(frozen=True, slots=True)
 class PatchReception:
-    """Receivers of a patch's frames: the patch's stream and node monitor."""
+    """Receivers of the frames of a patch."""
 
     stream: PatchStream
     monitor: NodeMonitor
@@ -40,14 +40,14 @@ class PatchReception:
 
 @dataclass(frozen=True, slots=True)
 class BusReception:
-    """Receivers of other masters' frames on a bus: the detector of other masters and the SYNC follower."""
+    """Receivers of the frames of other masters on a bus."""
 
     other_masters: OtherMasters
     follower: SyncFollower
 
 
 def receive_bus(hand: HandConfig, dispatcher: Dispatcher, ticks: Ticks) -> BusReception:
-    """Register the handlers that detect other masters on a bus and follow their SYNC."""
+    """Register the handlers for the frames of other masters on a bus."""
     config = dispatcher.config
     other_masters, follower = OtherMasters(config), SyncFollower(ticks)
     for cob_id, handler in other_masters.handlers(
@@ -67,25 +67,25 @@ def receive_patch(
     ticks: Ticks,
     output: StreamOutput,
 ) -> PatchReception:
-    """Register the handlers that pass a patch's frames to its monitor and its stream.
+    """Register the handlers for the frames of a patch.
 
-    The stream withholds scans until a solver is available. A node may already be sending scans if an earlier
-    host left the node operational.
+    The stream withholds scans until it has a solver. Scans may arrive at once if an earlier host has left the
+    node operational.
 
     Args:
         patch: Configuration of the patch.
         hand: Configuration of the hand to which the patch belongs.
-        dispatcher: Dispatcher of the frames on the patch's bus.
+        dispatcher: Dispatcher of the patch's bus.
         ticks: SYNC times of the patch's bus.
-        output: Workers and publisher for the patch's scans. Exceptions are reported to ``output.defects``. If
-            ``output.defects`` is None, exceptions are raised, and the publisher fails.
+        output: Workers and publisher for the patch's scans, and collector of the exceptions. Without a
+            collector, handlers raise their exceptions, and an exception in the solver stops the publisher.
     """
     period_ns = hand.sync.period_ms * 1_000_000
     watch = CodeWatch(CodeScale(patch.code_bits), patch.relative_noise)
     monitor = NodeMonitor(patch.name, patch.node_id, dispatcher.reject, watch)
 
     arrivals = ArrivalPredictor(period_ns)
-    dispatcher.expect(patch.name, ())  # no prediction is possible before the patch's first scan
+    dispatcher.expect(patch.name, ())  # no prediction before the first scan
 
     def on_scan(scan: Scan) -> None:
         if not scan.empty:
@@ -114,7 +114,7 @@ def receive_patch(
     def on_heartbeat(data: bytes, t_ns: int) -> None:
         monitor.on_heartbeat(data, t_ns)
         if len(data) == 1 and data[0] & STATE_MASK == NmtState.INITIALISING:
-            stream.withhold()  # a node that boots has lost its configuration
+            stream.withhold()  # a node loses its configuration when it boots
 
     dispatcher.handle(od.heartbeat_cob_id(patch.node_id), on_heartbeat, output.defects)
     dispatcher.handle(od.emcy_cob_id(patch.node_id), monitor.on_emergency, output.defects)
@@ -125,4 +125,4 @@ def receive_patch(
 
 
 def _ignore(data: bytes, t_ns: int) -> None:
-    """Ignore an NMT command from the master of the bus."""
+    """Ignore an NMT command of the bus's master."""

@@ -1,12 +1,13 @@
 """Compute the probability that a running converter with a given noise repeats its codes.
 
-The probability that a reading has the same code as the previous reading is at most 2Φ(1/2σ) − 1, where σ is
-the standard deviation of the noise in codes. This bound is reached if the true value is in the middle of a
-quantization step, as for skin at rest after a tare. Under a press, each crossing has a different value, so
-the position of the value within its quantization step is practically random. For a random position, the
-probability that n + 1 readings of one crossing all fall into the same code is E max(0, 1 − σ R), where R is
-the range of n + 1 standard normal variables. For random positions, the probability of repeated codes is much
-lower than the bound, even for a converter with little noise.
+A reading repeats the previous code with a probability of at most 2Φ(1/2σ) − 1, where σ is the standard
+deviation of the noise in codes. This maximum is reached if the true value lies in the middle of a
+quantization step, as for skin at rest after a tare.
+
+Under a press, the crossings have different values, whose positions within their quantization steps are
+practically random. For a random position, n + 1 readings of one crossing all give the same code with the
+probability E max(0, 1 − σ R), where R is the range of n + 1 standard normal variables. This is much less than
+the maximum, even for a converter with little noise.
 """
 
 from __future__ import annotations
@@ -16,13 +17,13 @@ import math
 from typing import Final
 
 _EDGES: Final = 0.1
-"""Upper limit of σ; larger values are replaced by the limit. Up to the limit, σ R is less than 1 for all
-relevant runs, so that E max(0, 1 − σ R) = 1 − σ E R.
+"""Upper limit to which larger values of σ are reduced. Up to this limit, σ R < 1 for all relevant runs and E
+max(0, 1 − σ R) = 1 − σ E R.
 """
 
 
 def log_stay(sigma: float) -> float:
-    """Return the natural logarithm of the maximum probability that a reading repeats the previous code.
+    """Return the logarithm of the maximum probability that a reading repeats the previous code.
 
     Args:
         sigma: Standard deviation of the noise, codes.
@@ -34,9 +35,9 @@ def log_stay(sigma: float) -> float:
 
 
 def log_stay_anywhere(sigma: float, run: int) -> float:
-    """Return the log probability that a code repeats ``run`` times.
+    """Return the logarithm of the probability that a code is repeated ``run`` times.
 
-    The true value is assumed to be at a random position within the quantization step.
+    The position of the true value within its quantization step is assumed to be random.
 
     Args:
         sigma: Standard deviation of the noise, codes.
@@ -57,7 +58,7 @@ def _mean_range(count: int) -> float:
 
 
 def deviations_of(log_p: float) -> float:
-    """Return the z-score that a standard normal variable exceeds with probability exp(log_p)."""
+    """Return the value that a standard normal variable exceeds with the probability exp(``log_p``)."""
     if log_p > -1.0:
         return 0.0
     z = math.sqrt(-2.0 * log_p)

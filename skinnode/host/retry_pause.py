@@ -1,4 +1,4 @@
-"""Determine the pauses between attempts to repeat a failed operation, such as bringing up a node."""
+"""Determine the pauses between attempts at a failed operation, such as bringing up a node."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from skinnode.process import clock
 
 FIRST_PAUSE_S: Final = 0.1
 LONGEST_PAUSE_S: Final = 1.0
-"""First and longest pause (s) before a failed operation is retried. Each pause is twice as long as the
-previous pause."""
+"""First and longest pause (s) before a failed operation is retried. Each pause is twice the previous one."""
 
 
 class Pause:
-    """Sequence of increasing pauses between attempts to repeat a failed operation.
+    """Sequence of increasing pauses between attempts at a failed operation.
 
-    If no failure occurs for longer than the longest pause, the sequence starts again.
+    The sequence restarts at a failure that occurs more than ``longest_s`` after the end of the previous
+    pause.
     """
 
     def __init__(self, first_s: float = FIRST_PAUSE_S, longest_s: float = LONGEST_PAUSE_S) -> None:
@@ -25,7 +25,7 @@ class Pause:
         self._end_s = -math.inf
 
     def next_s(self) -> float:
-        """Return the pause (s) before the next attempt."""
+        """Return the pause (s) before the next attempt. Call once per failure."""
         now_s = clock.monotonic()
         again = now_s <= self._end_s + self._longest_s
         self._pause_s = min(2 * self._pause_s, self._longest_s) if again else self._first_s

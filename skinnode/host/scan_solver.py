@@ -1,4 +1,4 @@
-"""Decode a patch's scans into resistances, and compute fields from the resistances."""
+"""Decode the scans of a patch into resistances, and solve them for fields."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ from skinnode.solve.tracker import Tracker
 
 
 class ScanSolver:
-    """Decoder and solver for one patch's scans. Not thread-safe.
+    """Decoder and solver for the scans of one patch. Not thread-safe.
 
     Args:
         facts: Layout, code scale and baseline of the patch.
         config: Settings of the solver.
-        now: Function that returns the current monotonic time in ns.
+        now: Function that returns the monotonic time, ns.
     """
 
     def __init__(
@@ -54,17 +54,17 @@ class ScanSolver:
         self._decoder = Decoder(facts.baseline_ohm, scale)
 
     def decode(self, scan: Scan, stamp: ScanStamp) -> ResistanceFrame:
-        """Return the resistances of a scan; NaN for each code that is not a measurement."""
+        """Return the resistances of a scan. A code that is not a measurement gives NaN."""
         resistance_ohm, valid = self._decoder.decode(scan.codes)
         if self._codes.gain is not None:
             resistance_ohm *= self._codes.gain
         return ResistanceFrame(resistance_ohm, valid, stamp)
 
     def solve(self, scan: Scan, stamp: ScanStamp) -> tuple[FieldFrame, int]:
-        """Solve a scan, assuming noise from the converter and from the rounding of the codes.
+        """Solve a scan, with the noise of the converter and the quantization error of the codes.
 
         Returns:
-            Field (time-stamped, with read-only arrays), and the number of codes that are not measurements.
+            Stamped field with read-only arrays, and the number of codes that are not measurements.
         """
         self._tracker.scan = stamp.scan
         field, invalid = self._tracker.update_codes(scan.codes)
@@ -75,13 +75,13 @@ class ScanSolver:
 def tracker_options(
     patch: PatchConfig, config: SolverConfig, *, relative_noise: float, baseline_ohm: Float | None = None
 ) -> TrackerOptions:
-    """Return the options with which a :class:`Tracker` solves the scans of a patch.
+    """Return the :class:`Tracker` options for the scans of a patch.
 
     Args:
         patch: Configuration of the patch.
         config: Settings of the solver.
-        relative_noise: Standard deviation of a resistance, as a fraction of the resistance.
-        baseline_ohm: (U, K) ohm: resistances at rest; None if the baseline is not known yet.
+        relative_noise: Standard deviation of a resistance, relative to the resistance.
+        baseline_ohm: Resistances at rest, (U, K), ohm; None if not known yet.
     """
     calibration = patch.calibration
     return TrackerOptions(
@@ -92,7 +92,7 @@ def tracker_options(
         stiffness_n_per_m=calibration.stiffness_n_per_m or config.stiffness_n_per_m,
         rubber=calibration.rubber,
         force_calibrated=calibration.force_calibrated,
-        # the exact inverse cannot include tolerances
+        # the exact inverse cannot account for tolerances
         tolerances=None if config.method == "exact" else patch.tolerances.build(),
         deadline_us=config.deadline_us,
         estimate_noise=config.estimate_noise,
@@ -104,9 +104,9 @@ def tracker_options(
 
 
 def check_solvable(patch: PatchConfig, config: SolverConfig) -> None:
-    """Check that the solver supports a patch's layout, and prepare the solver's kernels and tables.
+    """Check that the solver supports the layout of a patch, and prepare its kernels and tables.
 
-    Preparation is slow; call this function before starting any node.
+    The preparation is slow, so it must be done before any node is started.
 
     Raises:
         ConfigError: if the solver cannot compute displacements for the layout.

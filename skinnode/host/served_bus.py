@@ -1,4 +1,4 @@
-"""Serve a bus of the hand: SYNC, LSS, detection of other masters, and bus health."""
+"""Serve a bus of the hand: its SYNC, LSS, other masters and health."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from skinnode.host.sync import SyncFollower, Ticks
 
 @dataclass(frozen=True, slots=True)
 class ServedBus:
-    """Bus of the hand, including its SYNC times, SYNC follower, LSS master and detector of other masters."""
+    """Bus of the hand with its SYNC times, SYNC follower, LSS master and detector of other masters."""
 
     link: BusLink
     ticks: Ticks
@@ -25,7 +25,7 @@ class ServedBus:
     lss: LssMaster
 
     def health(self, *, no_sync: bool) -> BusHealth:
-        """Return the bus's health. The argument ``no_sync`` is copied to the result."""
+        """Return the health of the bus, including ``no_sync``."""
         masters, stats, failure = self.other_masters.stats(), self.link.stats(), self.link.failure
         return BusHealth(
             bus=self.link.config.name,
@@ -46,13 +46,13 @@ class ServedBus:
         )
 
     def sync_is_late(self, t_up_ns: int, period_ns: int) -> bool:
-        """Return whether another master's SYNC has been absent for :data:`SYNCS_MISSED` periods.
+        """Return whether another master's SYNC has been missing for :data:`SYNCS_MISSED` periods.
 
-        The SYNC time is compared with the time of the newest dispatched frame. With the current time, a delay
-        in the host would be reported as missing SYNC.
+        The time is measured up to the newest dispatched frame. If it were measured up to now, a delay in the
+        host would look like a missing SYNC.
 
         Args:
-            t_up_ns: Monotonic time (ns) at which bring-up was completed.
+            t_up_ns: Monotonic time (ns) at which bring-up ended.
             period_ns: SYNC period, ns.
         """
         if self.link.config.role == "master" or self.link.failure is not None:
@@ -62,7 +62,7 @@ class ServedBus:
 
 
 def serve_bus(hand: HandConfig, link: BusLink) -> ServedBus:
-    """Register a bus's handlers for the frames of other masters and for LSS responses."""
+    """Register the handlers for the frames of other masters and for LSS responses."""
     ticks = Ticks(hand.sync.counter_overflow)
     heard, lss = receive_bus(hand, link, ticks), LssMaster(link.send)
     link.handle(od.LSS_RESPONSE_COB_ID, lss.on_response)

@@ -1,4 +1,4 @@
-"""Define the pose of each patch on its link, and of each link in the hand's coordinate frame."""
+"""Define where the patches are on their links, and where the links are in the hand."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from skinnode.model.pose import Pose
 
 @dataclass(frozen=True, slots=True)
 class Skeleton:
-    """Poses of a hand's patches on their links, and of the links in the hand's coordinate frame."""
+    """Poses of the patches on their links, and of the links in the coordinate frame of the hand."""
 
     mounts: Mapping[str, Mount] = field(default_factory=dict)
-    """Link and pose of each patch, by patch name. A patch without an entry has the same coordinate frame as
-    the hand.
+    """Link and pose of each patch, by patch name. Without an entry, the frame of the patch is that of the
+    hand.
     """
     link_poses: Mapping[str, Pose] = field(default_factory=dict)
-    """Pose of each link in the hand's coordinate frame, by link name. A link without an entry has the same
-    coordinate frame as the hand.
+    """Pose of each link in the hand, by link name. Without an entry, the frame of the link is that of the
+    hand.
     """
 
     @classmethod
@@ -30,9 +30,9 @@ class Skeleton:
         return cls(mounts, {link.name: link.pose.build() for link in hand.links})
 
     def mount(self, patch: str) -> Mount:
-        """Return a patch's link, and the patch's pose on that link."""
+        """Return the link of a patch, and the pose of the patch on it."""
         return self.mounts.get(patch, Mount())
 
     def link_pose(self, link: str) -> Pose:
-        """Return the pose of a link in the hand's coordinate frame."""
+        """Return the pose of a link in the coordinate frame of the hand."""
         return self.link_poses.get(link, Pose())

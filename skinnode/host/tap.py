@@ -1,4 +1,4 @@
-"""Pass a host's sent and received frames, and the events that affect decoding, to a recorder."""
+"""Pass to a recorder the frames that a host sends and receives, and the events that affect decoding."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ from skinnode.transport import Frame
 
 
 class HostTap(StreamTap, Protocol):
-    """Recorder of all frames and of the events that affect how a host decodes the frames. Never waits."""
+    """Recorder of all frames, and of the events that affect their decoding. Its methods must not block."""
 
     def received(self, bus: str, frames: Sequence[Frame]) -> None:
-        """Record a batch of frames about to be dispatched. Called on the mainline."""
+        """Record a batch of frames before it is dispatched. Called on the mainline."""
 
     def sent(self, bus: str, frame: Frame) -> None:
-        """Record a frame that the interface accepted. The sending thread calls this method."""
+        """Record a frame that the interface has accepted. Called on the sending thread."""
 
 
 class ContainedTap:
-    """Wrapper that prevents a tap's exceptions from affecting the host.
+    """Wrapper that keeps the exceptions of a tap from affecting the host.
 
-    Exceptions raised by the tap are reported to ``defects``; only the current entry of the recording is lost.
+    An exception is reported to ``defects`` and costs only the current entry of the recording.
     """
 
     def __init__(self, tap: HostTap, defects: Defects) -> None:
@@ -64,13 +64,12 @@ class ContainedTap:
 
 
 def tap_link(tap: HostTap, link: BusLink) -> Callable[[], None]:
-    """Start passing every frame on a bus to ``tap``.
+    """Pass every frame on a bus to ``tap`` from now on.
 
-    After the mainline has started, only the mainline may call this function.
+    Once the mainline runs, only the mainline may call this function.
 
     Returns:
-        Function that ends the recording; may be called only from the mainline, or while the mainline is not
-        running.
+        Function that ends the recording. Once the mainline runs, only the mainline may call it.
     """
     received = functools.partial(tap.received, link.config.name)
     sent = functools.partial(tap.sent, link.config.name)
@@ -85,10 +84,10 @@ def tap_link(tap: HostTap, link: BusLink) -> Callable[[], None]:
 
 
 def tap_bus(tap: HostTap, link: BusLink, streams: Sequence[PatchStream]) -> Callable[[], None]:
-    """Start passing to ``tap`` the state of all streams, then every frame and change of state.
+    """Pass the current state of the streams to ``tap``, then every frame and every event.
 
     Returns:
-        Function that ends the recording; any thread may call this function.
+        Function that ends the recording. Any thread may call it.
     """
     ends: list[Callable[[], None]] = []
 

@@ -1,4 +1,4 @@
-"""Tare a patch: the node measures a new baseline, and the host uses it to solve the following scans."""
+"""Tare a patch: the node measures a new baseline, with which the host solves the following scans."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from skinnode.host.remote_node import RemoteNode
 from skinnode.process import clock
 
 TARE_DEADLINE_S: Final = 5.0
-"""Default time limit (s) for a tare, excluding the additional :data:`TARE_DEADLINE_SYNCS` SYNC periods.
+"""Default time limit (s) for a tare, to which :data:`TARE_DEADLINE_SYNCS` SYNC periods are added.
 
-A tare normally takes 0.1 to 0.3 s, but the host may wait up to 2 s between two reads of a baseline.
+A tare usually takes 0.1 s to 0.3 s, but the host may wait up to 2 s between reads of a baseline.
 """
 
 TARE_DEADLINE_SYNCS: Final = 3
-"""Number of SYNC periods added to the time limit of a tare. The node
-announces the new baseline only in the summary of the next scan.
+"""Number of SYNC periods added to the time limit of a tare, because the node announces the new baseline in
+the summary of the next scan.
 """
 
 _POLL_S: Final = 0.005
@@ -27,16 +27,16 @@ _POLL_S: Final = 0.005
 def tare(
     node: RemoteNode, baselines: Callable[[], int], health: Callable[[], PatchHealth], deadline_s: float
 ) -> None:
-    """Tare a patch, and return as soon as the solver uses the new baseline.
+    """Tare a patch. Return as soon as the solver uses the new baseline.
 
     Args:
         node: Node of the patch.
-        baselines: Function that returns how many new baselines the host has read so far.
+        baselines: Function that returns the number of new baselines that the host has read so far.
         health: Function that returns the current health of the patch.
-        deadline_s: Maximum time (s) to wait for the new baseline.
+        deadline_s: Time limit (s) for the new baseline.
 
     Raises:
-        NodeTimeout: if no new baseline is in use after ``deadline_s``.
+        NodeTimeout: if the solver uses no new baseline in time.
         SkinError: for the reasons listed under :meth:`RemoteNode.tare`.
     """
     before, emergencies = baselines(), health().emergencies

@@ -1,4 +1,4 @@
-"""Summarise how reliable a displacement field is, for reports and JSON output."""
+"""Summarise how far a field can be trusted, for reports and JSON output."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from skinnode.text.json_values import plain
 
 
 def trust_table(field: FieldFrame | None) -> dict[str, Any]:
-    """Return the trust, precision, data share and faults of a field; without a field, all values are None.
+    """Return the trust, precision, data share and faults of a field. Without a field, all values are None.
 
-    The value of ``deepest_data_share`` is explained at :func:`deepest_data_share`.
+    For the data share, see :func:`deepest_data_share`.
     """
     if field is None:
         return dict.fromkeys(("trusted", "distrust", "precise", "deepest_data_share", "data_faults"))
@@ -32,14 +32,14 @@ def trust_table(field: FieldFrame | None) -> dict[str, Any]:
 
 
 def deepest_data_share(field: FieldFrame) -> float:
-    """Return the share of the maximum depth that comes from data rather than the prior; 1 without a prior."""
+    """Return the data share of the depth at the most deeply pressed electrode; 1 without a prior."""
     if field.data_share is None:
         return 1.0
     return float(field.data_share[..., 2].flat[int(np.argmin(field.displacement_m[..., 2]))])
 
 
 def fault_table(fault: DataFault) -> dict[str, Any]:
-    """Return a data fault as a JSON-compatible dict, in which None replaces an infinite ``deviations``."""
+    """Return a fault as a dict for JSON. An infinite ``deviations`` becomes None."""
     table: dict[str, Any] = plain(
         {
             "part": str(fault.part),

@@ -1,4 +1,4 @@
-"""Wire faults in the health report of a patch, and detection of open and shorted wires in a scan."""
+"""Define wire faults, and detect open and shorted wires in a scan."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class WireFault:
 
 
 def broken_wires(codes: NDArray[Any], scale: CodeScale) -> tuple[WireFault, ...]:
-    """Return the faults of the wires whose crossings are all open or all shorted.
+    """Return the wires whose crossings are all open or all shorted.
 
     Args:
         codes: (U, K) codes of one scan.

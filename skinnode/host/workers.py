@@ -1,8 +1,8 @@
 """Run submitted jobs on a pool of worker threads, in order of submission.
 
-Submitting a job takes half a microsecond: unlike ThreadPoolExecutor, the pool creates no result objects and
-uses no lock other than the lock of its queue. If a job raises an exception, the exception is passed to an
-error handler submitted with the job, and the thread continues with the next job.
+Submitting a job takes half a microsecond. Unlike ThreadPoolExecutor, the pool creates no future and takes no
+lock besides that of its queue. An exception in a job is passed to the error handler submitted with the job,
+and the thread goes on to the next job.
 """
 
 from __future__ import annotations
@@ -17,15 +17,13 @@ from skinnode.process import clock
 
 Job = Callable[[], None]
 OnError = Callable[[Exception], object]
-"""Error handler, called with a job's exception on the thread that ran the job. An error handler must not
-raise exceptions.
-"""
+"""Error handler of a job, called on the same thread as the job. It must not raise."""
 
 
 class Workers:
-    """Pool of ``count`` worker threads that run from construction until :meth:`close`.
+    """Pool of ``count`` worker threads, running from construction until :meth:`close`.
 
-    Threads: any thread may submit jobs. Exceptions in the pool's own code are reported to ``defects``.
+    Any thread may submit jobs. Exceptions outside the jobs are reported to ``defects``.
     """
 
     def __init__(self, count: int, name: str, defects: Defects | None = None) -> None:
@@ -36,11 +34,11 @@ class Workers:
             thread.start()
 
     def submit(self, job: Job, on_error: OnError) -> None:
-        """Run ``job`` on the next free thread; if the job raises an exception, pass it to ``on_error``."""
+        """Run ``job`` on the next free thread. Pass its exception, if any, to ``on_error``."""
         self._jobs.put((job, on_error))
 
     def close(self) -> None:
-        """Wait until all submitted jobs have run, then end and join the threads."""
+        """Run the remaining jobs, then end and join the threads."""
         for _ in self._threads:
             self._jobs.put(None)
         for thread in self._threads:
@@ -58,7 +56,7 @@ class Workers:
         keep_on(self._turn, self._defects, "taking a job")
 
     def _turn(self) -> bool:
-        """Wait for the next job and run it. Return False after :meth:`close`, to end the thread."""
+        """Wait for the next job and run it. Return False if the thread must end."""
         task = self._jobs.get()
         if task is None:
             return False
@@ -71,10 +69,10 @@ class Workers:
 
 
 class Inline:
-    """Replacement for :class:`Workers` that runs each job immediately on the submitting thread."""
+    """Replacement for :class:`Workers` that runs each job at once on the submitting thread."""
 
     def submit(self, job: Job, on_error: OnError) -> None:
-        """Run ``job``; if the job raises an exception, pass it to ``on_error``."""
+        """Run ``job``. Pass its exception, if any, to ``on_error``."""
         try:
             job()
         except Exception as error:

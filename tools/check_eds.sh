@@ -1,5 +1,5 @@
 #!/bin/sh
-# Compare eds/ with what the profile generates, and read each file with an independent parser (dcf-tools).
+# Compare eds/ with the files generated from the profile, and check each file with an independent parser (dcf-tools).
 set -eu
 cd "$(dirname "$0")/.."
 made=$(mktemp -d)

@@ -1,9 +1,9 @@
-"""Print all messages of the programs, one per line, so that an editor can review them together::
+"""Print all messages of the programs, one per line, for review::
 
     python tools/messages.py [FOLDER...]
 
-Every string that contains a space counts as a message, except docstrings. In the output of an f-string, the
-expressions in braces stand for the inserted values.
+A message is any string with a space that is not a docstring. In an f-string, braces enclose the expressions
+whose values are inserted.
 """
 
 from __future__ import annotations

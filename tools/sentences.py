@@ -1,7 +1,7 @@
-"""Select random sentences for an editor to grade: ``python -m tools.sentences --seed 1``.
+"""Select random sentences for review: ``python -m tools.sentences --seed 1``.
 
 The sentences come from docstrings, comments, messages and documentation pages. A message is any other string
-of at least five words. Tests, the changelog, code blocks and tables are excluded.
+of at least five words. Tests, the changelog, code blocks and tables are left out.
 """
 
 from __future__ import annotations
@@ -92,7 +92,7 @@ def _split(text: str) -> Iterator[str]:
 
 
 def main() -> None:
-    """Print the selected sentences, one per line, with their locations."""
+    """Print the selected sentences and their locations, one per line."""
     parser = argparse.ArgumentParser(description="Select random sentences from the project.")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--count", type=int, default=50)

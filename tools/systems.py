@@ -1,12 +1,12 @@
 """Compare ``solve_system`` with SciPy on the Moré-Garbow-Hillstrom problems: ``python -m tools.systems``.
 
-All solvers use the same functions, a tolerance of 1e-12, and at most 2000 evaluations. They start from the
-standard starting points multiplied by 1, 10 and 100. A square system that has a root is solved if the final
-point is a root. Any other system is solved if the final point is a minimum of the residual norm. The status
-that a solver reports is not used to decide this; roots and minima are verified in 80-bit arithmetic.
+All solvers are given the same functions, a tolerance of 1e-12 and at most 2000 evaluations. They start from
+the standard starting points multiplied by 1, 10 and 100. A square system with a root counts as solved if the
+final point is a root, any other system if it is a minimum of the residual norm. Both are verified in 80-bit
+arithmetic, whatever status the solver reports.
 
-A solver makes a false claim if it reports success at a point that is neither a root nor a minimum. It also
-makes a false claim if it reports a root of a square system at a point that is only a minimum.
+A solver makes a false claim if it reports success at a point that is neither a root nor a minimum, or if it
+reports a root of a square system at a point that is only a minimum.
 """
 
 from __future__ import annotations
@@ -32,8 +32,8 @@ MOST = 2000
 
 Function = Callable[[Any], Any]
 Solve = Callable[[Function, Function, Any], tuple[Any, bool, bool]]
-"""Function that solves a system. It returns the final point, whether the solver claims a root or a minimum,
-and whether it claims a root."""
+"""Function that solves a system. It returns the final point, whether the solver claims success (a root or a
+minimum), and whether it claims a root."""
 
 
 def ours(operator: str) -> Solve:

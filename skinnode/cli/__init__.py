@@ -1,6 +1,6 @@
 """Subcommands of ``skinnode``, one per file.
 
-Every subcommand parses its options, prints its result and sets the exit status. A file imports its
-dependencies only when its command runs, so that ``--help`` prints without delay. Files whose names start with
-an underscore contain code shared by several commands.
+A subcommand parses its options, prints its result and sets the exit status. It imports what it needs only
+when it runs, which keeps ``--help`` fast. Files whose names begin with an underscore contain code shared by
+several commands.
 """

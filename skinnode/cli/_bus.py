@@ -10,7 +10,7 @@ if TYPE_CHECKING:
 
 
 class Place(NamedTuple):
-    """A bus and the hand to which the bus belongs; the hand is None if no hand file is given."""
+    """A bus and the hand that contains it; the hand is None without a hand file."""
 
     bus: BusConfig
     hand: HandConfig | None
@@ -21,7 +21,7 @@ class Place(NamedTuple):
         return () if self.hand is None else self.hand.patches_on(self.bus.name)
 
     def patch_name(self, node_id: int) -> str:
-        """Return the name of the patch that has the node-ID ``node_id``, or an empty string."""
+        """Return the name of the patch with this node-ID, or an empty string."""
         return next((patch.name for patch in self.patches if patch.node_id == node_id), "")
 
 
@@ -33,7 +33,7 @@ def find_buses(
     hand: Path | None,
     bus: str | None,
 ) -> list[Place]:
-    """Return the bus that the options specify, or every bus of the hand if ``--bus`` is not given.
+    """Return the bus that the options specify, or every bus of the hand without ``--bus``.
 
     Args:
         interface: Value of ``--interface``.

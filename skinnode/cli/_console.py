@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from rich.table import Table
 
 UNBOUNDED: Final = 10_000
-"""Console width for output to a pipe or file, in columns: so large that no line is wrapped."""
+"""Console width for output to a pipe or file, columns; too large for any line to be wrapped."""
 
 
 def print_json(value: Any) -> None:
@@ -33,9 +33,9 @@ def print_json(value: Any) -> None:
 def console(*, stderr: bool = False, soft_wrap: bool = False) -> Console:
     """Return the console that all commands use.
 
-    The console prints square brackets and colons literally, because names may contain them; styles are passed
-    as arguments to ``print``. The console has the width of the terminal. Unless ``COLUMNS`` sets a width,
-    output to a pipe or file is not wrapped, so that programs can read whole lines.
+    Square brackets and colons are printed literally, because names may contain them; styles are arguments of
+    ``print``. The console is as wide as the terminal. Output to a pipe or file is not wrapped unless
+    ``COLUMNS`` sets a width, so that programs can read whole lines.
 
     Args:
         stderr: Print to stderr instead of stdout.
@@ -59,7 +59,7 @@ def _width(stream: TextIO) -> int | None:
 
 @functools.cache
 def _console_type() -> type[Console]:
-    """Define the console class. Rich is imported on the first call, which keeps ``--help`` fast."""
+    """Define the console class on the first call, so that ``--help`` need not import rich."""
     from rich.console import Console, ConsoleOptions, RenderableType
     from rich.segment import Segment
     from rich.text import Text
@@ -99,7 +99,7 @@ def indented(text: str, columns: int = 10) -> Padding:
 
 @contextmanager
 def progress(quiet: bool = False) -> Iterator[Callable[[str], None]]:
-    """Yield a function that shows the current step on one line of stderr; the line is erased at the end.
+    """Yield a function that shows the current step on one line of stderr, which is erased at the end.
 
     Nothing is shown if ``quiet`` is set or stderr is not a terminal.
     """

@@ -11,7 +11,7 @@ if TYPE_CHECKING:
 
 
 def contact_tables(field: FieldFrame | None) -> list[dict[str, Any]] | None:
-    """Return a field's contacts, strongest first, including the standard deviation of each quantity.
+    """Return a field's contacts, strongest first, with the standard deviation of each quantity.
 
     Returns:
         The contacts (lengths in m, areas in m², forces in N); None if no field has been solved yet.

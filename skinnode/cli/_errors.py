@@ -18,7 +18,7 @@ _UsageError: type[Exception] = typer.BadParameter.__mro__[1]  # from click, or f
 def run(app: typer.Typer, argv: Sequence[str] | None = None) -> int:
     """Run ``app`` and return its exit status.
 
-    A SkinError, a file error or an invalid argument results in one line on stderr and status 2.
+    A SkinError, a file error or an invalid argument is printed as one line on stderr; the status is 2.
 
     Args:
         app: The application.
@@ -43,7 +43,7 @@ def run(app: typer.Typer, argv: Sequence[str] | None = None) -> int:
 
 
 def _printable(stream: Any) -> Any:
-    """Return ``stream``, wrapped to escape control characters and characters missing from its encoding."""
+    """Wrap ``stream`` to escape control characters and characters that its encoding lacks."""
     if hasattr(stream, "reconfigure"):
         stream.reconfigure(errors="backslashreplace")
     return stream if stream is None or isinstance(stream, PrintableStream) else PrintableStream(stream)
@@ -61,7 +61,7 @@ def _refused(line: str) -> int:
 
 
 def _wants_help(error: Any) -> bool:
-    """Return True if a command group was called without a command, after printing the group's help."""
+    """Return whether a command group was called without a command; if so, print the group's help."""
     if type(error).__name__ != "NoArgsIsHelpError":
         return False
     text = error.ctx.get_help()  # if rich is in use, get_help() prints the help and returns no text
@@ -73,8 +73,8 @@ def _wants_help(error: Any) -> bool:
 def usage_line(error: Any) -> str:
     """Return a usage error as one line, such as ``skinnode scan: --bitrate: got 'x', allowed: an integer``.
 
-    This line replaces Typer's own message for a missing or invalid value, which omits the argument's meaning,
-    the value given or the allowed range.
+    For a missing or invalid value, Typer's own message lacks the meaning of the argument, the value given or
+    the allowed range.
     """
     message = " ".join(error.format_message().split()).rstrip(".")
     param, kind = getattr(error, "param", None), type(error).__name__
@@ -82,7 +82,7 @@ def usage_line(error: Any) -> str:
         message = f"{_name(param)}: got nothing, allowed: {_meaning(param)}"
     elif param is not None and kind == "BadParameter":
         got, _, allowed = message.rpartition(": ")[2].partition(" is not ")
-        if error.__cause__ is not None and hasattr(error.__cause__, "errors"):  # pydantic converts for typer
+        if error.__cause__ is not None and hasattr(error.__cause__, "errors"):  # typer converts with pydantic
             got, allowed = repr(error.__cause__.errors()[0]["input"]), ""
         message = f"{_name(param)}: got {got}, allowed: {allowed or _values(param)}"
     else:

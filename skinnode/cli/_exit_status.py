@@ -11,9 +11,9 @@ status  meaning
         reader of its output closed the pipe (SIGPIPE)
 ======  ==============================================================================================
 
-A command that is stopped by a signal prints nothing, because the signal was sent on purpose. Open resources
-are closed before the process exits. SIGHUP remains ignored if it was ignored at the start, as under nohup.
-This module imports no slow modules, so that its handlers are installed before any other module is loaded.
+A command stopped by a signal prints nothing, because the signal was sent on purpose. It closes open resources
+before it exits. SIGHUP stays ignored if it was ignored at the start, as under nohup. This module imports only
+fast modules, so that its handlers are installed before the others are loaded.
 """
 
 from __future__ import annotations
@@ -44,11 +44,11 @@ class Stopped(SystemExit):
 def main_of(module: str, argv: Sequence[str] | None = None) -> NoReturn:
     """Run a typer application and exit with its status.
 
-    Before and after the application runs, a termination signal ends the process immediately.
+    Before the application starts and after it ends, a termination signal ends the process at once.
 
-    BLAS libraries are limited to one thread unless the environment sets their number of threads. BLAS threads
-    busy-wait. Under a real-time policy (``chrt -f``), threads that busy-wait on every processor prevent all
-    other threads of a host from running.
+    BLAS libraries are limited to one thread unless the environment sets another number. BLAS threads
+    busy-wait: under a real-time policy (``chrt -f``), they would occupy every processor and keep all other
+    threads of a host from running.
 
     Args:
         module: Name of the module that defines the application as ``app``.
@@ -72,7 +72,7 @@ def main_of(module: str, argv: Sequence[str] | None = None) -> NoReturn:
 
 
 def _handle(handler: Callable[[int, FrameType | None], object] | signal.Handlers) -> None:
-    """Install a signal handler; do nothing outside the main thread, where Python does not allow it."""
+    """Install a signal handler, except outside the main thread, where Python does not allow it."""
     import threading
 
     if threading.current_thread() is threading.main_thread():
@@ -112,7 +112,7 @@ def _imports(frame: FrameType | None) -> bool:
 
 
 def _flush(status: int) -> int:
-    """Flush the output, and return ``status``, or the SIGPIPE status if the reader has closed the pipe."""
+    """Flush the output; return ``status``, or the SIGPIPE status if the reader has closed the pipe."""
     try:
         for stream in (sys.stdout, sys.stderr):
             if stream is not None:

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from skinnode.model.frames import FieldFrame
 
 _OVERRUN_S, _OVERRUN_SYNCS = 1.0, 3
-"""Maximum time to wait at the end of a run for nodes to clear overrun emergencies: 1 s or three SYNC periods,
+"""Maximum wait at the end of a run for nodes to clear overrun emergencies: 1 s or three SYNC periods,
 whichever is longer."""
 
 _POLL_S = 0.01
@@ -37,7 +37,7 @@ _EXPLAINED_BY_SLOWNESS: Final = (
 
 
 def operational_text(running: Host) -> str:
-    """Return, as text, the number of operational patches and the condition of every other patch."""
+    """Describe how many patches are operational, and the condition of every other patch."""
     from skinnode.canopen.nmt import NmtState
 
     patches, name = running.hand.patches, running.hand.name
@@ -52,7 +52,7 @@ def operational_text(running: Host) -> str:
 
 
 def final_state_text(plan: HandConfig) -> str:
-    """Return, as text, the NMT state of the nodes on each bus after the host has stopped."""
+    """Describe the NMT state of the nodes on each bus after the host has stopped."""
     ends = {"master": "pre-operational", "guest": "left to their master"}
     used = [bus for bus in plan.buses if plan.patches_on(bus.name)]
     if len({bus.role for bus in used}) == 1:
@@ -63,9 +63,9 @@ def final_state_text(plan: HandConfig) -> str:
 def faults_and_notes(running: Host) -> tuple[list[str], list[str]]:
     """Return the faults and the notes of the run, one line each.
 
-    A node that skips scans because the computer running it is too slow sends EMCY 0x8110. If a node has sent
-    EMCY 0x8110, its missing and late frames are reported as notes, not as faults. An EMCY 0x8110 that is
-    still active at the end is also reported as a note. Wrong frames remain faults.
+    A node whose computer is too slow skips scans and sends EMCY 0x8110. Its missing and late frames are then
+    reported as notes, not as faults, and so is an EMCY 0x8110 that is still active at the end. Wrong frames
+    remain faults.
     """
     _let_overruns_end(running)
     stats = running.stats()
@@ -128,7 +128,7 @@ def _patch_faults_and_notes(
 
 
 def _noise(running: Host, name: str) -> str:
-    """Return the measured noise and the noise stated in the hand file, as text; empty if they agree."""
+    """Describe the measured noise and the noise stated in the hand file; empty if they agree."""
     field = running.latest(name)
     if field is None or field.noise_factor == 1.0:
         return ""
@@ -137,7 +137,7 @@ def _noise(running: Host, name: str) -> str:
 
 
 def reason(health: PatchHealth, before: str = "") -> str:
-    """Return ``before`` and the reason why a patch is faulty or refused; empty for any other patch."""
+    """Return ``before`` and the reason why a patch is faulty or refused; empty for all other patches."""
     if health.condition == "refused" and health.refusal:
         return f"{before}{health.refusal}"
     if health.condition == "faulty" and health.defect is not None:
@@ -153,7 +153,7 @@ def reason(health: PatchHealth, before: str = "") -> str:
 
 
 def _let_overruns_end(running: Host) -> None:
-    """Wait briefly for nodes on slow computers to clear their overrun emergencies."""
+    """Give nodes on slow computers time to clear their overrun emergencies."""
     end_s = time.monotonic() + max(_OVERRUN_S, _OVERRUN_SYNCS * running.hand.sync.period_s)
     while time.monotonic() < end_s:
         healths = [running.health(patch.name) for patch in running.hand.patches]
@@ -163,7 +163,7 @@ def _let_overruns_end(running: Host) -> None:
 
 
 class Second:
-    """Values that the host reports for one second. The attribute names are the keys of the JSON object."""
+    """Values reported for one second of a run. The attribute names are the keys of the JSON object."""
 
     def __init__(
         self,
@@ -220,7 +220,7 @@ def _patch(running: Host, name: str, before: HostStats, now: HostStats) -> dict[
 
 
 def _deepest(field: FieldFrame | None) -> dict[str, float | None]:
-    """Return the deepest electrode's depth (positive towards −z) and the depth's standard deviation, m."""
+    """Return the depth of the deepest electrode (positive towards −z) and its standard deviation, m."""
     if field is None:
         return {"deepest_m": None, "deepest_std_m": None}
     z = field.displacement_m[..., 2]
@@ -229,18 +229,18 @@ def _deepest(field: FieldFrame | None) -> dict[str, float | None]:
 
 
 def _percentile(ordered: Sequence[float], share: float) -> float | None:
-    """Return a percentile, in ms, of sorted times in s; None if there are no times."""
+    """Return a percentile, ms, of sorted times, s; None if there are none."""
     return round(ordered[min(len(ordered) - 1, int(share * len(ordered)))] * 1e3, 3) if ordered else None
 
 
 class Report(Protocol):
-    """Protocol implemented by the text and JSON reports of the host."""
+    """Interface of the host's text and JSON reports."""
 
     def note(self, text: str) -> None:
         """Report an event or a fault."""
 
     def second(self, second: Second) -> None:
-        """Report the values for one second."""
+        """Report the past second of the run."""
 
 
 class TextReport:
@@ -251,7 +251,7 @@ class TextReport:
         print(text, flush=True)
 
     def second(self, second: Second) -> None:
-        """Print the values for one second."""
+        """Print the values of the past second."""
         buses = "  ".join(
             f"{name} {facts['frames']} frames, load {facts['load']:.0%}, {facts['dropped']} dropped"
             for name, facts in second.buses.items()
@@ -282,7 +282,7 @@ def _patch_text(name: str, facts: Mapping[str, object]) -> str:
 
 
 def _doubts(facts: Mapping[str, object]) -> str:
-    """Return, as text, whether a trusted field is imprecise, and how many faults its readings have."""
+    """Describe the doubts about a trusted field: that it is imprecise, or has faulty readings."""
     doubts, faults = "  imprecise" if facts["precise"] is False else "", facts["data_faults"]
     if isinstance(faults, list) and faults:
         doubts += f"  {counted(len(faults), 'fault')} in the readings; the affected readings are excluded"
@@ -290,12 +290,12 @@ def _doubts(facts: Mapping[str, object]) -> str:
 
 
 class JsonReport:
-    """Prints one JSON object per line: {"note": …} or the values for one second."""
+    """Prints one JSON object per line: {"note": …} or the values of the past second."""
 
     def note(self, text: str) -> None:
         """Print ``text`` as a note."""
         print(json.dumps({"note": text}), flush=True)
 
     def second(self, second: Second) -> None:
-        """Print the values for one second."""
+        """Print the values of the past second."""
         print(json.dumps(vars(second)), flush=True)

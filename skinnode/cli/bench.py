@@ -1,6 +1,6 @@
 """``skinnode bench``: runs the benchmarks.
 
-Each ratio compares two times from the same run, because absolute times depend on the machine.
+Ratios compare times from the same run, because absolute times depend on the machine.
 """
 
 from __future__ import annotations
@@ -172,7 +172,7 @@ def trust(
     _print_machine(figures)
     _write(json, figures)
     if kept is not None:
-        kept.unlink(missing_ok=True)  # an interrupted run needs this file in order to continue
+        kept.unlink(missing_ok=True)  # this file is needed only to continue an interrupted run
     if not all(row["reached"] for row in figures["must"]):
         raise typer.Exit(1)
 

@@ -1,4 +1,4 @@
-"""``skinnode demo``: presses simulated patches, reads them over a virtual CAN bus and scores the result."""
+"""``skinnode demo``: presses simulated patches, reads them over a virtual CAN bus and scores the fields."""
 
 from __future__ import annotations
 

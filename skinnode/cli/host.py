@@ -46,7 +46,7 @@ def host(
     report = JsonReport() if as_json else TextReport()
     if is_cold():
         report.note("compiling the kernels once; this takes a few seconds")
-    for patch in plan.patches:  # no resource is open yet, so Ctrl-C may end the program immediately
+    for patch in plan.patches:  # no resource is open yet, so Ctrl-C may end the program at once
         check_solvable(patch, plan.solver)
     with stop_on_signal() as stop:
         status = _run(plan, seconds, report, stop)
@@ -82,7 +82,7 @@ def _run(plan: HandConfig, seconds: float | None, report: Report, stop: threadin
 
 
 def _watch(running: Host, stop: threading.Event, seconds: float | None, report: Report) -> None:
-    """Collect the fields and report every second until the host is stopped or the duration has elapsed."""
+    """Collect the fields and report every second, until the host is stopped or the duration has elapsed."""
     from skinnode.cli._host_report import Second
 
     start_s = time.monotonic()

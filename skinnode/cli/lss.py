@@ -148,7 +148,7 @@ def set_node(
 
 
 def _bus_of(places: list[Place], serial: int | None, node_id: int | None) -> Place:
-    """Return the bus of the patch that has the serial number or, failing that, the node-ID."""
+    """Return the bus of the patch with the serial number or, failing that, with the node-ID."""
     from skinnode.errors import NOTHING, ConfigError
 
     for number, key in ((serial, "serial"), (node_id, "node_id")):

@@ -1,6 +1,6 @@
 """Entry point of ``skinnode``.
 
-This module imports no slow modules, so that its signal handlers are installed first. The subcommands are in
+This module imports only fast modules, so that signal handlers are installed first. The subcommands are in
 :mod:`skinnode.cli._app`, the exit statuses in :mod:`skinnode.cli._exit_status`.
 """
 

@@ -97,7 +97,7 @@ def monitor(
 def _require_used(
     interface: str | None, channel: str | None, speed: float | None, *, played: bool, simulated: bool
 ) -> None:
-    """Raise ConfigError for an option that a recording or a simulated hand does not use."""
+    """Raise ConfigError for an option without effect on a recording or a simulated hand."""
     from skinnode.errors import ConfigError
 
     if speed is not None and not played:
@@ -122,7 +122,7 @@ def _require_screen() -> None:
 
 
 def _plan(hand: Path | None, interface: str | None, channel: str | None, simulate: bool) -> HandConfig:
-    """Return the hand to run, after changing its settings so that the host waits for missing patches."""
+    """Return the hand to run, with settings that make the host wait for missing patches."""
     from skinnode.config import load_hand
     from skinnode.demo.hand import demo_hand
 

@@ -172,7 +172,7 @@ def _node_text(node_id: int, given: int | None) -> str:
 
 @dataclass(frozen=True, slots=True)
 class _Progress:
-    """Counters of a running node; all counters are 0 when the node starts."""
+    """Counters of a running node, all 0 when the node starts."""
 
     elapsed_s: float
     node_id: int | None

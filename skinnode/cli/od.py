@@ -163,8 +163,8 @@ def _note(sheet: DataSheet) -> None:
 def _sheet_if_any(remote: RemoteOd, eds: Path | None) -> DataSheet:
     """Return the EDS of the node.
 
-    The EDS has no entries if a third-party device has no EDS file, or if the node refuses to identify itself.
-    Without EDS entries, the objects have only their CiA 301 names.
+    The EDS has no entries for a third-party device without an EDS file, or if the node refuses to identify
+    itself. Objects then have only their CiA 301 names.
     """
     from skinnode.conformance.eds_reader import Eds
     from skinnode.diagnose.data_sheet import DataSheet, data_sheet_of
@@ -184,7 +184,7 @@ def _sheet_if_any(remote: RemoteOd, eds: Path | None) -> DataSheet:
 def _read(remote: RemoteOd, entries: list[EdsEntry]) -> list[Reading]:
     """Read the objects.
 
-    A refused read raises SdoAbort if there is only one object; with several objects, the refusal is listed.
+    A refused read raises SdoAbort if it is the only one; among several, it is listed with the results.
     """
     from skinnode.diagnose.object_dictionary import read_entry
 

@@ -127,7 +127,7 @@ def _follow(
 ) -> None:
     """Print a line every second until the command is stopped or the duration has elapsed.
 
-    Each time, ``check`` is called first; its errors are propagated.
+    ``check`` is called before each line; its exceptions are propagated.
     """
     start_s = time.monotonic()
     end_s = float("inf") if seconds is None else start_s + seconds

@@ -1,15 +1,15 @@
 """Compare the results of two commits bit by bit: ``python -m tools.compare OLD [NEW]``.
 
-By default, NEW is the working tree. The old commit generates the inputs: recordings of simulated hands, and
-streams of resistances for five layouts and two noise levels, with and without faults. Each commit then
-processes the inputs. The results include the forward model, the fields from every tracker method and every
-path operator, the replayed recordings, and generated files such as EDS files.
+NEW defaults to the working tree. The old commit generates the inputs: recordings of simulated hands, and
+streams of resistances for five layouts and two noise levels, with and without faults. Both commits process
+these inputs. They compute the forward model and the fields of every tracker method and path operator, replay
+the recordings, and generate files such as EDS files.
 
-The results are divided into parts. For each part, the report contains one hash per commit and the largest
-relative difference of each array that differs between the commits.
+The results are divided into parts. For each part, the report gives the hash of each commit's results, and the
+largest relative difference in each array that differs.
 
-The exit status is 0 if all arrays are equal, or if the relative differences between float arrays do not
-exceed ``--rtol`` and all other arrays are equal. Otherwise, the exit status is 1.
+The exit status is 0 if float arrays agree to within ``--rtol``, by default exactly, and all other arrays are
+equal; otherwise, it is 1.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ def tree_of(commit: str | None, folder: Path) -> Path:
 
 
 def run_in(tree: Path, script: str, *arguments: str) -> None:
-    """Run a script from the folder of this module, with the packages in ``tree``."""
+    """Run a script of this folder with the packages in ``tree``."""
     code = (
         f"import runpy, sys, skinnode; assert skinnode.__file__.startswith({str(tree)!r}), 'another tree'; "
         f"sys.argv = {[script, *arguments]!r}; runpy.run_path({str(HERE / script)!r}, run_name='__main__')"
@@ -51,9 +51,9 @@ def run_in(tree: Path, script: str, *arguments: str) -> None:
 
 
 def relative_difference(old: Any, new: Any) -> float:
-    """Return the largest difference between two arrays, relative to the largest finite value in ``old``.
+    """Return the largest difference between two arrays, relative to the largest finite value of ``old``.
 
-    Returns inf if the arrays do not contain floats, or if they differ in shape, type, or non-finite values.
+    It is inf if the arrays do not contain floats or differ in shape, type or non-finite values.
     """
     if old.shape != new.shape or old.dtype != new.dtype or old.dtype.kind != "f":
         return np.inf
@@ -66,7 +66,7 @@ def relative_difference(old: Any, new: Any) -> float:
 
 
 def report(old: Any, new: Any, rtol: float) -> Iterable[tuple[str, bool]]:
-    """Yield each line of the report, and whether the difference reported in that line is within ``rtol``."""
+    """Yield each line of the report, and whether the difference in that line is within ``rtol``."""
     names = dict.fromkeys([*old.files, *new.files])
     for part in dict.fromkeys(name.partition(":")[0] for name in names):
         mine = [name for name in names if name.startswith(f"{part}:")]

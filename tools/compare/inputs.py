@@ -1,7 +1,7 @@
-"""Generates the inputs for comparing two commits: streams of resistances, and recordings of simulated hands.
+"""Generates the inputs for the comparison of two commits: streams of resistances, and recordings of hands.
 
-Both commits process the same inputs. The displacements are sums of Gaussian bumps instead of solutions of the
-elastic model, so that they do not depend on the code under comparison. The noise has a fixed seed.
+The displacements are sums of Gaussian bumps rather than solutions of the elastic model, so that they do not
+depend on the code under comparison. The noise has a fixed seed.
 
 Run ``python inputs.py FOLDER`` in the old commit's tree. The script uses only the public API.
 """

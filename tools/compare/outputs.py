@@ -1,4 +1,4 @@
-"""Computes the results of one commit for given inputs, and saves them as named arrays.
+"""Computes the results of a commit for given inputs and saves them as named arrays.
 
 Run ``python outputs.py FOLDER OUT.npz [PART ...]`` in the source tree of the commit. The script uses only the
 public API and the command line, so that it works with both commits.
@@ -58,7 +58,7 @@ def field_arrays(field: sk.FieldFrame) -> Arrays:
 
 
 def stacked(fields: list[sk.FieldFrame]) -> Arrays:
-    """Combine the fields of a stream into one array per quantity; varying shapes are concatenated."""
+    """Stack the fields of a stream, one array per quantity; arrays of varying shape are concatenated."""
     each = [field_arrays(field) for field in fields]
     found: Arrays = {}
     for name in sorted({name for one in each for name in one}):
@@ -219,7 +219,8 @@ def recordings(folder: Path) -> Iterator[tuple[str, Arrays]]:
 
 
 def commands(_folder: Path) -> Iterator[tuple[str, Arrays]]:
-    """Yield the output of the commands that generate EDS, DCF and hand files, and the conformance cases."""
+    """Yield the output of the commands that generate EDS, DCF and hand files or list the conformance
+    cases."""
     code = "import sys; from skinnode.cli.main import main; sys.exit(main())"
     for text in (
         *("eds", "eds --code-bits 24 --fd", "eds --upper-wires 7 --lower-wires 21 --lower-electrodes 4"),

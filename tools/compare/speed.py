@@ -1,9 +1,9 @@
 """Compare the benchmark times of two commits: ``python -m tools.compare.speed OLD [NEW]``.
 
-By default, NEW is the working tree. Each round runs the benchmark once per commit. The commits take turns to
-run first, so that changes in the machine's speed affect both equally. For each benchmark row, the report
-contains the shortest time of each commit and the ratio of the two times. The times for NumPy and LAPACK do
-not depend on the commit, so their ratios show the timing noise of the machine.
+NEW defaults to the working tree. Each round runs the benchmark once per commit. The commits take turns in
+running first, so that changes in the speed of the machine affect both equally. For each benchmark row, the
+report gives the shortest time of each commit and the ratio of the two. The times of NumPy and LAPACK do not
+depend on the commit, so their ratios show the timing noise of the machine.
 
 The exit status is 1 if the ratio of new to old time exceeds ``--limit`` in any row, otherwise 0.
 """
@@ -23,7 +23,7 @@ from tools.compare.__main__ import tree_of
 
 
 def rows_of(report: Any) -> dict[str, float]:
-    """Return all times in a benchmark's JSON report, by the name of the row and the name of the time."""
+    """Return all times in a benchmark's JSON report, keyed by row and kind of time."""
     found: dict[str, float] = {}
 
     def collect(part: Any, label: str) -> None:
@@ -69,7 +69,7 @@ def main() -> int:
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
         trees = [tree_of(options.old, folder / "old"), tree_of(options.new, folder / "new")]
-        for tree in trees:  # this run only fills the cache of compiled kernels
+        for tree in trees:  # fills the cache of compiled kernels
             run(tree, options.benchmark, arguments, folder / "out.json")
         best: list[dict[str, float]] = [{}, {}]
         for turn in range(options.rounds):

@@ -1,6 +1,6 @@
 """Generates the reference pages for hand.toml and scene files from the configuration models.
 
-For each key, the page states the purpose, type, unit, default and allowed values.
+A page lists each key with its purpose, type, unit, default and allowed values.
 """
 
 from __future__ import annotations

@@ -18,7 +18,7 @@ _PLAIN: Final = {
     "NEVER_SEEN": "No frame from the patch has arrived since the host started.",
     "OPERATIONAL": "All is well.",
 }
-"""Descriptions of the conditions that have no docstring."""
+"""Descriptions of the conditions without a docstring."""
 
 
 def conditions() -> str:

@@ -28,15 +28,15 @@ PROFILE: Final = REFERENCE_PROFILES[0]
 NODE_ID: Final = 4
 _BITRATE_BPS, _DATA_BITRATE_BPS = 1_000_000, 5_000_000
 _HIGHEST: Final = highest(0, 0).name
-"""Name of sub-index 0 in most objects. The tables omit this sub-index, because its value follows from the
-other sub-indices."""
+"""Name of sub-index 0 in most objects. The tables omit it, because its value follows from the other
+sub-indices."""
 _PLUS_NODE_ID: Final = " + node\u2011ID"
 _FEW: Final = 3
-"""Maximum number of similar entries with a row each; larger numbers of similar entries share one row."""
+"""Maximum number of similar entries that are given a row each; more than that share one row."""
 
 
 def cob_ids() -> str:
-    """List the CAN identifiers of a patch in ascending order, which means descending bus priority."""
+    """List the CAN identifiers of a patch, highest bus priority first."""
     rows = (
         ("NMT command", od.NMT_COB_ID, od.NMT_COB_ID, "NMT master → node", 2),
         ("SYNC", od.SYNC_COB_ID, od.SYNC_COB_ID, "producer → node", "1 (counter)"),
@@ -224,7 +224,7 @@ def _family(item: Object) -> str:
 
 
 def _dictionary(objects: Iterable[Object]) -> str:
-    """Return a table with one row per entry. Similar consecutive entries or objects share a row."""
+    """Return a table with one row per entry; similar consecutive entries or objects share a row."""
     runs: list[list[Object]] = []
     for item in objects:
         if runs and _family(item) == _family(runs[-1][-1]) and _shape(item) == _shape(runs[-1][0]):

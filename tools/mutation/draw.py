@@ -1,12 +1,12 @@
 """Select random mutants of the source: ``python -m tools.mutation.draw`` writes ``mutants.json``.
 
-The mutation operators are those of cosmic-ray. First, places in the source are chosen with equal probability;
-then, one mutation is chosen for each place. A direct choice among all mutations would select a ``+`` eleven
-times as often as a ``not``, because eleven different mutations apply to a ``+``.
+The mutation operators are those of cosmic-ray. Places in the source are drawn with equal probability, then
+one mutation for each place. A draw from all mutations would select a ``+``, which has eleven, eleven times as
+often as a ``not``, which has one.
 
-A mutant is identified by its file, function and operator, and by the text before and after the change. Line
-numbers are not used, so a list of mutants remains valid when code moves. Places are ranked by a hash of the
-seed and of their source text. An edit therefore hardly changes which of the other places are selected.
+A mutant is identified by its file, function and operator and by the text before and after the change, so a
+list of mutants remains valid when code moves. Places are ranked by a hash of the seed and of their source
+text, so an edit hardly changes which other places are drawn.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ GROUPS: Final = {
     "solve": ("solve",),
     "host": ("host",),
 }
-"""Names of the groups of packages, and the packages in each group; mutants are selected for each group."""
+"""Packages of each group; mutants are drawn for each group separately."""
 SEED: Final = 20260
 PER_PACKAGE: Final = 50
 
@@ -134,7 +134,7 @@ def _for_speed(decorator: ast.expr) -> bool:
 
 
 def _behaviour(source: str) -> str | None:
-    """Return the syntax tree without parts that need no tests; None if ``source`` does not compile."""
+    """Return the syntax tree without the parts that need no tests; None if ``source`` does not compile."""
     try:
         with warnings.catch_warnings(
             action="ignore"
@@ -195,7 +195,7 @@ def _changed_lines(source: str, other: str) -> tuple[str, str]:
 
 
 def _name(file: str, source: str, wanted: _Candidate) -> Mutant:
-    """Convert a candidate to a mutant; ``nth`` is the number of equal mutations before it in the file."""
+    """Convert a candidate to a mutant; ``nth`` counts the equal mutations before it in the file."""
     functions = _functions(source)
     function = functions.get(wanted.line, "<module>")
     before, after = _changed_lines(source, mutated(source, wanted.operator, wanted.occurrence))
@@ -228,7 +228,7 @@ def find(mutant: Mutant, source: str) -> str:
 
 
 def draw(group: str, count: int, seed: int, root: Path = ROOT) -> list[Mutant]:
-    """Select ``count`` mutants at different places in a group's packages."""
+    """Draw ``count`` mutants at different places in a group's packages."""
     sources: dict[str, str] = {}
     places: dict[str, list[tuple[str, _Candidate]]] = defaultdict(list)
     folders = [root / "skinnode" / package for package in GROUPS[group]]

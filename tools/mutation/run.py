@@ -1,14 +1,14 @@
 """Run the tests on each selected mutant: ``python -m tools.mutation.run --package protocol``.
 
-Each mutant is applied to a private copy of the repository, and the test stages listed in ``stages.toml`` run
-on this copy. A mutant is killed if a test fails or if a stage exceeds its time limit. The failure of a
-real-time test is ignored unless the test also fails when it runs alone.
+Each mutant is applied to a private copy of the repository, on which the test stages of ``stages.toml`` are
+run. A mutant is killed if a test fails or if a stage exceeds its time limit. The failure of a real-time test
+counts only if the test also fails when run alone.
 
-Each verdict is written to ``results.json`` immediately. Later runs skip mutants that already have a verdict;
-``--again`` runs the surviving mutants again.
+Each verdict is written to ``results.json`` immediately. Later runs skip mutants that have a verdict;
+``--again`` tests the surviving mutants again.
 
-Importing the libraries takes longer than most tests. This process therefore imports them once and forks a
-child for each pytest run.
+Importing the libraries takes longer than most tests, so this process imports them once and forks a child for
+each pytest run.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ _FILE_BYTES: Final = 1 << 30
 _TEST_S: Final = 120
 """Time limit for a single test, s."""
 _GRACE_S: Final = 60.0
-"""Constant part of a stage's time limit, s. The other part is six times the duration on unmutated code."""
+"""Constant part of a stage's time limit, s; six times the duration on unmutated code is added to it."""
 _PR_SET_CHILD_SUBREAPER: Final = 36
 _PASSED, _FAILED = 0, 1
 
@@ -68,7 +68,7 @@ class Outcome:
 
 
 class Tree:
-    """Private copy of the repository, and a cache with the kernels compiled from it."""
+    """Private copy of the repository, with a cache of the kernels compiled from it."""
 
     def __init__(self, folder: Path) -> None:
         self.source, self.cache, self.warm = folder / "tree", folder / "cache", folder / "warm"
@@ -102,10 +102,10 @@ class Tree:
             shutil.copy2(here, there)
 
     def put(self, mutant: Mutant) -> None:
-        """Apply a mutant to the copy and remove the compiled kernels that the mutant affects.
+        """Apply a mutant to the copy, and remove the compiled kernels that it affects.
 
-        numba detects the change of the mutated file and recompiles its kernels. It does not detect that
-        kernels in other files depend on the mutated file, so this method removes them.
+        numba recompiles the kernels of a file that has changed, but not the kernels of other files that
+        depend on it, so this method removes them.
         """
         path = self.source / mutant.file
         found = path.stat()
@@ -187,7 +187,7 @@ class _Failures:
 
 
 def run_tests(tree: Tree, arguments: Sequence[str], limit_s: float) -> Outcome:
-    """Run pytest in a new process group, then kill all processes that pytest has started."""
+    """Run pytest in a new process group, then kill every process that it started."""
     answer, begin_s = tree.log.with_name("answer"), time.monotonic()
     answer.unlink(missing_ok=True)
     child = os.fork()
@@ -262,7 +262,7 @@ def _end_children(group: int) -> None:
 
 
 def _stages(mutant: Mutant, table: dict[str, Any]) -> list[list[str]]:
-    """Return the test files for a mutant as one list per stage; each file occurs only once."""
+    """Return the test files for a mutant, one list per stage; each file occurs only once."""
     group = table[mutant.group]
     first = group.get("first", {}).get(Path(mutant.file).stem, [])
     stages, seen = [], set[str]()
@@ -282,7 +282,7 @@ def _expand(pattern: str) -> list[str]:
 
 
 class Session:
-    """Run tests on a tree. The results for the unmutated source code serve as a reference."""
+    """Runs tests on a tree, with the results on unmutated source code as a reference."""
 
     def __init__(self, tree: Tree, table: dict[str, Any], *, quick: bool) -> None:
         self._tree, self._table, self._quick = tree, table, quick
@@ -291,7 +291,7 @@ class Session:
         self._kept = tree.log.with_name("unmutated.json")
 
     def measure(self, mutants: Sequence[Mutant], *, trust: bool) -> None:
-        """Run the test files on unmutated code to measure their durations and to find failing tests."""
+        """Run the test files on unmutated code to measure their durations and find failing tests."""
         if self._kept.exists() and trust:
             self._known = json.loads(self._kept.read_text("utf-8"))
         files = {path: None for each in mutants for stage in self._stages(each) for path in stage}
@@ -307,7 +307,7 @@ class Session:
                 )
             failed = [
                 test for test in run.failed if run_tests(self._tree, [test], 900.0).status != _PASSED
-            ]  # a test that passes alone probably failed because of CPU load
+            ]  # a test that passes alone probably failed under CPU load
             for test in failed:
                 print(f"test excluded because it fails on unmutated source code: {test}", flush=True)
             self._known[path] = {"took_s": run.took_s, "failed": failed}
@@ -367,7 +367,7 @@ def show(mutant: Mutant) -> str:
 
 
 def summary(mutants: Sequence[Mutant], results: dict[str, Any]) -> str:
-    """Return one line per group with the number of mutants by verdict, then the surviving mutants."""
+    """Return one line per group with its numbers of mutants by verdict, then the surviving mutants."""
     equivalent, lines = _equivalent(), []
     verdict = {each.name: results.get(each.name, {}).get("verdict", "not run") for each in mutants}
     verdict |= dict.fromkeys(equivalent, "equivalent")

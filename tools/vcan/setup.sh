@@ -1,6 +1,6 @@
 #!/bin/sh
-# setup.sh DIR: what vcan-run needs, unpacked into DIR from Debian's packages; no root, unless the package lists
-# have to be fetched first. Needs a C compiler for the shim.
+# setup.sh DIR: unpack the Debian packages that vcan-run requires into DIR, and compile the shim. Requires a C
+# compiler, and root if the package lists must be fetched first.
 set -eu
 here=$(dirname "$(readlink -f "$0")")
 mkdir -p "$1"

@@ -1,7 +1,7 @@
-"""Constants and pure functions for CiA 301, 305 and 306, shared by the node, the host and the tools.
+"""Constants and pure functions for CiA 301, 305 and 306, shared by nodes, hosts and tools.
 
-The modules ``indices``, ``nmt``, ``abort``, ``emergency``, ``sdo`` and ``lss`` define the constants of these
-standards, such as indices, commands and error codes. The modules ``dictionary`` and ``communication``
-describe an object dictionary, and ``eds`` writes the object dictionary as an EDS or DCF file. The conformance
-suite does not use this code, because it tests the node with an independent implementation of the standard.
+``indices``, ``nmt``, ``abort``, ``emergency``, ``sdo`` and ``lss`` define constants such as indices, commands
+and error codes. ``dictionary`` and ``communication`` declare objects, and ``eds`` writes them as an EDS or
+DCF file. The conformance suite does not use this package, so that it remains an independent implementation of
+the standards.
 """

@@ -1,4 +1,4 @@
-"""SDO abort codes (CiA 301 v4.2, table 22), and the exception that carries an abort code."""
+"""SDO abort codes (CiA 301 v4.2, table 22), and the exception that carries one."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from enum import IntEnum
 
 
 class AbortCode(IntEnum):
-    """Reason for aborting a transfer, with the code defined by CiA 301."""
+    """SDO abort codes of CiA 301."""
 
     TOGGLE_BIT = 0x05030000
     TIMED_OUT = 0x05040000
@@ -42,13 +42,13 @@ class AbortCode(IntEnum):
 
 
 class Refused(Exception):
-    """Access to an object was refused; the SDO server sends the abort code to the client.
+    """Access to an object was refused. The SDO server sends the abort code to the client.
 
     Args:
-        code: abort code that states the reason for the refusal.
+        code: abort code.
     """
 
     def __init__(self, code: AbortCode) -> None:
         self.code = code
-        """Abort code that states the reason for the refusal."""
+        """Abort code."""
         super().__init__(f"0x{code:08X} {code.name}")

@@ -1,4 +1,4 @@
-"""Communication objects 0x1000 to 0x1FFF (CiA 301 v4.2, 7.5.2), and their default values in a patch."""
+"""Communication objects of a patch, 0x1000 to 0x1FFF (CiA 301 v4.2, 7.5.2), with their default values."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ _GROUPS = ("all", "communication", "application")
 
 @dataclass(frozen=True, slots=True)
 class PdoDefault:
-    """Default configuration of a PDO, which applies after a reset."""
+    """Default parameters of a PDO."""
 
     purpose: str
-    """Purpose of the PDO, included in the names of its communication and mapping records."""
+    """Purpose of the PDO, which becomes part of the names of its records."""
     cob_id: int
-    """COB-ID with its flag bits, as in 0x1800:1; the node-ID is added if ``plus_node_id`` is true."""
+    """COB-ID with its flag bits, as in 0x1800:1, but without the node-ID if ``plus_node_id`` is true."""
     kind: int = 254
     """Transmission type."""
     mapped: tuple[Entry, ...] = ()
@@ -33,11 +33,11 @@ class PdoDefault:
 
 
 def spare_pdo(cob_id: int | None) -> PdoDefault:
-    """Return the defaults of a spare PDO, which stays disabled until a client maps objects into it.
+    """Return the defaults of a spare PDO, which is disabled and has no mapped objects.
 
     Args:
         cob_id: COB-ID in the pre-defined connection set, without the node-ID; None if the set does not
-            include this PDO.
+            contain this PDO.
     """
     return PdoDefault("spare", od.PDO_INVALID | (cob_id or 0), plus_node_id=cob_id is not None)
 
@@ -53,7 +53,7 @@ def communication_objects(
     Args:
         rpdos: defaults of the RPDOs, starting with RPDO1.
         tpdos: defaults of the TPDOs, starting with TPDO1.
-        slots: maximum number of objects in a PDO mapping.
+        slots: maximum number of objects mapped into a PDO.
         revision: revision number (0x1018:3).
     """
     return (
@@ -160,6 +160,6 @@ def _mapping(index: int, name: str, pdo: PdoDefault, slots: int) -> Object:
     entries = tuple(
         Entry(index, sub, f"Mapped object {sub}", _U32, "rw", value) for sub, value in enumerate(values, 1)
     )
-    # No upper limit is declared, because CiA 301 has a special abort code for too many mapped objects.
+    # No upper limit is declared: CiA 301 has a separate abort code for too many mapped objects.
     first = Entry(index, 0, "Number of mapped objects", _U8, "rw", len(pdo.mapped))
     return record(index, f"{name} mapping parameter: {pdo.purpose}", entries, first)

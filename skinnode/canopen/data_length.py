@@ -7,17 +7,17 @@ from typing import Final
 from skinnode.text.words import counted
 
 FD_LENGTHS: Final[tuple[int, ...]] = (*range(9), 12, 16, 20, 24, 32, 48, 64)
-"""Data lengths of CAN FD frames, bytes, indexed by data length code (DLC)."""
+"""Payload lengths by data length code (DLC), bytes."""
 
 
 def fd_length(n_bytes: int) -> int:
-    """Return the shortest CAN FD data length, in bytes, that is at least ``n_bytes``.
+    """Return the length of the shortest CAN FD payload that holds ``n_bytes``, bytes.
 
     Args:
         n_bytes: number of bytes to send.
 
     Raises:
-        ValueError: if ``n_bytes`` exceeds 64, the maximum data length of a CAN FD frame.
+        ValueError: if ``n_bytes`` exceeds 64.
     """
     for length in FD_LENGTHS:
         if n_bytes <= length:

@@ -13,7 +13,7 @@ Value = int | float | str
 
 
 class ObjectType(enum.IntEnum):
-    """Object codes defined by CiA 301."""
+    """Object codes of CiA 301."""
 
     DOMAIN = 0x02
     VAR = 0x07
@@ -22,7 +22,7 @@ class ObjectType(enum.IntEnum):
 
 
 class DataType(enum.IntEnum):
-    """CiA 301 data types used in this project, with their indices."""
+    """Data types of CiA 301 that a patch uses, with their indices."""
 
     UNSIGNED8 = 0x05
     UNSIGNED16 = 0x06
@@ -34,7 +34,7 @@ class DataType(enum.IntEnum):
 
     @property
     def bits(self) -> int:
-        """Length of this data type in bits; 0 for a type of variable length."""
+        """Length of the data type, bits; 0 if it varies."""
         return _BITS[self]
 
 
@@ -51,34 +51,34 @@ _BITS = {
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """Declaration of the value at one index and sub-index of an object dictionary."""
+    """Declaration of a value in an object dictionary, at one index and sub-index."""
 
     index: int
     subindex: int
     name: str
-    """Name of the parameter in the EDS file."""
+    """Parameter name in the EDS."""
     data_type: DataType
     access: str
-    """Access type: ro, rw, wo, const or rww, where rww means rw and mappable into an RPDO."""
+    """Access type: ro, rw, wo, const, or rww (rw and mappable into an RPDO)."""
     default: Value | None = None
-    """Default value. None for a value that differs between devices, such as the serial number, and is
-    initially zero."""
+    """Default value; None if it differs between devices, as for the serial number. The initial value is then
+    0."""
     plus_node_id: bool = False
-    """Whether the node-ID is added to the default value at start-up, as for a COB-ID."""
+    """Whether the node-ID is added to the default value, as for a COB-ID."""
     mappable: bool = False
     """Whether the entry can be mapped into a PDO."""
     low: int | None = None
-    """Minimum value; None if there is no lower limit."""
+    """Lower limit of the value, or None."""
     high: int | None = None
-    """Maximum value; None if there is no upper limit."""
+    """Upper limit of the value, or None."""
 
     @property
     def mapping(self) -> int:
-        """Value that maps this entry into a PDO: index, sub-index and length in bits, packed into 32 bits."""
+        """Mapping entry for a PDO: index (16 bits), sub-index (8 bits) and length in bits (8 bits)."""
         return self.index << 16 | self.subindex << 8 | self.data_type.bits
 
     def value_at_start(self, node_id: int) -> Value | None:
-        """Return the default value, including the node-ID if ``plus_node_id`` is true.
+        """Return the default value, plus the node-ID if ``plus_node_id`` is true.
 
         Args:
             node_id: node-ID of the node.
@@ -90,7 +90,7 @@ class Entry:
 
 @dataclass(frozen=True, slots=True)
 class Object:
-    """Object of an object dictionary. An object of type VAR or DOMAIN has a single entry, at sub-index 0."""
+    """Object of an object dictionary. A VAR or DOMAIN has only one entry, at sub-index 0."""
 
     index: int
     name: str
@@ -115,7 +115,7 @@ def var(  # noqa: PLR0913 - one argument for each column of the standard's table
     mappable: bool = False,
     high: int | None = None,
 ) -> Object:
-    """Declare an object of type VAR or DOMAIN. The arguments are fields of :class:`Entry`."""
+    """Declare a VAR or DOMAIN. The arguments are those of :class:`Entry`."""
     entry = Entry(index, 0, name, data_type, access, default, plus_node_id, mappable, None, high)
     kind = ObjectType.DOMAIN if data_type is DataType.DOMAIN else ObjectType.VAR
     return Object(index, name, kind, (entry,))
@@ -137,8 +137,8 @@ def record(index: int, name: str, entries: Sequence[Entry], first: Entry | None 
     Args:
         index: index of the record.
         name: name of the record.
-        entries: entries at sub-index 1 and above, in ascending order of sub-index.
-        first: entry at sub-index 0; None for a constant entry that contains the highest sub-index.
+        entries: entries from sub-index 1, in ascending order.
+        first: entry at sub-index 0; by default, a constant with the highest sub-index.
     """
     first = first or highest(index, entries[-1].subindex)
     return Object(index, name, ObjectType.RECORD, (first, *entries))
@@ -156,10 +156,10 @@ def array(  # noqa: PLR0913 - one argument for each column of the standard's tab
     mappable: bool = False,
     high: int | None = None,
 ) -> Object:
-    """Declare an array with one entry per label.
+    """Declare an array.
 
-    Entry k, at sub-index k, is named after the k-th label. The argument ``first`` has the same meaning as in
-    :func:`record`; all other arguments are fields of :class:`Entry`.
+    ``labels`` contains the names of the entries from sub-index 1. ``first`` is described in :func:`record`.
+    The other arguments are those of :class:`Entry`.
     """
     entries = tuple(
         Entry(index, sub, label, data_type, access, default, mappable=mappable, high=high)

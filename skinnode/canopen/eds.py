@@ -1,9 +1,9 @@
-"""Conversion of an object dictionary to the text of an EDS or DCF file (CiA 306).
+"""Writes an object dictionary as an EDS or DCF file (CiA 306).
 
 An EDS (electronic data sheet) describes a type of device. A DCF (device configuration file) describes the
-configuration of one device. REAL32 defaults are written as hexadecimal IEEE 754 bit patterns, the notation
-that CiA 306 tools expect. The Python library ``canopen`` expects decimal numbers and ignores a hexadecimal
-REAL32 default; only 0 is the same in both notations.
+configuration of one device. REAL32 defaults are written as hexadecimal IEEE 754 bit patterns, as CiA 306
+tools expect. The Python library ``canopen`` expects decimal numbers, and ignores REAL32 defaults other than
+0.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from typing import Final
 from skinnode.canopen import indices as od
 from skinnode.canopen.dictionary import DataType, Entry, Object, ObjectType
 
-_DATE, _TIME = "01-01-2025", "12:00AM"  # fixed, so that regenerating an EDS yields an identical file
+_DATE, _TIME = "01-01-2025", "12:00AM"  # fixed, so that a regenerated EDS is identical
 _BIT_RATES_KBPS: Final = (10, 20, 50, 125, 250, 500, 800, 1000)
 _MANDATORY: Final = (0x1000, 0x1001, 0x1018)
 _DUMMY_TYPES: Final = range(1, 8)
@@ -24,7 +24,7 @@ _DUMMY_TYPES: Final = range(1, 8)
 
 @dataclass(frozen=True, slots=True)
 class DeviceInfo:
-    """Description of a device for the header sections of an EDS."""
+    """Content of the header sections of an EDS."""
 
     file_name: str
     description: str
@@ -40,22 +40,24 @@ class DeviceInfo:
 
 @dataclass(frozen=True, slots=True)
 class Commissioning:
-    """Information about one node that a DCF contains, but an EDS does not."""
+    """Description of a node, which only a DCF contains."""
 
     node_id: int
     bitrate_kbps: int
     node_name: str
     eds_name: str
-    """Name of the EDS file on which the DCF is based."""
+    """Name of the EDS file from which the DCF is derived."""
 
 
 def render_eds(info: DeviceInfo, objects: Iterable[Object], device: Commissioning | None = None) -> str:
-    """Return the text of an EDS or DCF file with LF line endings; the text depends only on the arguments.
+    """Return the content of an EDS or DCF file, with LF line endings.
+
+    The content depends only on the arguments.
 
     Args:
         info: description of the device.
         objects: object dictionary of the device.
-        device: the node whose configuration a DCF describes; None for an EDS.
+        device: description of the node for a DCF; None for an EDS.
     """
     listed = tuple(objects)
     lines = [*_head(info, device)]
@@ -118,7 +120,7 @@ def _head(info: DeviceInfo, device: Commissioning | None) -> Iterator[str]:
     )
     if device is not None:
         yield from _section(
-            "DeviceComissioning",  # CiA 306 itself misspells this section title
+            "DeviceComissioning",  # spelled like this in CiA 306
             [
                 ("NodeID", str(device.node_id)),
                 ("NodeName", device.node_name),
@@ -171,7 +173,7 @@ def _options(entry: Entry, kind: ObjectType, device: Commissioning | None) -> It
 
 
 def _is_configuration(entry: Entry) -> bool:
-    """Return whether the entry has a value in a DCF; commands and the error history have none."""
+    """Return whether a DCF contains a value for the entry. Commands and the error history are excluded."""
     refused = entry.index in (od.ERROR_FIELD, od.STORE, od.RESTORE)
     return entry.access not in ("ro", "const") and entry.default is not None and not refused
 

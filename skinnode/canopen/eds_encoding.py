@@ -1,8 +1,7 @@
-"""Decoding of EDS and DCF files with an unknown character encoding.
+"""Decoding of EDS and DCF files whose character encoding is unknown.
 
-CiA 306 requires ASCII, but some tools write other encodings. No information is lost: each non-ASCII byte
-becomes a lone surrogate (PEP 383), from which the original byte can be recovered. The function
-:func:`for_people` decodes text with surrogates for display.
+CiA 306 requires ASCII, but some tools write other encodings. Decoding is lossless: each non-ASCII byte
+becomes a lone surrogate (PEP 383). :func:`for_people` converts such text for display.
 """
 
 from __future__ import annotations
@@ -13,8 +12,7 @@ from typing import Final, NamedTuple
 ASCII: Final = "ASCII"
 
 MOST_EDS_BYTES: Final = 2 << 20
-"""Maximum accepted size of an EDS file, in bytes. The limit is twenty times the size of a patch's EDS, and
-greater than the size of any known EDS."""
+"""Maximum accepted size of an EDS file, bytes; twenty times the size of a patch's EDS."""
 
 _UTF_16: Final = {codecs.BOM_UTF16_LE: "utf-16-le", codecs.BOM_UTF16_BE: "utf-16-be"}
 _CODECS: Final = {
@@ -25,38 +23,38 @@ _CODECS: Final = {
     "Windows-1252": "cp1252",
     "Latin-1": "latin-1",
 }
-"""Python codec for the original bytes of an :class:`EdsText`, by the name of its encoding."""
+"""Python codec of the bytes in an :class:`EdsText`, by the name of its encoding."""
 
 
 class EdsText(NamedTuple):
-    """Text of an EDS or DCF file, and the encoding that was assumed."""
+    """Text of an EDS or DCF file, and its presumed encoding."""
 
     text: str
-    """ASCII text in which lone surrogates represent all non-ASCII bytes; lines end in ``\\n``."""
+    """Text in which lone surrogates represent all non-ASCII bytes, with LF line endings."""
     encoding: str
     """Name of the encoding, for display."""
 
     @property
     def codec(self) -> str:
-        """Python codec for the bytes that the surrogates represent; UTF-8 if the file was in UTF-16."""
+        """Python codec of the bytes that the surrogates represent. UTF-16 files are converted to UTF-8."""
         return _CODECS[self.encoding]
 
     @property
     def readable(self) -> str:
-        """Text with its non-ASCII bytes decoded, for display."""
+        """Text for display."""
         return for_people(self.text, self.codec)
 
     @property
     def note(self) -> str:
-        """One-line note about an encoding other than ASCII, for display; empty for an ASCII file."""
+        """Note for display if the encoding is not ASCII; otherwise empty."""
         return "" if self.encoding == ASCII else f"read as {self.encoding}: an EDS should be ASCII"
 
 
 def read_eds_text(data: bytes) -> EdsText:
-    """Return the text and the encoding of an EDS or DCF file.
+    """Decode an EDS or DCF file.
 
-    A byte order mark determines the encoding. Without a byte order mark, the encoding is the first of ASCII,
-    UTF-8, Windows-1252 and Latin-1 that can decode the file. The returned text omits the byte order mark.
+    The encoding is given by the byte order mark, which is removed. Without a byte order mark, it is the first
+    of ASCII, UTF-8, Windows-1252 and Latin-1 that can decode the file.
 
     Args:
         data: content of the file.
@@ -80,17 +78,17 @@ def read_eds_text(data: bytes) -> EdsText:
 
 
 def octets_text(data: bytes) -> str:
-    """Decode bytes to text from which :func:`octets` can recover the bytes."""
+    """Decode bytes to text in which each non-ASCII byte is a lone surrogate."""
     return data.decode("ascii", "surrogateescape")
 
 
 def octets(text: str) -> bytes:
-    """Encode text to its original bytes: surrogates become bytes, other non-ASCII characters become UTF-8."""
+    """Encode text from :func:`octets_text`. Any other non-ASCII characters become UTF-8."""
     return text.encode("utf-8", "surrogateescape")
 
 
 def for_people(text: str, codec: str) -> str:
-    """Decode text that contains surrogates, for display; bytes that the codec cannot decode become U+FFFD."""
+    """Convert text with surrogates for display. Bytes that the codec cannot decode become U+FFFD."""
     return octets(text).decode(codec, "replace")
 
 

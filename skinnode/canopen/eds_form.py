@@ -1,4 +1,4 @@
-"""Checks for CiA 306 format errors that EDS parsers ignore silently."""
+"""Checks of EDS files for CiA 306 format errors that parsers silently ignore."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from skinnode.errors import ProfileError, Shown
 _HEADER: Final = re.compile(r"\[(.+)\]")
 _OBJECT: Final = re.compile(r"[0-9a-f]{4}(sub[0-9a-f]{1,2})?", re.IGNORECASE)
 _FURTHER: Final = re.compile(r"[0-9a-f]{4}(?!sub)[g-z][a-z]*", re.IGNORECASE)
-"""Pattern for titles of supplementary object sections, such as 1003Value and 1003ObjectLinks. Such a title
-contains no digits after the index, so a misspelled sub-object such as 1018sb1 does not match."""
+"""Pattern of titles such as 1003Value and 1003ObjectLinks. No digits may follow the index, so a misspelled
+sub-object such as 1018sb1 does not match."""
 _OF_OBJECT: Final = re.compile(r"[0-9]\w*|[0-9a-f]{4}sub.*", re.IGNORECASE)
-"""Pattern for section titles that are probably meant to denote an object, including malformed titles."""
+"""Pattern of titles that seem to denote an object, including malformed ones."""
 _NUMBER: Final = re.compile(r"0x[0-9a-f]{1,8}|[0-9]{1,10}", re.IGNORECASE)
 _LISTS: Final = ("mandatoryobjects", "optionalobjects", "manufacturerobjects")
 _NUMBERS: Final = ("objecttype", "datatype", "pdomapping", "subnumber", "compactsubobj")
@@ -22,14 +22,14 @@ _LONGEST_SHOWN: Final = 60
 
 
 def check_form(text: str, source: str) -> None:
-    """Check the titles of the object sections and the object lists in an EDS file.
+    """Check the titles of object sections and the lists of objects in an EDS file.
 
     Args:
-        text: content of the EDS file.
-        source: name of the EDS file, shown in the error.
+        text: content of the file.
+        source: name of the file for the error message.
 
     Raises:
-        ProfileError: if the file has a format error; the message states the line of the first error.
+        ProfileError: if there is a format error. The message contains the line of the first error.
     """
     for line, section, key, value in _lines(text):
         if not key:
@@ -47,7 +47,7 @@ def check_form(text: str, source: str) -> None:
 
 
 def no_eds(error: Exception, source: str, text: str = "") -> ProfileError:
-    """Convert an EDS parser's error to a ProfileError that states the line or section, if known."""
+    """Convert the exception of an EDS parser to a ProfileError, with the line or section if known."""
     numbers = [getattr(error, "lineno", None), *(line for line, _ in getattr(error, "errors", ()))]
     line = next(filter(None, numbers), None)
     if line is not None:
@@ -83,9 +83,9 @@ def _mistake(key: str, got: str, allowed: str, source: str, line: int | None = N
 
 
 def _lines(text: str) -> Iterator[tuple[int, str, str, str]]:
-    """Yield the line number, section, key and value of each line; key and value of a header are empty.
+    """Yield the line number, section, key and value of each line.
 
-    Comments and continuation lines are skipped.
+    The key and value of a section header are empty. Comments and continuation lines are skipped.
     """
     section = ""
     for number, line in enumerate(text.split("\n"), 1):

@@ -1,8 +1,7 @@
-"""Human-readable texts for emergency messages (EMCY), the error register and the error history.
+"""Error codes of emergency messages (EMCY), and texts for these codes, the error register and error history.
 
-The codes follow CiA 301 v4.2, 7.2.7, tables 26 and 48. Skinnode patches use some of these codes in a more
-specific sense than CiA 301. The manufacturer-specific bytes after an error code are decoded only for skinnode
-patches.
+The codes are those of CiA 301 v4.2, 7.2.7, tables 26 and 48. Patches of this project use some of them in a
+narrower sense. Manufacturer-specific bytes are decoded only if the sender is such a patch.
 """
 
 from __future__ import annotations
@@ -15,7 +14,7 @@ from skinnode.text.words import counted
 
 
 class EmcyCode(IntEnum):
-    """Error codes in the emergency messages of a skinnode patch."""
+    """Error codes that a patch sends."""
 
     RESET = 0x0000
     HARDWARE = 0x5000
@@ -26,29 +25,28 @@ class EmcyCode(IntEnum):
     BUS_OFF_RECOVERED = 0x8140
     CAN_ID_COLLISION = 0x8150
     SYNC_WINDOW = 0x8200
-    """Error reported if a synchronous TPDO was not ready within the synchronous window (0x1007). Detail
-    bytes: u16 TPDO number. CiA 301 defines no specific code for a late synchronous TPDO, so a patch sends the
-    generic protocol error code."""
+    """A synchronous TPDO was not ready within the synchronous window (0x1007). Detail: u16 TPDO number. CiA
+    301 defines no specific code, so this is the generic protocol error."""
     PDO_NOT_PROCESSED = 0x8210
     PDO_LENGTH_EXCEEDED = 0x8220
     SYNC_LENGTH = 0x8240
     RPDO_TIMEOUT = 0x8250
     SOURCE = 0xFF00
-    """Error reported if the converter did not return a valid reading. Detail bytes: u8 fault (1 failed, 2
-    wrong array shape), u16 number of failures.
+    """The converter returned no valid reading. Detail: u8 fault (1 failed, 2 wrong array shape), u16 number
+    of failures.
     """
 
     @property
     def register_bit(self) -> int:
-        """Error register bit set by this code: bit 4 (communication) or bit 7 (manufacturer-specific)."""
+        """Bit of the error register that this error sets: communication or manufacturer-specific."""
         return 0x10 if self >> 12 == 8 else 0x80
 
 
 TOO_SLOW: Final = 1
 """Third detail byte of EMCY 0x8110 if scans were skipped because the node's computer or the bus is too slow.
 
-The first two detail bytes contain the number of skipped scans. A third byte of 0 means that the scan period
-is too short for a scan whose chunks are spaced by the inhibit time.
+If the byte is 0, the scan period is too short to send the chunks at the inhibit time. The first two detail
+bytes are the number of skipped scans.
 """
 
 _CODES: Final = {
@@ -73,7 +71,7 @@ _OWN_CODES: Final[dict[int, str]] = {
     EmcyCode.PDO_NOT_PROCESSED: "PDO not processed: too short",
     EmcyCode.SOURCE: "no reading from the converter",
 }
-"""Meanings of the error codes that skinnode patches use in a more specific sense than CiA 301."""
+"""Texts for the error codes that a patch uses in a narrower sense than CiA 301."""
 _CLASSES: Final = {
     0x10: "generic error",
     0x20: "current",
@@ -127,8 +125,8 @@ def error_text(code: int, detail: bytes = b"", *, ours: bool) -> str:
     Args:
         code: error code.
         detail: manufacturer-specific bytes; the error history contains only the first two.
-        ours: whether the sender is a skinnode patch, according to its vendor-ID and product code; otherwise,
-            the description follows CiA 301.
+        ours: whether the sender is a patch of this project, according to its vendor-ID and product code. If
+            not, the description follows CiA 301.
     """
     own = _OWN_CODES.get(code) if ours else None
     text = own or _CODES.get(code) or _CLASSES.get(code >> 8) or f"error of class 0x{code >> 12:X}000"
@@ -140,9 +138,9 @@ def history_text(entry: int, *, ours: bool) -> str:
     """Return a description of an entry in the error history (0x1003).
 
     Args:
-        entry: error code in the lower 16 bits, two manufacturer-specific bytes in the upper 16 bits.
-        ours: whether the sender is a skinnode patch, according to its vendor-ID and product code. The two
-            manufacturer-specific bytes are decoded only for a skinnode patch.
+        entry: error code (lower 16 bits) and manufacturer-specific information (upper 16 bits).
+        ours: whether the sender is a patch of this project. If not, the manufacturer-specific information is
+            shown as a number.
     """
     code, more = entry & 0xFFFF, entry >> 16
     text = f"0x{code:04X} {error_text(code, more.to_bytes(2, 'little'), ours=ours)}"
@@ -150,9 +148,9 @@ def history_text(entry: int, *, ours: bool) -> str:
 
 
 def says_too_slow(code: int, detail: bytes) -> bool:
-    """Return whether an emergency message reports scans skipped because of a slow computer or bus.
+    """Return whether an emergency message reports that scans were skipped because of a slow computer or bus.
 
-    Scans skipped because of a slow computer or bus do not indicate a fault in the skin.
+    Such a message does not indicate a fault of the skin.
 
     Args:
         code: error code.
@@ -162,7 +160,7 @@ def says_too_slow(code: int, detail: bytes) -> bool:
 
 
 def register_text(register: int) -> str:
-    """Return the names of the bits that are set in an error register (0x1001)."""
+    """Return the names of the bits set in an error register (0x1001)."""
     return ", ".join(name for bit, name in enumerate(_REGISTER) if register >> bit & 1) or "no error"
 
 
@@ -215,5 +213,5 @@ _DETAILS: Final[dict[int, Callable[[bytes], str]]] = {
     EmcyCode.CAN_ID_COLLISION: lambda detail: f"0x{_word(detail):03X}",
     EmcyCode.SOURCE: lambda detail: _SOURCE_FAULTS.get(detail[0], ""),
 }
-"""Functions, keyed by error code, that describe the manufacturer-specific bytes sent by a skinnode patch.
-Each function requires at least two bytes."""
+"""Functions that describe the manufacturer-specific bytes from a patch, by error code. They require at least
+two bytes."""

@@ -1,4 +1,4 @@
-"""Constants for layer setting services (LSS, CiA 305 v3.0), shared by the LSS master and slave."""
+"""Definitions of layer setting services (LSS, CiA 305 v3.0), shared by LSS masters and slaves."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from enum import IntEnum
 from typing import Final, NamedTuple
 
 NOT_CONFIGURED: Final = 0xFF
-"""Node-ID of a device that has not been assigned a node-ID."""
+"""Value in place of the node-ID of a device without one."""
 
 BIT_RATES_BPS: Final = {
     0: 1_000_000,
@@ -18,23 +18,22 @@ BIT_RATES_BPS: Final = {
     7: 20_000,
     8: 10_000,
 }
-"""Bit rates (bit/s) in the order of the CiA 301 bit timing table. Table index 5 is reserved, and table index
-9 selects automatic bit rate detection."""
+"""Bit rates by index in the bit timing table of CiA 301, bit/s. Index 5 is reserved, and index 9 selects
+automatic bit rate detection."""
 
 LSS_DONE: Final = 0
-"""Error code in the response to a successful configuration request."""
+"""Error code of a successful configuration request."""
 
 LSS_MANUFACTURER_ERROR: Final = 0xFF
-"""Error code which indicates that the next byte of the response contains a manufacturer-specific error
-code."""
+"""Error code of a manufacturer-specific error, which the next byte of the response specifies."""
 
 RESET_SCAN: Final = 0x80
-"""Fastscan bit-check value to which every node without a node-ID responds. A request with this value restarts
-the fastscan at the vendor-ID."""
+"""Bit number in a fastscan request that restarts the scan at the vendor-ID. Every node without a node-ID
+responds."""
 
 
 class LssCommand(IntEnum):
-    """LSS command specifiers. Most responses repeat the command specifier of the request."""
+    """LSS command specifiers. Most responses have the same command specifier as the request."""
 
     SWITCH_GLOBAL = 0x04
     CONFIGURE_NODE_ID = 0x11
@@ -56,14 +55,14 @@ class LssCommand(IntEnum):
 
 
 class LssState(IntEnum):
-    """States of an LSS slave, with the values of the mode byte in *switch state global*."""
+    """States of an LSS slave, with their values in *switch state global*."""
 
     WAITING = 0
     CONFIGURATION = 1
 
 
 class LssAddress(NamedTuple):
-    """LSS address of a device: the four fields of its identity object (0x1018), which together are unique."""
+    """LSS address of a device: the four values of its identity object (0x1018), unique in combination."""
 
     vendor_id: int
     product_code: int

@@ -1,4 +1,4 @@
-"""Network management (CiA 301 v4.2, 7.3.2): states, commands, and the services available in each state.
+"""Network management (CiA 301 v4.2, 7.3.2): NMT states and commands.
 
 ================  ===================  ===========================================================
 state             entered by           served
@@ -9,9 +9,8 @@ OPERATIONAL       command 1            the same, and PDO
 STOPPED           command 2            NMT, error control
 ================  ===================  ===========================================================
 
-A node executes NMT commands in every state except INITIALISING, in which it receives no commands. The command
-*reset node* (129) resets all objects to their power-on values. The command *reset communication* (130) resets
-only the objects from 0x1000 to 0x1FFF. The node boots after *reset node* or *reset communication*.
+A node obeys NMT commands in every state except INITIALISING. *Reset node* (129) sets all objects to their
+power-on values, and *reset communication* (130) only those from 0x1000 to 0x1FFF. The node boots after both.
 """
 
 from __future__ import annotations
@@ -25,17 +24,14 @@ ALL_NODES: Final = 0
 """Node-ID in an NMT command that addresses all nodes on the bus."""
 
 STATE_MASK: Final = 0x7F
-"""Mask for the NMT state in a heartbeat or guarding response."""
+"""Mask of the NMT state in a heartbeat or guarding response."""
 
 GUARD_TOGGLE: Final = 0x80
-"""Bit that toggles with each guarding response from a node."""
+"""Bit that a node toggles in each guarding response."""
 
 
 class NmtState(IntEnum):
-    """NMT states, with their values in heartbeats.
-
-    In this project, a node that is switched off also has the state INITIALISING.
-    """
+    """NMT states, with their values in heartbeats. A node that is switched off is INITIALISING, too."""
 
     INITIALISING = 0
     STOPPED = 4
@@ -71,11 +67,11 @@ AFTER_COMMAND: Final = {
     NmtCommand.STOP: NmtState.STOPPED,
     NmtCommand.ENTER_PRE_OPERATIONAL: NmtState.PRE_OPERATIONAL,
 }
-"""NMT state that a node enters after each command, excluding the two reset commands."""
+"""NMT state that a node enters after each command except the two resets."""
 
 
 def state_name(state: int) -> str:
-    """Return the name of an NMT state for display, or ``state N`` if CiA 301 does not define the state.
+    """Return the name of an NMT state for display; ``state N`` if CiA 301 does not define it.
 
     Args:
         state: state byte of a heartbeat, without the toggle bit.
@@ -84,21 +80,21 @@ def state_name(state: int) -> str:
 
 
 def encode(command: NmtCommand, node_id: int) -> bytes:
-    """Return the payload of an NMT command, which is sent with COB-ID 0.
+    """Return the payload of an NMT command.
 
     Args:
-        command: the command specifier.
+        command: command specifier.
         node_id: 1 to 127, or :data:`ALL_NODES`.
     """
     return bytes((command, node_id))
 
 
 def parse(data: bytes, node_id: int) -> NmtCommand | None:
-    """Return the NMT command in a frame with COB-ID 0; None if the frame addresses another node.
+    """Return the NMT command in a frame, or None if it addresses another node.
 
     Args:
         data: payload of the frame.
-        node_id: the node-ID of this node.
+        node_id: node-ID of this node.
 
     Raises:
         ValueError: if the payload is not two bytes long, or if the command specifier is unknown.

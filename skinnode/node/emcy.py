@@ -1,7 +1,4 @@
-"""EMCY producer: emergency messages (0x1014, 0x1015), error register (0x1001), error history (0x1003).
-
-CiA 301 v4.2, 7.2.7.
-"""
+"""EMCY producer (CiA 301 v4.2, 7.2.7), with the objects 0x1001, 0x1003, 0x1014 and 0x1015."""
 
 from __future__ import annotations
 
@@ -20,17 +17,17 @@ from skinnode.node.object_dictionary import ObjectStore
 from skinnode.node.pdo.parameters import COB_ID_MASK, INVALID_BIT, check_cob_id
 
 _WAITING: Final = 16
-"""Maximum number of queued emergency messages; if the queue is full, the oldest message is dropped. Messages
-are queued during the inhibit time, in the STOPPED state, and while the bus refuses frames."""
+"""Capacity of the queue of emergency messages. Messages wait during the inhibit time, in the STOPPED state,
+and while the bus refuses frames. If the queue is full, the oldest message is dropped."""
 _RESERVED_BIT: Final = 1 << 30
 
 
 class EmcyProducer:
-    """Producer of emergency messages, which report the beginning and the end of each error.
+    """EMCY producer of a node, which reports the beginning and the end of each error.
 
     Args:
         store: object dictionary.
-        send: called with the COB-ID and payload of each message.
+        send: function that sends a frame, given its COB-ID and payload.
     """
 
     def __init__(self, store: ObjectStore, send: Callable[[int, bytes], None]) -> None:
@@ -45,7 +42,7 @@ class EmcyProducer:
 
     @property
     def register(self) -> int:
-        """Value of the error register (0x1001); bit 0 is set while an error is active."""
+        """Value of the error register (0x1001). Bit 0 is set while any error is active."""
         bits = 0
         for code, _ in self._present:
             bits |= code.register_bit | 1
@@ -53,11 +50,11 @@ class EmcyProducer:
 
     @property
     def deadline_ns(self) -> int:
-        """Time (ns) at which the next queued message may be sent."""
+        """Time at which the next queued message may be sent, ns."""
         return self._free_ns if self._waiting and self._allowed else NO_DEADLINE_NS
 
     def report_once(self, code: EmcyCode, detail: bytes, t_ns: int) -> None:
-        """Report a momentary error in two messages: one for the error, and one for its end.
+        """Report an error and its end at the same time.
 
         Args:
             code: error code.
@@ -68,20 +65,20 @@ class EmcyProducer:
         self._send_end(code, t_ns)
 
     def report(self, code: EmcyCode, detail: bytes, t_ns: int, who: int = 0) -> None:
-        """Report an error that lasts until :meth:`clear`, unless it was already reported with this detail.
+        """Report an error that lasts until :meth:`clear`. Repeated calls with the same detail have no effect.
 
         Args:
             code: error code.
             detail: up to five manufacturer-specific bytes.
             t_ns: current time, ns.
-            who: number that distinguishes errors with the same code that occur and end independently.
+            who: number that distinguishes independent errors with the same code.
         """
         if self._present.get((code, who)) != detail:
             self._present[code, who] = detail
             self._send_error(code, self.register, detail, t_ns)
 
     def clear(self, code: EmcyCode, t_ns: int, who: int = 0) -> None:
-        """Report the end of an error; do nothing if :meth:`report` has not reported the error.
+        """Report the end of an error. If the error is not active, do nothing.
 
         Args:
             code: error code.
@@ -92,15 +89,15 @@ class EmcyProducer:
             self._send_end(code, t_ns)
 
     def allow(self, allowed: bool, t_ns: int) -> None:
-        """Set whether messages may be sent, which depends on the NMT state of the node."""
+        """Allow or forbid sending messages, depending on the NMT state of the node."""
         self._allowed = allowed
         self._try(t_ns)
 
     def on_timer(self, t_ns: int) -> None:
-        """Send the messages allowed at ``t_ns``. A message refused by the bus stays in the queue."""
+        """Send queued messages as the inhibit time allows. A message that the bus refuses stays queued."""
         cob_id = self._store.integer(od.COB_ID_EMCY) & COB_ID_MASK
         while self._waiting and self._allowed and t_ns >= self._free_ns:
-            if self._lost:  # report this first: the dropped messages were the oldest
+            if self._lost:  # the dropped messages were the oldest
                 self._send(cob_id, self._loss())
                 self._lost = 0
             else:
@@ -109,7 +106,7 @@ class EmcyProducer:
             self._sent_ns = t_ns
 
     def reset(self) -> None:
-        """Discard all errors and messages, as after power-on."""
+        """Discard all errors, the error history and all queued messages."""
         self._present.clear()
         self._history.clear()
         self._waiting.clear()
@@ -120,11 +117,11 @@ class EmcyProducer:
         self._queue(_message(code, register, detail), t_ns)
 
     def _send_end(self, code: EmcyCode, t_ns: int) -> None:
-        """Queue a message about the end of an error; its register byte shows the remaining errors."""
+        """Queue a message for the end of an error, with an error register of the remaining errors."""
         self._queue(_message(EmcyCode.RESET, self.register, code.to_bytes(2, "little")), t_ns)
 
     def _remember(self, code: EmcyCode, detail: bytes) -> None:
-        # The upper 16 bits of an error history entry are manufacturer-specific: the first two detail bytes.
+        # The upper 16 bits of an entry are manufacturer-specific: here, the first two detail bytes.
         self._history.appendleft(code | int.from_bytes(detail[:2], "little") << 16)
 
     def _queue(self, message: bytes, t_ns: int) -> None:
@@ -137,18 +134,18 @@ class EmcyProducer:
         self._try(t_ns)
 
     def _try(self, t_ns: int) -> None:
-        """Send the queued messages; if the bus refuses a message, try again at the next timer event.
+        """Send queued messages. If the bus refuses one, it is sent at a later timer event.
 
-        A BusError is suppressed, so that the caller can continue to handle the error being reported.
+        No BusError is raised, because the caller is still handling the error that it reports.
         """
         with contextlib.suppress(BusError):
             self.on_timer(t_ns)
 
     def _loss(self) -> bytes:
-        """Return an emergency message that reports how many emergency messages were dropped.
+        """Return an emergency message (0x8110) that reports the number of dropped emergency messages.
 
-        Detail bytes 2 and 3 contain the number of dropped messages. Detail bytes 0 and 1 are 0; in overrun
-        messages (0x8110) about scans, they contain the number of skipped scans.
+        The number is in detail bytes 2 and 3. Detail bytes 0 and 1 are 0, which distinguishes this message
+        from one about skipped scans, where they contain the number of skipped scans.
         """
         detail = struct.pack("<HH", 0, min(self._lost, 0xFFFF))
         self._remember(EmcyCode.CAN_OVERRUN, detail)
@@ -156,7 +153,7 @@ class EmcyProducer:
 
     @property
     def _free_ns(self) -> int:
-        """End (ns) of the inhibit time after the last message, when the next message may be sent."""
+        """End of the inhibit time of the last message, ns."""
         return self._sent_ns + self._store.integer(od.EMCY_INHIBIT_TIME) * 100_000
 
     # --- object dictionary
@@ -175,7 +172,7 @@ class EmcyProducer:
         store.watch(od.COB_ID_EMCY, lambda _: self._on_cob_id())
 
     def _read_history(self, subindex: int) -> bytes:
-        """Return a sub-object of the error history: the number of entries, or an entry, newest first."""
+        """Return a sub-index of the error history: the number of entries (0), or an entry, newest first."""
         if subindex == 0:
             return bytes((len(self._history),))
         if subindex > len(self._history):
@@ -188,7 +185,7 @@ class EmcyProducer:
         check_cob_id(value, self._store.integer(od.COB_ID_EMCY))
 
     def _on_cob_id(self) -> None:
-        if not self._exists:  # discard queued messages, so that they are not sent when EMCY is enabled again
+        if not self._exists:  # queued messages must not be sent when EMCY is enabled again
             self._waiting.clear()
             self._lost = 0
 

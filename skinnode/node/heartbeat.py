@@ -1,4 +1,4 @@
-"""Heartbeat producer (0x1017) and heartbeat consumer (0x1016): CiA 301 v4.2, 7.2.8.3.2.2."""
+"""Heartbeat producer (0x1017) and heartbeat consumer (0x1016), CiA 301 v4.2, 7.2.8.3.2.2."""
 
 from __future__ import annotations
 
@@ -15,21 +15,21 @@ from skinnode.node.emcy import EmcyProducer
 from skinnode.node.object_dictionary import ObjectStore
 
 _BOOTED: Final = 1
-"""Second detail byte of an emergency message about a monitored node that has restarted; the byte is 0 if the
-node has gone silent."""
+"""Second manufacturer-specific byte of the emergency message if a monitored node has restarted; 0 if its
+heartbeat is overdue."""
 
 
 class HeartbeatProducer:
-    """Schedule of a node's heartbeats. The schedule restarts if a heartbeat is late by a period or more."""
+    """Schedule of a node's heartbeats. A delay of a whole period or more shifts the schedule."""
 
     def __init__(self) -> None:
         self.period_ns = 0
         """Heartbeat period, ns; 0 if the node sends no heartbeats."""
         self.deadline_ns = NO_DEADLINE_NS
-        """Time (ns) at which the next heartbeat must be sent."""
+        """Time at which the next heartbeat must be sent, ns."""
 
     def boot_up(self, period_ms: int, t_ns: int) -> None:
-        """Start the schedule; the boot-up message is the first heartbeat.
+        """Start the schedule. The first heartbeat is due one period after the boot-up message.
 
         Args:
             period_ms: heartbeat period, ms; 0 for no heartbeats.
@@ -39,7 +39,7 @@ class HeartbeatProducer:
         self.deadline_ns = t_ns + self.period_ns if period_ms else NO_DEADLINE_NS
 
     def set_period(self, period_ms: int, t_ns: int) -> None:
-        """Change the heartbeat period; the next heartbeat is due immediately.
+        """Change the heartbeat period. A heartbeat is due immediately.
 
         Args:
             period_ms: heartbeat period, ms; 0 for no heartbeats.
@@ -49,7 +49,7 @@ class HeartbeatProducer:
         self.deadline_ns = t_ns if period_ms else NO_DEADLINE_NS
 
     def beat(self, t_ns: int) -> bool:
-        """Return whether a heartbeat is due at ``t_ns``; if so, schedule the next heartbeat."""
+        """Return whether a heartbeat is due at ``t_ns``. If so, schedule the next one."""
         if t_ns < self.deadline_ns:
             return False
         self.deadline_ns += self.period_ns
@@ -63,23 +63,23 @@ class _Monitored:
     node_id: int
     within_ns: int
     deadline_ns: int = NO_DEADLINE_NS
-    """Time (ns) at which the next heartbeat is overdue. Monitoring starts at the first heartbeat."""
+    """Time at which the next heartbeat is overdue, ns. Monitoring starts at the first heartbeat."""
 
 
 class HeartbeatConsumer:
-    """Heartbeat consumer that monitors the nodes in object 0x1016.
+    """Monitors the nodes listed in 0x1016.
 
     Args:
         store: object dictionary.
-        emcy: emergency producer, which reports missed heartbeats and restarts of monitored nodes.
-        failed: called with the time (ns) of a heartbeat event, after the emergency message.
+        emcy: EMCY producer of the node.
+        failed: callback for a missed heartbeat, given its time in ns.
     """
 
     def __init__(self, store: ObjectStore, emcy: EmcyProducer, failed: Callable[[int], None]) -> None:
         self._store, self._emcy, self._failed = store, emcy, failed
         self._monitored: dict[int, _Monitored] = {}
         self.deadline_ns = NO_DEADLINE_NS
-        """Earliest time (ns) at which a monitored node's heartbeat is overdue."""
+        """Time at which the first of the expected heartbeats is overdue, ns."""
         store.guard(od.HEARTBEAT_CONSUMER, self._guard)
 
     @property
@@ -88,12 +88,12 @@ class HeartbeatConsumer:
         return list(self._monitored)
 
     def reset(self) -> None:
-        """Apply object 0x1016 after a reset, as if no heartbeat had been received."""
+        """Apply 0x1016 after a reset, and forget all received heartbeats."""
         self._monitored = {}
         self.on_written(0)
 
     def on_written(self, t_ns: int) -> None:
-        """Apply a write to object 0x1016. Monitoring restarts only for changed entries."""
+        """Apply a write to 0x1016. Only changed entries start again without a received heartbeat."""
         words = [self._store.integer(od.HEARTBEAT_CONSUMER, i + 1) for i in range(od.HEARTBEAT_CONSUMERS)]
         wanted = [_Monitored(word >> 16, (word & 0xFFFF) * 1_000_000) for word in words]
         before, self._monitored = self._monitored, {}
@@ -110,13 +110,13 @@ class HeartbeatConsumer:
     def on_heartbeat(self, node_id: int, state: int, t_ns: int) -> None:
         """Handle a heartbeat or boot-up message from a monitored node.
 
-        A boot-up message does not start monitoring, because some nodes send no heartbeats after they boot. A
-        boot-up message after a heartbeat means that the node has restarted.
+        A boot-up message does not start monitoring, because not every node sends heartbeats after it has
+        booted. While a node is monitored, a boot-up message means that it has restarted.
 
         Args:
             node_id: node-ID of the monitored node.
             state: NMT state in the message.
-            t_ns: time of reception, ns.
+            t_ns: arrival time, ns.
         """
         item = self._monitored[node_id]
         if state == NmtState.INITIALISING:
@@ -128,7 +128,7 @@ class HeartbeatConsumer:
         self._plan()
 
     def on_timer(self, t_ns: int) -> None:
-        """Report each monitored node whose heartbeat is overdue, unless the node was already reported."""
+        """Report the monitored nodes whose heartbeat has become overdue."""
         if t_ns < self.deadline_ns:
             return
         for item in self._monitored.values():

@@ -1,8 +1,7 @@
-"""LSS slave (CiA 305 v3.0), which accepts a node-ID and a bit rate, and responds to node searches.
+"""LSS slave (CiA 305 v3.0), through which a master finds nodes and sets their node-IDs and bit rates.
 
-The slave receives requests and returns responses as bytes, independently of any bus or clock. Callbacks store
-the configuration and change the bit rate. :attr:`LssSlave.may_boot` tells the caller that the node must boot.
-The slave processes LSS requests in every NMT state. A node without a node-ID processes only LSS requests.
+The slave turns requests into responses, and accesses neither a bus nor a clock. It handles requests in every
+NMT state. A node without a node-ID handles no other requests.
 """
 
 from __future__ import annotations
@@ -26,10 +25,10 @@ from skinnode.node.clock import NO_DEADLINE_NS
 _CIA_301_TABLE: Final = 0
 
 _OUT_OF_RANGE, _CANNOT_STORE, _STORE_FAILED = 1, 1, 2
-"""Error codes in responses to configuration requests; the meaning of code 1 depends on the request."""
+"""Error codes in responses. The meaning of code 1 depends on the request."""
 
 
-# LSS address field and comparison for each request of *switch state selective* and *identify*.
+# Part of the LSS address, and comparison, for each request of *switch state selective* and *identify*.
 _QUESTIONS: Final[dict[int, tuple[int, Callable[[int, int], bool]]]] = {
     0x40: (0, operator.eq),
     0x41: (1, operator.eq),
@@ -49,14 +48,14 @@ class LssSlave:
     """LSS slave of one node.
 
     Args:
-        address: LSS address of the slave, equal to the node's identity object (0x1018).
+        address: LSS address, from the identity object (0x1018).
         node_id: persistent node-ID, 1 to 127, or :data:`NOT_CONFIGURED`.
-        bit_rates_bps: supported bit rates, bit/s; empty if the slave cannot change its bit rate.
-        bit_rate_bps: previously configured bit rate, bit/s; None if no bit rate has been configured.
-        store: saves the pending node-ID and bit rate permanently, or raises OSError; None if the node has no
-            memory.
-        activate: called with the pending bit rate and the delay in ms, to start the bit rate change; None if
-            the slave cannot change its bit rate. See :meth:`on_request`.
+        bit_rates_bps: supported bit rates, bit/s; empty if the bit rate cannot be changed.
+        bit_rate_bps: stored bit rate, bit/s, or None.
+        store: function that stores the pending node-ID and bit rate (bit/s or None), or raises OSError; None
+            if the node has no memory.
+        activate: function that starts a bit rate change, given the pending bit rate (bit/s or None) and the
+            delay in ms; None if the bit rate cannot be changed. See :meth:`on_request`.
     """
 
     def __init__(  # noqa: PLR0913 - keywords with defaults, one for each ability of a slave
@@ -73,61 +72,57 @@ class LssSlave:
         self._bit_rates_bps = frozenset(bit_rates_bps)
         self._store, self._activate = store, activate
         self.state = LssState.WAITING
-        """Current LSS state."""
+        """LSS state."""
         self.node_id = node_id
         """Active node-ID."""
         self.pending_node_id = node_id
-        """Node-ID that takes effect at the next *reset communication*."""
+        """Node-ID that becomes active at the next *reset communication*."""
         self._persistent_node_id = node_id
         self.pending_bit_rate_bps = bit_rate_bps
-        """Bit rate (bit/s) that takes effect at the next activation; None to keep the current bit rate."""
+        """Bit rate for the next *activate bit timing*, bit/s; None to keep the current bit rate."""
         self._next_question = 0
         self._scan_part = 0
 
     @property
     def configured(self) -> bool:
-        """Whether the node has a node-ID; a node without a node-ID processes only LSS requests."""
+        """Whether the node has a node-ID."""
         return self.node_id != NOT_CONFIGURED
 
     @property
     def may_boot(self) -> bool:
-        """Whether the node can boot, because it has received a node-ID and left the configuration state."""
+        """Whether the node must boot: it has been assigned a node-ID and left the configuration state."""
         return (
             not self.configured and self.pending_node_id != NOT_CONFIGURED and self.state is LssState.WAITING
         )
 
     def reset_node(self) -> None:
-        """Copy the persistent node-ID to the pending node-ID, as required on NMT *reset node*.
+        """Handle NMT *reset node*: the persistent node-ID becomes the pending node-ID.
 
-        A pending node-ID that was not stored is lost. The caller must then call :meth:`reset_communication`.
-
-        The CANopen stacks c-open (src/co_nmt.c) and CANopenNode (305/CO_LSSslave.h) handle the persistent and
-        the pending node-ID in the same way.
+        The caller must then call :meth:`reset_communication`. The CANopen stacks c-open (src/co_nmt.c) and
+        CANopenNode (305/CO_LSSslave.h) work in the same way.
         """
         self.pending_node_id = self._persistent_node_id
 
     def reset_communication(self) -> None:
-        """Copy the pending node-ID to the active node-ID, as required on NMT *reset communication*."""
+        """Handle NMT *reset communication*: the pending node-ID becomes the active node-ID."""
         self.node_id = self.pending_node_id
         self._enter(LssState.WAITING)
         self._scan_part = 0
 
     def on_request(self, data: bytes) -> bytes | None:
-        """Process a request from the LSS master and return the response.
+        """Handle a request of the LSS master.
 
-        As the standard requires, a frame with a length other than 8 bytes or with an unknown command is
-        ignored. A request that is not allowed in the current state is also ignored, because it may be
-        intended for other slaves.
+        CiA 305 requires a slave to ignore frames that are not 8 bytes long, unknown commands, and requests
+        that are not allowed in its current state, which may be intended for other slaves.
 
-        After *activate bit timing*, the node stops sending immediately and changes its bit rate after a
-        delay. The node may send again after a second delay, which gives all other nodes time to change their
-        bit rates.
+        After *activate bit timing*, the node is silent for two delays. It changes its bit rate after the
+        first one. During the second one, all other nodes change their bit rates.
 
         Args:
             data: payload of the frame.
 
         Returns:
-            The response; None if the request has no response.
+            The response, or None if there is none.
         """
         if len(data) != 8:
             return None
@@ -160,7 +155,7 @@ class LssSlave:
         self._next_question = 0
 
     def _agrees(self, command: int, value: int) -> bool:
-        """Return whether the LSS address matches this request and all previous requests in the sequence."""
+        """Return whether the LSS address matches this request and the preceding ones of its sequence."""
         part, holds = _QUESTIONS[command]
         in_turn = command in _FIRST_QUESTIONS or command == self._next_question
         agreed = in_turn and holds(self._address[part], value)
@@ -168,9 +163,9 @@ class LssSlave:
         return agreed
 
     def _fastscan(self, value: int, bit: int, part: int, next_part: int) -> bytes | None:
-        """Return the response to a fastscan request; None if bits ``bit`` to 31 differ from ``value``.
+        """Return the response to a fastscan request, or None if the LSS address does not match.
 
-        Only matching slaves respond, so a single request tests all slaves on the bus.
+        The address part must match ``value`` from bit ``bit`` to bit 31.
         """
         if bit == RESET_SCAN:
             self._scan_part = 0
@@ -180,7 +175,7 @@ class LssSlave:
             if (self._address[part] ^ value) >> bit:
                 return None
             self._scan_part = next_part
-            # All four address fields match: the master has found this slave.
+            # The whole address matches: the master has found this slave.
             if bit == 0 and next_part < part:
                 self._enter(LssState.CONFIGURATION)
         return _frame(LssCommand.IDENTIFIED)
@@ -223,10 +218,10 @@ class LssSlave:
 
 
 class BitRateChange:
-    """Bit rate change after the LSS request *activate bit timing*, with a delay before and after the change.
+    """Bit rate change after *activate bit timing*, with a delay before and after the change.
 
     Args:
-        set_bit_rate: changes the bit rate (bit/s); None if the node cannot change it.
+        set_bit_rate: function that changes the bit rate (bit/s), or None if it cannot be changed.
     """
 
     def __init__(self, set_bit_rate: Callable[[int], None] | None) -> None:
@@ -234,22 +229,22 @@ class BitRateChange:
         self._bit_rate_bps: int | None = None
         self._change_ns = self._over_ns = NO_DEADLINE_NS
         self.deadline_ns = NO_DEADLINE_NS
-        """Time (ns) at which the caller must call :meth:`silent` to continue the bit rate change."""
+        """Time at which :meth:`silent` must be called next, ns."""
 
     def begin(self, bit_rate_bps: int | None, delay_ms: int, t_ns: int) -> None:
         """Start a bit rate change.
 
         Args:
             bit_rate_bps: new bit rate, bit/s; None to keep the current bit rate.
-            delay_ms: delay specified in the request, ms.
-            t_ns: time at which the request was received, ns.
+            delay_ms: delay in the request, ms.
+            t_ns: arrival time of the request, ns.
         """
         self._bit_rate_bps = bit_rate_bps
         self._change_ns = self.deadline_ns = t_ns + delay_ms * 1_000_000
         self._over_ns = t_ns + 2 * delay_ms * 1_000_000
 
     def silent(self, t_ns: int) -> bool:
-        """Change the bit rate if the delay has elapsed; return whether the node must be silent."""
+        """Change the bit rate if the first delay has elapsed. Return whether the node must be silent."""
         if self.deadline_ns == NO_DEADLINE_NS:
             return False
         if t_ns >= self._change_ns:
@@ -261,7 +256,7 @@ class BitRateChange:
         return self.deadline_ns != NO_DEADLINE_NS
 
     def cancel(self) -> None:
-        """Cancel the bit rate change, because the node is switched off."""
+        """Cancel the bit rate change when the node is switched off."""
         self.deadline_ns = NO_DEADLINE_NS
 
 

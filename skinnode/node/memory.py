@@ -1,8 +1,7 @@
-"""Values that survive a node's power cycle, and the interface of the memory that stores these values.
+"""Non-volatile values of a node, and the interface of the memory that stores them.
 
-A memory saves a :class:`Kept` atomically. After an interrupted save, the memory contains either the complete
-old values or the complete new values. The module :mod:`skinnode.node.memory_file` implements a memory in a
-file.
+A memory saves a :class:`Kept` atomically: if saving is interrupted, it contains either all old or all new
+values. :mod:`skinnode.node.memory_file` implements a memory in a file.
 """
 
 from __future__ import annotations
@@ -17,22 +16,22 @@ from skinnode.errors import SkinError
 
 @dataclass(frozen=True, slots=True)
 class Parameters:
-    """Saved values of a parameter group (CiA 301 v4.2, 7.5.2.13). Default values are not saved."""
+    """Saved values of a group of parameters (CiA 301 v4.2, 7.5.2.13). Default values are not saved."""
 
     node_id: int = 0
-    """Node-ID of the node when the parameters were saved; some saved COB-IDs include this node-ID."""
+    """Node-ID when the parameters were saved. Some saved COB-IDs include it."""
     values: Mapping[tuple[int, int], bytes] = field(default_factory=dict)
-    """Saved bytes of each parameter, by index and sub-index."""
+    """Saved bytes, by index and sub-index."""
 
 
 @dataclass(frozen=True, slots=True)
 class Kept:
-    """Content of a memory: all values that survive a power cycle."""
+    """Content of a memory: the non-volatile values of a node."""
 
     patch: str = ""
-    """Text that identifies the sizes and layout of the patch. Other patches must not use this content."""
+    """Identifier of the sizes and layout of the patch. Other patches must not use this content."""
     node_id: int | None = None
-    """Node-ID stored by LSS: 1 to 127, or 255 for no node-ID; None if LSS has not stored a configuration."""
+    """Node-ID stored by LSS, 1 to 127, or 255 for no node-ID; None if LSS has stored nothing."""
     bit_rate_bps: int | None = None
     """Bit rate stored by LSS, bit/s; None if LSS has not stored a bit rate."""
     communication: Parameters = Parameters()
@@ -40,24 +39,24 @@ class Kept:
     application: Parameters = Parameters()
     """Saved application parameters (0x2000 to 0x9FFF)."""
     baseline_ohm: tuple[tuple[float, ...], ...] = ()
-    """(U, K) baseline R0 with REAL32 precision, ohm; empty if no baseline has been saved."""
+    """(U, K) baseline R0 with REAL32 precision, ohm; empty if none has been saved."""
 
 
 class Fault(IntEnum):
-    """Fault of a memory; the numeric value is the first detail byte of the emergency message."""
+    """Fault of a memory. The value is the first manufacturer-specific byte of the emergency message."""
 
     UNREADABLE = 1
     DAMAGED = 2
     FOREIGN = 3
-    """The memory's content belongs to another patch or has an unknown format."""
+    """The content belongs to another patch or has an unknown format."""
     REFUSED = 4
-    """The object dictionary does not accept a saved parameter."""
+    """An object does not accept its saved value."""
     NOT_SAVED = 5
-    """The node failed to save a value that it saves automatically, such as the baseline."""
+    """The node could not save a value that it saves automatically, such as the baseline."""
 
 
 class MemoryFault(SkinError):
-    """Error raised if a memory has no usable content."""
+    """A memory has no usable content."""
 
     def __init__(self, fault: Fault, message: str) -> None:
         self.fault = fault
@@ -65,33 +64,33 @@ class MemoryFault(SkinError):
 
 
 class Memory(Protocol):
-    """Interface of a node's non-volatile memory."""
+    """Interface of the non-volatile memory of a node."""
 
     def load(self) -> Kept | None:
-        """Return the saved content; None if nothing has been saved.
+        """Return the content, or None if nothing has been saved.
 
         Raises:
-            MemoryFault: if the memory has no usable content.
+            MemoryFault: if the content is not usable.
         """
 
     def save(self, kept: Kept) -> None:
-        """Replace the saved content, and return when the new content would survive a power failure.
+        """Replace the content, and return once a power failure can no longer destroy the new content.
 
         Raises:
-            OSError: if saving fails; the memory then keeps its old content.
+            OSError: if saving fails. The memory keeps its old content.
         """
 
 
 class VolatileMemory:
-    """Non-volatile memory of a simulated board. The content exists only as long as this object."""
+    """Memory of a simulated board, whose content exists only as long as this object."""
 
     def __init__(self) -> None:
         self._kept: Kept | None = None
 
     def load(self) -> Kept | None:
-        """Return the saved content; None if nothing has been saved."""
+        """Return the content, or None if nothing has been saved."""
         return self._kept
 
     def save(self, kept: Kept) -> None:
-        """Replace the saved content."""
+        """Replace the content."""
         self._kept = kept

@@ -1,4 +1,4 @@
-"""Non-volatile memory of a node in a JSON file, which has a checksum and is replaced atomically."""
+"""Non-volatile memory of a node in a JSON file with a checksum, which is replaced atomically."""
 
 from __future__ import annotations
 
@@ -21,23 +21,23 @@ from skinnode.node.memory import Fault, Kept, MemoryFault, Parameters
 
 _FORMAT: Final = "skinnode node memory 1"
 _MOST_BYTES: Final = 1 << 24
-"""Maximum accepted size of a memory file, in bytes; over ten times the size of the largest valid file."""
+"""Maximum accepted size of a memory file, bytes; over ten times the size of the largest valid file."""
 
 
 class FileMemory:
-    """Non-volatile memory of a node in a human-readable JSON file with a checksum.
+    """Non-volatile memory of a node in a JSON file.
 
-    Saving takes a few milliseconds and blocks all nodes that run on the same thread.
+    **Locking.** :meth:`claim` or the first :meth:`save` locks the file for exclusive access, until
+    :meth:`close` is called, a ``with`` block ends or the object is deleted. The lock is a kernel lock on a
+    separate file in the same folder, which the kernel releases even if the process is killed.
 
-    :meth:`claim` or the first :meth:`save` locks the file for exclusive access. The file stays locked until
-    :meth:`close`, the end of a ``with`` block or the deletion of the object. The lock is a kernel lock on a
-    separate file in the same folder. The kernel therefore releases the lock even if the process is killed.
+    **Saving** writes a temporary file, flushes it to the disk and renames it to the memory file. If the power
+    fails or the process is killed, the memory file has either its old or its new content. Saving takes a few
+    milliseconds, during which all nodes on the same thread are blocked.
 
-    Saving writes a temporary file, flushes it to the storage medium and renames it to the memory file. If the
-    power fails or the process is killed, the memory file therefore has either its old or its new content.
-    Only the owner can read the file (mode 0600). A path that is a symbolic link is rejected. Before a file
-    that is damaged or belongs to another patch is replaced, it is renamed by appending ``.unused-`` and a
-    digest of its content.
+    Only the owner can read the file (mode 0600). A symbolic link is rejected. A file that is damaged or
+    belongs to another patch is not overwritten, but renamed: ``.unused-`` and a digest of its content are
+    appended to its name.
 
     Args:
         path: path of the file; its folder must exist.
@@ -61,7 +61,7 @@ class FileMemory:
             discard_leftovers(self.path)
 
     def close(self) -> None:
-        """Release the lock on the file. The file can be locked again with :meth:`claim`."""
+        """Unlock the file. :meth:`claim` can lock it again."""
         release, self._release = self._release, None
         if release is not None:
             release()
@@ -74,10 +74,10 @@ class FileMemory:
         self.close()
 
     def load(self) -> Kept | None:
-        """Return the saved content; None if the file does not exist.
+        """Return the content, or None if the file does not exist.
 
         Raises:
-            MemoryFault: if the file cannot be read or has no usable content.
+            MemoryFault: if the file cannot be read, or its content is not usable.
         """
         try:
             return unpack(self._read())
@@ -89,14 +89,14 @@ class FileMemory:
             raise MemoryFault(error.fault, f"{self.path}: {error}") from None
 
     def save(self, kept: Kept) -> None:
-        """Replace the content of the file, and return when the new content is on the storage medium.
+        """Replace the content, and return once the new content is on the disk.
 
         Args:
-            kept: the new content.
+            kept: new content.
 
         Raises:
-            FileInUse: if another memory owns the file.
-            OSError: if the file cannot be written; the old content is then preserved.
+            FileInUse: if this process or another process has locked the file.
+            OSError: if the file cannot be written. It keeps its old content.
         """
         self.claim()
         beside = create_beside(self.path, pack(kept), durable=True)
@@ -109,7 +109,7 @@ class FileMemory:
         flush_folder(self.path.parent)
 
     def _read(self) -> bytes:
-        # O_NONBLOCK prevents blocking if the path is a named pipe.
+        # O_NONBLOCK: opening a named pipe would block otherwise.
         flags = os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
         try:
             descriptor = os.open(self.path, flags)
@@ -137,7 +137,7 @@ class FileMemory:
 
 
 def pack(kept: Kept) -> bytes:
-    """Convert a memory's content to the bytes of a memory file."""
+    """Return the bytes of a memory file with the given content."""
     content = {
         "patch": kept.patch,
         "node_id": kept.node_id,
@@ -151,7 +151,7 @@ def pack(kept: Kept) -> bytes:
 
 
 def unpack(data: bytes) -> Kept:
-    """Convert the bytes of a memory file to the memory's content.
+    """Return the content of a memory file.
 
     Args:
         data: bytes of the file.

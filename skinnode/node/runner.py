@@ -1,4 +1,4 @@
-"""Runs all nodes that share a CAN port in a single thread."""
+"""Runs nodes that share a CAN port, in one thread."""
 
 from __future__ import annotations
 
@@ -17,35 +17,33 @@ from skinnode.transport.frame import Frame
 from skinnode.transport.port import CanPort
 
 _IDLE_S: Final = 0.1
-"""Maximum time to wait for a frame, in seconds; also the maximum delay before the thread responds to a stop
-request."""
+"""Maximum time to wait for a frame before the thread checks whether it has to stop, s."""
 
 _RETRY_S: Final = 0.02
-"""Pause (s) after a bus error, long enough to drain a full transmit queue."""
+"""Pause after a bus error, s; long enough for a full transmit queue to drain."""
 
 _CATCH_UP_FRAMES: Final = 4096
-"""Maximum number of queued frames to process before a heartbeat is declared missed. A fully loaded 1 Mbit/s
+"""Maximum number of queued frames to handle before a heartbeat is reported as missed. A fully loaded 1 Mbit/s
 bus carries this number of frames in half a second."""
 
 OFF_AFTER_S: Final = 0.1
-"""Duration (s) of continuous bus errors after which the nodes treat their CAN controller as bus-off. A full
-transmit queue drains in a shorter time."""
+"""Duration of continuous bus errors after which the nodes assume that their CAN controller is bus-off, s. A
+full transmit queue drains sooner."""
 
 REOPEN_S: Final = 1.0
-"""Duration (s) of continuous bus errors after which the CAN interface is reopened. Reopening restores an
-interface that was unplugged and reconnected."""
+"""Duration of continuous bus errors after which the CAN interface is reopened, s. This recovers an interface
+that was unplugged and plugged in again."""
 
 
 class NodeRunner:
-    """Powers on a group of nodes and runs them until :meth:`stop` is called.
+    """Runs a group of nodes from :meth:`start` to :meth:`stop`. It can be started only once.
 
-    A runner can be started only once. Bus errors do not stop a runner. From :meth:`start` to :meth:`stop`,
-    only the runner's thread may use the nodes; other threads may read the nodes' counters. The runner does
-    not close the port. All timers run at the precision required by the most demanding node.
+    Bus errors do not stop the runner. While it runs, other threads may only read the counters of its nodes.
+    All timers have the precision of the most demanding node. The caller has to close the port.
 
     Args:
-        port: CAN port that all nodes share.
-        nodes: nodes to run, with or without a node-ID.
+        port: CAN port that the nodes share.
+        nodes: nodes to run.
 
     Raises:
         ValueError: if there are no nodes, or if two nodes have the same node-ID.
@@ -64,12 +62,11 @@ class NodeRunner:
         self.bus_errors = 0
         """Number of bus errors since the runner was created."""
         self.bus_error = ""
-        """One-line description of the first error in the latest series of bus errors; empty before any bus
-        error."""
+        """One-line description of the first error in the latest series of bus errors; empty if there has been
+        none."""
         self._heard = 0
         self._bus_state = BusState.ACTIVE
-        # Number of frames that the port had sent when the bus-off state began. The bus has recovered as soon
-        # as the port has sent more frames.
+        # Number of frames that the port had sent when bus-off began. Any further frame proves recovery.
         self._sent_before = 0
         self._powered, self._stopping = clock.event(), clock.event()
         self._error: BaseException | None = None
@@ -77,22 +74,22 @@ class NodeRunner:
 
     @property
     def failed(self) -> bool:
-        """Whether an error has terminated the runner's thread; :meth:`stop` raises this error."""
+        """Whether an error has ended the thread. :meth:`stop` raises this error."""
         return self._error is not None
 
     def start(self) -> None:
-        """Start the thread; return when all nodes have been powered on and have loaded their saved values.
+        """Start the thread, and return when all nodes have been powered on.
 
-        An error that terminates the thread is raised by :meth:`stop`.
+        :meth:`stop` raises any error that ends the thread.
         """
         self._thread.start()
         self._powered.wait()
 
     def stop(self) -> None:
-        """Power the nodes off and end the runner's thread. Further calls have no effect.
+        """Power the nodes off and end the thread. Repeated calls have no effect.
 
         Raises:
-            BaseException: if an error has terminated the thread; the error is re-raised.
+            BaseException: the error that has ended the thread, if any.
         """
         if self._stopping.is_set():
             return
@@ -137,7 +134,7 @@ class NodeRunner:
             try:
                 self._turn()
             except BusError as error:
-                # As in a hardware node, a frame that cannot be sent is lost; the nodes continue to run.
+                # The frame is lost and the nodes continue, as on a board.
                 self.bus_errors += 1
                 now_s = clock.monotonic()
                 if failing_since_s is None:
@@ -151,7 +148,7 @@ class NodeRunner:
                     with contextlib.suppress(BusError):
                         self._port.reopen()
                 self._stopping.wait(_RETRY_S)
-            # The bus is known to work only if a frame has been sent or received.
+            # Only a frame sent or received proves that the bus works.
             if self._port.sent + self._heard > moved:
                 failing_since_s = None
             if self._bus_state is BusState.OFF and self._port.sent > self._sent_before:
@@ -161,22 +158,21 @@ class NodeRunner:
         self._bus_state = state
         now_ns = clock.monotonic_ns()
         for node in self.nodes:
-            with contextlib.suppress(BusError):  # the unsent emergency message stays in the node's queue
+            with contextlib.suppress(BusError):  # the emergency message stays queued
                 node.on_bus(state, now_ns)
 
     def _on_error_frame(self, frame: Frame) -> None:
-        # Error frames are interpreted only on SocketCAN; on other interfaces, they have a different meaning.
+        # Only SocketCAN encodes the controller state in error frames.
         if self._port.config.interface == "socketcan":
             state = bus_state(frame)
             if state is not None:
                 self._set_bus_state(state)
-                self._sent_before = 1 << 63  # queuing a frame does not prove that the bus has recovered
+                self._sent_before = 1 << 63  # a frame counted as sent may only be queued
 
     def _turn(self) -> None:
-        """Process all due timers, then wait for a frame or for the next timer."""
+        """Handle the timers that are due, then wait for a frame or the next timer."""
         nodes, now = self.nodes, clock.monotonic_ns
-        # All nodes receive the same time, so a single wake-up handles the timers of all nodes that were
-        # started together.
+        # All nodes are given the same time, so that one wake-up serves nodes that were started together.
         now_ns, first_ns = now(), NO_DEADLINE_NS
         silent = any(now_ns >= node.silent_from_ns for node in nodes)
         failure = self._catch_up(now_ns) if silent else None
@@ -198,10 +194,10 @@ class NodeRunner:
             raise failure
 
     def _catch_up(self, now_ns: int) -> BusError | None:
-        """Process the queued frames that were received before ``now_ns``.
+        """Handle the queued frames that arrived before ``now_ns``.
 
-        If this thread is delayed, a heartbeat that arrived in time may still be in the queue. The queue
-        must be processed before the timers; otherwise, such a heartbeat would be reported as missed.
+        If this thread is late, a heartbeat that arrived in time may still be queued. It would be reported as
+        missed if the timers were handled first.
         """
         failure: BusError | None = None
         for _ in range(_CATCH_UP_FRAMES):
@@ -214,7 +210,7 @@ class NodeRunner:
         return failure
 
     def _serve(self, frame: Frame) -> BusError | None:
-        """Pass a frame to all nodes; return the last bus error that a node raised, or None."""
+        """Pass a frame to all nodes. Return the last BusError that a node raised, or None."""
         failure: BusError | None = None
         if frame.error:
             self._on_error_frame(frame)

@@ -150,7 +150,7 @@ class Sync:
     def accept(self, message: bytes, t_ns: int) -> bool:
         """Return whether the length of a received SYNC matches 0x1019.
 
-        A wrong length is reported in an emergency message, and again only if the length changes.
+        A wrong length is reported in an emergency message, but not again while it stays the same.
 
         Args:
             message: payload of the SYNC.

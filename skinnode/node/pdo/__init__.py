@@ -1,5 +1,1 @@
-"""Process data objects (PDO) of a node.
-
-The module ``parameters`` reads the records of a PDO and checks writes to these records. The module ``rpdo``
-receives PDOs, and ``tpdo`` transmits PDOs.
-"""
+"""Process data objects (PDO) of a node: their parameters, the RPDO engine and the TPDO engine."""

@@ -1,6 +1,6 @@
 """Communication and mapping parameters of PDOs (CiA 301 v4.2, 7.5.2.33 to 7.5.2.38).
 
-If the standard defines no abort code for an error, a node sends the same abort code as the stack CANopenNode.
+Where the standard does not specify an abort code, the abort code is that of the CANopenNode stack.
 """
 
 from __future__ import annotations
@@ -15,20 +15,20 @@ from skinnode.node.object_dictionary import ObjectStore
 
 INVALID_BIT: Final = od.PDO_INVALID
 NO_RTR_BIT: Final = 1 << 30
-"""Bit in a TPDO's COB-ID that forbids requests by remote frame."""
+"""Bit in the COB-ID of a TPDO: no remote frame allowed on this PDO."""
 EXTENDED_BIT: Final = 1 << 29
-"""Bit in a COB-ID that indicates a 29-bit CAN-ID."""
+"""Bit in a COB-ID: the CAN-ID has 29 bits."""
 COB_ID_MASK: Final = 0x7FF
-"""Mask for the 11-bit CAN-ID in a COB-ID."""
+"""Mask of the 11-bit CAN-ID in a COB-ID."""
 SYNC_CYCLIC_MAX: Final = 240
-"""Highest synchronous transmission type."""
+"""Highest cyclic synchronous transmission type."""
 SYNC_REMOTE, REMOTE = 252, 253
-"""Transmission types of PDOs that are sent only on request by a remote frame, with values sampled at the last
-SYNC (252) or at the request (253)."""
+"""Transmission types of PDOs that are sent only on a remote frame, with the values at the last SYNC (252) or
+at the remote frame (253)."""
 EVENT_TYPES: Final = (254, 255)
 """Event-driven transmission types."""
 
-_MOST_MAPPED: Final = 64  # maximum number of entries in a PDO mapping (CiA 301)
+_MOST_MAPPED: Final = 64  # maximum number of mapped objects (CiA 301)
 
 _TRANSMITTED: Final = ("const", "ro", "rw", "rwr")
 _RECEIVED: Final = ("wo", "rw", "rww")
@@ -41,7 +41,7 @@ _RESTRICTED: Final = (
     range(0x6E0, 0x700),
     range(0x701, 0x800),
 )
-"""Restricted CAN-IDs, which configurable services must not use (CiA 301 v4.2, table 40)."""
+"""CAN-IDs that configurable services must not use (CiA 301 v4.2, table 40)."""
 
 
 def check_cob_id(value: int, current: int) -> None:
@@ -52,8 +52,8 @@ def check_cob_id(value: int, current: int) -> None:
         current: current COB-ID, with its flag bits.
 
     Raises:
-        Refused: if the new COB-ID is restricted or malformed, or if the client tries to change the CAN-ID of
-            an enabled service.
+        Refused: if the new COB-ID is malformed, if its CAN-ID is restricted, or if its CAN-ID differs from
+            that of an enabled service.
     """
     if value & EXTENDED_BIT or value & ~(INVALID_BIT | NO_RTR_BIT) > COB_ID_MASK:
         raise Refused(AbortCode.INVALID_VALUE)
@@ -66,10 +66,7 @@ def check_cob_id(value: int, current: int) -> None:
 
 @dataclass(frozen=True, slots=True)
 class Mapped:
-    """Object mapped into a PDO.
-
-    If ``index`` is the index of a data type, the object is a dummy, whose bytes are ignored.
-    """
+    """Object mapped into a PDO. If ``index`` is that of a data type, it is a dummy without a value."""
 
     index: int
     subindex: int
@@ -79,44 +76,44 @@ class Mapped:
 
 @dataclass(frozen=True, slots=True)
 class PdoParameters:
-    """Communication and mapping parameters of a PDO. Times are in ns; 0 means that a time is not used."""
+    """Communication and mapping parameters of a PDO. A time of 0 ns means that it is not used."""
 
     enabled: bool
     """Whether the PDO is enabled and has at least one mapped object."""
     cob_id: int
     """CAN-ID of the PDO, 11 bits."""
     answers_rtr: bool
-    """Whether remote frames may request the PDO; always false for an RPDO."""
+    """Whether remote frames may request the PDO; false for an RPDO."""
     kind: int
-    """Transmission type of the PDO."""
+    """Transmission type."""
     inhibit_ns: int
     event_timer_ns: int
     sync_start: int
     mapping: tuple[Mapped, ...]
     """Mapped objects, in payload order."""
     size: int
-    """Length of the PDO's payload, bytes."""
+    """Length of the payload, bytes."""
 
     @property
     def event_driven(self) -> bool:
-        """Whether the PDO is event-driven."""
+        """Whether the transmission type is event-driven."""
         return self.kind in EVENT_TYPES
 
     @property
     def synchronous(self) -> bool:
-        """Whether SYNC triggers the PDO; false for type 252, which is sampled at SYNC but sent on request."""
+        """Whether a SYNC triggers the PDO. This is false for type 252, which is only sampled at a SYNC."""
         return self.kind <= SYNC_CYCLIC_MAX
 
 
 class PdoRecords:
-    """Communication record and mapping record of one PDO; values written by clients are checked.
+    """Communication record and mapping record of a PDO. Writes by clients are checked.
 
     Args:
         store: object dictionary.
         parameter: index of the communication record.
         mapping: index of the mapping record.
         transmits: whether the PDO is a TPDO.
-        taken: returns whether another PDO already uses the given CAN-ID; None if PDOs may share a CAN-ID.
+        taken: function that returns whether a PDO uses a CAN-ID; None if PDOs may share CAN-IDs.
     """
 
     def __init__(
@@ -131,14 +128,13 @@ class PdoRecords:
         self._store = store
         self._parameter, self._mapping, self._transmits = parameter, mapping, transmits
         self._taken = taken
-        # The maximum number of mapped objects equals the maximum PDO length in bytes, because the smallest
-        # object has one byte.
+        # The smallest object has one byte, so this is also the maximum PDO length in bytes.
         self._longest = sum([store.has(mapping, sub) for sub in range(1, _MOST_MAPPED + 1)])
         store.guard(parameter, self._guard_parameter)
         store.guard(mapping, self._guard_mapping)
 
     def _word(self, subindex: int) -> int:
-        """Return the communication parameter at a sub-index; 0 if the PDO does not have this parameter."""
+        """Return a communication parameter; 0 if the record does not have this sub-index."""
         has = self._store.has(self._parameter, subindex)
         return self._store.integer(self._parameter, subindex) if has else 0
 
@@ -147,7 +143,7 @@ class PdoRecords:
         return not self._word(od.PDO_COB_ID) & INVALID_BIT
 
     def read(self) -> PdoParameters:
-        """Return the current parameters."""
+        """Return the parameters in the object dictionary."""
         store = self._store
         count = store.integer(self._mapping, 0)
         words = [store.integer(self._mapping, sub) for sub in range(1, count + 1)]
@@ -191,7 +187,7 @@ class PdoRecords:
             raise Refused(AbortCode.UNSUPPORTED_ACCESS)
         if not subindex:
             self._check_mapping(value)
-        elif value:  # an unused entry is 0; sub-index 0 must not count unused entries
+        elif value:  # 0 marks an unused entry
             self._mapped_bytes(value)
 
     def _check_mapping(self, count: int) -> None:
@@ -202,7 +198,7 @@ class PdoRecords:
             raise Refused(AbortCode.PDO_TOO_LONG)
 
     def _mapped_bytes(self, word: int) -> int:
-        """Return the length, in bytes, of the object specified by a mapping entry."""
+        """Return the length of the object in a mapping entry, bytes."""
         index, subindex, bits = word >> 16, word >> 8 & 0xFF, word & 0xFF
         if not self._transmits and not subindex and index in od.DUMMY_BITS:
             allowed, size = True, od.DUMMY_BITS[index]

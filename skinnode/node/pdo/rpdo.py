@@ -1,11 +1,12 @@
-"""RPDO engine, which writes received RPDOs to the object dictionary (CiA 301 v4.2, 7.2.2 and 7.5.2.33).
+"""RPDO engine: writes received RPDOs to the object dictionary (CiA 301 v4.2, 7.2.2 and 7.5.2.33).
 
-A synchronous RPDO (types 0 to 240) is applied at the SYNC after its reception, if it was received within the
-synchronous window (0x1007). Of several RPDOs with the same number received between two SYNCs, only the last
-is applied. An RPDO of type 254 or 255 is applied immediately. Excess bytes of an RPDO are ignored; an RPDO
-that is too short is not applied. A length error is reported by an emergency message, and is not reported
-again until an RPDO with the correct length has arrived. After an RPDO has been received for the first time in
-OPERATIONAL, its event timer monitors its reception.
+- Types 0 to 240: applied at the next SYNC, if received within the synchronous window (0x1007). If an RPDO is
+  received several times between two SYNCs, only the last one counts.
+- Types 254 and 255: applied immediately.
+
+Excess bytes are ignored. An RPDO that is too short is not applied. Length errors are reported in emergency
+messages, but not again while the same error persists. The event timer monitors the reception of an RPDO from
+its first reception in OPERATIONAL.
 """
 
 from __future__ import annotations
@@ -26,12 +27,12 @@ from skinnode.node.timers import Timers
 
 
 class _Rpdo:
-    """State of one RPDO, including its parameters and its current length error."""
+    """Parameters and state of one RPDO."""
 
     def __init__(self, number: int, records: PdoRecords) -> None:
         self.number, self._records = number, records
         self.wrong: EmcyCode | None = None
-        """Length error of the last PDO received; None if the length was correct."""
+        """Length error of the last frame received; None if its length was correct."""
         self.parameters = records.read()
         self.fields = self._fields()
 
@@ -41,7 +42,7 @@ class _Rpdo:
         self.fields = self._fields()
 
     def _fields(self) -> list[tuple[int, int, int, int]]:
-        """Return index, sub-index, start byte and end byte of each mapped object except dummies."""
+        """Return the index, sub-index, first byte and end byte of each mapped object except dummies."""
         at, fields = 0, []
         for each in self.parameters.mapping:
             if each.index not in od.DUMMY_BITS:
@@ -51,7 +52,7 @@ class _Rpdo:
 
 
 class RpdoEngine:
-    """Engine for all RPDOs of a node.
+    """Receives the RPDOs of a node.
 
     Args:
         services: resources that all services of the node share.
@@ -66,9 +67,9 @@ class RpdoEngine:
         self._operational = False
         self._timers = Timers()
         self._by_cob_id: dict[int, list[_Rpdo]] = {}
-        self._pending: dict[int, bytes] = {}  # payloads of synchronous RPDOs to apply at the next SYNC
+        self._pending: dict[int, bytes] = {}  # payloads to apply at the next SYNC, by RPDO number
 
-        # Numbers of the RPDOs with an active error: received too short, or overdue.
+        # numbers of the RPDOs with an active error: too short, or overdue
         self._short: set[int] = set()
         self._late: set[int] = set()
         self._rpdos: list[_Rpdo] = []
@@ -82,13 +83,13 @@ class RpdoEngine:
 
     @property
     def deadline_ns(self) -> int:
-        """Earliest time (ns) at which a monitored RPDO is overdue."""
+        """Time at which the first of the monitored RPDOs is overdue, ns."""
         return self._timers.deadline_ns
 
     # --- parameters
 
     def restore(self) -> None:
-        """Apply all parameters after a reset, and discard all errors."""
+        """Apply the parameters of all RPDOs after a reset, and discard all errors."""
         self._by_cob_id.clear()
         self._pending.clear()
         self._timers.clear()
@@ -117,10 +118,10 @@ class RpdoEngine:
     # --- events
 
     def enter(self, *, operational: bool) -> None:
-        """Handle a change of the NMT state: drop the pending RPDOs, and end deadline monitoring.
+        """Handle a change of the NMT state.
 
-        Deadlines are monitored only in OPERATIONAL (CiA 301 v4.2, 7.5.2.33), so active RPDO timeout errors
-        end.
+        Pending RPDOs are dropped. Deadlines are monitored only in OPERATIONAL (CiA 301 v4.2, 7.5.2.33), so
+        monitoring stops and RPDO timeout errors end.
         """
         self._operational = operational
         self._pending.clear()
@@ -129,12 +130,12 @@ class RpdoEngine:
             self._recover(self._late, number, EmcyCode.RPDO_TIMEOUT, self._now())
 
     def on_frame(self, cob_id: int, data: bytes, t_ns: int) -> None:
-        """Pass a frame to each RPDO that has the frame's COB-ID.
+        """Handle a frame, which may belong to several RPDOs.
 
         Args:
             cob_id: identifier of the frame.
             data: payload of the frame.
-            t_ns: time of reception, ns.
+            t_ns: arrival time, ns.
         """
         if self._operational:
             for rpdo in tuple(self._by_cob_id.get(cob_id, ())):
@@ -147,7 +148,7 @@ class RpdoEngine:
             self._execute(self._rpdos[number], pending[number])
 
     def on_timer(self, t_ns: int) -> None:
-        """Report each RPDO that is overdue. Monitoring restarts when the RPDO is received again."""
+        """Report each overdue RPDO. Its monitoring restarts when it is received again."""
         for number in self._timers.take(t_ns):
             self._late.add(number)
             self._emcy.report(EmcyCode.RPDO_TIMEOUT, (number + 1).to_bytes(2, "little"), t_ns)
@@ -172,7 +173,7 @@ class RpdoEngine:
             self._pending[rpdo.number] = data
 
     def _execute(self, rpdo: _Rpdo, data: bytes) -> None:
-        """Write the mapped objects. Ignore values that an object refuses, because a PDO has no response."""
+        """Write the mapped objects. Refused values are ignored, because a PDO has no response."""
         for index, subindex, start, end in rpdo.fields:
             with contextlib.suppress(Refused):
                 self._store.write(index, subindex, data[start:end])
@@ -180,7 +181,7 @@ class RpdoEngine:
     # --- errors
 
     def _set_wrong(self, rpdo: _Rpdo, wrong: EmcyCode | None, data: bytes, t_ns: int) -> None:
-        """Report a new length error of an RPDO, or the end of a length error."""
+        """Report the beginning or the end of a length error."""
         if wrong is rpdo.wrong:
             return
         rpdo.wrong = wrong

@@ -1,4 +1,4 @@
-"""TPDO engine, which transmits mapped objects according to PDO parameters (CiA 301 v4.2, 7.2.2, 7.5.2.37).
+"""TPDO engine (CiA 301 v4.2, 7.2.2 and 7.5.2.37).
 
 =========  =======================================================================================
 type       sent
@@ -11,12 +11,12 @@ type       sent
            never before the inhibit time has passed
 =========  =======================================================================================
 
-An application can *claim* an object of the object dictionary. The application then sends all TPDOs whose
-first mapped object is the claimed object. SYNC and events do not trigger claimed TPDOs. The engine still
-counts SYNCs, answers remote frames and runs the event timers for claimed TPDOs.
+An application can *claim* an object. It then owns all TPDOs whose first mapped object is the claimed object,
+and sends them itself: SYNCs and events do not trigger them. The engine still counts SYNCs, answers remote
+frames and runs the event timers of these TPDOs.
 
-The time needed to process a SYNC depends only on the number of enabled TPDOs that a SYNC sends or samples.
-The time needed to process a timer event depends only on the number of TPDOs that are due.
+A SYNC takes time in proportion to the number of enabled TPDOs that SYNCs send or sample. A timer event takes
+time in proportion to the number of TPDOs that are due.
 """
 
 from __future__ import annotations
@@ -39,40 +39,39 @@ class Tpdo:
 
     Args:
         number: number of the TPDO, counted from 0.
-        records: the TPDO's records in the object dictionary.
+        records: records of the TPDO in the object dictionary.
     """
 
     def __init__(self, number: int, records: PdoRecords) -> None:
         self.number, self._records = number, records
         self.ready_ns = 0
-        """Time (ns) at which the inhibit time ends and the TPDO may be sent again."""
+        """Time at which the inhibit time ends, ns."""
         self.timer_ns = NO_DEADLINE_NS
-        """Time (ns) at which the TPDO's event timer elapses."""
+        """Time at which the event timer elapses, ns."""
         self.waiting = False
         """Whether the TPDO is waiting for a SYNC or for the end of the inhibit time."""
         self.last: bytes | None = None
-        """Last payload sent or, for transmission type 252, last payload sampled; None before the first
-        payload."""
+        """Last payload sent or, for type 252, sampled; None before the first payload."""
         self.owner: Owner | None = None
-        """Part of the application that sends the TPDO; None if the TPDO engine sends the TPDO."""
+        """Owner that sends the TPDO; None if the engine sends it."""
         self._in_step = False
         self._syncs = 0
         self.parameters = records.read()
 
     @property
     def first_index(self) -> int:
-        """Index of the first mapped object; 0 if the mapping is empty."""
+        """Index of the first mapped object; 0 if none is mapped."""
         mapping = self.parameters.mapping
         return mapping[0].index if mapping else 0
 
     @property
     def deadline_ns(self) -> int:
-        """Time (ns) at which the TPDO's timers must be handled next."""
+        """Time at which the event timer or the inhibit time of a waiting TPDO elapses, ns."""
         held = self.waiting and self.parameters.event_driven
         return min(self.timer_ns, self.ready_ns) if held else self.timer_ns
 
     def reload(self, t_ns: int) -> None:
-        """Apply this TPDO's parameters, which were written to the object dictionary at ``t_ns``."""
+        """Apply the parameters in the object dictionary."""
         old, new = self.parameters, self._records.read()
         self.parameters = new
         if (old.enabled, old.kind, old.sync_start) != (new.enabled, new.kind, new.sync_start):
@@ -81,21 +80,21 @@ class Tpdo:
             self.start_timer(t_ns)
 
     def start(self, t_ns: int) -> None:
-        """Reset the TPDO's state and start its event timer when the node enters OPERATIONAL."""
+        """Reset the state and start the event timer, because the node enters OPERATIONAL."""
         self.waiting, self.last, self._in_step, self._syncs = False, None, False, 0
         self.start_timer(t_ns)
 
     def start_timer(self, t_ns: int) -> None:
-        """Restart the event timer at ``t_ns``, if an event timer is configured."""
+        """Restart the event timer, if one is configured."""
         parameters = self.parameters
         timed = parameters.enabled and parameters.event_driven and parameters.event_timer_ns > 0
         self.timer_ns = t_ns + parameters.event_timer_ns if timed else NO_DEADLINE_NS
 
     def elapse(self, t_ns: int) -> None:
-        """Restart an elapsed event timer.
+        """Restart the event timer after it has elapsed.
 
-        The new period begins at the end of the elapsed period. If the delay exceeds a whole period, the new
-        period begins at ``t_ns`` instead.
+        The new period begins when the last one ended or, after a delay of a whole period or more, at
+        ``t_ns``.
         """
         self.timer_ns += self.parameters.event_timer_ns
         if self.timer_ns <= t_ns:
@@ -105,17 +104,17 @@ class Tpdo:
         """Count a SYNC.
 
         Args:
-            counter: SYNC counter; None if the SYNC message contains no counter.
+            counter: SYNC counter; None if the SYNC contains no counter.
 
         Returns:
-            Whether this synchronous TPDO is due after this SYNC.
+            Whether this synchronous TPDO is due at this SYNC.
         """
         parameters = self.parameters
         if not self._in_step and parameters.sync_start and counter is not None:
             if counter != parameters.sync_start:
                 return False
             self._in_step, self._syncs = True, 0
-            return True  # counting begins at the SYNC whose counter has the start value
+            return True  # the SYNC with the start value is the first
         self._syncs += 1
         if self._syncs < parameters.kind:
             return False
@@ -124,14 +123,14 @@ class Tpdo:
 
 
 class Owner(Protocol):
-    """Sender of the TPDOs that carry claimed objects; usually a part of the application."""
+    """Part of an application that sends the TPDOs with a claimed object."""
 
     def sends(self, tpdo: Tpdo) -> bool:
-        """Return whether the owner will soon send this TPDO without a trigger from the TPDO engine."""
+        """Return whether the owner is about to send this TPDO anyway, so that nothing need trigger it."""
         ...
 
     def on_reload(self, tpdo: Tpdo) -> None:
-        """Handle a change of a TPDO's parameters or of its owner."""
+        """Handle a change of a TPDO's parameters or owner."""
         ...
 
 
@@ -148,12 +147,12 @@ class TpdoEngine:
         store = services.store
         self._store, self._send, self._now = store, services.send, services.now
         self.window = window
-        """Synchronous window (0x1007), within which owners must send their synchronous TPDOs."""
+        """Synchronous window (0x1007), which owners must observe for synchronous TPDOs."""
         self._claims: dict[int, Owner] = {}
         self._running = False
         self._timers = Timers()
-        # Numbers of the enabled TPDOs in ascending order, in three lists: TPDOs that a SYNC sends or
-        # samples, TPDOs sent on events, and TPDOs with an owner.
+        # Numbers of enabled TPDOs, ascending: those that a SYNC sends or samples, those that events send, and
+        # those with an owner.
         self._listening: list[int] = []
         self._eventful: list[int] = []
         self._owned: list[int] = []
@@ -169,16 +168,16 @@ class TpdoEngine:
 
     @property
     def deadline_ns(self) -> int:
-        """Time (ns) at which :meth:`on_timer` must be called next."""
+        """Time at which :meth:`on_timer` must be called next, ns."""
         return self._timers.deadline_ns
 
     def claim(self, index: int, owner: Owner) -> None:
-        """Register ``owner`` as the sender of all TPDOs whose first mapped object has this index."""
+        """Claim the object at ``index`` for ``owner``."""
         self._claims[index] = owner
         self.restore()
 
     def owned(self, index: int) -> list[Tpdo]:
-        """Return the enabled TPDOs whose first mapped object is the claimed object at this index."""
+        """Return the enabled TPDOs whose first mapped object is the claimed object at ``index``."""
         return [tpdo for tpdo in map(self._tpdos.__getitem__, self._owned) if tpdo.first_index == index]
 
     # --- parameters
@@ -211,8 +210,7 @@ class TpdoEngine:
         self._plan(tpdo)
 
     def _taken(self, cob_id: int) -> bool:
-        # Read the COB-IDs from the object dictionary: when parameters are restored, the TPDOs still have
-        # their previous COB-IDs.
+        # While parameters are being restored, only the object dictionary has the new COB-IDs.
         numbers = range(od.TPDO1_PARAMETER, od.TPDO1_PARAMETER + len(self._tpdos))
         words = [self._store.integer(index, od.PDO_COB_ID) for index in numbers]
         return any(not word & INVALID_BIT and word & COB_ID_MASK == cob_id for word in words)
@@ -220,22 +218,22 @@ class TpdoEngine:
     # --- events
 
     def start(self, t_ns: int) -> None:
-        """Start all TPDOs when the node enters OPERATIONAL."""
+        """Start all TPDOs, because the node enters OPERATIONAL."""
         self._running = True
         for tpdo in self._tpdos:
             tpdo.start(t_ns)
             self._plan(tpdo)
 
     def stop(self) -> None:
-        """Stop all TPDOs when the node leaves OPERATIONAL."""
+        """Stop all TPDOs, because the node leaves OPERATIONAL."""
         self._running = False
         self._timers.clear()
 
     def count_sync(self, counter: int | None) -> frozenset[int]:
-        """Count a SYNC for all TPDOs, and determine the synchronous TPDOs that are due.
+        """Count a SYNC for all synchronous TPDOs.
 
         Args:
-            counter: SYNC counter; None if the SYNC message contains no counter.
+            counter: SYNC counter; None if the SYNC contains no counter.
 
         Returns:
             Numbers of the synchronous TPDOs that are due.
@@ -248,11 +246,11 @@ class TpdoEngine:
     def on_sync(self, turns: Collection[int], t_ns: int) -> None:
         """Send the synchronous TPDOs that are due, and sample the TPDOs of type 252.
 
-        This method must be called after the application has handled the SYNC.
+        The application must have handled the SYNC before.
 
         Args:
             turns: numbers of the synchronous TPDOs that are due.
-            t_ns: time at which the SYNC was received, ns.
+            t_ns: arrival time of the SYNC, ns.
         """
         for number in tuple(self._listening):
             tpdo = self._tpdos[number]
@@ -264,17 +262,17 @@ class TpdoEngine:
                     self._transmit(tpdo, payload, t_ns)
 
     def trigger(self, t_ns: int) -> None:
-        """Signal an event: send all event-driven TPDOs that have no owner."""
+        """Signal an event, which triggers all event-driven TPDOs without an owner."""
         for number in tuple(self._eventful):
             self.request(self._tpdos[number], t_ns)
 
     def request(self, tpdo: Tpdo, t_ns: int) -> None:
-        """Send an event-driven TPDO when its inhibit time has elapsed."""
+        """Send an event-driven TPDO as soon as its inhibit time has elapsed."""
         tpdo.waiting = True
         self._let_out(tpdo, t_ns)
 
     def on_remote(self, cob_id: int, t_ns: int) -> None:
-        """Send the TPDO that a remote frame requests, unless the TPDO is synchronous (CiA 301, 7.2.2.3)."""
+        """Send the TPDO that a remote frame requests. Synchronous TPDOs ignore it (CiA 301, 7.2.2.3)."""
         tpdo = self._by_cob_id.get(cob_id)
         if tpdo is None or not tpdo.parameters.answers_rtr or self._sent_anyway(tpdo):
             return
@@ -303,16 +301,16 @@ class TpdoEngine:
     # --- sending
 
     def payload(self, tpdo: Tpdo) -> bytes:
-        """Return the payload of a TPDO: the current values of its mapped objects."""
+        """Return the current values of the objects mapped into a TPDO."""
         raw = self._store.raw
         return b"".join([raw(each.index, each.subindex) for each in tpdo.parameters.mapping])
 
     def emit(self, tpdo: Tpdo, payload: bytes) -> None:
-        """Send a payload immediately; the TPDO's owner is responsible for its timing."""
+        """Send a payload immediately, without regard to the inhibit time; used by owners."""
         self._send(tpdo.parameters.cob_id, payload)
 
     def transmit(self, tpdo: Tpdo, t_ns: int) -> None:
-        """Send a synchronous TPDO if the synchronous window (0x1007) is open; otherwise, discard the TPDO."""
+        """Send a synchronous TPDO, or discard it if the synchronous window (0x1007) is closed."""
         if self.window.lets_out(tpdo.number, t_ns):
             self._transmit(tpdo, self.payload(tpdo), t_ns)
         else:
@@ -325,13 +323,13 @@ class TpdoEngine:
             self._plan(tpdo)
 
     def _transmit(self, tpdo: Tpdo, payload: bytes, t_ns: int, *, timer: bool = True) -> None:
-        """Send a payload, start the inhibit time, and restart the event timer if ``timer`` is true."""
+        """Send a payload and start the inhibit time. If ``timer`` is true, also restart the event timer."""
         tpdo.last, tpdo.waiting = payload, False
         tpdo.ready_ns = t_ns + tpdo.parameters.inhibit_ns
         if timer:
             tpdo.start_timer(t_ns)
         self._plan(tpdo)
-        # The state is updated before the frame is sent, because sending may raise a bus error.
+        # This comes last, because it may raise a BusError.
         self._send(tpdo.parameters.cob_id, payload)
 
     def _plan(self, tpdo: Tpdo) -> None:
@@ -339,7 +337,7 @@ class TpdoEngine:
 
 
 def _keep(numbers: list[int], number: int, wanted: bool) -> None:
-    """Add ``number`` to the sorted list ``numbers`` if ``wanted`` is true; otherwise, remove ``number``."""
+    """Add ``number`` to the sorted list ``numbers`` if ``wanted``, else remove it."""
     at = bisect_left(numbers, number)
     there = at < len(numbers) and numbers[at] == number
     if wanted and not there:

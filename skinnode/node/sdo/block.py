@@ -1,9 +1,9 @@
-"""SDO block transfer, with one acknowledgement per block of segments (CiA 301 v4.2, 7.2.4.3.9 to 7.2.4.3.15).
+"""SDO block transfers (CiA 301 v4.2, 7.2.4.3.9 to 7.2.4.3.15), in which a block is acknowledged as a whole.
 
-CAN may deliver a frame twice if the last bit of its end-of-frame field is disturbed (ISO 11898-1). If this
-happens to an acknowledgement, the copy could be mistaken for the acknowledgement of the next block, because
-frames contain no block number. Segments would then be skipped. A frame identical to the previous frame is
-therefore ignored, unless the protocol allows two identical frames in succession.
+CAN delivers a frame twice if the last bit of its end-of-frame field is disturbed (ISO 11898-1).
+Acknowledgements contain no block number, so a duplicate would be taken for the acknowledgement of the next
+block, and segments would be skipped. A frame identical to the previous one is therefore ignored, unless the
+protocol allows two identical frames in succession.
 """
 
 from __future__ import annotations
@@ -20,30 +20,24 @@ from skinnode.errors import BusError
 from skinnode.node.sdo.transfer import MULTIPLEXER_U32, Channel, Incoming, Target, Transfer
 
 SEGMENT_NS: Final = 500_000
-"""Minimum mean interval between segments, in ns.
+"""Initial mean interval between segments, ns.
 
-PDOs may cause a bus load of 70 %. A 1 Mbit/s bus then has a remaining capacity of at least 2200 frames/s.
-Block transfers use 2000 frames/s, so the transmit queue does not fill up.
-
-A block of 127 segments takes 64 ms, or 100 ms if the thread wakes up late. Clients wait longer for a frame
-than one block takes; the canopen library, for example, waits 300 ms. Each time a segment cannot be sent, for
-example at a lower bit rate, the interval is doubled for the rest of the transfer.
+The rate of 2000 frames/s is below the 2200 frames/s that remain on a 1 Mbit/s bus with 70 % PDO load, so the
+transmit queue does not fill up. A block of 127 segments takes 64 ms, which is well within the time-outs of
+clients (the canopen library waits 300 ms). Whenever the bus refuses a segment, for example at a lower bit
+rate, the interval is doubled for the rest of the transfer.
 """
 SLOWEST_SEGMENT_NS: Final = 8 * SEGMENT_NS
-"""Maximum mean interval between segments, in ns. At this interval, the segments use only a quarter of the
-capacity of a 125 kbit/s bus."""
+"""Maximum mean interval between segments, ns. At this interval, segments use a quarter of the capacity of a
+125 kbit/s bus."""
 SEGMENTS_AT_ONCE: Final = 4
-"""Maximum number of segments sent per timer event.
+"""Maximum number of segments sent at once after the thread has woken up late.
 
-Several segments are sent if the thread has woken up late, by default by up to 2 ms. Two timer events in
-succession must not overflow the transmit queue, which holds 10 frames on Linux.
+Two bursts in quick succession must fit into the transmit queue, which holds 10 frames on Linux.
 """
 TWICE_NS: Final = 3_000_000
-"""Maximum interval (ns) between the two receptions of a duplicated frame: the duration of two maximum-length
-frames and an error frame at 125 kbit/s.
-
-An acknowledgement that is not a duplicate differs from the previous one, because the client has received more
-segments.
+"""Maximum time between a frame and its duplicate, ns: the duration of two frames of maximum length and an
+error frame at 125 kbit/s.
 """
 
 _LAST: Final = 0x80
@@ -53,7 +47,7 @@ _FIVE_ZEROS: Final = bytes(5)
 
 
 class _Client(IntEnum):
-    """Client sub-commands in a block upload (the lowest two bits of a request)."""
+    """Client subcommand of a block upload: the lower two bits of a request."""
 
     END = 1
     ACKNOWLEDGE = 2
@@ -61,23 +55,23 @@ class _Client(IntEnum):
 
 
 class _Upload(Enum):
-    """Event that a block upload is waiting for."""
+    """Event for which a block upload is waiting."""
 
     START = auto()
     TIME = auto()
-    """The next segment becomes due."""
+    """Time at which the next segment is due."""
     ACKNOWLEDGEMENT = auto()
     END = auto()
 
 
 @dataclass(frozen=True, slots=True)
 class Upload:
-    """Value to send in a block upload, and the options requested by the client."""
+    """Value and options of a block upload."""
 
     data: bytes
-    """Value to be sent."""
+    """Value of the object."""
     block_size: int
-    """Number of segments per block, which the client can change with each acknowledgement."""
+    """Number of segments in the first block. Each acknowledgement contains that of the next block."""
     crc: bool
     """Whether the client supports a CRC."""
 
@@ -87,9 +81,9 @@ class BlockUpload(Transfer):
 
     Args:
         channel: SDO server channel.
-        target: object to read or write.
-        upload: value of the object, and the options requested by the client.
-        t_ns: time at which the initiate request was received, ns.
+        target: object to read.
+        upload: value and options.
+        t_ns: arrival time of the initiate request, ns.
 
     Raises:
         Refused: if the block size is not from 1 to 127.
@@ -99,23 +93,23 @@ class BlockUpload(Transfer):
         super().__init__(channel, target, t_ns)
         data, crc = upload.data, upload.crc
         self._data, self._crc = data, crc
-        self._segments = max(1, -(-len(data) // SEGMENT_BYTES))  # even an empty value needs one segment
+        self._segments = max(1, -(-len(data) // SEGMENT_BYTES))  # an empty value needs one segment, too
         self._block_size = _checked(upload.block_size)
-        self._first = 0  # number of acknowledged segments before the current block
+        self._first = 0  # number of segments before the current block
         self._pace_ns = SEGMENT_NS
-        self._sent = 0  # number of segments of the current block sent so far
+        self._sent = 0  # number of segments sent in the current block
         self._waits_for = _Upload.START
         self._previous, self._previous_ns = b"", t_ns
-        # The server offers a CRC only if the client supports one: some clients expect a CRC whenever the
-        # server offers it, even if they did not request one.
+        # Offer a CRC only if the client supports it: some clients expect the CRC that a server offers, even
+        # if they have not requested one.
         channel.send(MULTIPLEXER_U32.pack(0xC2 | crc << 2, target.index, target.subindex, len(data)))
 
     def wants(self, request: bytes) -> bool:
-        """Return whether a request from the client belongs to this transfer."""
+        """Return whether a request belongs to this transfer."""
         return request[0] >> 5 == 5 and request[0] & 3 != 0
 
     def on_request(self, request: bytes, t_ns: int) -> bool:
-        """Process a request that belongs to this transfer; return whether the transfer has ended."""
+        """Handle a request that belongs to this transfer. Return whether the transfer has ended."""
         twice = request == self._previous and t_ns - self._previous_ns < TWICE_NS
         if twice and self._waits_for is not _Upload.ACKNOWLEDGEMENT:
             return False
@@ -132,7 +126,7 @@ class BlockUpload(Transfer):
         return False
 
     def on_timer(self, t_ns: int) -> None:
-        """Send the segments due at ``t_ns``, or abort if the client has not responded in time."""
+        """Send the segments due at ``t_ns``, or abort the transfer if it has timed out."""
         if self._waits_for is not _Upload.TIME:
             super().on_timer(t_ns)
         due_ns = max(self.deadline_ns, t_ns - (SEGMENTS_AT_ONCE - 1) * self._pace_ns)
@@ -155,7 +149,7 @@ class BlockUpload(Transfer):
         head = self._sent + 1 | (_LAST if last else 0)
         try:
             self._channel.send(bytes((head,)) + segment.ljust(SEGMENT_BYTES, b"\0"))
-        except BusError:  # the segment was not sent and will be retried at the longer interval
+        except BusError:  # this segment will be sent again
             self._pace_ns = min(2 * self._pace_ns, SLOWEST_SEGMENT_NS)
             raise
         self._sent += 1
@@ -163,7 +157,7 @@ class BlockUpload(Transfer):
             self._waits_for = _Upload.ACKNOWLEDGEMENT
 
     def _acknowledge(self, received: int, block_size: int, t_ns: int) -> None:
-        """Continue after segment number ``received`` of this block, the last that the client received."""
+        """Continue after the first ``received`` segments of the block, which have reached the client."""
         if received > self._sent:
             raise Refused(AbortCode.INVALID_SEQUENCE)
         self._block_size = _checked(block_size)
@@ -181,18 +175,18 @@ class BlockUpload(Transfer):
 class BlockDownload(Transfer):
     """Block download. The constructor sends the response to the initiate request.
 
-    At the end of each block, the server acknowledges the last segment received without a gap. If the last
-    segment of a block is lost, the transfer times out.
+    At the end of a block, the server acknowledges the segments before the first lost one. If the last segment
+    of a block is lost, the transfer times out.
 
     Args:
         channel: SDO server channel.
-        target: object to read or write.
-        announced: size announced by the client, bytes; None if the client announced no size.
-        t_ns: time at which the initiate request was received, ns.
+        target: object to write.
+        announced: size announced by the client, bytes, or None.
+        t_ns: arrival time of the initiate request, ns.
         crc: whether the client supports a CRC.
 
     Raises:
-        Refused: if the object is not writable or does not accept a value of the announced size.
+        Refused: if the object is not writable, or does not accept the announced size.
     """
 
     def __init__(
@@ -201,19 +195,19 @@ class BlockDownload(Transfer):
         super().__init__(channel, target, t_ns)
         self._incoming = Incoming(channel.store, target, announced)
         self._crc = crc
-        self._received = 0  # number of segments of the current block received without a gap
-        # last segment of the transfer; the end request states how many of its bytes are data
+        self._received = 0  # number of segments of the current block before the first lost one
+        # last segment of the transfer; the end request tells how many of its bytes are data
         self._last: bytes | None = None
-        self._previous = b""  # the last acknowledged request; a copy of this request is ignored
+        self._previous = b""  # last segment of the acknowledged block, to recognise a duplicate
         channel.send(MULTIPLEXER_U32.pack(0xA0 | crc << 2, target.index, target.subindex, MAX_BLOCK_SEGMENTS))
 
     def wants(self, request: bytes) -> bool:
-        """Return whether a frame belongs to this transfer; within a block, every frame is a segment."""
+        """Return whether a request belongs to this transfer. Within a block, every request does."""
         return self._last is None or _is_end(request) or request == self._previous
 
     def on_request(self, request: bytes, t_ns: int) -> bool:
-        """Process a request that belongs to this transfer; return whether the transfer has ended."""
-        # End requests must be checked before duplicates, because an end request may equal the previous frame.
+        """Handle a request that belongs to this transfer. Return whether the transfer has ended."""
+        # Check for the end first, because an end request may be identical to the last segment.
         if self._last is not None and _is_end(request):
             self._end(request, self._last)
             return True

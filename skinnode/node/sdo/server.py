@@ -1,8 +1,7 @@
 """SDO server (CiA 301 v4.2, 7.2.4.3), with expedited and segmented transfers.
 
-Block transfers are in :mod:`skinnode.node.sdo.block`. The SDO server of the ``canopen`` library is not used:
-it does not abort a transfer that starts with an unknown command, and it supports neither a time-out nor block
-transfers.
+Block transfers are in :mod:`skinnode.node.sdo.block`. The SDO server of the ``canopen`` library is no
+substitute: it does not reject unknown commands, and has neither a time-out nor block transfers.
 """
 
 from __future__ import annotations
@@ -19,14 +18,14 @@ from skinnode.node.sdo.block import BlockDownload, BlockUpload, Upload
 from skinnode.node.sdo.transfer import MULTIPLEXER, MULTIPLEXER_U32, Channel, Incoming, Target, Transfer
 
 TIMEOUT_NS: Final = 1_000_000_000
-"""Maximum interval (ns) between two requests from a client, after which the transfer is aborted. CiA 301 does
-not define this time-out."""
+"""Maximum time to wait for the next request of a client before the transfer is aborted, ns. CiA 301 does not
+specify this time-out."""
 
 _TOGGLE: Final = 0x10
 
 
 class _Client(IntEnum):
-    """Client command specifiers (the top three bits of a request)."""
+    """Client command specifier: the upper three bits of a request."""
 
     DOWNLOAD_SEGMENT = 0
     DOWNLOAD = 1
@@ -37,19 +36,19 @@ class _Client(IntEnum):
 
 
 _NAMELESS: Final = (0, 3, 5, 6)
-"""Command specifiers of requests that continue a transfer and therefore contain no index."""
+"""Command specifiers of requests that continue a transfer and contain no index."""
 
 
 class SdoServer:
     """SDO server with one channel, which performs one transfer at a time.
 
-    A new initiate request ends an unfinished transfer, because the client has evidently abandoned it. An
-    error raised by ``send`` propagates to the caller but does not end the transfer.
+    An initiate request replaces an unfinished transfer, which the client must have abandoned. An exception
+    from ``send`` propagates to the caller and does not end the transfer.
 
     Args:
         store: object dictionary.
-        send: called with the eight bytes of each response.
-        timeout_ns: maximum interval between two requests from a client, ns.
+        send: function that sends a response of eight bytes.
+        timeout_ns: maximum time to wait for the next request of a client, ns.
     """
 
     def __init__(
@@ -60,15 +59,15 @@ class SdoServer:
 
     @property
     def deadline_ns(self) -> int:
-        """Time (ns) at which :meth:`on_timer` must be called next, to send block segments or an abort."""
+        """Time at which :meth:`on_timer` must be called next, ns."""
         return self._transfer.deadline_ns if self._transfer is not None else NO_DEADLINE_NS
 
     def reset(self) -> None:
-        """End a transfer in progress without sending an abort."""
+        """End the current transfer without an abort."""
         self._transfer = None
 
     def on_timer(self, t_ns: int) -> None:
-        """Send block upload segments due at ``t_ns``, or abort a transfer that has timed out."""
+        """Send the block segments due at ``t_ns``, or abort the transfer if it has timed out."""
         transfer = self._transfer
         if transfer is not None and t_ns >= transfer.deadline_ns:
             try:
@@ -77,11 +76,11 @@ class SdoServer:
                 self._abort(transfer.target, refused.code)
 
     def on_request(self, request: bytes, t_ns: int) -> None:
-        """Handle a request from the client. The server does not respond to an abort from the client.
+        """Handle a request.
 
         Args:
-            request: eight bytes.
-            t_ns: time of reception, ns.
+            request: payload of eight bytes.
+            t_ns: arrival time, ns.
         """
         transfer = self._transfer
         if request[0] == ABORT:
@@ -130,7 +129,7 @@ class SdoServer:
 
     def _start_upload(self, target: Target, data: bytes, t_ns: int) -> None:
         size = len(data)
-        if 1 <= size <= 4:  # an expedited response cannot contain an empty value
+        if 1 <= size <= 4:  # an empty value cannot be expedited
             head = MULTIPLEXER.pack(0x43 | (4 - size) << 2, target.index, target.subindex)
             self._channel.send(head + data.ljust(4, b"\0"))
         else:
@@ -139,7 +138,7 @@ class SdoServer:
     def _block_upload(self, request: bytes, target: Target, t_ns: int) -> None:
         data = self._read(target)
         block_size, switch_threshold, crc = request[4], request[5], bool(request[0] & 4)
-        # For values up to the switch threshold, the client does not want a block transfer.
+        # Up to the protocol switch threshold, the client prefers a normal upload.
         if 0 < len(data) <= switch_threshold:
             self._start_upload(target, data, t_ns)
         else:
@@ -153,7 +152,7 @@ class SdoServer:
             self._transfer = _Download(self._channel, target, announced, t_ns)
             return
         store = self._channel.store
-        # If the request states no size, use the object's length, but at most four bytes.
+        # If the request states no size, the size is that of the object, up to four bytes.
         index, subindex = target.index, target.subindex
         size = 4 - (command >> 2 & 3) if size_given else min(store.lengths(index, subindex).most, 4)
         store.write(index, subindex, request[4 : 4 + size])
@@ -161,7 +160,7 @@ class SdoServer:
 
 
 class _Upload(Transfer):
-    """Segmented upload, which sends up to seven bytes of the value per request."""
+    """Segmented upload, with up to seven bytes per request."""
 
     def __init__(self, channel: Channel, target: Target, data: bytes, t_ns: int) -> None:
         super().__init__(channel, target, t_ns)
@@ -169,11 +168,11 @@ class _Upload(Transfer):
         channel.send(MULTIPLEXER_U32.pack(0x41, target.index, target.subindex, len(data)))
 
     def wants(self, request: bytes) -> bool:
-        """Return whether a request from the client belongs to this transfer."""
+        """Return whether a request belongs to this transfer."""
         return request[0] >> 5 == _Client.UPLOAD_SEGMENT
 
     def on_request(self, request: bytes, t_ns: int) -> bool:
-        """Process a request that belongs to this transfer; return whether the transfer has ended."""
+        """Handle a request that belongs to this transfer. Return whether the transfer has ended."""
         if request[0] & _TOGGLE != self._toggle:
             raise Refused(AbortCode.TOGGLE_BIT)
         segment = self._data[self._at : self._at + SEGMENT_BYTES]
@@ -187,7 +186,7 @@ class _Upload(Transfer):
 
 
 class _Download(Transfer):
-    """Segmented download, which receives up to seven bytes of the value per request."""
+    """Segmented download, with up to seven bytes per request."""
 
     def __init__(self, channel: Channel, target: Target, announced: int | None, t_ns: int) -> None:
         super().__init__(channel, target, t_ns)
@@ -196,11 +195,11 @@ class _Download(Transfer):
         channel.send(MULTIPLEXER_U32.pack(0x60, target.index, target.subindex, 0))
 
     def wants(self, request: bytes) -> bool:
-        """Return whether a request from the client belongs to this transfer."""
+        """Return whether a request belongs to this transfer."""
         return request[0] >> 5 == _Client.DOWNLOAD_SEGMENT
 
     def on_request(self, request: bytes, t_ns: int) -> bool:
-        """Process a request that belongs to this transfer; return whether the transfer has ended."""
+        """Handle a request that belongs to this transfer. Return whether the transfer has ended."""
         command = request[0]
         if command & _TOGGLE != self._toggle:
             raise Refused(AbortCode.TOGGLE_BIT)

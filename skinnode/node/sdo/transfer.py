@@ -1,4 +1,4 @@
-"""Classes shared by all SDO transfers: channel, base class with a time-out, and value being downloaded."""
+"""Classes shared by all SDO transfers."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from skinnode.canopen.abort import AbortCode, Refused
 from skinnode.node.object_dictionary import ObjectStore
 
 MULTIPLEXER: Final = struct.Struct("<BHB")
-"""Format of the first four bytes of an initiate request and its response: command, index and sub-index."""
+"""First four bytes of an initiate request or response: command, index and sub-index."""
 MULTIPLEXER_U32: Final = struct.Struct("<BHBI")
-"""Format of a message with command, index, sub-index, and a 32-bit size or abort code."""
+"""Command, index and sub-index, followed by a 32-bit size or abort code."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,12 +26,12 @@ class Channel:
     send: Callable[[bytes], None]
     """Function that sends a response of eight bytes."""
     timeout_ns: int
-    """Maximum interval (ns) between two requests from a client."""
+    """Maximum time to wait for the next request of a client, ns."""
 
 
 @dataclass(frozen=True, slots=True)
 class Target:
-    """Index and sub-index of the object that a transfer reads or writes."""
+    """Object that a transfer reads or writes."""
 
     index: int
     """Index of the object."""
@@ -40,34 +40,34 @@ class Target:
 
 
 class Transfer(ABC):
-    """Base class for transfers that consist of several requests. A transfer aborts itself by raising Refused.
+    """Transfer that takes several requests. Its methods raise Refused to abort it.
 
     Args:
         channel: SDO server channel.
         target: object to read or write.
-        t_ns: time at which the initiate request was received, ns.
+        t_ns: arrival time of the initiate request, ns.
     """
 
     def __init__(self, channel: Channel, target: Target, t_ns: int) -> None:
         self._channel = channel
         self.target = target
-        """The object."""
+        """Object to read or write."""
         self.deadline_ns = t_ns + channel.timeout_ns
-        """Time (ns) at which :meth:`on_timer` must be called next."""
+        """Time at which :meth:`on_timer` must be called next, ns."""
 
     @abstractmethod
     def wants(self, request: bytes) -> bool:
-        """Return whether a request from the client belongs to this transfer."""
+        """Return whether a request belongs to this transfer."""
 
     @abstractmethod
     def on_request(self, request: bytes, t_ns: int) -> bool:
-        """Process a request that belongs to this transfer; return whether the transfer has ended."""
+        """Handle a request that belongs to this transfer. Return whether the transfer has ended."""
 
     def on_timer(self, t_ns: int) -> None:
-        """Abort the transfer, because the client has sent no request before the time-out.
+        """Abort the transfer, because it has timed out. Overridden if the transfer has other timer events.
 
         Raises:
-            Refused: always. Transfers that also send frames at timer events override this method.
+            Refused: always.
         """
         raise Refused(AbortCode.TIMED_OUT)
 
@@ -76,15 +76,15 @@ class Transfer(ABC):
 
 
 class Incoming:
-    """Value of a download, which is received in parts and then written to the object as a whole.
+    """Value of a download, received in parts and then written to the object as a whole.
 
     Args:
         store: object dictionary.
         target: object to read or write.
-        announced: size announced by the client, bytes; None if the client announced no size.
+        announced: size announced by the client, bytes, or None.
 
     Raises:
-        Refused: if the object is not writable or does not accept a value of the announced size.
+        Refused: if the object is not writable, or does not accept the announced size.
     """
 
     def __init__(self, store: ObjectStore, target: Target, announced: int | None) -> None:
@@ -111,7 +111,7 @@ class Incoming:
         """Write the complete value to the object.
 
         Raises:
-            Refused: if the value is too short or not allowed.
+            Refused: if the value is too short, or the object does not accept it.
         """
         if self._announced is not None and len(self.data) < self._announced:
             raise Refused(AbortCode.TOO_SHORT)

@@ -12,9 +12,8 @@
      │     └ SdoAbort              with the code and text from CiA 301
      └ CodecError(ValueError)      a payload does not match its COB-ID
 
-Lost chunks, stale patches and solves that do not converge are part of normal operation: they are reported by
-statuses and counters, and never raise an exception. An array of the wrong shape raises a plain
-``ValueError``.
+Lost chunks, stale patches and solves that do not converge occur in normal operation. They are reported by
+statuses and counters, not by exceptions. An array of the wrong shape raises a plain ``ValueError``.
 """
 
 from __future__ import annotations
@@ -29,7 +28,7 @@ class SkinError(Exception):
 
 
 class Shown(str):
-    """String whose ``repr`` has no quotes, for values that an error message shows unquoted."""
+    """String that is shown without quotes in error messages."""
 
     __slots__ = ()
 
@@ -38,18 +37,18 @@ class Shown(str):
 
 
 NOTHING: Final = Shown("nothing")
-"""Placeholder that an error message shows as the value of a missing key."""
+"""Value of a missing key in error messages."""
 
 _MOST_SHOWN: Final = 240
 
 
 class ConfigError(SkinError, ValueError):
-    """Configuration value that cannot be used.
+    """Invalid value in a configuration file, in another input file or on the command line.
 
     Args:
-        key: Dotted path of the value, such as ``patches[1].node_id``, or the name of the option.
-        got: Value found; None if there is no value.
-        allowed: Phrase that describes the accepted values.
+        key: Dotted path of the key, such as ``patches[1].node_id``, or name of the option.
+        got: Value found; None if there is none.
+        allowed: Description of the valid values.
         where: File, line and column of the value, if known.
     """
 
@@ -57,7 +56,7 @@ class ConfigError(SkinError, ValueError):
         self.key, self.got, self.allowed, self.where = key, got, allowed, where
         prefix = f"{where}: " if where else ""
         shown = repr(NOTHING if got is None else got)
-        if len(shown) > _MOST_SHOWN:  # shortened: the value may be an array or a long path
+        if len(shown) > _MOST_SHOWN:  # such as an array or a long path
             shown = f"{shown[: _MOST_SHOWN - 40]}…{shown[-40:]}"
         super().__init__(f"{prefix}{key}: got {shown}, allowed: {allowed}")
 
@@ -77,11 +76,11 @@ class BusLoadError(ConfigError):
 
 
 class BusError(SkinError):
-    """Failure to open a CAN interface, or to send or receive on it; raised ``from`` the python-can error."""
+    """Failure to open a CAN interface, or to send or receive on it; the cause is the error of python-can."""
 
 
 class NodeError(BusError):
-    """Protocol violation by a CANopen node, or failure to communicate with the node."""
+    """Protocol violation by a CANopen node, or failure to communicate with it."""
 
     def __init__(self, node_id: int, message: str) -> None:
         self.node_id = node_id
@@ -89,11 +88,11 @@ class NodeError(BusError):
 
 
 class NodeTimeout(NodeError, TimeoutError):
-    """Timeout while waiting for a node's response."""
+    """A node did not respond in time."""
 
 
 class SdoAbort(NodeError):
-    """Aborted SDO transfer; ``code`` is the abort code from CiA 301, table 22."""
+    """Aborted SDO transfer; ``code`` is the SDO abort code (CiA 301, table 22)."""
 
     def __init__(self, node_id: int, code: int, text: str) -> None:
         self.code = code
@@ -101,7 +100,7 @@ class SdoAbort(NodeError):
 
 
 class CodecError(SkinError, ValueError):
-    """Payload that cannot be decoded; ``cob_id`` and ``data`` are the frame's COB-ID and payload."""
+    """Frame whose payload cannot be decoded; ``cob_id`` and ``data`` are its COB-ID and payload."""
 
     def __init__(self, cob_id: int, data: bytes, allowed: str) -> None:
         self.cob_id, self.data, self.allowed = cob_id, bytes(data), allowed

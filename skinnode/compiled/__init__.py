@@ -1,5 +1,5 @@
-"""Infrastructure for compiled kernels.
+"""Support for kernels compiled with numba.
 
-``jit`` provides the decorators, ``kernel_cache`` stores compiled kernels, ``array_table`` passes many arrays
-in one argument, and ``simd`` provides vector instructions.
+``jit`` contains the decorators, ``kernel_cache`` the cache of compiled kernels, ``array_table`` a type that
+passes many arrays to a kernel in one argument, and ``simd`` vector instructions.
 """

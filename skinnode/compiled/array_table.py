@@ -1,8 +1,8 @@
-"""Tables that pass many arrays and numbers to a kernel in one argument, with access by name.
+"""Tables that pass many arrays and numbers to a kernel in one argument.
 
-Numba checks and unpacks every argument of every call. For the fifty arrays of a patch, this takes 4 µs with
-warm caches and 40 µs with cold caches. An :class:`ArrayTable` is one array of addresses and shapes. A
-subclass declares the fields once, for Python and for kernels:
+Numba checks and unpacks every argument of every call, which takes 4 to 40 µs for the fifty arrays of a patch.
+An :class:`ArrayTable` passes a single array that contains the addresses and shapes of all arrays. A subclass
+declares the fields once, for Python and for kernels:
 
     class Scan(ArrayTable):
         ohm: Annotated[NDArray[np.float64], "U K"]     # element type and axes
@@ -15,10 +15,10 @@ subclass declares the fields once, for Python and for kernels:
 
     kernel(Scan(ohm=np.zeros((10, 30)), limit=1.0).table)
 
-Python writes fields and kernels read them by name, so the order of declaration does not matter. The
-constructor checks the element type, number of axes and contiguity of each array, and requires axes with the
-same name to have the same length. The first entry of a table is a digest of its declaration; a kernel that
-receives a table of another class raises TypeError.
+Fields are accessed by name, so their order does not matter. The constructor checks the element type, the
+number of axes and the contiguity of each array, and that axes with the same name have the same length. The
+first entry of a table is a digest of its declaration. A kernel that receives a table of another class raises
+TypeError.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ from numba.extending import register_model as typed_register_model
 from numba.np import arrayobj as typed_arrayobj
 from numpy.typing import NDArray
 
-cgutils: Any = typed_cgutils  # Any, because numba's type hints do not match the use here
+cgutils: Any = typed_cgutils  # Any: numba's type hints do not allow this use
 errors: Any = typed_errors
 imputils: Any = typed_imputils
 types: Any = typed_types
@@ -52,7 +52,7 @@ register_model: Any = typed_register_model
 arrayobj: Any = typed_arrayobj
 
 READONLY: Final = "readonly"
-"""Annotation for a field that kernels may read but not write."""
+"""Annotation of an array that kernels may only read."""
 _AXES_MAX: Final = 3
 _COLUMNS: Final = 1 + _AXES_MAX
 _T = TypeVar("_T", bound="ArrayTable")
@@ -72,7 +72,7 @@ class _Field:
         return kind if self.axes is None else types.Array(kind, len(self.axes), "C", readonly=self.readonly)
 
     def check(self, table: str, array: Any, lengths: dict[str, int]) -> None:
-        """Raise TypeError unless a kernel can use ``array``; ``lengths`` collects the axis lengths."""
+        """Raise TypeError unless ``array`` fits the declaration and the known axis ``lengths``."""
         assert self.axes is not None
         if not isinstance(array, np.ndarray):
             raise TypeError(f"{table}.{self.name}: got {type(array).__name__}, {self._wanted()}")
@@ -92,13 +92,13 @@ class _Field:
                 )
 
     def _wanted(self) -> str:
-        """Return the part of an error message that states the requirements on the array."""
+        """Return the requirements on the array, for an error message."""
         return f"must be a contiguous, writable {self.dtype} array with axes ({', '.join(self.axes or ())})"
 
 
 @dataclass(frozen=True)
 class _Group:
-    """Table entry declared as a NamedTuple; kernels read its fields as one tuple."""
+    """Several fields declared as a NamedTuple, which kernels read as one tuple."""
 
     name: str
     made_of: type
@@ -132,18 +132,18 @@ def _declared(table: str, hints: dict[str, Any]) -> tuple[_Field | _Group, ...]:
 
 
 class ArrayTable:
-    """Base class for tables of named arrays and numbers; subclasses declare the fields as annotations.
+    """Base class for tables of named arrays and numbers; a subclass declares its fields as annotations.
 
     Args:
-        values: Value of every declared field, by name. Arrays are not copied; write to them in place.
+        values: Value of each declared field. Arrays are not copied; write to them in place.
 
-    Raises TypeError if a field is missing or unknown, if an array is not contiguous or is read-only, or if
+    Raises TypeError if a field is missing or unknown, if an array is not contiguous or not writable, or if
     its element type, number of axes or length differs from the declaration.
     """
 
     table: NDArray[np.int64]
-    """(1 + fields, 4) int64 argument for kernels: a digest of the declaration, then the address and shape of
-    each field."""
+    """(1 + fields, 4) argument for kernels: a row with the digest of the declaration, then one row with the
+    address and the shape of each field."""
     _fields: ClassVar[tuple[_Field | _Group, ...]] = ()
     _names: ClassVar[frozenset[str]] = frozenset()
     _rows: ClassVar[dict[str, int]] = {}
@@ -199,7 +199,7 @@ def _enter(table: str, field: _Field, value: Any, row: NDArray[np.int64], length
 
 
 class _ViewType(types.Type):  # type: ignore[misc]  # numba has no type hints
-    """Numba type of an :class:`ArrayTable` in a kernel; its value is the address of the table."""
+    """Numba type of an :class:`ArrayTable` in a kernel, represented by the address of the table."""
 
     def __init__(self, made_of: type[ArrayTable]) -> None:
         self.made_of = made_of
@@ -216,11 +216,11 @@ class _ViewModel(models.PrimitiveModel):  # type: ignore[misc]
 
 
 def reader(made_of: type[_T]) -> Callable[[NDArray[np.int64]], _T]:
-    """Return a function that gives kernels access to the fields of a table by name.
+    """Return a function with which kernels access the fields of a table by name.
 
-    Only compiled code can call the returned function. Each use of a field name reads the table again, so read
-    fields before loops. In kernels, bool arrays have the element type uint8. The kernel raises TypeError if
-    its table is not an instance of ``made_of``.
+    The function can only be called in compiled code. It raises TypeError if the table does not belong to
+    ``made_of``. Each access to a field reads the table again, so access fields outside loops. In kernels,
+    bool arrays have the element type uint8.
     """
     view, digest = _ViewType(made_of), made_of._digest
     message = f"table: got a table of another class, must be the table of a {made_of.__name__}"

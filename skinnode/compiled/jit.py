@@ -1,14 +1,14 @@
-"""Compilation of kernels: ``@njit`` with a cache that cannot go stale.
+"""Decorators that compile kernels and cache them without the risk of stale code.
 
-A plain file cache detects edits to the file that defines a function, but not edits to other files whose
-functions the function calls. Therefore the cache folder (:mod:`skinnode.compiled.kernel_cache`) is named
-after a digest of every file that contains kernels: an edit to any of these files recompiles all kernels. The
-cache folder is created in the first writable location among ``$SKINNODE_CACHE_DIR``, the user's cache folder
-and the system's temporary folder. If no location is writable, kernels are not cached.
+Numba's own cache misses changes in other files whose functions a kernel calls. The name of the cache folder
+(:mod:`skinnode.compiled.kernel_cache`) therefore contains a digest of all files with kernels, and a change in
+any of them recompiles all kernels. The folder is created in ``$SKINNODE_CACHE_DIR``, in the user's cache
+folder or in the system's temporary folder, whichever is writable first. If none is writable, kernels are not
+cached.
 
-With ``error_model="numpy"``, a division by zero yields inf instead of raising an exception. With ``nogil``, a
-thread pool can solve several patches at the same time. ``fastmath`` is off because results must not depend on
-how a compiler reorders sums.
+Kernels are compiled with ``error_model="numpy"``, so that a division by zero yields inf and no exception.
+Most are also compiled with ``nogil``, so that several threads can solve patches in parallel. ``fastmath`` is
+off, because it would allow the compiler to reorder sums.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ import numba as typed_numba
 
 from skinnode.compiled.kernel_cache import SUFFIX, KernelCache
 
-numba: Any = typed_numba  # numba's type hints lack the configuration and options used here
+numba: Any = typed_numba  # Any: numba's type hints lack options used here
 _F = TypeVar("_F", bound=Callable[..., Any])
 _KERNEL_FILES = (
     "compiled/*.py",
@@ -42,7 +42,7 @@ _KERNEL_FILES = (
 def _writable(folder: Path) -> bool:
     try:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-        if folder.stat().st_uid != os.getuid():  # never load another user's compiled code
+        if folder.stat().st_uid != os.getuid():  # do not load another user's compiled code
             return False
         with tempfile.TemporaryFile(dir=folder):
             return True
@@ -69,9 +69,9 @@ def cache_dir() -> Path | None:
 
 
 def is_cold(kernel: str = "solve_patch") -> bool:
-    """Return whether ``kernel`` still has to be compiled.
+    """Return whether ``kernel`` is missing from the cache and will be compiled on its first call.
 
-    Commands use this function to explain a slow start.
+    Commands announce the slow start in this case.
     """
     folder = cache_dir()
     return folder is None or not any(folder.glob(f"*.{kernel}-*{SUFFIX}"))
@@ -81,19 +81,19 @@ _OPTIONS = {"nogil": True, "error_model": "numpy", "_nrt": False}
 
 
 def njit_part(function: _F) -> _F:
-    """Compile ``function`` for calls from other kernels only; its code is cached with its callers' code.
+    """Compile ``function`` for use by other kernels; it is cached as part of their code.
 
-    Python cannot call the compiled function. Omitting the Python entry point saves a fifth of the compile
-    time.
+    Python cannot call the compiled function. Without the entry point for Python, the compile time is a fifth
+    shorter.
     """
     compiled: _F = numba.njit(no_cpython_wrapper=True, no_cfunc_wrapper=True, **_OPTIONS)(function)
     return compiled
 
 
 def njit_body(function: _F) -> _F:
-    """Inline ``function`` into the only kernel that calls it, before compilation.
+    """Inline ``function`` into the kernel that calls it; for functions with a single caller.
 
-    Compiling and linking ``function`` separately takes 50 % longer.
+    Separate compilation and linking would take 50 % longer.
     """
     compiled: _F = numba.njit(inline="always", **_OPTIONS)(function)
     return compiled
@@ -105,10 +105,10 @@ def njit(function: _F) -> _F:
 
 
 def njit_brief(function: _F) -> _F:
-    """Compile ``function`` as :func:`njit` does, but hold the interpreter lock while it runs.
+    """Compile ``function`` like :func:`njit`, but keep the interpreter lock (GIL) while it runs.
 
-    Use this decorator for kernels that take about a microsecond. After releasing the lock, such a kernel
-    could wait for the lock much longer than it runs.
+    This decorator is for kernels that take about a microsecond. Acquiring the lock again after such a kernel
+    could take much longer than the kernel itself.
     """
     return _kept(function, nogil=False)
 
@@ -116,6 +116,6 @@ def njit_brief(function: _F) -> _F:
 def _kept(function: _F, *, nogil: bool) -> _F:
     compiled: _F = numba.njit(no_cfunc_wrapper=True, **_OPTIONS | {"nogil": nogil})(function)
     folder = cache_dir()
-    if folder is not None and compiled is not function:  # if NUMBA_DISABLE_JIT is set, nothing is compiled
+    if folder is not None and compiled is not function:  # equal if NUMBA_DISABLE_JIT is set
         compiled._cache = KernelCache(function, folder)  # type: ignore[attr-defined]
     return compiled

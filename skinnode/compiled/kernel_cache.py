@@ -1,15 +1,13 @@
 """File cache of compiled kernels that verifies each file before use.
 
-Numba's own file cache unpickles any file that it finds. A truncated file therefore causes an exception in the
-first call to a kernel on every run, and machine code with a flipped bit is executed. In numba's cache, all
-signatures of a function share one index file. Two processes that compile different signatures at the same
-time can therefore store the code of one signature under the name of the other.
+Numba's own cache has two weaknesses. It loads any file that it finds: a truncated file causes an exception in
+every run, and damaged machine code is executed. Moreover, all signatures of a function share one index file,
+so two processes that compile different signatures at the same time can mix up their code.
 
-In this cache, each compiled signature has its own file, which contains a magic number, the SHA-256 of the
-payload, and the payload itself. The file name contains a digest of all inputs of the compilation, so no
-index is needed. Files are written under a temporary name and renamed. If a file fails verification, it is
-removed, the kernel is recompiled, and one line is logged. One line is also logged if a kernel cannot be
-cached. Cache errors never reach the caller.
+This cache has a separate file for each compiled signature. The file contains a magic number, the SHA-256 of
+the payload, and the payload. Its name contains a digest of all inputs of the compilation, so that no index is
+needed. Files are replaced atomically. A file that fails the check is removed, and the kernel is compiled
+again. This event, or a failure to write a file, is logged in one line; no error reaches the caller.
 """
 
 from __future__ import annotations
@@ -44,9 +42,9 @@ _reported: set[str] = set()
 
 
 class KernelCache:
-    """Cache of the compiled signatures of a function.
+    """Cache of the compiled signatures of one function.
 
-    Replaces ``numba.core.caching.FunctionCache`` as the ``_cache`` of a dispatcher.
+    It replaces ``numba.core.caching.FunctionCache`` as the ``_cache`` of a numba dispatcher.
 
     Args:
         function: The Python function.
@@ -58,16 +56,16 @@ class KernelCache:
         file = inspect.getfile(function)
         self._folder = folder
         self._stem = f"{Path(file).stem}.{function.__qualname__}-{code.co_firstlineno}"
-        # the path of the file is omitted, so that all installations of the same code share their kernels
+        # without the path of the file, so that installations of the same code share their kernels
         self._source = (sys.implementation.cache_tag, _file_digest(file), code.co_code.hex())
 
     @property
     def cache_path(self) -> str:
-        """Path of the cache folder; numba's statistics read this property."""
+        """Path of the cache folder, for numba's statistics."""
         return str(self._folder)
 
     def load_overload(self, signature: Any, target_context: Any) -> Any:
-        """Return the compiled code of ``signature``, or None if there is no usable file."""
+        """Return the compiled code of ``signature``; None if there is no usable file."""
         target_context.refresh()
         path = self._path(signature, target_context.codegen())
         try:
@@ -84,7 +82,7 @@ class KernelCache:
                 if kept_signature == signature
                 else None
             )
-        except Exception as error:  # an intact file that another installation has written
+        except Exception as error:  # intact, but written by another installation
             if _remove(path):
                 _report(
                     self._folder, f"a file could not be loaded ({error!r:.200}) and was removed; recompiling"
@@ -92,7 +90,7 @@ class KernelCache:
             return None
 
     def save_overload(self, signature: Any, compiled: Any) -> None:
-        """Write ``compiled`` to the cache if possible."""
+        """Write the compiled code of ``signature`` to the cache, if possible."""
         if compiled.lifted or compiled.library.has_dynamic_globals:  # numba's cache excludes these too
             return
         path = self._path(signature, compiled.codegen)
@@ -112,7 +110,7 @@ class KernelCache:
         """Do nothing: the cache is always enabled."""
 
     def flush(self) -> None:
-        """Do nothing: a recompiled kernel replaces its file."""
+        """Do nothing: a recompiled kernel overwrites its file."""
 
     def _path(self, signature: Any, codegen: Any) -> Path:
         depends_on = repr((self._source, signature, codegen.magic_tuple()))
@@ -126,8 +124,8 @@ def _file_digest(file: str) -> str:
 
 
 def _read(path: Path) -> bytes:
-    """Return the payload of a file. Raises OSError if the file is unreadable, ValueError if it is damaged."""
-    if not stat.S_ISREG(path.stat().st_mode):  # reading a named pipe could block forever
+    """Return the payload of a file. Raises OSError if it cannot be read, ValueError if it is damaged."""
+    if not stat.S_ISREG(path.stat().st_mode):  # opening a named pipe could block forever
         raise ValueError("not a file")
     data = path.read_bytes()
     payload = data[_HEAD_BYTES:]
@@ -141,9 +139,9 @@ def _write(path: Path, payload: bytes) -> None:
 
 
 def _heal(folder: Path) -> None:
-    """Remove all damaged files in ``folder`` together, so that one log line reports them.
+    """Remove all damaged files in ``folder`` at once, and log them in one line.
 
-    If several processes find the damage, only the first removes and reports the files.
+    If several processes find damaged files at the same time, only one of them removes and logs them.
     """
     with _locked(folder):
         files = list(folder.glob(f"*{SUFFIX}"))
@@ -195,7 +193,7 @@ def _locked(folder: Path) -> Iterator[None]:
 
 
 def _report(folder: Path, what: str) -> None:
-    """Log the message ``what`` once per process and folder, so that a full disk produces only one line."""
+    """Log a warning about the cache, but only once per process, folder and kind of message."""
     kind = f"{folder} {what[:1].isdigit()}"
     if kind not in _reported:
         _reported.add(kind)

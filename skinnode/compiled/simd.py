@@ -1,12 +1,12 @@
-"""Explicit vectors of doubles for kernels in which automatic vectorisation is not good enough.
+"""Explicit SIMD vectors of doubles for numba kernels.
 
-LLVM prefers 256-bit vectors even if 512-bit vectors are twice as fast. LLVM vectorises only code whose rows
-provably do not overlap, and it may keep sums in memory instead of registers. ``load``, ``fma`` and ``store``
-each compile to the vector instruction of the same name, and each lane accumulates its own sum in the order
-written. A kernel's results therefore do not depend on the number of threads or on how the columns are
-divided. On processors with vectors narrower than LANES doubles, each operation is split.
+Automatic vectorisation falls short in several ways: LLVM prefers 256-bit vectors even where 512-bit vectors
+are twice as fast, vectorises only if it can prove that arrays do not overlap, and may keep sums in memory
+instead of registers. With this module, a kernel states its vector operations itself. Each lane accumulates
+its own sum in the order of the source code, so the result does not depend on the number of threads or on how
+columns are distributed. On processors with vectors of fewer than LANES doubles, LLVM splits each operation.
 
-Vectors support +, − and *; a double in such an expression is broadcast to a vector.
+Vectors support +, − and *. A double in such an expression is broadcast to all lanes.
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ from numba.core.typing import templates as typed_templates
 
 from skinnode.compiled.jit import numba
 
-extending: Any = typed_extending  # Any, because numba's type hints do not match the use here
+extending: Any = typed_extending  # Any: numba's type hints do not allow this use
 types: Any = typed_types
 templates: Any = typed_templates
 signature: Any = templates.signature
 
 
 def _lanes() -> int:
-    """Return 8 if numba compiles for 512-bit vectors, else 4."""
+    """Return 8 if numba compiles for a processor with AVX-512, otherwise 4."""
     chosen = numba.config.CPU_FEATURES
     if chosen is not None or numba.config.CPU_NAME is not None:
         return 8 if "+avx512f" in (chosen or "") else 4
@@ -43,7 +43,7 @@ def _lanes() -> int:
 
 LANES: Final = _lanes()
 Lanes = Any
-"""Type of a vector of LANES doubles; the type exists only in compiled code."""
+"""Vector of LANES doubles. The type exists only in compiled code; in Python, it is Any."""
 
 _DOUBLE = ir.DoubleType()
 _INT = ir.IntType(64)
@@ -70,7 +70,7 @@ def _constant(vector: Any, value: Any) -> Any:
 
 
 def _splat(builder: Any, value: Any) -> Any:
-    """Return ``value`` as a vector; a double is copied to every lane, a vector is returned unchanged."""
+    """Broadcast a double to all lanes; a vector is returned unchanged."""
     if value.type == _VECTOR:
         return value
     seed = builder.insert_element(ir.Constant(_VECTOR, ir.Undefined), value, ir.Constant(ir.IntType(32), 0))
@@ -97,7 +97,7 @@ def _address(context: Any, builder: Any, array_type: Any, array: Any, index: Any
 
 
 def _first(builder: Any, count: Any) -> Any:
-    """Return a mask of the first ``count`` lanes."""
+    """Return a mask that selects the first ``count`` lanes."""
     undefined = ir.Constant(_BITS, ir.Undefined)
     seed = builder.insert_element(undefined, count, ir.Constant(ir.IntType(32), 0))
     every = builder.shuffle_vector(seed, undefined, ir.Constant(ir.VectorType(ir.IntType(32), LANES), None))
@@ -128,14 +128,12 @@ _binary(operator.mul, operator.imul, "fmul")
 
 @extending.intrinsic  # type: ignore[untyped-decorator]
 def load(_typing: Any, row: Any, start: Any, count: Any) -> Any:
-    """Load LANES elements of a row, starting at ``start``.
-
-    Only the first ``count`` elements are read; the remaining lanes are 0.
+    """Load up to LANES elements of a row into a vector; lanes from ``count`` on are 0.
 
     Args:
         row: Contiguous row of float64.
         start: Index of the first element.
-        count: Number of elements to read.
+        count: Number of elements to load; values above LANES have the effect of LANES.
     """
     _require_row(row)
 
@@ -150,13 +148,13 @@ def load(_typing: Any, row: Any, start: Any, count: Any) -> Any:
 
 @extending.intrinsic  # type: ignore[untyped-decorator]
 def store(_typing: Any, row: Any, start: Any, count: Any, value: Any) -> Any:
-    """Store the first ``count`` lanes of ``value`` in a row, starting at ``start``.
+    """Store the first ``count`` lanes of a vector in a row.
 
     Args:
         row: Contiguous row of float64.
         start: Index of the first element.
-        count: Number of lanes to store.
-        value: Vector to store.
+        count: Number of lanes to store; values above LANES have the effect of LANES.
+        value: The vector.
     """
     _require_row(row)
 
@@ -172,7 +170,7 @@ def store(_typing: Any, row: Any, start: Any, count: Any, value: Any) -> Any:
 
 @extending.intrinsic  # type: ignore[untyped-decorator]
 def splat(_typing: Any, value: Any) -> Any:
-    """Return a vector with ``value`` in every lane."""
+    """Return a vector with ``value`` in all lanes."""
 
     def generate(_context: Any, builder: Any, _sig: Any, arguments: Any) -> Any:
         return _splat(builder, arguments[0])
@@ -182,7 +180,7 @@ def splat(_typing: Any, value: Any) -> Any:
 
 @extending.intrinsic  # type: ignore[untyped-decorator]
 def fma(_typing: Any, a: Any, b: Any, c: Any) -> Any:
-    """Return a·b + c, with a single rounding if the processor supports it."""
+    """Return a·b + c, rounded only once if the processor has such an instruction."""
 
     def generate(_context: Any, builder: Any, _sig: Any, arguments: Any) -> Any:
         inputs = [_splat(builder, argument) for argument in arguments]
@@ -193,7 +191,7 @@ def fma(_typing: Any, a: Any, b: Any, c: Any) -> Any:
 
 @extending.intrinsic  # type: ignore[untyped-decorator]
 def drop(_typing: Any, value: Any, count: Any) -> Any:
-    """Return ``value`` with zeros in its first ``count`` lanes."""
+    """Return ``value`` with its first ``count`` lanes set to 0."""
 
     def generate(_context: Any, builder: Any, _sig: Any, arguments: Any) -> Any:
         return builder.select(_first(builder, arguments[1]), ir.Constant(_VECTOR, None), arguments[0])
@@ -203,7 +201,7 @@ def drop(_typing: Any, value: Any, count: Any) -> Any:
 
 @extending.intrinsic  # type: ignore[untyped-decorator]
 def total(_typing: Any, value: Any) -> Any:
-    """Return the sum of the lanes, computed by repeatedly adding one half of the vector to the other."""
+    """Return the sum of all lanes, computed pairwise by adding one half of the vector to the other."""
 
     def generate(_context: Any, builder: Any, _sig: Any, arguments: Any) -> Any:
         value, width = arguments[0], LANES
@@ -219,9 +217,9 @@ def total(_typing: Any, value: Any) -> Any:
 
 @extending.intrinsic  # type: ignore[untyped-decorator]
 def rough_inverse_root(_typing: Any, value: Any) -> Any:
-    """Return 1 / √value to within 3.5 % by bit manipulation; inf for values below the smallest normal number.
+    """Return 1 / √value with an error below 3.5 %; inf for values below the smallest normal number.
 
-    Source: Lomont, Fast inverse square root, 2003, for doubles.
+    The result is obtained by bit manipulation (Lomont, Fast inverse square root, 2003, for doubles).
     """
 
     def generate(_context: Any, builder: Any, _sig: Any, arguments: Any) -> Any:

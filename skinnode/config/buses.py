@@ -11,9 +11,9 @@ from skinnode.config.table import Allowed, Name, NodeId, Table, one_of
 from skinnode.errors import ConfigError
 
 MAX_BUS_LOAD: Final = 0.70
-"""Default load limit of a bus, as a fraction. At higher loads, the response times of low-priority frames grow
-steeply, and too little capacity remains to repeat frames after errors. Source: Davis, Burns, Bril, Lukkien:
-Controller Area Network (CAN) schedulability analysis, Real-Time Systems 35, 2007."""
+"""Default limit of the planned bus load, as a fraction. Above it, the response times of low-priority frames
+grow steeply (Davis, Burns, Bril and Lukkien, Controller Area Network (CAN) schedulability analysis, Real-Time
+Systems 35, 2007), and too little capacity is left to repeat frames after errors."""
 
 Role = Literal["master", "guest"]
 GuestSends = Literal["nothing", "sdo"]

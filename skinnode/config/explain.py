@@ -1,7 +1,7 @@
-"""Explains pydantic validation errors in one line: key, value found, values allowed, position.
+"""Converts pydantic validation errors to one-line errors with key, value found, values allowed and position.
 
-Pydantic reports the key but not its line in the file, and its messages name Python types ("Input should be a
-valid integer") instead of the range of values allowed in the file.
+Pydantic does not know the position of a key in its file. Its messages name Python types ("Input should be a
+valid integer") instead of the allowed range of values.
 """
 
 from __future__ import annotations
@@ -24,19 +24,19 @@ _LONGEST_SHOWN: Final = 60
 def first_error(
     error: ValidationError, table: type[BaseModel], where: Callable[[KeyPath], str]
 ) -> ConfigError:
-    """Return the error to report, selected from pydantic's errors about a table.
+    """Return the most helpful of pydantic's validation errors as a ConfigError.
 
     Args:
-        error: All validation errors of the table.
+        error: The validation errors of a table.
         table: Model of the table.
         where: Function that returns the position of a key in its file.
     """
     found = error.errors()
-    # Pydantic also reports a misspelt required key as missing; the error about the misspelling is clearer.
+    # A misspelt required key is reported as both unknown and missing; the first error is more helpful.
     first = next((item for item in found if item["type"] == "extra_forbidden"), found[0])
     location, kind = first["loc"], first["type"]
     cause = first.get("ctx", {}).get("error")
-    if isinstance(cause, ConfigError):  # raised by a model's validator, with a key relative to the model
+    if isinstance(cause, ConfigError):  # from a validator; its key is relative to the model
         path = (*location, *key_path(cause.key))
         return ConfigError(dotted(path), cause.got, cause.allowed, where=where(path))
     keys, allowed = _place(location, table)
@@ -55,7 +55,7 @@ def first_error(
 
 
 def short(value: object) -> object:
-    """Return ``value``; if its text exceeds 60 characters, return the shortened text."""
+    """Return ``value``, or its text truncated to 60 characters if it is longer."""
     text = repr(value)
     return value if len(text) <= _LONGEST_SHOWN else Shown(text[: _LONGEST_SHOWN - 1] + "…")
 
@@ -67,13 +67,13 @@ def dotted(path: KeyPath) -> str:
 
 
 def key_path(key: str) -> KeyPath:
-    """Return the path of a dotted key; the inverse of :func:`dotted`."""
+    """Split a dotted key into its parts; the inverse of :func:`dotted`."""
     parts = re.findall(r"\[(\d+)\]|([^.\[\]]+)", key)
     return tuple(int(index) if index else name for index, name in parts)
 
 
 def _place(location: KeyPath, table: type[BaseModel]) -> tuple[list[str], str | None]:
-    """Return the keys of the table that contains ``location``, and the values allowed at ``location``."""
+    """Return the keys of the table that contains ``location``, and the description of the allowed values."""
     allowed: str | None = None
     for depth, part in enumerate(location):
         if isinstance(part, int):
@@ -90,19 +90,19 @@ def _place(location: KeyPath, table: type[BaseModel]) -> tuple[list[str], str | 
 
 
 def allowed_in(field: FieldInfo) -> str | None:
-    """Describe the values allowed for a key; return None if the key's type describes them sufficiently."""
+    """Return the description of the values allowed for a key; None if the key has no description."""
     marks = [mark.text for mark in field.metadata if isinstance(mark, Allowed)]
     return next(iter([*marks, *_marks_in(field.annotation)]), None)
 
 
 def tables_in(annotation: Any) -> list[type[BaseModel]]:
-    """Return the models of the tables that the value of a key may contain, directly or in a list."""
+    """Return the models of all tables in the type of a key, such as a table or a list of tables."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return [annotation]
     return [table for part in get_args(annotation) for table in tables_in(part)]
 
 
 def _marks_in(annotation: Any) -> list[str]:
-    """Return the texts of all :class:`Allowed` annotations, even in a union such as ``Stiffness | None``."""
+    """Return the texts of all :class:`Allowed` marks in a type, including the members of a union."""
     own = [mark.text for mark in getattr(annotation, "__metadata__", ()) if isinstance(mark, Allowed)]
     return own + [text for part in get_args(annotation) for text in _marks_in(part)]

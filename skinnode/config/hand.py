@@ -1,4 +1,4 @@
-"""Defines the model of a hand: the contents of ``hand.toml`` as immutable, validated settings."""
+"""Model of ``hand.toml``: the configuration of a hand as immutable, validated values."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from skinnode.model.layout_file import impossible
 from skinnode.text.words import counted
 
 MOST_BUSES: Final = 64
-"""Maximum number of buses per hand, far above the number of CAN interfaces on any machine."""
+"""Maximum number of buses of a hand; no machine has so many CAN interfaces."""
 
 
 class HandConfig(Table):
@@ -81,8 +81,8 @@ class HandConfig(Table):
         """Return a copy of the hand that uses another interface or channel.
 
         Args:
-            interface: python-can interface of all buses, which replaces the interfaces in the file.
-            channel: Channel of the bus, which replaces the channel in the file.
+            interface: New python-can interface of all buses; None to keep the interfaces in the file.
+            channel: New channel of the bus; None to keep the channel in the file.
 
         Raises:
             ConfigError: A channel is given for a hand with several buses, or a name is empty.
@@ -101,9 +101,9 @@ class HandConfig(Table):
     @model_validator(mode="before")
     @classmethod
     def _counts(cls, table: Any) -> Any:
-        """Check the numbers of buses and patches before their models are built.
+        """Limit the numbers of buses and patches before their models are built.
 
-        Building the models of ten thousand patches would take minutes.
+        The models of ten thousand patches would take minutes to build.
         """
         if isinstance(table, Mapping):
             buses, patches = table.get("buses"), table.get("patches")
@@ -135,7 +135,7 @@ class HandConfig(Table):
         return self
 
     def _check_links(self) -> None:
-        """Check that each link has only one entry in the file, and carries at least one patch."""
+        """Check that each link is defined once and has at least one patch."""
         _require_unique("links", "name", [link.name for link in self.links])
         used = list(dict.fromkeys(patch.link for patch in self.patches if patch.link is not None))
         for i, link in enumerate(self.links):
@@ -168,7 +168,7 @@ class HandConfig(Table):
         self._check_guests()
 
     def _check_guests(self) -> None:
-        """Check that the file contains the data that a guest cannot request from the nodes."""
+        """Check that the file contains all data that a silent guest cannot read from the nodes."""
         for i, patch in enumerate(self.patches):
             bus = self.bus(patch.bus)
             if bus.role == "master" or bus.guest_sends == "sdo":
@@ -186,15 +186,15 @@ class HandConfig(Table):
 
 
 def load_hand(path: Path | str) -> HandConfig:
-    """Read a hand file. Paths in a hand file are relative to the folder that contains the file.
+    """Read a hand file. Paths in it are relative to its folder.
 
     Args:
         path: The file.
 
     Raises:
-        ConfigError: The file cannot be read, is not TOML, has an unknown or missing key, has a value of the
-            wrong type or out of range, or fails a check of :class:`HandConfig`. The error message is one line
-            and includes the line and column in the file.
+        ConfigError: The file cannot be read, is not TOML, has an unknown or missing key or an invalid value,
+            or fails a check of :class:`HandConfig`. The message is one line and contains the position in the
+            file.
     """
     path = Path(path)
     return _parse(read_toml(path, "hand file"), path.parent)
@@ -205,8 +205,8 @@ def parse_hand(table: Mapping[str, Any], *, folder: Path | None = None, where: s
 
     Args:
         table: The table, as returned by tomllib.
-        folder: Base folder for relative paths; by default the working directory.
-        where: File name for error messages.
+        folder: Folder to which paths are relative; by default, the working directory.
+        where: Name of the file, for error messages.
 
     Raises:
         ConfigError: See :func:`load_hand`.
@@ -224,7 +224,7 @@ def _parse(document: Document, folder: Path) -> HandConfig:
 
 
 def _check_geometry(key: str, patch: PatchConfig) -> None:
-    """Raise ConfigError if the geometry is impossible, or if the number of gains is wrong."""
+    """Raise ConfigError if the geometry is impossible, or if there is not one gain per upper wire."""
     try:
         layout = patch.layout.build()
     except ValueError as error:

@@ -109,10 +109,10 @@ class LayoutConfig(Table):
 
 @functools.lru_cache(maxsize=256)
 def _preset(name: str, **sizes: float | int | None) -> PatchLayout:
-    """Return a preset layout from a cache.
+    """Return a preset layout, from a cache if possible.
 
-    Layouts are immutable and can be shared. Most patches of a hand have the same layout, and several checks
-    of a hand file build the layout of every patch.
+    Layouts are immutable, and most patches of a hand have the same layout. Several checks of a hand file need
+    the layout of every patch.
     """
     return PatchLayout.preset(name, **sizes)  # type: ignore[arg-type]
 
@@ -173,12 +173,12 @@ class TolerancesConfig(Table):
         return asdict(_NAMED_TOLERANCES[value])
 
     def build(self) -> Tolerances:
-        """Return the tolerances as the type that the solvers require."""
+        """Return the tolerances as a :class:`~skinnode.model.tolerances.Tolerances`."""
         return Tolerances(**self.model_dump())
 
 
 def _or_named(schema: dict[str, Any]) -> None:
-    """Add the named tolerances to the JSON Schema of the key ``tolerances``."""
+    """Allow the names of tolerances in the JSON Schema of the key ``tolerances``."""
     named = {"type": "string", "enum": list(_NAMED_TOLERANCES)}
     schema["anyOf"] = [named, {"$ref": schema.pop("$ref")}]
 
@@ -239,8 +239,7 @@ def load_layout(path: Path | str) -> PatchLayout:
             ``[patches.layout]``.
 
     Raises:
-        ConfigError: The file cannot be read or does not contain a valid layout. The error message is one
-            line.
+        ConfigError: The file cannot be read or does not contain a valid layout. The message is one line.
     """
     path = Path(path)
     if path.suffix == ".npz":

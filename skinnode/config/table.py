@@ -1,4 +1,4 @@
-"""Defines the base class and the value types of the tables in a hand file."""
+"""Base class and common value types of the tables in a hand file."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from skinnode.canopen.indices import MAX_NODE_ID
 
 @dataclass(frozen=True, slots=True)
 class Allowed:
-    """Annotation that describes the allowed values of a field, for use in error messages."""
+    """Annotation that describes the allowed values of a key in error messages."""
 
     text: str
 
@@ -33,7 +33,7 @@ def one_of(names: Any) -> Allowed:
 
 
 def existing_file(value: Path | None, info: ValidationInfo, what: str) -> Path | None:
-    """Resolve ``value``, a path relative to the hand file's folder.
+    """Resolve a path that is relative to the folder of the hand file, and check that the file exists.
 
     Raises:
         ValueError: The file does not exist.
@@ -50,7 +50,7 @@ _NAME: Final = "a string of 1 to 64 printable characters, not all blank"
 
 
 def _printable(value: str) -> str:
-    """Check that a name contains no control codes or line breaks, because names are printed unescaped."""
+    """Reject a name that is blank or not printable, because names are printed unescaped."""
     if not value.isprintable() or not value.strip():
         raise ValueError(_NAME)
     return value

@@ -1,8 +1,8 @@
-"""Reads TOML files and returns the value of each key with its line and column.
+"""Reads TOML files, and finds the line and column of each key.
 
-tomllib parses the file and checks its syntax, but does not record positions. Each file that tomllib accepts
-is therefore scanned again to find the positions of its keys. The scanner is hand-written because no
-maintained TOML reader with positions is as strict as tomllib.
+tomllib parses a file and checks its syntax, but does not record positions. A scanner therefore reads each
+file that tomllib has accepted once more, to find the positions of the keys. No maintained TOML parser that
+records positions is as strict as tomllib.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from skinnode.errors import NOTHING, ConfigError, Shown
 from skinnode.files.input_file import read_input
 
 KeyPath = tuple[int | str, ...]
-"""Path of a key in a TOML file: ``patches[1].node_id`` is ``("patches", 1, "node_id")``."""
+"""Path of a key: ``patches[1].node_id`` is ``("patches", 1, "node_id")``."""
 
 _GAP: Final = re.compile(r"(?:[ \t\r\n]|#[^\n]*)*")
 _SPACE: Final = re.compile(r"[ \t]*")
@@ -32,11 +32,11 @@ _VALUE: Final = re.compile(rf"{_STRING}|[^,\[\]{{}}#\n]+", re.DOTALL)
 _KEY: Final = re.compile(r'"(?:\\.|[^"\\\n])*"|\'[^\'\n]*\'|[A-Za-z0-9_-]+')
 _LONGEST_LINE: Final = 60
 _DEEPEST: Final = 32
-"""Maximum number of parts in a key; keys in a hand file have at most six parts."""
+"""Maximum number of parts of a key path. Keys in a hand file have at most six parts."""
 _PART: Final = r"(?:[\w-]++|\"[^\"\n]*+\"|'[^'\n]*+')[ \t]*+"
 _LONG_KEY: Final = re.compile(rf"(?<![\w\-\"'])(?:{_PART}\.[ \t]*+){{{4 * _DEEPEST}}}")
-"""Pattern that matches a key with at least four times ``_DEEPEST`` parts. The pattern also matches any other
-equally long sequence of words joined by dots; hand files contain no such sequences."""
+"""Pattern for a key with at least 4 × ``_DEEPEST`` parts. It also matches other text that consists of so many
+words joined by dots, which does not occur in hand files."""
 _LEAST, _MOST = -(1 << 63), (1 << 63) - 1  # range of integers in TOML 1.0
 _INTEGERS: Final = "integers from -2^63 to 2^63 - 1"
 _TOO_LONG: Final = Shown("a longer integer")
@@ -45,7 +45,7 @@ _TOO_DEEP: Final = f"tables and arrays nested at most {_DEEPEST} deep"
 
 @dataclass(frozen=True, slots=True)
 class Document:
-    """Contents of a TOML file."""
+    """Content of a TOML file, with the positions of its keys."""
 
     path: str
     table: dict[str, Any]
@@ -53,7 +53,7 @@ class Document:
     """Line and column of each key, array item and table, counted from 1."""
 
     def where(self, key: KeyPath) -> str:
-        """Return ``file:line:column`` of ``key``, or of the enclosing table if the key is missing."""
+        """Return ``file:line:column`` of a key; if the key is missing, that of the enclosing table."""
         for length in range(len(key), 0, -1):
             if key[:length] in self.places:
                 line, column = self.places[key[:length]]
@@ -70,7 +70,7 @@ def read_toml(path: Path, what: str) -> Document:
 
     Raises:
         ConfigError: The file cannot be read, is not TOML, is nested too deeply, or contains an integer
-            outside the range of TOML 1.0. The error message is one line.
+            outside the range of TOML 1.0. The message is one line.
     """
     try:
         text = read_input(what, path).decode()
@@ -78,7 +78,7 @@ def read_toml(path: Path, what: str) -> Document:
         raise ConfigError(
             f"byte {error.start}", error.object[error.start : error.end], "UTF-8", where=str(path)
         ) from None
-    if _LONG_KEY.search(text):  # tomllib would take minutes to parse such a long key
+    if _LONG_KEY.search(text):  # tomllib would take minutes
         raise ConfigError(what, Shown("deeper nesting"), _TOO_DEEP, where=str(path))
     try:
         table = tomllib.loads(text)
@@ -86,7 +86,7 @@ def read_toml(path: Path, what: str) -> Document:
         raise _syntax_error(str(path), text, str(error)) from None
     except RecursionError:
         raise ConfigError(what, Shown("deeper nesting"), _TOO_DEEP, where=str(path)) from None
-    except ValueError:  # the file contains an integer with more digits than Python accepts
+    except ValueError:  # an integer with more digits than Python converts
         raise ConfigError(what, _TOO_LONG, _INTEGERS, where=str(path)) from None
     leaves = list(_leaves(table))
     if any(len(key) > _DEEPEST for key, _ in leaves):
@@ -99,7 +99,7 @@ def read_toml(path: Path, what: str) -> Document:
 
 
 def _leaves(table: dict[str, Any]) -> Iterator[tuple[KeyPath, Any]]:
-    """Yield each scalar or empty value and its key; values nested too deeply are not split."""
+    """Yield path and value of all scalars, of empty tables and arrays, and of values nested too deeply."""
     todo: list[tuple[KeyPath, Any]] = [((), table)]
     while todo:
         key, value = todo.pop()
@@ -117,7 +117,7 @@ def _leaves(table: dict[str, Any]) -> Iterator[tuple[KeyPath, Any]]:
 def _syntax_error(where: str, text: str, message: str) -> ConfigError:
     """Convert an error message of tomllib to a ConfigError.
 
-    A tomllib message ends with the position, ``(at line 3, column 5)`` or ``(at end of document)``.
+    The message ends with the position: ``(at line 3, column 5)`` or ``(at end of document)``.
     """
     match = re.fullmatch(r"(?P<what>.*) \(at (?P<place>.*)\)", message, flags=re.DOTALL)
     what, place = (match["what"], match["place"]) if match else (message, "somewhere")
@@ -129,7 +129,7 @@ def _syntax_error(where: str, text: str, message: str) -> ConfigError:
 
 
 def places(text: str) -> dict[KeyPath, tuple[int, int]]:
-    """Return the line and column of every key, array item and table of a document that tomllib accepts."""
+    """Return the line and column of each key, array item and table; tomllib must accept the document."""
     offsets = _Scanner(text.replace("\r\n", " \n")).offsets
     found, line, start = {}, 1, 0
     for path, offset in sorted(offsets.items(), key=lambda item: item[1]):
@@ -140,7 +140,7 @@ def places(text: str) -> dict[KeyPath, tuple[int, int]]:
 
 
 class _Scanner:
-    """Scanner that records where the first occurrence of each path begins."""
+    """Scanner that records the offset at which each path first occurs."""
 
     def __init__(self, text: str) -> None:
         self._text, self._at = text, 0

@@ -1,10 +1,10 @@
-"""Runs, scores and displays a simulated hand, for ``skinnode demo`` and ``skinnode monitor --simulate``.
+"""Simulated hand for ``skinnode demo`` and ``skinnode monitor --simulate``: run, score and display.
 
 ::
 
     hand -> vcan_sim.fleet (nodes on a virtual bus) -> skinnode.host -> run (score against the truth) -> view,
     plot
 
-No other package except some benchmarks imports both the simulator and the host. The simulator and the host
-communicate only over the bus. The simulator's true displacements are used only for scoring.
+This package, apart from some benchmarks, is the only one that imports both the simulator and the host. The
+two communicate only over the bus. The true displacements of the simulator are used only for scoring.
 """

@@ -9,12 +9,12 @@ from skinnode.config import HandConfig, parse_hand
 
 _NAMES: Final = ("palm", "thumb", "index", "middle", "ring", "little", "wrist", "back")
 _SYNC_MS_PER_PATCH: Final = 20
-"""SYNC period divided by the number of patches, ms. Each scan takes 101 frames of up to 135 bits, so the bus
-load is at most 68 % at 1 Mbit/s."""
+"""SYNC period per patch, ms. A scan consists of 101 frames of up to 135 bits, so the bus load is at most 68 %
+at 1 Mbit/s."""
 
 
 def demo_hand(patches: int, seed: int) -> HandConfig:
-    """Return a hand of reference patches on a virtual bus not used by any other program.
+    """Return a hand of reference patches on a virtual bus that no other program uses.
 
     Args:
         patches: Number of patches, 1 to 127.

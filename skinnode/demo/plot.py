@@ -1,4 +1,4 @@
-"""Plots a demo run: each patch's true displacement, estimate and error."""
+"""Plots a demo run: true displacement, estimate and error of each patch."""
 
 from __future__ import annotations
 
@@ -15,29 +15,29 @@ from skinnode.model.layout import Float
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PatchTrace:
-    """Plot data of one patch; times are in seconds since the start, lengths in metres."""
+    """Plot data of one patch and T scans; times are in seconds since the start, lengths in metres."""
 
     name: str
     rest_m: Float
-    """(U, N, 3)"""
+    """(U, N, 3) positions of the upper electrodes at rest."""
     time_s: Float
-    """(T,)"""
+    """(T,) reception time of each scan."""
     depth_m: Float
-    """(T,), true depth of each scan's deepest electrode."""
+    """(T,) true depth of the deepest electrode in each scan."""
     error_m: Float
-    """(T,), RMS error of each scan's field."""
+    """(T,) RMS error of the field of each scan."""
     reported_m: Float
-    """(T,), RMS reported standard deviation of each scan's field."""
+    """(T,) RMS of the standard deviations reported for each scan."""
     snapshot_truth_m: Float
-    """(U, N, 3), true displacement in the deepest scan."""
+    """(U, N, 3) true displacement in the scan with the deepest press."""
     snapshot_m: Float
-    """(U, N, 3), decoded displacement in the deepest scan."""
+    """(U, N, 3) displacement computed by the host for the same scan."""
 
 
 def _map(  # noqa: PLR0913 - the options of an image
     axes: Any, field_m: Float, rest_m: Float, *, scale_um: float, colours: str, low: float
 ) -> Any:
-    """Plot the depth of a displacement field as a colour image of the patch."""
+    """Plot the depth of a displacement field as an image, one pixel per electrode."""
     x, y = 1e3 * rest_m[..., 0], 1e3 * rest_m[..., 1]
     half = 0.5 * (x[0, 1] - x[0, 0]) if x.shape[1] > 1 else 1.0
     extent = (x.min() - half, x.max() + half, y.min() - half, y.max() + half)
@@ -56,10 +56,13 @@ def _map(  # noqa: PLR0913 - the options of an image
 
 
 def draw_demo(file: Path, traces: Sequence[PatchTrace]) -> None:
-    """Plot one column per patch: true and decoded displacement, their difference, and the error over time.
+    """Write a figure with one column per patch.
+
+    Each column shows the true displacement, the displacement computed by the host, their difference, and the
+    error over time.
 
     Args:
-        file: File to write; its suffix determines the format.
+        file: Output file; its suffix determines the format.
         traces: Plot data of each patch.
 
     Raises:
@@ -73,7 +76,7 @@ def draw_demo(file: Path, traces: Sequence[PatchTrace]) -> None:
     FigureCanvasAgg(figure)
     grid = figure.subplots(4, count, squeeze=False, height_ratios=[1, 1, 1, 0.9])
     deepest_um = 1e6 * max(float(-trace.snapshot_truth_m[..., 2].min()) for trace in traces)
-    full_um = max(deepest_um, 1.0)  # avoids an axis with zero range if no patch has been pressed
+    full_um = max(deepest_um, 1.0)  # prevents an empty axis range if no patch was pressed
     shear_um = 1e6 * max(float(np.abs(trace.snapshot_truth_m[..., :2]).max()) for trace in traces)
     highest_um = 1e6 * max(float(np.fmax(trace.error_m, trace.reported_m).max()) for trace in traces)
     errors = [trace.snapshot_m - trace.snapshot_truth_m for trace in traces]

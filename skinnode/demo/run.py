@@ -1,4 +1,4 @@
-"""Runs ``skinnode demo``: simulates the patches, collects the fields and compares them with the truth."""
+"""Runs ``skinnode demo``: simulates patches, solves their scans and compares the fields with the truth."""
 
 from __future__ import annotations
 
@@ -35,22 +35,22 @@ BITRATE_BPS: Final = 1_000_000
 _REDRAW_S: Final = 0.2
 _LINE_S: Final = 1.0
 _LULL_S: Final = 0.004
-"""Maximum wait for a new field, s; if none arrives, the scans of the current SYNC are considered solved."""
+"""Time without a new field after which all scans of the current SYNC are considered solved, s."""
 
 
 @dataclass(frozen=True, slots=True)
 class PatchReport:
-    """Results for one patch: one row of the report."""
+    """Results for one patch."""
 
     patch: str
     node_id: int
     scans_sent: int
     scans_solved: int
     scans_skipped: int
-    """Number of scans skipped because a newer scan arrived before a solver became free."""
+    """Number of scans that were skipped, because a newer scan arrived before a solver was free."""
     scans_torn: int
     frames_lost: int
-    """Number of PDOs sent by the node but not assembled into a scan by the host."""
+    """Number of PDOs that the node sent and the host did not assemble into scans."""
     latency_p50_ms: float
     latency_p99_ms: float
     score: Score
@@ -71,10 +71,9 @@ class Report:
     """Number of PDOs assembled into scans by the host."""
     frames_lost: int
     bus_load: float
-    """Equivalent bus load: time that all frames would occupy on a 1 Mbit/s bus, as a fraction of the run's
-    duration."""
+    """Equivalent bus load: fraction of the duration for which all frames would occupy a 1 Mbit/s bus."""
     faults: tuple[str, ...]
-    """Reasons for exit status 1; empty if the run succeeded."""
+    """Faults, each of which causes exit status 1; empty if the run succeeded."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,7 +93,8 @@ class _Watch:
     arrivals_s: deque[float] = field(default_factory=lambda: deque(maxlen=32))
     latency_ms: list[float] = field(default_factory=list)
     history: list[tuple[float, float, float, float]] = field(default_factory=list)
-    """For each scan: time (s), true depth (m), RMS error (m) and RMS reported standard deviation (m)."""
+    """Time (s), true depth (m), RMS error (m) and RMS of the reported standard deviations (m) of each
+    scan."""
     deepest: tuple[float, Float, Float] | None = None
     newest: FieldFrame | None = None
     distrust: str = ""
@@ -144,13 +144,13 @@ class _Watch:
 
 
 def _depth_std_m(frame: FieldFrame) -> float:
-    """Return the standard deviation reported for the deepest electrode's depth."""
+    """Return the reported standard deviation of the depth of the deepest electrode."""
     deepest = frame.displacement_m[..., 2].argmin()
     return float(frame.displacement_std_m[..., 2].flat[deepest])
 
 
 class _Progress:
-    """Displays the progress of a run: as a live view on a terminal, otherwise as one line per second."""
+    """Displays the progress of a run, as a live view on a terminal or else as one line per second."""
 
     def __init__(self, console: Console, hand: HandConfig, watches: Sequence[_Watch], seconds: float) -> None:
         self._console, self._watches, self._seconds = console, watches, seconds
@@ -219,7 +219,7 @@ def play(hand: HandConfig, seconds: float, console: Console) -> Run:
         soft_wrap=True,
     )
     with responsive_threads(), Fleet(hand) as fleet:
-        # Entering this ``with`` block triggers a garbage collection before the first SYNC.
+        # without_long_collections() runs a garbage collection here, before the first SYNC.
         with without_long_collections(), Host.from_config(hand) as host:
             bits_before = _bits(host)
             t_start_ns = time.monotonic_ns()
@@ -233,7 +233,7 @@ def play(hand: HandConfig, seconds: float, console: Console) -> Run:
                     if frame is not None:
                         unscored.append(frame)
                         continue
-                    # Score and display fields only between scans, to avoid delaying the host.
+                    # Score and display only while no scan is being solved, so as not to delay the host.
                     if unscored:
                         _take(unscored.popleft(), watches, fleet, t_start_ns)
                     progress.update(host, elapsed_s, bits_before)
@@ -277,7 +277,7 @@ def play(hand: HandConfig, seconds: float, console: Console) -> Run:
 
 def _take(frame: FieldFrame, watches: dict[str, _Watch], fleet: Fleet, t_start_ns: int) -> None:
     assert frame.stamp is not None  # always true: the host timestamps every field
-    if frame.stamp.device_time_us == 0:  # the time of a scan is unknown if its summary was lost
+    if frame.stamp.device_time_us == 0:  # the summary was lost, so the time of the scan is unknown
         return
     true_upper_m = fleet.truth_m(frame.stamp.patch, frame.stamp.device_time_us)
     watches[frame.stamp.patch].take(frame, true_upper_m, t_start_ns)
@@ -288,7 +288,7 @@ def _bits(host: Host) -> int:
 
 
 def _losses(host: Host) -> int:
-    """Return the host's loss count: frames dropped from the host's queues plus lost chunks."""
+    """Return the number of frames dropped from the host's queues plus the number of lost chunks."""
     stats = host.stats()
     dropped = sum(bus.dropped for bus in stats.buses.values())
     return dropped + sum(stream.assembler.chunks_lost for stream in stats.patches.values())
@@ -324,7 +324,7 @@ def _faults(rows: Sequence[PatchReport], lost: int) -> tuple[str, ...]:
 
 
 def print_report(console: Console, report: Report) -> None:
-    """Print the results of all patches as a table, and then one line per fault."""
+    """Print the results as a table with one row per patch, followed by one line per fault."""
     table = Table(box=None, header_style="dim", padding=(0, 1, 0, 0))
     table.add_column("\npatch")
     for heading in (
@@ -386,6 +386,6 @@ def print_report(console: Console, report: Report) -> None:
 
 
 def as_json(report: Report) -> dict[str, Any]:
-    """Convert the report to JSON-compatible types; missing values become None."""
+    """Convert the report to JSON-compatible types; NaN becomes None."""
     result: dict[str, Any] = plain(dataclasses.asdict(report))
     return result

@@ -1,7 +1,7 @@
-"""Runs simulated patches for commands that demonstrate the host.
+"""Runs simulated patches in a separate process, for commands that demonstrate the host.
 
-The patches run in a separate process, so that they do not share a Python interpreter with the host.
-As with a real hand, performance figures therefore include only the host.
+In the same process, the patches and the host would compete for the interpreter lock, and the performance
+figures of the host would include the simulation.
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ from skinnode.process.child_processes import starting_children
 
 
 def on_simulated_buses(hand: HandConfig) -> HandConfig:
-    """Return a copy of the hand with virtual buses (UDP multicast) in place of the real buses.
+    """Return a copy of the hand for simulated patches.
 
-    The buses are replaced because simulated nodes must never send on a bus with real nodes. The
-    copy's tolerances are "exact", because simulated patches match their layouts exactly.
+    All buses are replaced with virtual buses (UDP multicast), because simulated nodes must never send on a
+    bus with real nodes. All tolerances are "exact", because simulated patches match their layouts exactly.
     """
     exact = TolerancesConfig.model_validate("exact")
     patches = tuple(patch.model_copy(update={"tolerances": exact}) for patch in hand.patches)
@@ -42,7 +42,9 @@ def on_simulated_buses(hand: HandConfig) -> HandConfig:
 
 @contextmanager
 def simulated(hand: HandConfig) -> Iterator[None]:
-    """Run a hand's patches as nodes in a child process, which exits when its parent exits.
+    """Simulate the patches of a hand in a child process during the ``with`` block.
+
+    The child process exits even if this process is killed.
 
     Raises:
         SkinError: The child process cannot run the patches.
@@ -62,17 +64,17 @@ def simulated(hand: HandConfig) -> Iterator[None]:
             raise SkinError(f"simulated patches: {complaint}")
         yield
     finally:
-        ours.close()  # closing the pipe makes the child process exit
+        ours.close()  # makes the child process exit
         process.join()
 
 
 def _run_nodes(hand: HandConfig, parent: Connection) -> None:
-    """Run the nodes until the parent process closes its end of the pipe or is killed."""
+    """Run the nodes until the parent process closes its end of the pipe or exits."""
     import signal
 
     from vcan_sim.fleet import Fleet
 
-    signal.signal(signal.SIGTERM, signal.SIG_IGN)  # the parent also receives SIGTERM and closes the pipe
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)  # the parent, which also receives it, closes the pipe
     try:
         with Fleet(hand):
             parent.send("")

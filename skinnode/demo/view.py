@@ -1,4 +1,4 @@
-"""Displays the demo on a terminal: bus load, and each patch's height map, health and scan rate."""
+"""Draws the demo on a terminal: bus load, and height map, health and scan rate of each patch."""
 
 from __future__ import annotations
 
@@ -20,25 +20,26 @@ from skinnode.monitor.field_map import MapStyle, Surface, mean_shear_m, paint_ma
 from skinnode.monitor.patch_panel import shear_text
 
 MAP_SIZE = 16
-"""Width of a square height map, characters; each character shows two pixels, one above the other."""
+"""Width of a height map, characters. A character shows two pixels, one above the other, so that the map is
+square."""
 
 
 @dataclass(frozen=True, slots=True)
 class PatchView:
-    """Display data of one patch; lengths are in metres; unknown lengths are NaN."""
+    """Display data of one patch. Lengths are in metres; NaN stands for an unknown length."""
 
     name: str
     health: str
     displacement_m: Float | None
-    """(U, N, 3)"""
+    """(U, N, 3) displacement in the newest field; None if there is no field yet."""
     depth_std_m: float
-    """Standard deviation reported for the deepest electrode's depth."""
+    """Reported standard deviation of the depth of the deepest electrode."""
     error_m: float
     """RMS error of the newest field."""
     rate_hz: float
     torn: int
     distrust: str = ""
-    """Why the newest field is not trusted; empty if it is trusted."""
+    """Reason why the newest field is not trusted; empty if it is trusted."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,7 +56,7 @@ class BusView:
 
 
 class HeightMap:
-    """Height map of a patch, drawn as in the monitor; the first upper wire is at the bottom."""
+    """Height map of a patch in the style of the monitor; upper wire 0 is at the bottom."""
 
     def __init__(self, surface: Surface, full_scale_m: float) -> None:
         height = MAP_SIZE // 2
@@ -71,7 +72,7 @@ class HeightMap:
 
 
 def _surface(displacement_m: Float | None) -> Surface:
-    """Return the field's surface for rendering, or a flat surface if there is no field yet."""
+    """Return the surface to draw; it is flat if there is no field yet."""
     moved = np.zeros((2, 2, 3)) if displacement_m is None else displacement_m
     unknown = np.zeros(moved.shape[:2], dtype=np.bool_)
     return Surface(-moved[..., 2], np.moveaxis(moved[..., :2], -1, 0), np.zeros(unknown.shape), unknown, 1.0)
@@ -105,7 +106,7 @@ def _patch_panel(patch: PatchView, full_scale_m: float) -> Panel:
 
 
 def panels_in(columns: int, lines: int) -> int:
-    """Return the number of patches that fit on a terminal with the given number of columns and lines."""
+    """Return the number of patches that fit on a terminal of the given size, at least 1."""
     across, down = columns // (MAP_SIZE + 4), (lines - 4) // (MAP_SIZE // 2 + 8)
     return max(1, across) * max(1, down)
 
@@ -113,7 +114,7 @@ def panels_in(columns: int, lines: int) -> int:
 def render(
     patches: Sequence[PatchView], bus: BusView, full_scale_m: float, room: int = 1000
 ) -> RenderableType:
-    """Return the complete screen contents.
+    """Return the contents of the screen.
 
     Args:
         patches: Data of each patch.

@@ -1,1 +1,1 @@
-"""File access with locks, atomic writes and one-line error messages."""
+"""File access: size limits, atomic writes, lock files, and errors with one-line messages."""

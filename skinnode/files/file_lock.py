@@ -1,4 +1,4 @@
-"""Implements a lock file that contains the owner's process ID and never becomes stale."""
+"""Lock files that contain the process ID of the owner and never become stale."""
 
 from __future__ import annotations
 
@@ -12,11 +12,12 @@ from pathlib import Path
 from typing import Final
 
 _TRIES: Final = 100
-"""Maximum number of locking attempts; an attempt fails if the previous owner removes the opened file."""
+"""Maximum number of attempts to lock a file. An attempt fails if the previous owner removes the file
+meanwhile."""
 
 
 class FileInUse(BlockingIOError):
-    """Raised if the lock is held; ``process`` is the owner's process ID, or None if unknown."""
+    """Raised if the lock is held; ``process`` is the process ID of the owner, None if unknown."""
 
     def __init__(self, path: Path, process: int | None) -> None:
         self.process = process
@@ -34,9 +35,9 @@ class NotARegularFile(OSError):
 
 @dataclass(frozen=True, slots=True)
 class FileLock:
-    """Acquired lock.
+    """Lock that this process holds.
 
-    The kernel releases the lock when the owning process exits, even if that process is killed.
+    The kernel releases the lock when the process exits, even if the process is killed.
     """
 
     path: Path
@@ -44,9 +45,9 @@ class FileLock:
     process: int
 
     def release(self) -> None:
-        """Release the lock; must be called only once.
+        """Release the lock, and remove the file if this process created the lock. Call it only once.
 
-        A forked child that inherited the lock still keeps the file locked.
+        The lock persists as long as a forked child that inherited it is running.
         """
         if self.process == os.getpid():
             with contextlib.suppress(OSError):
@@ -55,13 +56,13 @@ class FileLock:
 
 
 def lock_file(path: Path) -> FileLock:
-    """Create and lock the file ``path``, and write the ID of this process into it.
+    """Create the file ``path`` if necessary, lock it, and write the ID of this process into it.
 
     Returns:
-        The lock, which the caller must release.
+        The lock; the caller must release it.
 
     Raises:
-        FileInUse: This process or another process already holds the lock.
+        FileInUse: The lock is already held, by this or by another process.
         NotARegularFile: ``path`` exists and is not a regular file.
         OSError: The lock file cannot be created.
     """
@@ -90,7 +91,7 @@ def lock_file(path: Path) -> FileLock:
         except BaseException:
             os.close(descriptor)
             raise
-        os.close(descriptor)  # try again: the previous owner removed the file after it was opened here
+        os.close(descriptor)  # the previous owner has removed this file: try again
     raise FileInUse(path, None)
 
 

@@ -1,4 +1,4 @@
-"""Reads user-specified files up to a size limit, without blocking indefinitely."""
+"""Reads input files specified by the user, with a size limit."""
 
 from __future__ import annotations
 
@@ -10,27 +10,29 @@ from typing import Final
 from skinnode.errors import ConfigError
 
 MOST_BYTES: Final = 1 << 20
-"""Maximum size of a text file in bytes, ten times the size of the largest known hand, layout or baseline
-file. The limit is needed because parsers use about a hundred times as much memory as the text."""
+"""Maximum size of a text file, bytes. This is ten times the size of the largest known file; parsers need
+about a hundred times as much memory as the text."""
 
 
 def read_input(key: str, path: Path, most_bytes: int = MOST_BYTES) -> bytes:
-    """Read the whole content of a user-specified file, or of a pipe with a writer, as in ``<(command)``.
+    """Read a file, or a pipe that another process writes, as in ``<(command)``.
+
+    A named pipe without a writer does not block; it counts as an empty file.
 
     Args:
         key: Option or key that specifies the file, for error messages.
         path: The file.
-        most_bytes: Maximum size of the file.
+        most_bytes: Maximum size, bytes.
 
     Raises:
-        ConfigError: ``path`` is not a file, cannot be read, or is larger than ``most_bytes``.
+        ConfigError: The file cannot be read, or is larger than ``most_bytes``.
     """
     try:
         descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK | os.O_NOCTTY)
         with open(descriptor, "rb") as file:
             if stat.S_ISDIR(os.fstat(descriptor).st_mode):
                 raise ConfigError(key, str(path), "a file that can be read (Is a directory)")
-            os.set_blocking(descriptor, True)  # O_NONBLOCK was needed only for open()
+            os.set_blocking(descriptor, True)  # only open() must not block
             data = file.read(most_bytes + 1)
     except OSError as error:
         raise ConfigError(key, str(path), f"a file that can be read ({error.strerror})") from None

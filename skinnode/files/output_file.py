@@ -1,4 +1,4 @@
-"""Writes the output files of commands, and checks beforehand that they can be written."""
+"""Writes the output files of commands, and checks in advance that they can be written."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from skinnode.files.whole_file import replace_file
 
 
 def require_writable(option: str, file: Path) -> None:
-    """Check that a file can be written; call this function before computing the content.
+    """Check that a file can be written, before its content is computed.
 
     Args:
         option: Option that specifies the file, for error messages.
-        file: The file.
+        file: The file; it need not exist.
 
     Raises:
-        ConfigError: ``file`` is a folder, or cannot be written.
+        ConfigError: The file is a folder or cannot be written.
     """
     try:
         if file.is_dir():
@@ -31,22 +31,22 @@ def require_writable(option: str, file: Path) -> None:
 
 
 def write_text(option: str, file: Path, text: str) -> None:
-    """Encode ``text`` in UTF-8 and write it to ``file``; error messages name ``option``.
+    """Write ``text`` in UTF-8 to ``file``, like :func:`write_bytes`.
 
     Raises:
-        ConfigError: The text could not be written completely; a regular file then keeps its old content.
+        ConfigError: The file cannot be written; a regular file then keeps its old content.
     """
     write_bytes(option, file, text.encode())
 
 
 def write_bytes(option: str, file: Path, data: bytes) -> None:
-    """Write ``data`` to ``file``; error messages name ``option``.
+    """Write ``data`` to ``file``.
 
-    A regular file is replaced atomically after all data has been written, and keeps its permissions. Data for
-    any other target, such as a pipe, is written directly to the target.
+    A regular file is replaced atomically and keeps its permissions. Anything else, such as a pipe, is written
+    directly. ``option`` is the option that specifies the file, for error messages.
 
     Raises:
-        ConfigError: The data could not be written completely; a regular file then keeps its old content.
+        ConfigError: The file cannot be written; a regular file then keeps its old content.
     """
     try:
         target = Path(os.path.realpath(file))  # for /dev/stdout, the resolved path may not exist

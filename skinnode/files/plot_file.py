@@ -1,4 +1,4 @@
-"""Writes plots with matplotlib, and checks in advance that this optional dependency is installed."""
+"""Writes matplotlib figures, and checks in advance that matplotlib, an optional dependency, is installed."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def require_matplotlib(file: Path) -> None:
 
 
 def save_figure(option: str, file: Path, figure: Any, dpi: int) -> None:
-    """Write a matplotlib figure atomically to a file, in the format given by the file's suffix.
+    """Write a figure to a file atomically; the suffix of the file determines the format.
 
     Args:
         option: Option that specifies the file, for error messages.

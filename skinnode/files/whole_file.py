@@ -1,9 +1,8 @@
 """Writes files atomically.
 
-The new content is first written to a temporary file with a random name in the same folder. The temporary file
-is created exclusively, never through a symbolic link, and is renamed when it is complete. Readers therefore
-always see either the complete old content or the complete new content. If writing fails, the file keeps its
-old content.
+The new content is written to a temporary file with a random name in the same folder, which is then renamed.
+Readers therefore see either the complete old content or the complete new content. If writing fails, the file
+keeps its old content. The temporary file is always newly created, never opened through a symbolic link.
 """
 
 from __future__ import annotations
@@ -19,16 +18,16 @@ SUFFIX: Final = ".new"
 
 
 def replace_file(path: Path, data: bytes, *, mode: int = 0o600, durable: bool = False) -> None:
-    """Atomically replace the content of ``path`` with ``data``; a symbolic link is replaced, not followed.
+    """Replace the content of a file atomically. A symbolic link is replaced, not followed.
 
     Args:
-        path: The file to write; it need not exist.
+        path: The file; it need not exist.
         data: New content.
-        mode: Permissions, reduced by the umask.
-        durable: Whether to return only after the file and its name are on the storage medium.
+        mode: Permissions of the file, reduced by the umask.
+        durable: Whether to flush the file and its folder to the storage medium before returning.
 
     Raises:
-        OSError: The file cannot be written; it keeps its old content.
+        OSError: The file cannot be written and keeps its old content.
     """
     beside = create_beside(path, data, mode=mode, durable=durable)
     try:
@@ -41,13 +40,13 @@ def replace_file(path: Path, data: bytes, *, mode: int = 0o600, durable: bool = 
 
 
 def create_beside(path: Path, data: bytes, *, mode: int = 0o600, durable: bool = False) -> Path:
-    """Write ``data`` to a temporary file in the folder of ``path``; the caller must rename or discard it.
+    """Write ``data`` to a temporary file next to ``path``; the caller must rename or discard it.
 
     Args:
         path: File that the temporary file will replace.
         data: Content of the temporary file.
-        mode: Permissions, reduced by the umask.
-        durable: Whether to return only after the data is on the storage medium.
+        mode: Permissions of the temporary file, reduced by the umask.
+        durable: Whether to flush the data to the storage medium before returning.
 
     Returns:
         The path of the temporary file.
@@ -71,15 +70,15 @@ def create_beside(path: Path, data: bytes, *, mode: int = 0o600, durable: bool =
 
 
 def discard(path: Path) -> None:
-    """Remove the file ``path``; ignore errors."""
+    """Remove a file; errors are ignored."""
     with contextlib.suppress(OSError):
         os.unlink(path)
 
 
 def discard_leftovers(path: Path) -> None:
-    """Remove temporary files left behind by processes that were killed while writing ``path``.
+    """Remove the temporary files of processes that were killed while writing ``path``.
 
-    Call this function only if no other process writes ``path``.
+    No other process may be writing ``path`` at the same time.
     """
     start = f".{path.name[:200]}."
     with contextlib.suppress(OSError), os.scandir(path.parent) as entries:
@@ -90,7 +89,7 @@ def discard_leftovers(path: Path) -> None:
 
 
 def flush_folder(folder: Path) -> None:
-    """Flush the directory entries of ``folder`` to the storage medium, so that renames are durable."""
+    """Flush the entries of ``folder`` to the storage medium, so that renames survive a power failure."""
     descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
     try:
         os.fsync(descriptor)

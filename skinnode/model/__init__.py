@@ -1,8 +1,8 @@
-"""Physical and geometric model of a patch, consisting of immutable values and pure functions.
+"""Physical and geometric model of a patch: immutable values and pure functions.
 
-``layout`` and ``layout_file`` define the electrodes at rest, ``forward`` and ``kernels`` compute resistances
-from positions, and ``elastic`` computes displacements from loads. ``frames``, ``status`` and ``data_fault``
-define the inputs and results of a solver. ``distrust`` explains why a result is not trusted, and
-``tolerances`` defines how far a patch may differ from its layout. ``pose`` and ``hand_contact`` express
-contacts in the coordinate frames of a robot's links and of the hand.
+``layout`` and ``layout_file`` define the electrode positions at rest, and ``tolerances`` how far a patch may
+differ from them. ``forward`` and ``kernels`` compute resistances from positions. ``elastic`` and
+``bonded_layer`` compute displacements from loads. ``frames``, ``status`` and ``data_fault`` define the inputs
+and results of a solver, and ``distrust`` explains why a result is not trusted. ``pose`` and ``hand_contact``
+express contacts in the frames of the robot's links and of the hand.
 """

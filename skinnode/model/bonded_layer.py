@@ -1,15 +1,15 @@
-"""Surface displacement of an incompressible elastic layer bonded to a rigid base, under normal loads.
+"""Surface displacement of an incompressible elastic layer on a rigid base, under normal loads.
 
-In the Fourier domain, with the wave number k, the thickness h, x = k h and the shear modulus G, a normal
-pressure of amplitude 1 displaces the surface by the amplitudes
+The layer has the thickness h and the shear modulus G and is bonded to the base. A sinusoidal pressure with
+wave number k and amplitude 1 displaces the surface by the following amplitudes, where x = k h:
 
     normal      (sinh 2x − 2x) / (2 G k (cosh 2x + 1 + 2x²))
     outwards            x²     / (  G k (cosh 2x + 1 + 2x²))
 
-The normal displacement is in the direction of the load. The outward displacement is along the surface, away
-from the load, with a phase shift of 90°. Both formulas follow from the biharmonic stream function of an
-incompressible layer, with no displacement at z = −h and no shear traction at z = 0. For x → ∞ the normal
-displacement is that of a half-space, 1 / (2 G k), and the outward displacement vanishes.
+The normal displacement has the direction of the pressure. The outward displacement is tangential, points away
+from the load, and has a phase shift of 90°. Both formulas follow from the biharmonic stream function of an
+incompressible layer with zero displacement at z = −h and zero shear traction at z = 0. For x → ∞, the normal
+displacement approaches that of a half-space, 1 / (2 G k), and the outward displacement vanishes.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ from skinnode.model.elastic import Rubber
 from skinnode.model.layout import Float
 
 BLUR: Final = 0.1
-"""Standard deviation of the Gaussian that blurs the rim of the load, relative to the radius of the load. The
-blur limits the wave numbers that contribute to the displacement."""
+"""Standard deviation of the Gaussian that smooths the edge of the load, relative to the radius of the load.
+Without smoothing, the integral over the wave number would converge too slowly."""
 _END: Final = 6.0
-"""Upper limit of the integral over the wave number, times the standard deviation of the blur. At this limit,
-the blur attenuates the Fourier transform of the load to 1e-8 of its value."""
+"""Upper limit of the integral over the wave number, multiplied by the standard deviation of the Gaussian. At
+this limit, the Gaussian attenuates the Fourier transform of the load by a factor of 1e-8."""
 _NODES_PER_WAVE: Final = 8
 """Number of quadrature nodes per period of the Bessel functions at the largest distance."""
 
@@ -36,18 +36,19 @@ _NODES_PER_WAVE: Final = 8
 def bonded_layer_compliance(
     rubber: Rubber, thickness_m: float, distance_m: Float, radius_m: float
 ) -> tuple[Float, Float]:
-    """Return the displacement of the surface per unit normal force on a disc.
+    """Return the displacement of surface points per unit normal force on a disc.
 
     Args:
-        rubber: The material; its Poisson's ratio is taken as 0.5.
-        thickness_m: Thickness h of the layer, m.
-        distance_m: Distance of each surface point from the centre of the load, m; any shape.
-        radius_m: Radius of the disc, m; the pressure is uniform except for the blurred rim (:data:`BLUR`).
+        rubber: The material; Poisson's ratio is assumed to be 0.5.
+        thickness_m: Thickness h of the layer, metres.
+        distance_m: Distance of each surface point from the centre of the disc, metres; any shape.
+        radius_m: Radius of the disc, metres. The pressure is uniform except at the smoothed edge
+            (:data:`BLUR`).
 
     Returns:
-        Two displacements per unit force, m/N, each with the shape of ``distance_m``. The first is normal to
-        the surface, in the direction of the force. The second is tangential; it is positive away from the
-        load if the force presses on the layer, and positive towards the load if the force pulls.
+        Normal and tangential displacement per unit force, m/N, each with the shape of ``distance_m``. The
+        normal displacement has the direction of the force. Under a pressing force, a positive tangential
+        displacement points away from the load.
 
     Raises:
         ValueError: If the thickness or the radius is not positive and finite.

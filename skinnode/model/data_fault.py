@@ -1,4 +1,4 @@
-"""Faults in the data of a patch: readings that failed a test and were not used to compute a field."""
+"""Faults in the data of a patch: readings that failed a test and are left out of the solution."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 
 class FaultyPart(enum.StrEnum):
-    """Part of a patch that has faulty readings."""
+    """Part of a patch that a fault affects."""
 
     CROSSING = "crossing"
     """Crossing of one upper wire and one lower wire."""
@@ -30,7 +30,7 @@ class FaultKind(enum.StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class DataFault:
-    """Readings of a patch that failed a test and were not used to compute a field."""
+    """Faulty readings of a patch, which are left out of the solution."""
 
     part: FaultyPart
     kind: FaultKind
@@ -39,11 +39,11 @@ class DataFault:
     lower: int | None = None
     """Number of the lower wire; None if the fault affects all lower wires."""
     since: int = 0
-    """Number of the scan in which the fault was first found. A tracker that is used without a host counts the
-    scans since its last reset."""
+    """Number of the scan in which the fault was found. Without a host, scans are counted from the last reset
+    of the tracker."""
     deviations: float = 0.0
-    """Significance of the fault, as the number of standard deviations of a normal variable with the same tail
-    probability; infinite for a fault that is certain."""
+    """Significance of the fault: number of standard deviations that have the same tail probability in a
+    normal distribution; inf if the fault is certain."""
 
     @property
     def place(self) -> str:

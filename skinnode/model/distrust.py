@@ -1,4 +1,4 @@
-"""Explain in words why a displacement field is not trusted."""
+"""Explains in words why a displacement field is not trusted."""
 
 from __future__ import annotations
 
@@ -9,10 +9,9 @@ from skinnode.model.status import Status
 
 
 def why_not(field: FieldFrame) -> str:
-    """Return a text that explains why a field is not trusted; empty if the field is trusted.
+    """Return the reason why a field is not trusted; empty if the field is trusted.
 
-    If the data of the field were not tested, the text lists the number of wires with each status other than
-    CONVERGED.
+    For a field that was not tested, this is the number of wires with each status other than CONVERGED.
     """
     if field.trusted:
         return ""

@@ -1,11 +1,11 @@
-"""Forward model of a patch: wire-to-wire resistances from electrode positions (NumPy reference).
+"""Forward model of a patch: wire-to-wire resistances from electrode positions.
 
-The rubber between two electrodes at distance d is a resistor ρ d. The N·M paths between an upper and a lower
-wire are in parallel, so  ρ / R_k = F_k(X) = Σ_j Σ_i 1 / |x_i − x̄_jk|  (Xu et al. 2018, eq. 2). F is the
-potential of M unit charges at the lower wire's electrodes, summed over the N electrodes of the upper wire,
-and ∂F_k/∂x_i = − Σ_j (x_i − x̄_jk) / |x_i − x̄_jk|³.
+The rubber between two electrodes at distance d has the resistance ρ d. The N·M paths between an upper and a
+lower wire are in parallel, so  ρ / R_k = F_k(X) = Σ_j Σ_i 1 / |x_i − x̄_jk|  (Xu et al. 2018, eq. 2). F_k is
+the electrostatic potential of M unit charges at the electrodes of lower wire k, summed over the N electrodes
+of the upper wire. Its gradient is ∂F_k/∂x_i = − Σ_j (x_i − x̄_jk) / |x_i − x̄_jk|³.
 
-These functions are the readable reference for the compiled versions in ``kernels``.
+These NumPy functions are the reference for the compiled functions in ``kernels``.
 """
 
 from __future__ import annotations
@@ -23,7 +23,9 @@ def _offsets(layout: PatchLayout, upper_m: ArrayLike) -> Float:
 
 
 def potential_per_m(layout: PatchLayout, upper_m: ArrayLike) -> Float:
-    """Return F (U, K) in 1/m for electrodes at ``upper_m`` (U, N, 3) in metres; inf if electrodes coincide.
+    """Return F (U, K), 1/m, for upper electrodes at ``upper_m`` (U, N, 3), metres.
+
+    F is inf if an upper electrode coincides with a lower electrode.
 
     Raises:
         ValueError: If the array has the wrong shape or contains NaN.
@@ -50,7 +52,7 @@ def resistance_ohm(layout: PatchLayout, upper_m: ArrayLike) -> Float:
 
 
 def jacobian(layout: PatchLayout, upper_m: ArrayLike) -> Float:
-    """Return the Jacobian ∂F/∂x of F = ρ / R.
+    """Return the Jacobian of F = ρ / R with respect to the positions of the upper electrodes.
 
     Args:
         layout: The patch.

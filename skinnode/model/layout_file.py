@@ -1,4 +1,7 @@
-"""Read layout files, which contain either electrode positions (NPZ or TOML) or preset parameters (TOML)."""
+"""Reads layout files that contain electrode positions.
+
+Layout files in TOML format that contain the parameters of a preset are read by :mod:`skinnode.config`.
+"""
 
 from __future__ import annotations
 
@@ -19,23 +22,23 @@ _ARRAYS = ("upper_m", "lower_m")
 _KEYS = (*_ARRAYS, "resistivity_ohm_per_m")
 _MOST_NPZ_BYTES: Final = 16 << 20
 _MOST_VALUES: Final = {"upper_m": 3 * MOST_ELECTRODES, "lower_m": 3 * MOST_PAIRS, "resistivity_ohm_per_m": 1}
-"""Maximum number of values in each array of a layout file."""
+"""Maximum number of elements of each array in a layout file."""
 _MOST_ITEM_BYTES: Final = 32
-"""Maximum size of one array element, in bytes; the largest numeric type of NumPy has this size."""
+"""Size of NumPy's largest numeric type, bytes."""
 _LONGEST_KEY: Final = 40
 _MOST_HEADER_BYTES: Final = 10_240
-"""Maximum size of an array's header, in bytes; NumPy reads headers of up to 10,000 characters."""
+"""Maximum size of an array header, bytes; NumPy accepts headers of up to 10,000 characters."""
 
 
 def read_npz(path: Path) -> PatchLayout:
-    """Read a layout from an NPZ file without unpickling objects.
+    """Read a layout from an NPZ file. Pickled objects are refused.
 
     Args:
-        path: File with the arrays ``upper_m`` (U, N, 3) and ``lower_m`` (K, M, 3) in metres and, optionally,
+        path: File with the arrays ``upper_m`` (U, N, 3) and ``lower_m`` (K, M, 3), in metres, and optionally
             the number ``resistivity_ohm_per_m``.
 
     Raises:
-        ConfigError: If the file is not an NPZ file, or does not contain a layout.
+        ConfigError: If the file is not an NPZ file or does not contain a valid layout.
     """
     try:
         data = io.BytesIO(read_input("layout file", path, _MOST_NPZ_BYTES))
@@ -52,12 +55,12 @@ def read_npz(path: Path) -> PatchLayout:
 
 
 def _require_sizes(data: io.BytesIO, path: Path) -> None:
-    """Check the array sizes in an NPZ file before unpacking, because a small file can unpack to gigabytes.
+    """Check the sizes of the arrays in an NPZ file, because a small file can decompress to gigabytes.
 
     Raises:
-        ConfigError: If an array is unknown, duplicate or too large, or if its compression method is not
+        ConfigError: If an array is unknown, duplicate or too large, or its compression method is not
             supported.
-        Exception: An error from zipfile or NumPy, if the file is not an NPZ file.
+        Exception: If the file is not an NPZ file; zipfile and NumPy raise various exceptions.
     """
     with zipfile.ZipFile(data) as members:
         seen: set[str] = set()
@@ -70,7 +73,7 @@ def _require_sizes(data: io.BytesIO, path: Path) -> None:
             if member.compress_type not in (
                 zipfile.ZIP_STORED,
                 zipfile.ZIP_DEFLATED,
-            ):  # zipfile would unpack a whole member at once for other compression methods
+            ):  # with other methods, zipfile decompresses a whole member at once
                 got = Shown(f"compression method {member.compress_type}")
                 raise ConfigError(key, got, "stored or deflated, as NumPy writes it", where=str(path))
             most_bytes = _MOST_VALUES[key] * _MOST_ITEM_BYTES
@@ -91,15 +94,15 @@ def _require_size(key: str, got: str, size: int, most: int, path: Path) -> None:
 
 
 def has_electrodes(table: Mapping[str, Any]) -> bool:
-    """Return whether the table of a TOML layout file contains electrodes rather than the keys of a preset."""
+    """Return whether a TOML layout file contains electrode positions instead of preset parameters."""
     return any(key in table for key in _ARRAYS)
 
 
 def from_electrodes(table: Mapping[str, Any], path: Path) -> PatchLayout:
-    """Return the layout defined by ``table``, whose keys must be those that :func:`read_npz` expects.
+    """Return the layout in ``table``, which has the same keys as an NPZ file (:func:`read_npz`).
 
     Raises:
-        ConfigError: If a key is missing or unknown, or a value is invalid; the error names ``path``.
+        ConfigError: If a key is missing or unknown, or a value is invalid. The message names ``path``.
     """
     for key in _ARRAYS:
         if key not in table:
@@ -117,7 +120,7 @@ def from_electrodes(table: Mapping[str, Any], path: Path) -> PatchLayout:
 
 
 def impossible(error: ValueError, table: str = "", where: str = "") -> ConfigError:
-    """Convert an error from :class:`PatchLayout` to a ConfigError for the key in ``table``."""
+    """Convert an error of :class:`PatchLayout` to a ConfigError about a key of ``table``."""
     key, _, what = str(error).partition(": ")
     got, _, allowed = what.partition(", must be ")
     key = f"{table}.{key}" if table else key

@@ -1,4 +1,4 @@
-"""Poses of coordinate frames, such as a patch's frame on a link, and conversion between frames."""
+"""Poses of coordinate frames, and conversion of points and vectors between frames."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from skinnode.model.frames import FieldFrame
 from skinnode.model.layout import Float, PatchLayout
 
 UNIT_TOLERANCE: Final = 1e-3
-"""Maximum deviation of a quaternion's length from 1 that is accepted as a rounding error."""
+"""Maximum deviation of the length of a quaternion from 1, to allow for rounded input."""
 
 
 @dataclass(frozen=True, slots=True)
 class Pose:
-    """Position and orientation of a coordinate frame in its parent frame, such as a patch on a link.
+    """Position and orientation of a coordinate frame, such as that of a patch, in its parent frame.
 
-    The x axis of a patch is along its upper wires, and the z axis points out of the skin.
+    In the frame of a patch, x points along the upper wires, y across them, and z out of the skin.
 
     Args:
-        position_m: Origin of the frame, in the parent frame, metres.
-        quaternion_xyzw: Orientation of the frame, real part last.
+        position_m: Origin of the frame in the parent frame, metres.
+        quaternion_xyzw: Orientation of the frame as a unit quaternion, real part last.
 
     Raises:
         ValueError: If a number is not finite, or the quaternion does not have unit length.
@@ -42,13 +42,12 @@ class Pose:
 
     @classmethod
     def from_rpy(cls, position_m: tuple[float, float, float], rpy_rad: tuple[float, float, float]) -> Self:
-        """Return the pose after rotations about the parent's axes: x (roll), then y (pitch), then z (yaw).
-
-        URDF uses the same convention.
+        """Return a pose from roll, pitch and yaw, as in URDF.
 
         Args:
-            position_m: Origin of the frame, metres.
-            rpy_rad: Roll, pitch and yaw, radians.
+            position_m: Origin of the frame in the parent frame, metres.
+            rpy_rad: Rotations about the fixed axes x (roll), y (pitch) and z (yaw) of the parent frame, in
+                this order, radians.
         """
         (sr, sp, sy), (cr, cp, cy) = (
             tuple(function(angle / 2) for angle in rpy_rad) for function in (math.sin, math.cos)
@@ -65,7 +64,7 @@ class Pose:
 
     @property
     def rotation(self) -> Float:
-        """(3, 3) matrix that rotates vectors from this frame to its parent."""
+        """(3, 3) rotation matrix that converts vectors from this frame to the parent frame."""
         x, y, z, w = self._unit()
         return np.array(
             [
@@ -76,17 +75,17 @@ class Pose:
         )
 
     def vectors(self, inner: ArrayLike) -> Float:
-        """Convert displacements, forces or normals (..., 3) from this frame to its parent."""
+        """Convert vectors (..., 3), such as displacements or forces, from this frame to the parent frame."""
         turned: Float = np.asarray(inner, np.float64) @ self.rotation.T
         return turned
 
     def points_m(self, inner_m: ArrayLike) -> Float:
-        """Convert points (..., 3) in metres from this frame to its parent."""
+        """Convert points (..., 3), metres, from this frame to the parent frame."""
         points: Float = self.vectors(inner_m) + np.array(self.position_m)
         return points
 
     def __matmul__(self, inner: Pose) -> Pose:
-        """Convert ``inner``, a pose in this frame, to a pose in the parent frame."""
+        """Convert the pose ``inner`` from this frame to the parent frame."""
         x, y, z, w = self._unit()
         a, b, c, d = inner._unit()
         x_m, y_m, z_m = self.points_m(inner.position_m).tolist()
@@ -101,19 +100,22 @@ class Pose:
         )
 
     def inverse(self) -> Pose:
-        """Return the inverse pose: the parent's pose in this frame."""
+        """Return the pose of the parent frame in this frame."""
         x, y, z, w = self._unit()
         back = Pose((0.0, 0.0, 0.0), (-x, -y, -z, w))
         x_m, y_m, z_m = (-back.vectors(self.position_m)).tolist()
         return Pose((x_m, y_m, z_m), back.quaternion_xyzw)
 
     def _unit(self) -> tuple[float, float, float, float]:
-        """Return the quaternion normalised to unit length, so that rounding errors do not accumulate."""
+        """Return the quaternion scaled to unit length; otherwise rounding errors would accumulate."""
         length = math.hypot(*self.quaternion_xyzw)
         x, y, z, w = self.quaternion_xyzw
         return x / length, y / length, z / length, w / length
 
 
 def positions_in_hand_m(field: FieldFrame, layout: PatchLayout, pose: Pose) -> Float:
-    """Return the positions (U, N, 3) of the upper electrodes in the hand's frame, metres."""
+    """Return the positions (U, N, 3) of the upper electrodes in the hand's frame, metres.
+
+    ``pose`` is the pose of the patch's frame in the hand's frame.
+    """
     return pose.points_m(layout.upper_m + field.displacement_m)

@@ -7,31 +7,31 @@ from collections.abc import Iterable
 
 
 class Status(enum.IntEnum):
-    """Outcome of a solve. If a solve does not converge, its result is the best iterate found."""
+    """Outcome of a solve. The result of a solve that did not converge is the best iterate found."""
 
     CONVERGED = 0
-    """The result is a root that passed all checks."""
+    """The result is a root and passed all checks."""
     MAX_STEPS = 1
     """The maximum number of steps was reached before the tolerance was met."""
     DEADLINE = 2
     """The time limit was reached."""
     RADIUS_TOO_SMALL = 3
-    """The trust region became too small: no step reduces the residual, and the iterate is not a root."""
+    """The trust region became too small, because no step reduced the residual. The iterate is not a root."""
     STEP_TOO_SMALL = 4
-    """The steps became smaller than the tolerance, and the iterate is not a root."""
+    """The steps became smaller than the tolerance, but the iterate is not a root."""
     ILL_CONDITIONED = 5
-    """The Jacobian is singular, resistances are missing, or the root may be wrong."""
+    """The Jacobian is singular, too few resistances remain, or the root may be on a wrong branch."""
     NON_FINITE = 6
-    """A value became too large for a float, or resistances were not usable."""
+    """A value overflowed, or the resistances were not usable."""
     INVALID_START = 7
-    """F or its Jacobian J is not finite at the starting point, which `solve_system` returns unchanged."""
+    """F or its Jacobian is not finite at the starting point, which `solve_system` returns unchanged."""
     INCONSISTENT = 8
-    """No deformation explains the resistances: their χ² is far larger than noise can explain."""
+    """No deformation explains the resistances: χ² is far too large for noise."""
 
 
 _BY_NUMBER = tuple(Status)
 
 
 def as_statuses(numbers: Iterable[int]) -> tuple[Status, ...]:
-    """Convert numbers to statuses, five times as fast as ``map(Status, numbers)``."""
+    """Convert integers to statuses; five times as fast as ``map(Status, numbers)``."""
     return tuple(map(_BY_NUMBER.__getitem__, numbers))

@@ -1,4 +1,4 @@
-"""Manufacturing tolerances of a patch, as differences between the real patch and its layout."""
+"""Manufacturing tolerances of a patch: how far it may differ from its layout."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Final
 
 @dataclass(frozen=True, slots=True)
 class Tolerances:
-    """Standard deviations of the differences between a patch and its layout; 0 means no difference.
+    """Standard deviations of the differences between a real patch and its layout.
 
     Raises:
         ValueError: If a tolerance is negative, or not below 0.5.
@@ -20,9 +20,9 @@ class Tolerances:
     thickness: float = 0.0
     """Rubber thickness between upper and lower electrodes, as a fraction of their smallest distance."""
     electrode_radius: float = 0.0
-    """Radius of the electrodes, in pitches. The forward model assumes point electrodes."""
+    """Radius of the electrodes, in pitches; the forward model assumes point electrodes."""
     gain: float = 0.0
-    """Gain of the front end for changes in resistance, as a fraction of the nominal gain."""
+    """Gain of the front end for changes in resistance, relative to the nominal gain."""
 
     def __post_init__(self) -> None:
         for entry in fields(self):
@@ -37,6 +37,6 @@ class Tolerances:
 
 
 EXACT: Final = Tolerances()
-"""Zero tolerances, for a patch that matches its layout exactly, such as a simulated patch."""
+"""Tolerances of a patch that matches its layout exactly, such as a simulated patch."""
 ORDINARY: Final = Tolerances(placement=0.02, thickness=0.05, electrode_radius=0.05, gain=0.02)
 """Typical tolerances of carefully manufactured patches."""

@@ -1,1 +1,1 @@
-"""Clock, signal handling, child processes and garbage collection of a running program."""
+"""Process-wide facilities: clock, signal handling, child processes and garbage collection."""

@@ -1,9 +1,9 @@
-"""Starts child processes that are protected from the terminal's signals.
+"""Starts child processes that do not receive the signals of the terminal.
 
-A terminal sends SIGINT (Ctrl-C) and SIGHUP both to a command and to the command's child processes. A child
-that receives SIGINT while importing modules would print a traceback. SIGHUP would terminate the resource
-tracker of ``multiprocessing`` before the tracker has cleaned up. Child processes therefore run with both
-signals blocked, and the command itself terminates them.
+A terminal sends SIGINT (Ctrl-C) and SIGHUP to a command and to all of its child processes. SIGINT would make
+a child print a traceback if it is still importing modules, and SIGHUP would kill the resource tracker of
+``multiprocessing`` before its clean-up. Child processes therefore run with both signals blocked, and the
+command ends them itself.
 """
 
 from __future__ import annotations
@@ -21,15 +21,14 @@ _TERMINAL_SIGNALS: Final = (signal.SIGINT, signal.SIGHUP)
 
 @contextmanager
 def starting_children() -> Iterator[None]:
-    """Block the terminal's signals for child processes started in this ``with`` block.
+    """Block the signals of the terminal for all child processes started in this ``with`` block.
 
-    A signal that arrives during the block is handled at the end of the block. A child process interrupted
-    during its start would print a traceback.
+    In this process, a signal that arrives during the block is handled at the end of the block.
     """
     with _signals_deferred():
         before = signal.pthread_sigmask(signal.SIG_BLOCK, _TERMINAL_SIGNALS)
         try:
-            resource_tracker.ensure_running()  # this call unblocks SIGINT
+            resource_tracker.ensure_running()  # unblocks SIGINT
             signal.pthread_sigmask(signal.SIG_BLOCK, _TERMINAL_SIGNALS)
             yield
         finally:
@@ -40,9 +39,9 @@ def starting_children() -> Iterator[None]:
 def _signals_deferred() -> Iterator[None]:
     """Defer the handling of signals to the end of the ``with`` block.
 
-    Blocking the signals in the main thread is not sufficient: another thread can receive a signal, and Python
-    then calls the handler on the main thread. Python handles signals only on the main thread, so this
-    function does nothing on any other thread.
+    To block signals in the main thread would not be sufficient: another thread can receive the signal, and
+    Python then calls its handler on the main thread. On other threads, this function does nothing, because
+    Python never handles signals there.
     """
     if threading.current_thread() is not threading.main_thread():
         yield

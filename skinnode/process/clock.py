@@ -1,8 +1,8 @@
-"""Functions that read the time, wait, and start threads on either the system clock or a virtual clock.
+"""Time, waiting and threads, on the system clock or on a virtual clock.
 
-Code that reads the time, waits or starts threads must call these functions. A new thread uses the clock of
-the thread that created it, and :func:`use` sets the clock of the current thread. Without a virtual clock,
-these functions call their counterparts in the standard library.
+All code that reads the time, waits or starts threads must use this module, so that it can run in virtual
+time. :func:`use` sets the clock of the current thread, and a new thread inherits the clock of the thread that
+creates it. By default, the functions call their counterparts in the standard library.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from typing import Any, Protocol
 
 
 class Clock(Protocol):
-    """Source of time, of threads, and of the synchronisation objects that threads wait on."""
+    """Source of time, threads and synchronisation objects."""
 
     def monotonic_ns(self) -> int:
         """Return the monotonic time, ns."""
@@ -82,7 +82,7 @@ _here = _Here()
 
 @contextmanager
 def use(clock: Clock) -> Iterator[None]:
-    """Use ``clock`` for the current thread and for all threads that it starts in this ``with`` block."""
+    """Use ``clock`` on the current thread, and on threads that it creates, during the ``with`` block."""
     before, _here.clock = _here.clock, clock
     try:
         yield
@@ -154,8 +154,8 @@ def thread(target: Callable[..., object], name: str, args: tuple[Any, ...] = ())
 def pool(threads: int, name: str) -> Executor:
     """Create a :class:`concurrent.futures.ThreadPoolExecutor`.
 
-    To wait for a job of the pool, use :meth:`concurrent.futures.Future.add_done_callback`. Other ways of
-    waiting ignore the virtual clock.
+    To wait for a job, use :meth:`concurrent.futures.Future.add_done_callback`; other ways of waiting do not
+    work with a virtual clock.
     """
     return _here.clock.pool(threads, name)
 

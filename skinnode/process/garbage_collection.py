@@ -1,4 +1,4 @@
-"""Prevents garbage collection and busy threads from delaying time-critical code."""
+"""Context managers that keep garbage collection and busy threads from delaying time-critical code."""
 
 from __future__ import annotations
 
@@ -10,12 +10,11 @@ from contextlib import contextmanager
 
 @contextmanager
 def without_long_collections() -> Iterator[None]:
-    """Exclude all objects that exist on entry to the ``with`` block from garbage collection during the block.
+    """Exclude all existing objects from garbage collection during the ``with`` block.
 
-    With numba and canopen loaded, a full garbage collection on a small computer stops all threads for 30 ms.
-    During the pause, a node can miss a scan, or the host's SYNC can be delayed. Enter the ``with`` block
-    after setup is complete. Objects that exist on entry and become cyclic garbage are freed only after the
-    block.
+    With numba and canopen loaded, a full collection stops all threads for 30 ms on a small computer, during
+    which a node can miss a scan or SYNC can be late. Enter the block when the set-up is complete. Existing
+    objects that become cyclic garbage during the block are freed after it.
     """
     gc.collect()
     gc.freeze()
@@ -27,10 +26,10 @@ def without_long_collections() -> Iterator[None]:
 
 @contextmanager
 def responsive_threads() -> Iterator[None]:
-    """Set Python's thread switch interval to 0.5 ms for the duration of the block; the default is 5 ms.
+    """Set the thread switch interval to 0.5 ms during the ``with`` block.
 
-    At the default interval, a thread that receives frames or updates the screen could delay the solver by
-    more time than the solver needs for a scan.
+    With Python's default of 5 ms, a thread that receives frames or updates the screen could delay the solver
+    for longer than it takes to solve a scan.
     """
     kept = sys.getswitchinterval()
     sys.setswitchinterval(5e-4)

@@ -11,11 +11,10 @@ from types import FrameType
 
 
 class SignalEvent(threading.Event):
-    """Event that a signal handler can safely set.
+    """Event that can be set in a signal handler.
 
-    Both ``wait`` and ``set`` of ``threading.Event`` acquire the event's lock. If a signal interrupts ``wait``
-    while the lock is held, a signal handler that calls ``set`` blocks forever. This class uses
-    ``SimpleQueue.put`` instead, which is reentrant.
+    ``threading.Event`` cannot: if the signal interrupts ``wait`` while it holds the lock of the event,
+    ``set`` blocks forever. This class is based on ``SimpleQueue.put``, which is reentrant.
     """
 
     def __init__(self) -> None:
@@ -33,23 +32,23 @@ class SignalEvent(threading.Event):
         self._wake.put(None)
 
     def wait(self, timeout: float | None = None) -> bool:
-        """Wait for the event for at most ``timeout`` seconds; return whether the event is set."""
+        """Wait until the event is set, for at most ``timeout`` seconds; return whether it is set."""
         if not self._is_set:
             with suppress(Empty):
                 self._wake.get(timeout=None if timeout is None else max(0.0, timeout))
-                self._wake.put(None)  # wake up the next waiting thread
+                self._wake.put(None)  # wakes the next waiting thread
         return self._is_set
 
 
 @contextmanager
 def stop_on_signal() -> Iterator[threading.Event]:
-    """Yield an event that is set by any stop signal; restore the previous signal handlers on exit.
+    """Yield an event that is set by SIGINT (Ctrl-C), SIGTERM or SIGHUP (terminal closed).
 
-    The stop signals are SIGINT (Ctrl-C), SIGTERM and SIGHUP (terminal closed). SIGHUP remains ignored if it
-    was already ignored on entry, as under nohup.
+    SIGHUP stays ignored if it is ignored on entry, as under nohup. The previous signal handlers are restored
+    on exit.
 
     Raises:
-        ValueError: The caller is not in the main thread; only the main thread can set signal handlers.
+        ValueError: The function is not called on the main thread.
     """
     stop = SignalEvent()
 

@@ -1,1 +1,1 @@
-"""Helpers for text output: plural forms, printable characters, HTML pages and JSON values."""
+"""Text output: counted nouns, printable characters, HTML pages and JSON values."""

@@ -1,4 +1,4 @@
-"""HTML template of all pages that skinnode writes, and a function that escapes untrusted text."""
+"""Template of all HTML pages, and escaping of untrusted text in them."""
 
 from __future__ import annotations
 
@@ -29,13 +29,13 @@ def page(title: str, style: str, body: Iterable[str]) -> str:
     """Return a self-contained HTML page.
 
     Args:
-        title: Title of the page; may be untrusted text.
+        title: Title of the page, as plain text.
         style: CSS rules.
-        body: HTML elements; the caller must escape untrusted text in them with :func:`escaped`.
+        body: HTML elements, in which untrusted text must already be escaped with :func:`escaped`.
     """
     return _PAGE.substitute(title=escaped(title), style=style, body="\n".join(body))
 
 
 def escaped(text: object) -> str:
-    """Return ``text`` without control sequences and with HTML's special characters escaped."""
+    """Return ``text`` with non-printable characters and the special characters of HTML escaped."""
     return html.escape(printable_lines(str(text)))

@@ -1,18 +1,17 @@
-r"""Makes untrusted text safe to print. No other module defines which characters are printable.
+r"""Escapes non-printable characters in untrusted text.
 
-Text from a device, a file, a recording or the command line is untrusted. The rules are:
+Text from a device, a file, a recording or the command line is untrusted. It is handled as follows:
 
-* Text from a bus or an EDS is converted to one printable line when it is decoded (:func:`printable`). Only
+* Text from a bus or an EDS becomes one printable line when it is decoded (:func:`printable`). Only
   ``od --json``, DCF files and comparisons use the original bytes.
-* A name in hand.toml that is not printable is rejected (``skinnode.config``).
-* The output of every command passes through :class:`PrintableStream`, or through the console of
-  ``skinnode.cli`` if the output comes from rich. File names and arguments in the output are therefore
-  escaped, too.
-* In HTML pages, text is also HTML-escaped, so that untrusted text is never interpreted as markup.
+* ``skinnode.config`` rejects names in hand.toml that are not printable.
+* All output of commands passes through :class:`PrintableStream` or, for output by rich, through the console
+  of ``skinnode.cli``. This covers file names and arguments, too.
+* In HTML pages, the special characters of HTML are escaped as well.
 
-The method :meth:`str.isprintable` decides whether a character is printable. Control characters, surrogates
-and format characters, such as those that reverse the text direction, are not printable. Non-printable
-characters are replaced by Python escape sequences, such as ``\x1b`` and ``\u202e``.
+:meth:`str.isprintable` defines which characters are printable. Control characters, surrogates and format
+characters, such as those that reverse the text direction, are not. They are replaced with Python escape
+sequences such as ``\x1b`` and ``\u202e``.
 """
 
 from __future__ import annotations
@@ -21,8 +20,7 @@ import re
 from typing import Any, Final, TextIO
 
 MOST: Final = 200
-"""Maximum number of characters of an untrusted text that are printed. Names are always shorter than 200
-characters."""
+"""Number of characters to which untrusted text is truncated. All valid names are shorter."""
 
 _SUSPECT: Final = re.compile(r"[^ -~]")
 _SUSPECT_IN_LINES: Final = re.compile(r"[^\n\t -~]")
@@ -32,7 +30,7 @@ def printable(text: str | bytes, most: int = MOST) -> str:
     """Return ``text`` as one line, with non-printable characters escaped.
 
     Args:
-        text: The text. Bytes are decoded as a VISIBLE_STRING: one character per byte, without trailing NULs.
+        text: The text, or the bytes of a VISIBLE_STRING: one character per byte; trailing NULs are removed.
         most: Maximum number of characters; longer text is truncated and ends in ``…``.
     """
     if isinstance(text, bytes):
@@ -43,9 +41,9 @@ def printable(text: str | bytes, most: int = MOST) -> str:
 
 
 def printable_lines(text: str) -> str:
-    """Return ``text`` with non-printable characters escaped, except line ends and tabs.
+    """Return ``text`` with non-printable characters escaped, except newlines and tabs.
 
-    Use this function for messages that contain untrusted parts.
+    This is meant for messages that contain untrusted text.
     """
     return text if text.isprintable() else _SUSPECT_IN_LINES.sub(_escaped, text)
 
@@ -56,16 +54,16 @@ def _escaped(found: re.Match[str]) -> str:
 
 
 class PrintableStream:
-    """Wrapper for a text stream, such as stdout, that escapes non-printable characters.
+    """Wrapper of a text stream, such as stdout, that escapes non-printable characters.
 
-    Rich finds the original stream in the attribute ``rich_proxied_file`` and writes to that stream directly.
+    Rich bypasses the wrapper: it writes to the stream in the attribute ``rich_proxied_file``.
     """
 
     def __init__(self, stream: TextIO) -> None:
         self.rich_proxied_file = stream
 
     def write(self, text: str) -> int:
-        """Write ``text`` with non-printable characters escaped; return the length of ``text``."""
+        """Write ``text`` with non-printable characters escaped; return the length of the original text."""
         if not isinstance(text, str):
             raise TypeError(f"write() argument must be str, not {type(text).__name__}")
         self.rich_proxied_file.write(printable_lines(text))

@@ -1,10 +1,9 @@
-"""Solvers that compute displacements from resistances, without buses or threads.
+"""Solvers that compute displacements from resistances; independent of buses and threads.
 
-``tracker`` solves a live stream with the method that suits the patch: ``exact`` inverts each wire separately,
-and ``posterior`` estimates the whole patch. ``root_gate`` uses the posterior to check doubtful wires of the
-exact inverse, according to the rules and thresholds in ``roots``. ``checks`` finds readings that contradict
-other readings, and determines whether a field is trusted. ``noise_estimate`` corrects the configured noise if
-the stream contradicts this value; ``precision`` compares standard deviations with the user's limits.
-``paths`` tracks the displacements through a recorded press. All of these packages and modules use
-``operators``, ``linalg`` and ``wires``.
+``tracker`` solves a live stream with one of two methods: ``exact`` inverts each wire separately, and
+``posterior`` estimates the whole patch. ``root_gate`` checks doubtful roots of the exact inverse with the
+posterior; ``roots`` contains the criteria. ``checks`` finds readings that contradict the others, and decides
+whether a field is trusted. ``noise_estimate`` corrects the stated noise if the stream contradicts it.
+``precision`` compares standard deviations with the user's limits. ``paths`` follows the displacements through
+a recorded press. All of these use ``operators``, ``linalg`` and ``wires``.
 """

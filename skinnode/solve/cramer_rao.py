@@ -1,8 +1,8 @@
-"""Cramér-Rao bound J⁺ diag(σ²) J⁺ᵀ on the covariance of a wire's position, evaluated at rest.
+"""Cramér-Rao bound J⁺ diag(σ²) J⁺ᵀ on the covariance of a wire's position at rest.
 
-J is the Jacobian of the relative residual a F − 1 at rest, and σ is the relative noise in each resistance.
-Standard deviations are in clearances; the clearance is the smallest distance at rest between an upper and a
-lower electrode.
+J is the Jacobian of the relative residual a F − 1, and σ is the relative noise of each resistance. Standard
+deviations are in clearances. The clearance is the smallest distance at rest between an upper and a lower
+electrode.
 """
 
 from __future__ import annotations
@@ -24,16 +24,16 @@ def patch_std(layout: PatchLayout, relative_noise: ArrayLike, normal_only: bool 
 
 
 def wire_std(layout: PatchLayout, relative_noise: ArrayLike, normal_only: bool = False) -> Float:
-    """Return each wire's standard deviation at rest, as computed by the exact inverse.
+    """Return the standard deviation of the exact inverse at rest for each wire.
 
     Args:
         layout: The patch.
         relative_noise: Relative standard deviation of R, a number or (U, K).
-        normal_only: True if only the z coordinates are unknowns.
+        normal_only: Whether to solve for z only.
 
     Returns:
-        (U,) RMS standard deviation of each wire's coordinates, in clearances; inf if the wire's Jacobian is
-        singular.
+        (U,) RMS of the standard deviations of each wire's coordinates, in clearances; inf if the Jacobian of
+        the wire is singular.
     """
     if np.ndim(relative_noise) == 0:
         return np.asarray(relative_noise) * _unit_std(layout, normal_only)

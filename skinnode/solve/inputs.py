@@ -1,4 +1,4 @@
-"""Checks of a tracker's arguments. Wrong shapes raise an exception; resistance values never do."""
+"""Validation of a tracker's arguments. Wrong shapes raise an exception; resistances never do."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from numpy.typing import ArrayLike, NDArray
 from skinnode.model.layout import Float, PatchLayout
 
 NOISE_MAX: Final = 1e12
-"""Maximum relative noise of a usable resistance, small enough that its square does not overflow."""
+"""Relative noise above which a resistance is unusable; its square does not overflow."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CodeMap:
-    """Mapping from a converter's codes to R = (lo + code · step) · R0 · gain, for codes up to ``steps``."""
+    """Mapping of a converter's codes 0 to ``steps`` to resistances: R = (lo + code · step) · R0 · gain."""
 
     baseline_ohm: Float
-    """(U, K) R0, ohm; a code is invalid if its R0 is not positive and finite."""
+    """(U, K) baselines R0, ohm; the codes of a crossing are invalid if its R0 is not positive and finite."""
     lo: float
     """Ratio R / R0 at code 0."""
     step: float
@@ -27,14 +27,17 @@ class CodeMap:
     steps: int
     """Largest valid code."""
     rounding_ohm: Float
-    """(U, K) standard deviation of the error due to rounding to a code, ohm."""
+    """(U, K) standard deviation of the quantization error, ohm."""
     relative_noise: float
-    """Relative standard deviation of the signal before the converter."""
+    """Relative standard deviation of the resistances before quantization."""
     gain: Float | None = None
     """(U, K) or (U, 1) gain of the front end; None for a gain of 1."""
 
     def decode(self, codes: NDArray[np.uint32]) -> tuple[Float, NDArray[np.bool_]]:
-        """Return the resistances (U, K) in ohm (NaN for invalid codes) and a mask of the valid codes."""
+        """Return the resistances (U, K), ohm, and a mask (U, K) of the valid codes.
+
+        The resistance of an invalid code is NaN.
+        """
         valid = (codes <= self.steps) & (self.baseline_ohm > 0) & (self.baseline_ohm < np.inf)
         ohm = (self.lo + codes * self.step) * self.baseline_ohm
         ohm = ohm if self.gain is None else ohm * self.gain
@@ -45,7 +48,7 @@ def broadcast_noise(relative_noise: ArrayLike, layout: PatchLayout) -> Float:
     """Return the relative noise as an array (U, K).
 
     Raises:
-        ValueError: If the noise is neither a number nor of that shape.
+        ValueError: If the noise is neither a number nor an array of this shape.
     """
     if isinstance(relative_noise, np.ndarray) and relative_noise.shape == layout.shape:
         return np.asarray(relative_noise, np.float64)  # fast path: hosts pass an array with every frame
@@ -60,7 +63,8 @@ def checked_noise(relative_noise: ArrayLike, layout: PatchLayout) -> Float:
     """Return the relative noise as an array (U, K).
 
     Raises:
-        ValueError: If the noise is neither a number nor of that shape, or a value is not positive and finite.
+        ValueError: If the noise is neither a number nor an array of this shape, or if a value is not positive
+            and finite.
     """
     noise = broadcast_noise(relative_noise, layout)
     if not ((noise > 0) & (noise < np.inf)).all():
@@ -70,10 +74,10 @@ def checked_noise(relative_noise: ArrayLike, layout: PatchLayout) -> Float:
 
 
 def checked_mask(valid: Any, layout: PatchLayout) -> NDArray[np.bool_]:
-    """Return the mask as an array (U, K) after checking its type and shape.
+    """Return the mask as an array (U, K).
 
     Raises:
-        ValueError: If the mask is not bool or not of that shape.
+        ValueError: If the mask is not bool or does not have this shape.
     """
     mask = np.asarray(valid)
     if mask.dtype != np.bool_ or mask.shape != layout.shape:
@@ -83,10 +87,10 @@ def checked_mask(valid: Any, layout: PatchLayout) -> NDArray[np.bool_]:
 
 
 def checked_codes(codes: Any, layout: PatchLayout) -> NDArray[np.uint32]:
-    """Return the codes unchanged if their type and shape are correct.
+    """Return the codes unchanged.
 
     Raises:
-        ValueError: If the codes are not uint32 or not of shape (U, K).
+        ValueError: If the codes are not a uint32 array of shape (U, K).
     """
     if getattr(codes, "dtype", None) != np.uint32 or codes.shape != layout.shape:
         got = f"{codes.dtype} of shape {codes.shape}" if isinstance(codes, np.ndarray) else f"{codes!r:.40}"

@@ -1,10 +1,9 @@
 """Precision of a field: whether its standard deviations are within the user's limits.
 
-The default limit for the displacement depends on the layout, the noise and the tolerances. The default limit
-is the root sum square of two terms: :data:`MULTIPLE` times the standard deviation of the exact inverse at
-rest, and a term for the tolerances. The limit never exceeds :data:`MOST` times the clearance. The standard
-deviations of a healthy patch are below the default limit; if readings are lost or the noise is higher than
-stated, they can exceed it.
+The default limit for the displacement is the root sum square of two terms: :data:`MULTIPLE` times the
+standard deviation of the exact inverse at rest, and a term for the manufacturing tolerances. It is at most
+:data:`MOST` times the clearance. A healthy patch stays below the default limit. Lost readings, or more noise
+than stated, can raise the standard deviations above it.
 """
 
 from __future__ import annotations
@@ -24,42 +23,49 @@ from skinnode.solve.options import TrackerOptions
 from skinnode.solve.wires.problem import PatchProblem
 
 MULTIPLE: Final = 15.0
-"""Maximum standard deviation, as a multiple of the exact inverse's RMS standard deviation at rest. In 2,640
-fields of healthy patches (ten layouts, relative noise from 3e-6 to 1e-3, presses from 5 to 30 %), the largest
-standard deviation was 12.2 times this RMS."""
-MOST: Final = 0.3
-"""Maximum standard deviation, in clearances, for layouts and noise levels at which the displacement mainly
-depends on the prior. Of the 2,640 fields described at :data:`MULTIPLE`, only fields of thick patches (h = 1)
-with a relative noise of 1e-3 exceeded the limit of 0.3 clearances."""
-TOLERANCE_SHARE: Final = 0.06
-"""Contribution of ordinary manufacturing tolerances to the limit, in clearances. For other tolerances, the
-contribution is scaled with the largest tolerance. In presses with a relative noise of at most 1e-5, ordinary
-tolerances caused standard deviations of up to 0.028 clearances."""
-FORCE_SHARE: Final = 0.3
-"""Maximum standard deviation of a normal force, divided by the product of modulus, clearance and pitch.
+"""Default limit of a standard deviation, divided by the RMS standard deviation of the exact inverse at rest.
 
-In the fields described at :data:`MULTIPLE`, the force ratio was at most 0.1. In presses of 50 % that were
-half outside the patch, the force ratio reached 0.26.
+In 2,640 simulated fields of healthy patches (ten layouts, relative noise 3e-6 to 1e-3, presses of 5 to 30 %),
+the largest ratio was 12.2.
+"""
+MOST: Final = 0.3
+"""Upper bound of the default limit, in clearances; larger standard deviations mean that the prior dominates
+the displacement.
+
+Of the 2,640 fields described at :data:`MULTIPLE`, only those with h = 1 and a relative noise of 1e-3 exceeded
+this bound.
+"""
+TOLERANCE_SHARE: Final = 0.06
+"""Term of the default limit for ordinary manufacturing tolerances, in clearances.
+
+For other tolerances, the term is scaled by the largest ratio of a tolerance to its ordinary value. In
+simulated presses with a relative noise of at most 1e-5, ordinary tolerances caused standard deviations of up
+to 0.028 clearances.
+"""
+FORCE_SHARE: Final = 0.3
+"""Default limit of a normal force's standard deviation, divided by modulus · clearance · pitch.
+
+In the fields described at :data:`MULTIPLE`, this ratio was at most 0.1. It reached 0.26 in presses of 50 %
+that were half outside the patch.
 """
 
 
 @dataclass(frozen=True, slots=True)
 class PrecisionLimits:
-    """Largest standard deviations of a precise field; inf for no limit."""
+    """Maximum standard deviations in a precise field; inf for no limit."""
 
     std_m: float
     """Limit for each coordinate of the displacement, metres."""
     force_std_n: float
-    """Limit for the normal force of each contact whose force is calibrated, N."""
+    """Limit for each calibrated normal force, N."""
     uncalibrated_force_std_n: float
-    """Limit for the normal force of each contact whose force is not calibrated, N."""
+    """Limit for each uncalibrated normal force, N."""
 
 
 def limits_of(layout: PatchLayout, options: TrackerOptions) -> PrecisionLimits:
-    """Return the user's limits, or the defaults for the layout and the noise.
+    """Return the user's limits, or the default limits where the user set none.
 
-    By default, uncalibrated forces have no limit; ``Contact.force_calibrated`` shows whether a force is
-    calibrated.
+    There is no default limit for uncalibrated forces.
 
     Args:
         layout: The patch.
@@ -92,7 +98,10 @@ def is_precise(field: FieldFrame, limits: PrecisionLimits) -> bool:
 
 
 def _at_rest(layout: PatchLayout, options: TrackerOptions) -> float:
-    """Return the standard deviation of the exact inverse at rest, in clearances, or inf."""
+    """Return the RMS standard deviation of the exact inverse at rest, in clearances.
+
+    Returns inf if a wire has fewer resistances than unknowns.
+    """
     unknowns = layout.unknowns // 3 if options.normal_only else layout.unknowns
     if layout.shape[1] < unknowns:
         return math.inf
@@ -105,7 +114,7 @@ def _at_rest(layout: PatchLayout, options: TrackerOptions) -> float:
 
 
 def _looseness(tolerances: Tolerances | None) -> float:
-    """Return the largest ratio of a tolerance to the ordinary tolerance; 0 for an exact patch."""
+    """Return the largest ratio of a tolerance to its ordinary value; 0 for an exact patch."""
     if tolerances is None:
         return 0.0
     ordinary = astuple(ORDINARY)

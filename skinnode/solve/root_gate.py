@@ -1,11 +1,10 @@
-"""Check the roots found by the exact inverse, and correct them with the posterior.
+"""Checks of the roots found by the exact inverse, with the posterior.
 
-The solution of a wire is doubtful if the solver found no root, if an electrode moved too far between two
-frames, or if the displacement is too rough to be caused by a press. On some layouts, a press can move a wire
-past a fold, where two roots of F = b merge. On such a layout, all solutions are doubtful, because the exact
-inverse cannot tell which of two nearby roots is right. The posterior estimates the positions from all wires
-of the patch. Each doubtful root is then confirmed, replaced or rejected. The thresholds are defined in
-:mod:`skinnode.solve.roots`.
+A root is doubtful in three cases: an electrode moved too far since the previous frame, the displacement is
+too rough for a press, or a press can move the wire across a fold, where two roots of F = b merge. Near a
+fold, the exact inverse cannot tell which of two roots is the correct one. A wire without a root is doubtful
+too. The posterior estimates the positions from all wires of the patch, and this estimate confirms, replaces
+or rejects each doubtful root. :mod:`skinnode.solve.roots` defines the thresholds.
 """
 
 from __future__ import annotations
@@ -29,32 +28,34 @@ from skinnode.solve.wires.problem import PatchProblem
 from skinnode.solve.wires.root_check import SOME_ROUGH, SOME_SUSPECT, RootCheck, check_roots
 
 PAUSE: Final = 16
-"""Number of frames without a posterior solve after a posterior solve has missed its deadline.
+"""Number of frames without a posterior solve after one that missed its deadline.
 
-If the posterior missed its deadline in every frame, other patches on the same thread would be delayed by 2 ms
-per frame.
+Without this pause, a posterior that misses every deadline would delay the other patches on the same thread by
+2 ms per frame.
 """
 APART: Final = 3.0
-"""Weight of the distance between a confirmed root near a fold and the posterior estimate.
+"""Factor for the distance between a confirmed root and the posterior estimate, for wires that a press can
+move across a fold.
 
-The weighted distance is added in quadrature to the standard deviation of the root, because the posterior
-cannot distinguish two very close roots.
+The product is added in quadrature to the standard deviation of the root, because the posterior cannot
+distinguish two roots that are very close to each other.
 """
 NEAR_FOLD: Final = 2.0
-"""Factor by which the standard deviation is enlarged if a posterior estimate replaces a root near a fold."""
+"""Factor for the standard deviation of a posterior estimate that replaces a root, for wires that a press can
+move across a fold."""
 
 Mask = NDArray[np.bool_]
 
 
 class RootGate:
-    """Checks each field of an exact tracker against the posterior estimate of the same patch.
+    """Check of the fields of an exact tracker against the posterior estimate of the same patch.
 
     Each exact tracker needs its own gate.
 
     Args:
         exact: Tracker whose fields are checked.
         posterior: Posterior estimator of the same patch.
-        options: Options of both estimators.
+        options: Options of the exact tracker and of the posterior estimator.
     """
 
     def __init__(self, exact: ExactTracker, posterior: FrameEstimator, options: TrackerOptions) -> None:
@@ -65,11 +66,11 @@ class RootGate:
         clearance_m = float(problem.clearance.min()) * layout.pitch_m
         self._last_m = np.zeros_like(layout.upper_m)
         self._lost, self._unsure, self._rough = np.zeros((3, layout.shape[0]), np.bool_)
-        self._pause = 0  # number of frames until the next posterior solve
+        self._pause = 0  # remaining number of frames without a posterior solve
         self.hurried = False
-        """Whether there was too little time to check all doubtful roots in the last field."""
-        self._confirmed: Float | None = None  # displacements that the posterior last confirmed, m
-        self._apart = np.zeros((len(problem.rest), 1, 1))  # additional standard deviation, m; see APART
+        """Whether the last check ended before all doubtful roots were checked, for lack of time."""
+        self._confirmed: Float | None = None  # each wire's last displacement confirmed by the posterior, m
+        self._apart = np.zeros((len(problem.rest), 1, 1))  # addition to the standard deviation, m; see APART
         self._any_apart = False
         self._blind = roots.blind_wires(layout, options.normal_only)
         self._options = options
@@ -91,10 +92,14 @@ class RootGate:
             pitch_m=layout.pitch_m,
             rough_limit=roots.ROUGH_IN_STREAM / problem.step_limit,
         )
-        self._doubtful()  # called once here to compile the kernel before a stream starts
+        self._doubtful()  # compiles the kernel before a stream starts
 
     def _folded_with(self, noise_factor: float) -> Mask:
-        """Return a mask (U,) of the wires to check if the stated noise is scaled by ``noise_factor``."""
+        """Return a mask (U,) of the wires to check in every frame.
+
+        Args:
+            noise_factor: Ratio of the actual to the stated noise.
+        """
         layout, normal_only = self._exact.layout, self._options.normal_only
         noise = np.multiply(noise_factor, self._options.relative_noise)
         if roots.nonlinear_in_noise(layout, noise, normal_only):
@@ -102,7 +107,7 @@ class RootGate:
         return roots.folded_wires(layout, normal_only)
 
     def set_noise(self, factor: float) -> None:
-        """Scale the stated noise by ``factor``, starting with the next frame."""
+        """Set the factor that scales the stated noise; it applies from the next frame."""
         self._folded[:] = self._folded_with(factor)
         self._root_check.folded[:] = self._folded
 
@@ -114,14 +119,12 @@ class RootGate:
         self._pause = 0
 
     def check(self, field: FieldFrame, start: float, *, again: bool = False) -> FieldFrame:
-        """Return the field after confirming, replacing or rejecting the root of each doubtful wire.
+        """Return the field with the root of each doubtful wire confirmed, replaced or rejected.
 
         Args:
             field: Field of the exact tracker.
-            start: Time at which the tracker's update of this frame began, from
-                :func:`skinnode.process.clock.perf_counter`, s.
-            again: Whether this frame has already been checked and was solved again without some of its
-                readings.
+            start: Start of the tracker's update, on the clock :func:`skinnode.process.clock.perf_counter`, s.
+            again: True if this frame was already checked, and was then solved again without some readings.
         """
         doubtful: Mask | None = None
         self.hurried = False
@@ -132,10 +135,10 @@ class RootGate:
                 field, self.hurried = self._give_up(field, doubtful), True
             else:
                 if anew:
-                    self._posterior.reset()  # start from the rest position, not from a possibly wrong root
+                    self._posterior.reset()  # the last estimate may belong to a wrong root
                 its = self._exact.arrays
                 self._posterior.stop_at(until)
-                # Non-positive noise marks unusable resistances, so it is passed on unchanged.
+                # Noise that is not positive marks unusable resistances and stays unchanged.
                 noise = np.where(its.noise > 0.0, np.maximum(its.noise, roots.REFEREE_NOISE), its.noise)
                 estimate = self._posterior.estimate(its.ohm.copy(), its.valid.copy(), noise)
                 if Status.DEADLINE in estimate.status:
@@ -150,7 +153,7 @@ class RootGate:
         return field
 
     def _doubtful(self) -> bool:
-        """Find doubtful roots; return whether any root is missing or doubtful."""
+        """Find wires with a doubtful root or none; return whether there are any."""
         found = check_roots(self._root_check.table)
         if found & SOME_ROUGH:
             if self._confirmed is not None:
@@ -159,7 +162,12 @@ class RootGate:
         return found & SOME_SUSPECT != 0 or bool(found & SOME_ROUGH and self._rough.any())
 
     def _keep_apart(self, field: FieldFrame, unasked: Mask) -> FieldFrame:
-        """Enlarge the standard deviations of held wires whose roots near folds were confirmed earlier."""
+        """Enlarge the standard deviations of held wires as in the frame that confirmed their roots.
+
+        Args:
+            field: Field to amend.
+            unasked: (U,) mask of the wires that were not checked in this frame.
+        """
         if field.held is None:
             return field
         self._apart[unasked & ~field.held] = 0.0
@@ -177,7 +185,7 @@ class RootGate:
         )
 
     def _give_up(self, field: FieldFrame, doubtful: Mask) -> FieldFrame:
-        """Reject all doubtful roots; called if there is no time for a posterior solve."""
+        """Reject all doubtful roots, for lack of time for a posterior solve."""
         std = field.displacement_std_m.copy()
         std[doubtful] = np.inf
         self._apart[doubtful] = 0.0
@@ -191,7 +199,7 @@ class RootGate:
         )
 
     def _select(self, field: FieldFrame, doubtful: Mask, estimate: FieldFrame) -> FieldFrame:
-        """Confirm, replace or reject the doubtful roots using the posterior's estimate."""
+        """Confirm, replace or reject the doubtful roots, given the posterior estimate."""
         known = np.array(estimate.status) == Status.CONVERGED
         converged = np.array(field.status) == Status.CONVERGED
         spread = np.hypot(field.displacement_std_m, estimate.displacement_std_m)
@@ -218,7 +226,7 @@ class RootGate:
 
         self._apart[doubtful] = 0.0
         self._apart[agreed & self._folded] = apart[agreed & self._folded]
-        self._any_apart = True  # provisional; the check of the next frame recomputes it
+        self._any_apart = True  # updated by the next call of _keep_apart
 
         assert estimate.core_std_m is not None
         self._exact.adopt(replaced, moved)
@@ -248,14 +256,14 @@ class RootGate:
 
 
 def _mixed_share(estimate: FieldFrame, replaced: Mask) -> Float | None:
-    """Return the data share: from the posterior ``estimate`` for ``replaced`` wires (U,), otherwise 1."""
+    """Return the data share: that of ``estimate`` for the ``replaced`` wires (U,), 1 for all others."""
     if estimate.data_share is None or not replaced.any():
         return None
     return np.where(replaced[:, None, None], estimate.data_share, 1.0)
 
 
 def _selected(status: tuple[Status, ...], changed: Mask, replaced: Mask) -> tuple[Status, ...]:
-    """Return ``status`` after replacing or rejecting the roots of the ``changed`` wires."""
+    """Return the statuses after the roots of the ``changed`` wires (U,) were replaced or rejected."""
     found = list(status)
     for u in np.flatnonzero(changed).tolist():
         if replaced[u]:

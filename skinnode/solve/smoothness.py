@@ -1,9 +1,9 @@
-"""Gaussian covariance of the displacement of an upper wire, for a model of smooth rubber.
+"""Smoothness model: prior covariance of the displacement of an upper wire.
 
-C_ij = s² exp(−d_ij² / 2ℓ²) for each coordinate, where d is the distance between two electrodes at rest.
-Unlike an elastic model of the patch, this covariance requires no material constants. The covariance provides
-starting points for solves (:mod:`skinnode.solve.starts`) and ranks two roots of one wire: the root with the
-smaller roughness √(uᵀ C⁻¹ u) is likelier.
+Each coordinate has the covariance C_ij = s² exp(−d_ij² / 2ℓ²), where d_ij is the distance between two
+electrodes at rest. Unlike an elastic model, it requires no material constants. The covariance has two uses:
+it yields starting points for solves (:mod:`skinnode.solve.starts`), and it ranks the roots of a wire. The
+root with the smallest roughness √(uᵀ C⁻¹ u) is the likeliest.
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ from skinnode.model.layout import Float, PatchLayout
 from skinnode.solve.wires.problem import PatchProblem
 
 CORRELATION_PITCHES: Final = 1.0
-"""Correlation length ℓ, pitches. In simulations of the staggered layout, the guided start found 3204 of 3209
-roots with a correlation length of 1 pitch, and fewer roots with 0.7 or 1.5 pitches."""
+"""Correlation length ℓ, pitches. On the simulated staggered layout, the guided start found 3204 of 3209 roots
+with a length of 1 pitch, and fewer with 0.7 or 1.5 pitches."""
 ROUGH_SHARE: Final = 1e-3
-"""Relative increase in the diagonal of C, to prevent C from being numerically singular."""
+"""Relative increase in the diagonal of C, which keeps C from being numerically singular."""
 
 
 class Smoothness:
@@ -30,8 +30,8 @@ class Smoothness:
         problem: The patch.
 
     Attributes:
-        covariance: (U, n, n) C, pitches², with n = 3N coordinates per wire.
-        whitening: (U, N, N) inverse of the Cholesky factor of one coordinate's C, 1/pitch.
+        covariance: (U, n, n) C for the n = 3N coordinates of each wire, pitches².
+        whitening: (U, N, N) inverse Cholesky factor of C for one coordinate, 1/pitch.
     """
 
     def __init__(self, problem: PatchProblem) -> None:
@@ -53,7 +53,7 @@ class Smoothness:
 
 @functools.lru_cache(maxsize=64)
 def _covariance(layout: PatchLayout, size: float) -> tuple[Float, Float]:
-    """Return C (U, n, n) for a standard deviation of ``size`` pitches, and C's whitening matrix (U, N, N)."""
+    """Return C (U, n, n) for a standard deviation of ``size`` pitches, and the whitening matrix (U, N, N)."""
     electrodes: Float = layout.upper_m / layout.pitch_m
     wires, most = electrodes.shape[:2]
     gaps = electrodes[:, :, None, :] - electrodes[:, None, :, :]

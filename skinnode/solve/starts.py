@@ -1,11 +1,12 @@
-"""Starting points for the solver, for samples or frames without an earlier solution nearby.
+"""Starting points for solves without an earlier solution nearby.
 
-- ``guided_start`` computes the maximum a posteriori estimate of a displacement with a smoothness prior. The
-  assumed noise is reduced after each Gauss-Newton step (Tarantola 2005, section 3.4).
-- ``near_twin`` estimates the position of a root's twin, the root on the other side of the nearest fold. Let σ
-  be the smallest singular value of J, with left vector w and right vector v. To second order, the distance α
-  between the roots along v satisfies σ α + ½ α² wᵀF″[v, v] = 0. The twin is therefore at α = −2σ / wᵀF″[v, v]
-  (Golubitsky & Schaeffer 1985, chapter I.3).
+``guided_start`` computes the maximum a posteriori estimate of a displacement, with a smoothness prior and
+with noise that decreases from one Gauss-Newton step to the next (Tarantola 2005, section 3.4).
+
+``near_twin`` estimates the twin of a root, which is the root on the other side of the nearest fold. With the
+smallest singular value σ of J and its left and right vectors w and v, the second-order condition for a root
+at x + α v is σ α + ½ α² wᵀF″[v, v] = 0. The twin is therefore at α = −2σ / wᵀF″[v, v] (Golubitsky & Schaeffer
+1985, chapter I.3).
 """
 
 from __future__ import annotations
@@ -23,31 +24,30 @@ from skinnode.solve.linalg.vectors import Index, dot, largest, padded
 from skinnode.solve.wires.problem import PatchProblem
 
 NOISE_LEVELS: Final[Float] = np.power(10.0, -0.5 * np.arange(2.0, 16.0))
-"""Standard deviations of r assumed in the successive steps of the guided start: two per decade from 0.1 to
-3e-8.
+"""Standard deviations of r in the successive steps of the guided start: two per decade, from 0.1 to 3e-8.
 
-With only one noise level per decade, the guided start failed on an additional 1 % of the simulated wires.
+With one per decade, the guided start fails on an additional 1 % of simulated wires.
 """
 POWER_STEPS: Final = 8
-"""Number of inverse iterations for the smallest singular value of J. Inverse iteration converges quickly,
-because the second-smallest singular value is about three times the smallest."""
+"""Number of inverse iterations for the smallest singular value of J. The next singular value is about three
+times as large, so the iteration converges quickly."""
 DIFFERENCE: Final = 1e-4
-"""Step in either direction for the central difference of two Jacobians, pitches. Rounding errors are
-negligible with steps that are much larger than eps^(1/3) = 6e-6."""
+"""Step of the central difference of two Jacobians in either direction, pitches. It is much larger than
+eps^(1/3) = 6e-6, which makes rounding errors negligible."""
 
 
 def guided_start(problem: PatchProblem, wire: int, a: Float, covariance: Float) -> tuple[Float, int]:
-    """Find a position near the likeliest root of a F = 1.
+    """Return a starting point near the likeliest root of a F = 1, and the cost of computing it.
 
     Args:
         problem: The patch.
         wire: Index of the upper wire.
         a: (K,) scaled resistances R · gain of the wire.
-        covariance: (n, n) prior covariance of the wire's displacement, pitches².
+        covariance: (n, n) prior covariance of the displacement of the wire, pitches².
 
     Returns:
-        (n,) position, pitches, and the number of evaluations of F and J. If the iteration fails, the rest
-        position is returned.
+        The position (n,) in pitches, which is the rest position if the iteration fails; and the number of
+        evaluations of F and J.
     """
     n, equations = problem.rest.shape[1], a.size
     x = problem.rest[wire].copy()
@@ -73,10 +73,10 @@ def _follow_noise(  # noqa: PLR0913, C901 - a kernel: arrays and scratch by name
     inner: Float,
     pivot: Index,
 ) -> int:
-    """Update ``x`` by one Gauss-Newton step per noise level: x = rest + C Jᵀ (J C Jᵀ + σ²)⁻¹ y.
+    """Update ``x`` by one Gauss-Newton step per noise level σ: x ← rest + C Jᵀ (J C Jᵀ + σ²)⁻¹ y.
 
-    Here, y = J (x − rest) − r, and σ is the noise level. The arrays after ``noises`` are workspace. Returns
-    the number of evaluations of F and J.
+    Here, y = J (x − rest) − r. The arrays after ``noises`` are scratch. Returns the number of evaluations of
+    F and J.
     """
     n, equations = jt.shape
     for level in range(noises.size):
@@ -117,7 +117,7 @@ def _follow_noise(  # noqa: PLR0913, C901 - a kernel: arrays and scratch by name
 
 
 def near_twin(problem: PatchProblem, x: Float, a: Float, inverse: Float) -> Float:
-    """Estimate the position of the root on the other side of the nearest fold.
+    """Estimate the twin of a root: the root on the other side of the nearest fold.
 
     Args:
         problem: The patch.
@@ -126,7 +126,7 @@ def near_twin(problem: PatchProblem, x: Float, a: Float, inverse: Float) -> Floa
         inverse: (n, K) ∂x/∂r at ``x``.
 
     Returns:
-        (n,) position, pitches; not finite if the second-order approximation has no second root.
+        (n,) position of the twin, pitches; not finite if there is none to second order.
     """
     w = np.ones(a.size)
     for _ in range(POWER_STEPS):

@@ -187,7 +187,7 @@ def shortest_cycle(solved: NDArray[np.bool_]) -> int | None:
 
 @dataclass(frozen=True)
 class Adaptive:
-    """Schedule with an adaptive step length per wire, which needs the fewest points; interpolates R.
+    """Schedule that adapts the step length of each wire, to solve few points; interpolates R between samples.
 
     Each step consists of an Euler step along ∂X/∂R, with the factors of the last Jacobian, and of operator
     steps that correct the position. The step length keeps the distance between the predicted and the

@@ -23,7 +23,7 @@ from skinnode.demo.plot import PatchTrace
 from skinnode.demo.view import BusView, PatchView, panels_in, render
 from skinnode.host import Host
 from skinnode.host.patch_stream import StreamStats
-from skinnode.model.distrust import why_not
+from skinnode.model.distrust_text import why_not
 from skinnode.model.frames import FieldFrame
 from skinnode.model.layout import Float
 from skinnode.process.garbage_collection import responsive_threads, without_long_collections

@@ -15,7 +15,7 @@ from typing import Final, Self
 from skinnode.host.health import SCANS_MISSED, Condition
 from skinnode.host.publish import Subscription, check_timeout
 from skinnode.host.skeleton import Skeleton
-from skinnode.model.distrust import why_not
+from skinnode.model.distrust_text import why_not
 from skinnode.model.frames import FieldFrame
 from skinnode.model.hand_contact import HAND, HandContact, Wrench, wrench_of
 from skinnode.model.pose import Pose

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from skinnode.model.data_fault import DataFault
-from skinnode.model.distrust import why_not
+from skinnode.model.distrust_text import why_not
 from skinnode.model.frames import FieldFrame
 from skinnode.text.json_values import plain
 

@@ -20,7 +20,7 @@ from skinnode.host.health import BusHealth, Condition, PatchHealth
 from skinnode.host.patch_stream import StreamStats
 from skinnode.host.trust_report import deepest_data_share
 from skinnode.model.data_fault import DataFault, FaultKind, FaultyPart
-from skinnode.model.distrust import why_not
+from skinnode.model.distrust_text import why_not
 from skinnode.model.layout import Float
 from skinnode.monitor.field_map import Surface, mean_shear_m, surface_of
 from skinnode.monitor.source import Snapshot

@@ -17,7 +17,7 @@ from skinnode.model.layout import Float
 from skinnode.solve.checks import data_check
 from skinnode.solve.checks.data_check import PATIENCE
 from skinnode.solve.checks.fault_list import ADMIT, FRAMES
-from skinnode.solve.checks.trust import UNEXAMINED
+from skinnode.solve.checks.field_trust import UNEXAMINED
 from tests.solve.press import dent, noisy
 
 LAYOUT = sk.PatchLayout.preset("staggered")

@@ -26,9 +26,9 @@ from skinnode.process.clock import perf_counter
 from skinnode.solve.checks.crossed_wires import likeliest
 from skinnode.solve.checks.explanations import DOUBT, Explainer, Group
 from skinnode.solve.checks.fault_list import FaultList, agree
+from skinnode.solve.checks.field_trust import CONTRADICTION, NOISIER, OF_WIRE, UNEXAMINED, assess
 from skinnode.solve.checks.greedy_search import crossing_gain
 from skinnode.solve.checks.reading_model import ReadingModel, changes, evidences
-from skinnode.solve.checks.trust import CONTRADICTION, NOISIER, OF_WIRE, UNEXAMINED, assess
 from skinnode.solve.checks.wire_tests import GAIN_STD, LEAST, least_fitting
 from skinnode.solve.linalg.cholesky import multiply_vector, solve_positive
 from skinnode.solve.wires.problem import PatchProblem

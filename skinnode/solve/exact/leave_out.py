@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 
 from skinnode.model.forward import jacobian
 from skinnode.model.layout import Float
-from skinnode.solve.exact.recover import recover
+from skinnode.solve.exact.recover_lost_wires import recover
 from skinnode.solve.exact.stream import TOLERANCE, Frame, StreamState
 from skinnode.solve.linalg.vectors import Index
 from skinnode.solve.operators import codes as op

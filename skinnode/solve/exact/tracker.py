@@ -25,7 +25,7 @@ from skinnode.model.layout import Float, PatchLayout, require_array
 from skinnode.model.status import as_statuses
 from skinnode.process.clock import perf_counter
 from skinnode.solve.exact.leave_out import LeftOut
-from skinnode.solve.exact.recover import recover_lost
+from skinnode.solve.exact.recover_lost_wires import recover_lost
 from skinnode.solve.exact.stream import FRAME_STEPS, Frame, StreamState
 from skinnode.solve.inputs import CodeMap, broadcast_noise, checked_codes, checked_mask, checked_noise
 from skinnode.solve.noise_estimate import NoiseEstimate

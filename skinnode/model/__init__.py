@@ -3,6 +3,6 @@
 ``layout`` and ``layout_file`` define the electrode positions at rest, and ``tolerances`` how far a patch may
 differ from them. ``forward`` and ``kernels`` compute resistances from positions. ``elastic`` and
 ``bonded_layer`` compute displacements from loads. ``frames``, ``status`` and ``data_fault`` define the inputs
-and results of a solver, and ``distrust_text`` explains why a result is not trusted. ``pose`` and ``hand_contact``
-express contacts in the frames of the robot's links and of the hand.
+and results of a solver, and ``distrust_text`` explains why a result is not trusted. ``pose`` and
+``hand_contact`` express contacts in the frames of the robot's links and of the hand.
 """

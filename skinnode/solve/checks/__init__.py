@@ -3,6 +3,6 @@
 ``data_check`` checks each field of a tracker. The checks use ``reading_model``, the joint distribution of a
 layout's readings linearised at rest. ``explanations`` finds the most likely explanation of a frame: either
 loads or wrong readings. ``greedy_search``, ``wire_tests`` and ``crossed_wires`` supply the candidates.
-``fault_list`` decides which readings to leave out of the next frames. ``field_trust`` decides whether a field and
-each of its wires are trusted.
+``fault_list`` decides which readings to leave out of the next frames. ``field_trust`` decides whether a field
+and each of its wires are trusted.
 """

@@ -1,7 +1,7 @@
-"""Control of a running simulator from another process, with JSON messages on a Unix socket.
+"""Control of a running simulator from another process, through JSON messages on a Unix socket.
 
-Each simulator has its own socket, ``PID.sock``, in a folder that only the user can access. Each request and
-each response is one line::
+Each simulator listens on its own socket, ``PID.sock``, in a folder that only the user can access. A request
+is one line, and so is its response::
 
     {"faults": ["palm:unplugged"]}
     {"hand": "gripper", "now": ["palm:unplugged"], "counts": {"palm": {"unplugged": 1}, "can0": {}}}
@@ -27,19 +27,19 @@ from skinnode.errors import ConfigError, SkinError
 
 _LONGEST_LINE: Final = 1 << 16
 _ANSWER_S: Final = 10.0
-"""Maximum time to wait for a simulator's response, s."""
+"""Time-out for the response of a simulator, s."""
 _POLL_S: Final = 0.2
-"""Interval at which a server thread checks whether it must stop, s."""
+"""Interval at which the server thread checks whether to stop, s."""
 KEY: Final = "inject"
-"""Name of the requested faults in error messages."""
+"""Key that error messages name for the requested faults."""
 
 
 class ControlError(SkinError):
-    """A simulator cannot be controlled, for example because the simulator is not running."""
+    """A simulator cannot be controlled, for example because none is running."""
 
 
 class Controlled(Protocol):
-    """Interface of a fleet whose faults can be read and changed through a control socket."""
+    """Fleet whose faults can be read and changed through a control socket."""
 
     @property
     def faults(self) -> Any:
@@ -51,16 +51,16 @@ class Controlled(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """Response of a simulator: its current faults and the counts of injected faults."""
+    """Response of a simulator: current faults and counts of injected faults."""
 
     hand: str
     now: tuple[str, ...]
-    """Current faults in text form, one string for each patch or bus that has faults."""
+    """Current faults in text form, one string per faulty patch or bus."""
     counts: dict[str, dict[str, int]]
     """Counts of the faults injected so far, by patch and bus."""
 
     def lines(self) -> list[str]:
-        """Return a line for each patch and bus: its current faults and its counts of injected faults."""
+        """Return one line per patch and bus, with its current faults and its counts of injected faults."""
         now = dict(text.rpartition(":")[::2] for text in self.now)
         return [
             f"{place}: {now.get(place, 'none')} now; {_listed(counts)} so far"
@@ -73,7 +73,7 @@ def _listed(counts: dict[str, int]) -> str:
 
 
 def control_folder() -> Path:
-    """Return the folder for control sockets, created if necessary; only this user can access it.
+    """Return the folder of the control sockets, after creating it with access for this user only.
 
     Raises:
         ControlError: If the folder cannot be created, or other users can access it.
@@ -111,7 +111,7 @@ class ControlServer:
 
     def __enter__(self) -> Self:
         self._path = control_folder() / f"{os.getpid()}.sock"
-        self._path.unlink(missing_ok=True)  # socket of an earlier process with the same ID
+        self._path.unlink(missing_ok=True)  # left behind by an earlier process with the same ID
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
         try:
             self._socket.bind(str(self._path))
@@ -165,10 +165,10 @@ def running_simulator(wanted: str | None = None) -> Path:
     """Return the control socket of a running simulator.
 
     Args:
-        wanted: Process-ID of the simulator, or name of its hand; None if only one simulator is running.
+        wanted: Process-ID of the simulator or name of its hand; None for the only running simulator.
 
     Raises:
-        ControlError: If no simulator is running, or not exactly one simulator matches ``wanted``.
+        ControlError: If no simulator is running, or ``wanted`` matches none or several.
     """
     found = dict(_running())
     if not found:
@@ -208,7 +208,7 @@ def request(path: Path, faults: list[str]) -> Answer:
 
 
 def _running() -> Iterator[tuple[Path, str]]:
-    """Yield the socket and the hand of each running simulator; delete sockets of ended processes."""
+    """Yield the socket and the hand of each running simulator, and delete stale sockets."""
     for path in sorted(control_folder().glob("*.sock")):
         try:
             yield path, request(path, []).hand
@@ -222,7 +222,7 @@ def _send(connection: socket.socket, message: dict[str, Any]) -> None:
 
 
 def _receive(connection: socket.socket) -> bytes:
-    """Receive and return one line of at most 64 KiB."""
+    """Receive one line of at most 64 KiB."""
     received = b""
     while len(received) < _LONGEST_LINE and (part := connection.recv(4096)):
         received += part

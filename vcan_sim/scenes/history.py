@@ -1,8 +1,8 @@
-"""Computation of one touch at fixed time steps, each from the preceding step.
+"""Contact mechanics of one touch at fixed time steps.
 
-Friction depends on the past, so the time steps are computed in order and stored. The cells lie on a lattice
-that is fixed to the patch. The window of cells follows the body by whole cells, so the tractions need no
-interpolation.
+Friction depends on history, so the time steps are computed in order and stored. The cells belong to a lattice
+that is fixed to the patch. The window of cells follows the body in whole cells, so tractions are never
+interpolated.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ from vcan_sim.scenes.tables import TouchConfig
 from vcan_sim.scenes.window import CLOSE, Window, centred_m, overlap_m, solve_depth
 
 _LEAST: Final = 1e-5
-"""Depth or force below which the body does not touch the skin, relative to the maximum of the touch."""
+"""Depth or force below which contact is neglected, relative to the maximum of the touch."""
 _LOOSER: Final = (1.0, 10.0, 100.0)
-"""Factors for the tolerance of the contact solver, tried in this order until the solver converges."""
+"""Factors for the tolerance of the contact solver, tried in turn until it converges."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,7 +33,7 @@ class Step:
     """State of a touch at one time step.
 
     Attributes:
-        first: (2,) lattice indices of the window's first cell.
+        first: (2,) lattice indices of the first cell of the window.
         traction_pa: (3, X, Y) tractions on the skin, Pa.
         electrodes_m: (E, 3) displacement of the electrodes, metres.
         force_n: (3,) force on the skin, N.
@@ -52,7 +52,7 @@ class Step:
 
 
 class History:
-    """Time steps of one touch, computed in order when first needed. Several threads may share an instance.
+    """Time steps of one touch, computed on demand. Threads may share an instance.
 
     Args:
         touch: Touch to compute.
@@ -74,9 +74,9 @@ class History:
     ) -> None:
         self.touch, self.window, self.step_s = touch, window, step_s
         self.first = math.floor(touch.from_s / step_s)
-        """Number of the first time step; the body does not touch the skin before this step."""
+        """Number of the first time step. There is no contact before it."""
         self.last = math.ceil(touch.to_s / step_s)
-        """Number of the last time step, after which the body does not touch the skin."""
+        """Number of the last time step. There is no contact after it."""
         self._shape, self._friction, self._electrodes = shape, friction, electrodes
         self._steps: list[Step | None] = []
         self._contact = untouched(window.grid)
@@ -91,7 +91,7 @@ class History:
         return self.window.grid.size_m
 
     def step(self, number: int) -> Step | None:
-        """Return the state at time ``number * step_s``, or None if the body does not touch the skin."""
+        """Return the state at time ``number * step_s``; None without contact."""
         index = number - self.first
         if index < 0 or number > self.last:
             return None
@@ -101,7 +101,7 @@ class History:
             return self._steps[index]
 
     def cell_m(self, first: tuple[int, int]) -> Float:
-        """Return a lattice cell's centre (2,) in the patch frame, in metres."""
+        """Return the centre (2,) of a lattice cell in the patch frame, metres."""
         return np.asarray(self.touch.at_m) + centred_m(self.window.grid) + self.size_m * np.array(first)
 
     def _following(self, number: int) -> Step | None:
@@ -113,7 +113,9 @@ class History:
             self._contact, self._pose = untouched(self.window.grid), pose
             self._depth_and_force = None
             return None
-        start = self._contact  # initial guess: the tractions of a sliding contact move with the body
+        start = (
+            self._contact
+        )  # as initial guess, before _follow: in sliding contact, tractions move with the body
         self._follow(pose)
         offset = self.cell_m(self._first_cell) - np.asarray(pose.place_m)
         slide = np.zeros(2) if last is None else np.subtract(pose.slid_m, last.slid_m)
@@ -126,7 +128,7 @@ class History:
         return self._summary(depth)
 
     def _solve(self, pose: Pose, offset_m: Float, slide_m: Float, start: Contact) -> tuple[float, Contact]:
-        """Return depth (m) and contact at a new pose, with ``start`` as the solver's initial guess."""
+        """Return the depth (m) and contact at a new pose. ``start`` is the initial guess."""
         grid = self.window.grid
 
         def at(depth_m: float) -> Contact:
@@ -151,7 +153,7 @@ class History:
         return depth, newest
 
     def _follow(self, pose: Pose) -> None:
-        """Shift the window by whole cells to the position of the body, without moving the tractions."""
+        """Move the window to the body in whole cells. The tractions stay in place on the skin."""
         grid = self.window.grid
         way = (np.asarray(pose.place_m) - np.asarray(self.touch.at_m)) / grid.size_m
         first = (round(float(way[0])), round(float(way[1])))
@@ -192,8 +194,8 @@ def _advance(  # noqa: PLR0913 - all inputs of a time step
 ) -> Contact:
     """Return the contact after the body has moved.
 
-    If the solver does not converge, it is restarted with a larger tolerance. If it does not converge with any
-    factor in ``_LOOSER``, the time step is computed without friction.
+    If the solver does not converge, the tolerance is increased by the factors in ``_LOOSER``. If no tolerance
+    is large enough, the time step is computed without friction.
 
     Raises:
         NoSolution: If the solver does not converge without friction either.
@@ -207,7 +209,7 @@ def _advance(  # noqa: PLR0913 - all inputs of a time step
 
 
 def _shifted(traction_pa: Float, shift: tuple[int, int]) -> Float:
-    """Return the tractions (3, X, Y) in a window shifted by whole cells; new cells have zero traction."""
+    """Return tractions (3, X, Y) in a window shifted by whole cells, with zeros in the new cells."""
     moved = np.zeros_like(traction_pa)
     size = traction_pa.shape[1:]
     if abs(shift[0]) >= size[0] or abs(shift[1]) >= size[1]:

@@ -1,4 +1,4 @@
-"""Window of grid cells that moves with a body, sized for the deepest contact of a touch."""
+"""Window of grid cells under a body, large enough for the deepest contact of a touch."""
 
 from __future__ import annotations
 
@@ -16,25 +16,24 @@ from vcan_sim.contact.solve import press
 from vcan_sim.scenes.shapes import Float, Shape
 
 MOST_CELLS: Final = 1.4
-"""Maximum number of cells in a window, as a multiple of n², where n is the requested number of cells across
-the narrow side. Longer windows have larger cells, up to twice the size."""
+"""Approximate maximum number of cells in a window, as a multiple of n², for n cells requested across the
+narrow side. Elongated windows have larger cells, up to twice the size."""
 MARGIN: Final = 0.1
-"""Margin of the window around the deepest contact, relative to the contact's half width. The margin is at
-least ``MARGIN_CELLS`` cells wide."""
+"""Margin of the window around the deepest contact, relative to the half width of the contact. The minimum is
+``MARGIN_CELLS`` cells."""
 FRICTION_MARGIN: Final = 0.15
-"""Additional margin per unit of the friction coefficient, because a sliding body piles up the skin in front
-of it."""
+"""Additional margin per unit of the friction coefficient. A sliding body piles up the skin in front of it."""
 MARGIN_CELLS: Final = 2
 CLOSE: Final = 3e-4
 """Tolerance of the contact solver (:func:`vcan_sim.contact.solve.press`), relative to the depth."""
 FORCE_CLOSE: Final = 2e-3
 """Relative tolerance of the normal force of a force-controlled touch."""
 _TURNS: Final = 12
-"""Maximum number of window sizes to try for one contact."""
+"""Maximum number of window sizes tried for one contact."""
 _SEARCHES: Final = 40
-"""Maximum number of depths to try when searching for the depth at a given force."""
+"""Maximum number of depths tried in a search for a given force."""
 _NOWHERE_M: Final = -1.0
-"""Lower limit of the overlap (m); the overlap has this value at points outside the body."""
+"""Lower limit of the overlap, metres. Points outside the body have this value."""
 
 
 class TooMuch(ValueError):
@@ -51,7 +50,7 @@ class Window:
 
     Attributes:
         grid: Grid of the cells, with their elastic response.
-        half_m: Half of the deepest contact's bounding box along x and y, metres.
+        half_m: Half widths of the deepest contact along x and y, metres.
         deepest_m: Depth of the deepest contact without friction, metres.
         force_n: Normal force of the deepest contact without friction, N.
     """
@@ -63,7 +62,7 @@ class Window:
 
 
 def overlap_m(grid: Grid, shape: Shape, offset_m: Float, yaw_rad: float, depth_m: float) -> Float:
-    """Return the overlap of a rigid body and the undeformed elastic layer.
+    """Return the overlap of a rigid body with the undeformed surface.
 
     Args:
         grid: Cells at which the overlap is computed.
@@ -79,7 +78,7 @@ def overlap_m(grid: Grid, shape: Shape, offset_m: Float, yaw_rad: float, depth_m
 
 
 def centred_m(grid: Grid) -> Float:
-    """Return the centre (2,) of a grid's first cell relative to the middle of the grid, metres."""
+    """Return the centre (2,) of the first cell of a grid relative to the middle of the grid, metres."""
     return -0.5 * grid.size_m * (np.array(grid.shape, float) - 1.0)
 
 
@@ -94,7 +93,7 @@ def window_of(  # noqa: PLR0913 - all inputs of a contact
     cells: int,
     margin: float = MARGIN,
 ) -> Window:
-    """Return a window of cells that covers the deepest contact of a touch.
+    """Return a window that covers the deepest contact of a touch.
 
     Args:
         layer: Elastic layer.
@@ -104,7 +103,7 @@ def window_of(  # noqa: PLR0913 - all inputs of a contact
         by_force: Whether ``level`` is a force.
         most_m: Maximum allowed depth, metres.
         cells: Number of cells across the narrow side of the window.
-        margin: Margin around the frictionless contact, relative to the contact's half width.
+        margin: Margin around the frictionless contact, relative to its half width.
 
     Raises:
         TooMuch: If the force requires a depth larger than ``most_m``.
@@ -125,7 +124,7 @@ def window_of(  # noqa: PLR0913 - all inputs of a contact
 
 @dataclass(frozen=True, eq=False)
 class BodyKey:
-    """Hashable wrapper of a body's shape, for use as a cache key."""
+    """Shape of a body, wrapped for use as a cache key."""
 
     shape: Shape
 
@@ -144,15 +143,13 @@ def solve_depth(
 ) -> float:
     """Find the depth at which the contact force reaches a target.
 
-    The search uses a bracketed secant method for the logarithms of force and depth, because the force is
-    nearly a power of the depth. This is not the case while only a few cells are in contact, so every second
-    step bisects the bracket.
+    Force is nearly a power of depth, so the search is a bracketed secant method in the logarithms of both.
+    With few cells in contact, the power law fails; every second step therefore bisects the bracket.
 
     Args:
-        force_n: Function from depth (m) to force (N). Its last call is for the returned depth.
+        force_n: Function from depth (m) to force (N). Its last call is made with the returned depth.
         target_n: Target force, N, positive.
-        known: Known pair of depth (m) and force (N), from which the first trial depth is extrapolated with
-            F ∝ δ^1.5.
+        known: Depth (m) and force (N) from which F ∝ δ^1.5 extrapolates the first trial depth.
         close: Tolerance of the force, relative to the target.
 
     Raises:
@@ -169,7 +166,7 @@ def solve_depth(
             low = max(low, depth)
         else:
             high = min(high, depth)
-        if high - low < 0.1 * close * high:  # the remaining error is the contact solver's tolerance
+        if high - low < 0.1 * close * high:  # what remains is the error of the contact solver
             return depth
         power = 1.5
         if force > 0.0 and last[1] > 0.0 and last[0] != depth and last[1] != force:
@@ -195,7 +192,7 @@ def _fit(  # noqa: PLR0913 - all inputs of a contact
     cells: int,
     margin: float,
 ) -> Window:
-    """Return a window that covers the contact at a given depth for every rotation in ``yaws_rad``."""
+    """Return a window that covers the contact at a given depth, for all rotations in ``yaws_rad``."""
     half = 1.5 * np.max([_extent_m(shape, yaw, depth_m) for yaw in yaws_rad], axis=0)
     for _ in range(_TURNS):
         grid = _grid(layer, half, cells)
@@ -222,19 +219,19 @@ def _grid_of(layer: Layer, shape: tuple[int, int], size_m: float) -> Grid:
 
 
 def _grid(layer: Layer, half_m: Float, across: int) -> Grid:
-    """Return a grid with side lengths along x and y of at least twice ``half_m`` (2,), metres."""
+    """Return a grid that extends at least ``half_m`` (2,) metres from its middle along x and y."""
     wide = 2.0 * half_m
     narrow = float(wide.min())
     size = max(narrow / across, math.sqrt(float(wide.prod()) / MOST_CELLS) / across)
     size = min(size, 2.0 * narrow / across)
-    size = min(size, layer.thickness_m)  # larger cells do not resolve the layer's response
-    size = float(f"{size:.2g}")  # rounded, so that more windows share a cached response
+    size = min(size, layer.thickness_m)  # larger cells would not resolve the response of the layer
+    size = float(f"{size:.2g}")  # rounded, so that similar windows share a cached response
     cells = np.maximum(np.ceil(wide / size - 1e-9), 4).astype(int)
     return _grid_of(layer, (int(cells[0]), int(cells[1])), size)
 
 
 def _extent_m(shape: Shape, yaw_rad: float, depth_m: float) -> Float:
-    """Return rough upper bounds (2,) for a body's half width (m) along x and y at a given depth."""
+    """Return upper bounds (2,) of the half width (m) of a body along x and y, at a given depth."""
     reach = 1e-5
     for _ in range(20):
         line = np.linspace(-reach, reach, 65)
@@ -244,7 +241,7 @@ def _extent_m(shape: Shape, yaw_rad: float, depth_m: float) -> Float:
         if extent.max() < reach * (1.0 - 1e-9):
             break
         reach *= 2.0
-    for axis in (0, 1):  # a narrow body may lie between the points sampled above
+    for axis in (0, 1):  # a narrow body can fall between the points sampled above
         line = np.linspace(0.0, extent[axis] + 2.0 * reach / 64, 257)
         places = np.stack([line, 0.0 * line] if axis == 0 else [0.0 * line, line], axis=-1)
         inside = shape.over(places, yaw_rad) <= depth_m

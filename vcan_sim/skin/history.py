@@ -1,6 +1,6 @@
-"""Hysteresis and creep of the rubber: the displacement that a load causes depends on earlier loads.
+"""Hysteresis and creep of the rubber, by which the displacement depends on earlier loads.
 
-The model is applied to each coordinate of each electrode's displacement, first hysteresis and then creep:
+Hysteresis and then creep act on each coordinate of the displacement of each electrode:
 
 hysteresis   The fraction w of the displacement passes through parallel play operators. Each operator follows
              its input s only outside a band of ±r: p ← max(s − r, min(s + r, p)), with p = 0 initially. The
@@ -10,10 +10,9 @@ creep        d = s + c₁ q₁ + c₂ q₂, where τᵢ dqᵢ/dt = s − qᵢ. T
              elements (Findley, Lai and Onaran, Creep and Relaxation of Nonlinear Viscoelastic Materials,
              1976, section 5.5). The response to a step s is s (1 + Σ cᵢ (1 − exp(−t/τᵢ))).
 
-The result is the true displacement of the electrodes. The state is computed in time steps of :data:`STEP_S`
-from time 0, on the assumption that the output of the hysteresis model is linear within each step. For a time
-between two steps, a partial step is computed but not stored. The displacement therefore does not depend on
-which times were requested earlier.
+The result is the true displacement of the electrodes. The state advances from time 0 in steps of
+:data:`STEP_S`, within which the output of the hysteresis model is taken as linear. A time between two steps
+is reached by a partial step that is not stored, so results do not depend on the times requested earlier.
 """
 
 from __future__ import annotations
@@ -30,26 +29,25 @@ from skinnode.model.layout import Float
 from vcan_sim.skin.imperfections import Imperfections
 
 STEP_S: Final = 1.0 / 32.0
-"""Time step of the rubber's state, s. The value is a power of two, so the times of all steps are exact."""
+"""Time step, s. It is a power of two, so the times of all steps are exact."""
 THRESHOLDS: Final = (0.0025, 0.005, 0.01, 0.02)
 """Thresholds r of the play operators, as fractions of the clearance; the operators have equal weights."""
 _RECENT: Final = 128
-"""Number of most recent time steps whose states are stored."""
+"""Number of recent time steps whose states are stored."""
 _KEPT_EVERY: Final = 64
-"""Number of time steps between states that are stored for longer; the interval is 2 s."""
+"""Number of time steps (2 s) between states that are stored for longer."""
 _KEPT: Final = 300
-"""Number of states stored at intervals of ``_KEPT_EVERY`` steps, for ten minutes. Of the states older than
-this, only every ``_THINNED``-th is kept."""
+"""Number of states stored at intervals of ``_KEPT_EVERY`` steps (ten minutes). Of older states, only every
+``_THINNED``-th is kept."""
 _THINNED: Final = 64
 
 Load = Callable[[float], "Float | None"]
-"""Function that takes the time (s) and returns the displacement (U, N, 3) without hysteresis and creep, in m,
-or None at rest."""
+"""Function from time (s) to the displacement (U, N, 3) without hysteresis and creep (m); None at rest."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class State:
-    """State of the rubber at one instant, in m, for each coordinate (U, N, 3) of the displacement."""
+    """State of the rubber at one instant, m, for each coordinate (U, N, 3) of the displacement."""
 
     play: Float
     """(P, U, N, 3): outputs of the play operators."""
@@ -60,11 +58,11 @@ class State:
 
 
 class History:
-    """Displacement of the rubber's surface, with hysteresis and creep, under a varying load.
+    """Displacement of the rubber surface under a varying load, with hysteresis and creep.
 
     Args:
         imperfections: Sizes of hysteresis and creep.
-        clearance_m: Clearance between the layers in the layout, m, which scales the hysteresis thresholds.
+        clearance_m: Clearance between the electrode layers, m. It scales the hysteresis thresholds.
     """
 
     def __init__(self, imperfections: Imperfections, clearance_m: float) -> None:
@@ -75,15 +73,15 @@ class History:
         self._load: Load | None = None
         self._kept: dict[int, State | None] = {}
         self._recent: OrderedDict[int, State | None] = OrderedDict()
-        self._lock = threading.Lock()  # a node takes readings while another thread requests the truth
+        self._lock = threading.Lock()  # the node reads in one thread while another requests the truth
 
     def displacement_m(self, t_s: float, load: Load) -> Float | None:
-        """Return the rubber's displacement (U, N, 3), in m, at ``t_s``; None before the first load.
+        """Return the displacement (U, N, 3) at ``t_s``, m; None before the first load.
 
         Args:
             t_s: Time since the start of the history, s.
-            load: Displacement without hysteresis and creep, as a pure function of time. Passing a different
-                function restarts the history.
+            load: Displacement without hysteresis and creep, as a pure function of time. A different function
+                restarts the history.
         """
         if t_s < 0.0:
             return load(t_s)
@@ -100,7 +98,7 @@ class History:
         return np.asarray(state.followed + np.tensordot(self._creep, state.delayed, axes=1))
 
     def _at(self, step: int, load: Load) -> State | None:
-        """Return the state at a time step, computed from the latest stored state up to this step."""
+        """Return the state at a time step, starting from the latest stored state."""
         known = step
         while known >= 0 and known not in self._recent and known not in self._kept:
             known -= 1
@@ -141,6 +139,6 @@ class History:
             return State(play, followed, state.delayed)
         risen = -np.expm1(-dt_s / self._creep_s)
         lag = (followed - state.followed) * (self._creep_s / dt_s)
-        # exact if the displacement with hysteresis is linear within the step
+        # exact if ``followed`` is linear within the step
         delayed = followed - lag * risen + (state.delayed - state.followed) * (1.0 - risen)
         return State(play, followed, delayed)

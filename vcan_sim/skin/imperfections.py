@@ -1,4 +1,4 @@
-"""Sizes of all imperfections of a simulated patch."""
+"""Sizes of the imperfections of a simulated patch."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ _LIMITS: Final[dict[str, tuple[float, float, str]]] = {
     "row_time_s": (0.0, 1.0, "s"),
     "noise": (0.0, 0.01, ""),
 }
-"""Minimum, maximum and unit of each numeric imperfection."""
+"""Minimum, maximum and unit of each imperfection."""
 _OF_NETWORK: Final = (
     "contact_ohm",
     "upper_wire_ohm",
@@ -42,23 +42,23 @@ _OF_NETWORK: Final = (
     "multiplexer_ohm",
     "virtual_ground_ohm",
 )
-"""Resistances that are modelled only with the read-outs ``grounded`` and ``floating``."""
+"""Resistances that only the read-outs ``grounded`` and ``floating`` model."""
 _WITHOUT_SIZE: Final = ("seed", "temperature_per_k", "warming_s", "creep_s")
-"""Fields that are not sizes; they have no effect if all sizes are zero."""
+"""Fields that are not sizes. They have no effect if every size is zero."""
 _BITS: Final = (8, 32)
 
 
 @dataclass(frozen=True, slots=True)
 class Imperfections:
-    """Sizes of a simulated patch's deviations from its layout; if all are zero, the patch is exact.
+    """Sizes of the deviations of a simulated patch from its layout. The default is an exact patch.
 
-    A size marked *drawn* is the standard deviation of normal random draws, which are clipped at three
-    standard deviations. Each imperfection has its own random stream, so enabling one imperfection does not
-    change the random draws of the others.
+    A size marked *drawn* is the standard deviation of a normal distribution that is clipped at three standard
+    deviations. Each imperfection has its own random stream, so enabling one does not change the draws of the
+    others.
 
     Raises:
-        ConfigError: If a value has the wrong type or is out of range, or a resistance of the network is
-            nonzero with the read-out ``ideal``.
+        ConfigError: If a value has the wrong type or is out of range, or the read-out ``ideal`` is combined
+            with a nonzero network resistance.
     """
 
     seed: int = 1
@@ -143,18 +143,17 @@ class Imperfections:
 
     @property
     def exact(self) -> bool:
-        """Whether every size is zero, so that the patch matches its layout exactly."""
+        """Whether the patch matches its layout exactly."""
         unsized = {name: getattr(EXACT, name) for name in _WITHOUT_SIZE}
         return dataclasses.replace(self, **unsized) == EXACT
 
     @classmethod
     def ordinary(cls, seed: int = 1) -> Self:
-        """Return the sizes of a carefully manufactured patch, consistent with ``tolerances = "ordinary"``.
+        """Return the imperfections of a carefully manufactured patch (``tolerances = "ordinary"``).
 
-        Gain, placement, thickness and electrode radius have the values in
-        :data:`skinnode.model.tolerances.ORDINARY`; the other sizes are assumptions. The temperature is
-        constant and the read-out is ideal, because the tolerances do not include temperature and read-out
-        effects.
+        Gain, placement, thickness and electrode radius are those of
+        :data:`skinnode.model.tolerances.ORDINARY`. The other sizes are assumptions. Temperature is constant
+        and the read-out is ideal, because the tolerances cover neither.
 
         Args:
             seed: Random seed.
@@ -180,7 +179,7 @@ class Imperfections:
 
     @classmethod
     def from_text(cls, text: str) -> Self:
-        """Return the imperfections given as a string, such as ``ordinary,placement=0.05,seed=3``.
+        """Parse imperfections in text form, such as ``ordinary,placement=0.05,seed=3``.
 
         Raises:
             ConfigError: If a name is unknown or a value is invalid.
@@ -198,12 +197,12 @@ class Imperfections:
 
     @classmethod
     def from_table(cls, table: Mapping[str, Any], key: str = "imperfections") -> Self:
-        """Return the imperfections defined by a TOML table.
+        """Return the imperfections in a TOML table.
 
         Args:
-            table: Values by field name. With ``ordinary = true``, missing fields come from :meth:`ordinary`
-                instead of the defaults.
-            key: Path of the table, for error messages.
+            table: Values by field name. With ``ordinary = true``, missing fields have the values of
+                :meth:`ordinary` instead of the defaults.
+            key: Key of the table, for error messages.
 
         Raises:
             ConfigError: If a key is unknown or a value is invalid.
@@ -227,7 +226,7 @@ class Imperfections:
 
 
 def _value(text: str) -> int | float | str:
-    """Convert a string to a number if possible; otherwise, return the string unchanged."""
+    """Return a string as a number if it is one; otherwise, return the string itself."""
     for kind in (int, float):
         try:
             return kind(text)
@@ -237,7 +236,7 @@ def _value(text: str) -> int | float | str:
 
 
 def _checked(name: str, value: object, least: float, greatest: float, unit: str) -> object:
-    """Return a number as a float or a pair as a tuple. Raises ConfigError if the value is not allowed."""
+    """Return a number as a float, or a pair as a tuple. Raises ConfigError for an invalid value."""
     allowed = f"a number from {least:g} to {greatest:g} {unit}".rstrip()
     if not name.startswith("creep"):
         return _number(name, value, least, greatest, allowed)
@@ -254,4 +253,4 @@ def _number(name: str, value: object, least: float, greatest: float, allowed: st
 
 
 EXACT: Final = Imperfections()
-"""Imperfections of an exact patch, which has no deviations from its layout."""
+"""Imperfections of an exact patch."""

@@ -17,29 +17,28 @@ from vcan_sim.skin.history import History
 from vcan_sim.skin.imperfections import EXACT, Imperfections
 
 ROW_STEP_S: Final = 1e-3
-"""Maximum time (s) for which the electrodes' motion during a scan is approximated as linear."""
+"""Maximum interval of a scan over which the motion of the electrodes is taken as linear, s."""
 
 Surface = Callable[[float], Float]
-"""Function that takes the time (s) and returns the positions (U, N, 3) of the upper electrodes, in m, of an
-exact patch. At rest, the function returns ``layout.upper_m`` itself, as :meth:`vcan_sim.scene.Scene.upper_m`
-does."""
+"""Function from time (s) to the positions (U, N, 3) of an exact patch's upper electrodes (m). At rest, it
+returns the array ``layout.upper_m`` itself; :meth:`vcan_sim.scene.Scene.upper_m` is an example."""
 
 
 class PhysicalPatch:
     """Patch with imperfections, and its read-out.
 
-    Placement errors do not change the displacement of an electrode; hysteresis and creep do. The results do
-    not depend on the order in which times are requested. Without imperfections, the resistances are
-    bit-identical to those of :class:`ExactForward`.
+    Hysteresis and creep change the displacement of an electrode; placement errors do not. Results depend
+    only on time, not on earlier calls. Without imperfections, the resistances equal those of
+    :class:`ExactForward` bit for bit.
 
-    With the read-outs ``grounded`` and ``floating``, the conductances of an upper wire's paths are always
-    those at the sampling time of that wire, even while another upper wire is sampled. This simplification
-    affects only sneak currents.
+    The read-outs ``grounded`` and ``floating`` contain a simplification: the paths of each upper wire have
+    their conductances at the sampling time of that wire, even while another upper wire is sampled. Only sneak
+    currents are affected.
 
     Args:
         layout: Nominal layout of the patch, as in the hand file.
         imperfections: Deviations from the layout.
-        number: Number of the patch in the hand; each patch has its own random draws.
+        number: Number of the patch in the hand, which selects its random draws.
 
     Raises:
         ConfigError: If the random errors make the gap between an upper and a lower electrode too small.
@@ -69,7 +68,7 @@ class PhysicalPatch:
         at_rest_ohm = self._network_ohm(body.upper_m, cold)
         self._front_end = FrontEnd(imperfections, draws, at_rest_ohm)
         self.rest_ohm: Final = self._front_end.amplified_ohm(at_rest_ohm)
-        """(U, K) float64, ohm: resistances at rest at time 0 at the converter's input; read-only."""
+        """(U, K) float64, ohm: converter input at rest, at time 0; read-only."""
         for shared in (self.rest_m, self.lower_m, self.rest_ohm):
             shared.setflags(write=False)
 
@@ -81,10 +80,9 @@ class PhysicalPatch:
             upper_m_at: Motion of the exact patch, as a pure function of time.
 
         Returns:
-            (U, N, 3) float64, m: positions of the electrodes of upper wire u at ``t_s + u · row_time_s``.
-            These positions include the placement errors, which are unknown to solvers. Subtract
-            :attr:`rest_m` to obtain the displacement that solvers estimate. If the electrodes have no
-            position errors and the patch is at rest, the method returns ``layout.upper_m`` itself.
+            (U, N, 3) float64, m: positions of the electrodes of upper wire u at ``t_s + u · row_time_s``,
+            including placement errors. The displacement that solvers estimate is this array minus
+            :attr:`rest_m`. At rest, without position errors, the result is ``layout.upper_m`` itself.
         """
         if not self.imperfections.row_time_s:
             return self._upper_m(t_s, upper_m_at)
@@ -99,7 +97,7 @@ class PhysicalPatch:
         return np.asarray((1.0 - share) * every[span, wires] + share * every[span + 1, wires])
 
     def analogue_ohm(self, t_s: float, upper_m_at: Surface) -> Float:
-        """Return the resistances (U, K) in ohm at the converter's input.
+        """Return the resistances (U, K) at the input of the converter, ohm.
 
         Args:
             t_s: Scene time of the scan, s.
@@ -111,21 +109,21 @@ class PhysicalPatch:
         return self._front_end.amplified_ohm(self._network_ohm(upper_m, self._warmth(t_s)))
 
     def converted_ohm(self, analogue_ohm: Float, reading: int) -> Float:
-        """Return the resistances at the converter's output for given resistances at its input.
+        """Return the converter's output for a given input.
 
         Args:
-            analogue_ohm: (U, K) float64, ohm: resistances at the converter's input.
-            reading: Number of the reading, at least 0, which seeds the noise.
+            analogue_ohm: (U, K) float64, ohm: input of the converter.
+            reading: Number of the reading, at least 0. It seeds the noise.
 
         Returns:
-            (U, K) float64, ohm; the input array itself if the converter is exact.
+            (U, K) float64, ohm; the input array itself for an exact converter.
         """
         return self._front_end.converted_ohm(analogue_ohm, reading)
 
     def resistance_ohm(self, t_s: float, upper_m_at: Surface) -> Float:
-        """Return the resistances (U, K) in ohm at the converter's output for one scan.
+        """Return the output (U, K) of the converter for one scan, ohm.
 
-        The scene time in whole nanoseconds seeds the noise.
+        The scene time, in whole nanoseconds, seeds the noise.
 
         Args:
             t_s: Scene time of the scan, s.
@@ -134,7 +132,7 @@ class PhysicalPatch:
         return self.converted_ohm(self.analogue_ohm(t_s, upper_m_at), abs(round(t_s * 1e9)))
 
     def _upper_m(self, t_s: float, upper_m_at: Surface) -> Float:
-        """Return the true positions (U, N, 3) of the upper electrodes, in m, or ``rest_m`` itself at rest."""
+        """Return the true positions (U, N, 3) of the upper electrodes, m; at rest, ``rest_m`` itself."""
         layout_m = self.layout.upper_m
         if self._history is None:
             upper = upper_m_at(t_s)
@@ -145,7 +143,7 @@ class PhysicalPatch:
         return self.rest_m if moved is None else np.asarray(self.rest_m + moved)
 
     def _warmth(self, t_s: float) -> Float:
-        """Return the resistivity (U, 1) at each upper wire's sampling time, relative to that at time 0."""
+        """Return the resistivity (U, 1) relative to time 0, at the sampling time of each upper wire."""
         sizes = self.imperfections
         since_s = np.maximum(t_s + self._row_s, 0.0)
         risen_k = -sizes.warming_k * np.expm1(-since_s / sizes.warming_s)
@@ -183,9 +181,9 @@ class PhysicalPatch:
 
 
 class _Motion:
-    """Displacement of an exact patch as a function of time; None at rest.
+    """Function from time to the displacement of an exact patch; None at rest.
 
-    Two motions are equal if they wrap the same function, so that :class:`History` can detect a new scene.
+    Motions that wrap the same function are equal, which is how :class:`History` detects a new scene.
     """
 
     __slots__ = ("_layout_m", "_upper_m_at")

@@ -1,4 +1,4 @@
-"""Deterministic model of a CAN bus with exact event times. The model uses neither threads nor a clock.
+"""Deterministic model of a CAN bus with exact event times, without threads and without a clock.
 
 ::
 
@@ -8,10 +8,10 @@
         -> attempt (delivered or destroyed, and when) -> bus
     confinement (error counters and states), bit_rates (exact times), occupancy (bus load) -> bus
 
-The caller supplies the time. ``TimedBus.send`` queues a frame at a given time, ``TimedBus.advance`` returns
-all events up to a given time, and ``TimedBus.next_event_ns`` is the time to pass to the next call of
-``advance``. Identical calls produce identical events. The docstrings of the modules ``bus``, ``attempt`` and
-``confinement`` list the simplifications of the model.
+The caller supplies the time. ``TimedBus.send`` queues a frame at a given time, ``TimedBus.advance`` simulates
+the bus up to a given time, and ``TimedBus.next_event_ns`` is the time at which to call ``advance`` next. The
+same calls produce the same events. The modules ``bus``, ``attempt`` and ``confinement`` list the
+simplifications of the model.
 """
 
 from vcan_sim.timed_bus.bit_rates import BitRates

@@ -1,17 +1,17 @@
-"""Course of one transmission attempt: the time at which a frame is delivered or destroyed.
+"""Course of one transmission attempt: whether and when its frame is delivered or destroyed.
 
-:func:`undisturbed` covers the common case and needs only the number of bits; :func:`disturbed` examines the
-individual bits of the frame.
+:func:`undisturbed` handles the common case, for which the number of bits is enough. :func:`disturbed`
+examines the individual bits of the frame.
 
-Error frames (ISO 11898-1:2015; Bosch CAN 2.0, part B, sections 3.1.3 and 7): The first station to detect an
-error starts an error flag of 6 bits at the next bit. The other stations start their error flags when they
-detect the first flag as an error, up to 6 bits later, so the superposed flags are 6 to 12 bits long. An error
-delimiter of 8 recessive bits and the intermission of 3 bits follow. Error flags are sent at the nominal bit
-rate. The delay of the second flag is computed with the bit rate of the phase in which the error occurs.
+Error frames follow ISO 11898-1:2015 and Bosch CAN 2.0, part B, sections 3.1.3 and 7. The first station to
+detect an error sends an error flag of 6 bits, starting at the next bit. This flag is an error to the other
+stations, which start their own flags up to 6 bits later. The superposed flags are thus 6 to 12 bits long. An
+error delimiter of 8 recessive bits and the intermission of 3 bits follow. Error flags have the nominal bit
+rate. The delay of the second flag is computed at the bit rate of the phase in which the error occurs.
 
 Simplifications: A disturbance seen by all stations destroys the frame, even if it inverts a recessive bit of
-the arbitration field. Error flags and delimiters are never disturbed. A passive error flag ends together with
-the other error flags. Overload frames are not modelled.
+the arbitration field. Error flags and delimiters are never disturbed. A passive error flag ends when the
+other error flags end. Overload frames are not modelled.
 """
 
 from __future__ import annotations
@@ -54,32 +54,32 @@ class BitError:
     """Error in a transmission attempt. Times are in ticks from the start of frame."""
 
     ticks: int
-    """Start of the first error flag, in ticks."""
+    """Start of the first error flag."""
     bit: int
     cause: Cause
     detected_by: tuple[int, ...]
-    """Stations that detect the error at the bit position ``bit``."""
+    """Stations that detect the error in this bit."""
 
 
 class Course(NamedTuple):
     """Course of a transmission attempt. Times are in ticks from the start of frame."""
 
     senders: tuple[int, ...]
-    """Stations whose frame is delivered or destroyed at the end of the attempt."""
+    """Stations that are still sending when the frame is delivered or destroyed."""
     end: int
-    """End of the last bit of the end of frame, or start of the first error flag, in ticks."""
+    """End of the frame, or start of the first error flag."""
     recessive: int
-    """Time from which the bus remains recessive, in ticks."""
+    """Time after which the bus stays recessive."""
     free: int
-    """End of the intermission, in ticks."""
+    """End of the intermission."""
     error: BitError | None = None
     """Error that destroys the frame; None if the frame is delivered."""
     side_errors: tuple[BitError, ...] = ()
-    """Errors of error-passive stations that do not destroy the frame, in chronological order."""
+    """Errors of error-passive stations, which do not destroy the frame, in chronological order."""
 
 
 def undisturbed(senders: tuple[int, ...], frame: CanFrame, esi: bool, rates: BitRates) -> Course:
-    """Return the course of a transmission attempt that is acknowledged and not disturbed.
+    """Return the course of an undisturbed and acknowledged transmission attempt.
 
     Args:
         senders: stations that send the frame.
@@ -95,12 +95,12 @@ def undisturbed(senders: tuple[int, ...], frame: CanFrame, esi: bool, rates: Bit
 def disturbed(
     senders: Sequence[Participant], receivers: Sequence[Participant], hit: Hit | None, rates: BitRates
 ) -> Course:
-    """Return the course of a transmission attempt with a disturbance, a collision or no acknowledgement.
+    """Return the course of a transmission attempt bit by bit, with all of its errors.
 
     Args:
-        senders: stations that send frames with the same arbitration field.
+        senders: stations that send frames with identical arbitration fields.
         receivers: all other stations on the bus.
-        hit: disturbed bit, or None if no rule disturbs the attempt.
+        hit: disturbed bit; None if no rule disturbs the attempt.
         rates: bit rates of the bus.
     """
     wires = {each.station: wire_frame(each.frame, each.passive) for each in senders if each.frame}
@@ -144,7 +144,7 @@ def cut_off(
     receivers: Sequence[Participant],
     rates: BitRates,
 ) -> Course:
-    """Return the course of a transmission attempt whose only sender is disconnected during the frame.
+    """Return the course of a transmission attempt whose only sender leaves the bus during the frame.
 
     Args:
         frame: frame on the bus.
@@ -163,7 +163,7 @@ def cut_off(
 
 @dataclass(slots=True)
 class _OnBus:
-    """Stations that still take part in a transmission attempt, and errors that did not destroy the frame."""
+    """Stations still taking part in a transmission attempt, and the errors so far."""
 
     sending: dict[int, Participant]
     receiving: dict[int, Participant]
@@ -176,7 +176,7 @@ def _destroyed_by_hit(hit: Hit, wire: WireFrame, bus: _OnBus) -> Course:
     flag = _PASSIVE if all(bus.sending[station].passive for station in detecting) else _ACTIVE
     seen = wire.bits[hit.bit] ^ (hit.station == -1)
     lag = receiver_lag(wire, hit.bit, seen, flag) if bus.receiving else 0
-    if hit.station == -1 and lag == 0:  # the receivers also detect the disturbed bit as an error
+    if hit.station == -1 and lag == 0:  # the disturbed bit is an error to the receivers too
         detecting += tuple(bus.receiving)
     error = _bit_error(wire, hit.bit, Cause.DISTURBED, detecting, bus.rates)
     return _destroyed(error, _lag_ticks(wire, hit.bit, lag, bus.rates), bus)
@@ -216,13 +216,13 @@ def _lag_ticks(wire: WireFrame, bit: int, lag: int, rates: BitRates) -> int:
 
 
 def _sender_lag(wire: WireFrame, bit: int) -> int:
-    """Return the number of error flag bits up to a sender's next recessive bit, at most 6."""
+    """Return the number of error flag bits up to the sender's next recessive bit, at most 6."""
     later = wire.bits[bit + 1 : bit + 1 + FLAG_BITS]
     return later.index(1) + 1 if 1 in later else FLAG_BITS
 
 
 def _first_difference(streams: Sequence[tuple[int, ...]]) -> int | None:
-    """Return the first bit position at which the frames of several senders differ, or None."""
+    """Return the first bit position at which the bit streams differ, or None."""
     for position, bits in enumerate(zip(*streams, strict=False)):
         if 0 < sum(bits) < len(bits):
             return position

@@ -1,4 +1,4 @@
-"""Bit rates of a bus, and the unit of time (tick) in which all bit times are whole numbers."""
+"""Bit rates of a bus, and a unit of time, the tick, in which every bit time is a whole number."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Final
 from skinnode.errors import ConfigError
 
 NOMINAL_BPS: Final = range(10_000, 1_000_001)
-"""Allowed nominal bit rates of a high-speed CAN bus, bit/s."""
+"""Permissible nominal bit rates of a high-speed CAN bus, bit/s."""
 
 MAX_DATA_BPS: Final = 8_000_000
 """Maximum bit rate of the CAN FD data phase, bit/s."""
@@ -19,10 +19,9 @@ MAX_DATA_BPS: Final = 8_000_000
 class BitRates:
     """Bit rates of a bus.
 
-    Time is counted in ticks of 1/``ticks_per_s`` s, the longest unit in which a nanosecond, a nominal bit and
-    a data bit are all whole numbers. Bit times in ticks are therefore exact, and rounding errors do not
-    accumulate. A tick is 1 ns if both bit times are whole nanoseconds. Only the times reported to callers are
-    rounded, each independently.
+    Time is counted in ticks. A tick is the longest unit of which a nanosecond, a nominal bit and a data bit
+    are all whole multiples; it is 1 ns if both bit times are whole nanoseconds. Times in ticks are exact.
+    Only the times reported to callers are rounded, each on its own, so rounding errors do not accumulate.
 
     Raises:
         ConfigError: if a bit rate is out of range.
@@ -57,9 +56,9 @@ class BitRates:
             object.__setattr__(self, name, value)
 
     def ticks(self, bits: tuple[int, int]) -> int:
-        """Return the duration in ticks of the given numbers of nominal bits and data bits."""
+        """Return the duration of the given numbers of nominal and data bits, ticks."""
         return bits[0] * self.nominal_ticks + bits[1] * self.data_ticks
 
     def ceil_ns(self, ticks: int) -> int:
-        """Convert ticks to ns, rounded up, so that no event is reported before it happens."""
+        """Convert ticks to ns. Rounding up ensures that no event is reported before it happens."""
         return ticks if self.ticks_per_ns == 1 else -(-ticks // self.ticks_per_ns)

@@ -1,7 +1,7 @@
 """Fault confinement: error counters and error states of a station (ISO 11898-1:2015).
 
-The rules are numbered as in Bosch CAN 2.0, part B, section 8. Rules 4 to 6 and exception 2 of rule 3
-concern disturbed error flags and stuff errors during arbitration, which the simulated bus does not model.
+Rule numbers are those of Bosch CAN 2.0, part B, section 8. Rules 4 to 6 and exception 2 of rule 3 are absent,
+because the simulated bus has no disturbed error flags and no stuff errors during arbitration.
 """
 
 from __future__ import annotations
@@ -11,30 +11,31 @@ from dataclasses import dataclass
 from typing import Final
 
 PASSIVE_FROM: Final = 128
-"""Error-passive limit: a station with a counter of at least this value is error-passive."""
+"""Error-passive limit: at this value of either error counter, a station becomes error-passive."""
 
 BUS_OFF_FROM: Final = 256
-"""Bus-off limit: a station goes bus-off when its transmit error counter reaches this value."""
+"""Bus-off limit: at this value of its transmit error counter, a station goes bus-off."""
 
 MAX_RECEIVE_ERRORS: Final = 255
-"""Maximum receive error counter. The standard sets no maximum; controllers use 7-bit or 8-bit counters."""
+"""Upper limit of the receive error counter. The standard sets none; controllers have 7-bit or 8-bit
+counters."""
 
 _BACK_TO_ACTIVE: Final = 119
-"""Receive error counter after a successful reception if the counter was above 127; the standard allows 119 to
+"""Receive error counter after a successful reception in the error-passive state. The standard allows 119 to
 127."""
 
 RECOVERY_RUNS: Final = 128
-"""Number of runs of recessive bits after which the bus-off state ends."""
+"""Number of recessive runs after which a station recovers from bus-off."""
 
 RECOVERY_RUN_BITS: Final = 11
-"""Length (bits) of a recessive run that counts towards recovery from bus-off."""
+"""Length of a recessive run that counts towards recovery from bus-off, bits."""
 
 SUSPEND_BITS: Final = 8
-"""Time for which an error-passive station waits after its own frame and the intermission, bits."""
+"""Suspend transmission: extra time that an error-passive station waits after its own frame, bits."""
 
 
 class ErrorState(enum.StrEnum):
-    """Error state of a station, as defined by its error counters."""
+    """Error state of a station."""
 
     ACTIVE = "error-active"
     PASSIVE = "error-passive"
@@ -52,7 +53,7 @@ class Counters:
 
     @property
     def state(self) -> ErrorState:
-        """Error state that follows from the error counters."""
+        """Error state for these counters."""
         if self.tec >= BUS_OFF_FROM:
             return ErrorState.BUS_OFF
         if self.tec >= PASSIVE_FROM or self.rec >= PASSIVE_FROM:
@@ -61,7 +62,7 @@ class Counters:
 
 
 ZERO: Final = Counters()
-"""Error counters of a station after its start or its recovery from bus-off."""
+"""Error counters of a station after start-up or recovery from bus-off."""
 
 
 def transmission_failed(counters: Counters, *, unanswered: bool = False) -> Counters:
@@ -69,7 +70,7 @@ def transmission_failed(counters: Counters, *, unanswered: bool = False) -> Coun
 
     Args:
         counters: error counters before the error.
-        unanswered: whether no other station acknowledges the frame or sends a dominant bit during the error
+        unanswered: whether the frame is not acknowledged and no station sends a dominant bit during the error
             flag. An error-passive transmitter does not count this error.
 
     Returns:
@@ -85,8 +86,8 @@ def reception_failed(counters: Counters, *, first: bool = False) -> Counters:
 
     Args:
         counters: error counters before the error.
-        first: whether the receiver detected the error before all other stations, so that it sees a dominant
-            bit after its own error flag.
+        first: whether the receiver is the first station to detect the error. It then sees a dominant bit
+            after its own error flag.
 
     Returns:
         Error counters after the error.

@@ -1,7 +1,7 @@
-"""Rules that inject bit errors, and the disturbed bits.
+"""Rules that inject bit errors.
 
-A disturbance inverts one bit of a frame, for all stations or for one station only. Rules count every
-transmission attempt, so a rule can also destroy retransmissions.
+A disturbance inverts one bit of a frame, for all stations or for only one. Rules apply to every transmission
+attempt, so they can also destroy retransmissions.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from vcan_sim.timed_bus.frame import CanFrame
 
 @dataclass(frozen=True, slots=True)
 class NthFrame:
-    """Rule that disturbs consecutive attempts to send frames with one identifier.
+    """Rule that disturbs a run of consecutive attempts to send frames with a given identifier.
 
     Raises:
         ConfigError: if a number is out of range.
@@ -25,15 +25,15 @@ class NthFrame:
 
     can_id: int
     first: int
-    """Number of the first disturbed attempt, counted from 1."""
+    """Number of the first disturbed attempt, from 1."""
     attempts: int = 1
     """Number of disturbed attempts."""
     bit: int = 20
-    """Position of the disturbed bit, including stuff bits; the start of frame is 0. Larger positions are
-    limited to the second-to-last bit of the end of frame."""
+    """Position of the disturbed bit, counting stuff bits; the start of frame is 0. The second-to-last bit of
+    the end of frame is the maximum, to which larger values are reduced."""
     extended: bool = False
     station: int | None = None
-    """Only station that sees the disturbance; None if all stations see it."""
+    """Station that sees the disturbance; None for all stations."""
 
     def __post_init__(self) -> None:
         for name, least in (("first", 1), ("attempts", 1), ("bit", 0)):
@@ -58,7 +58,7 @@ class RandomShare:
     """Position of the disturbed bit, as in :class:`NthFrame`; None for a uniformly distributed position."""
     extended: bool = False
     station: int | None = None
-    """Only station that sees the disturbance; None if all stations see it."""
+    """Station that sees the disturbance; None for all stations."""
 
     def __post_init__(self) -> None:
         if not 0 <= self.share <= 1:
@@ -69,7 +69,7 @@ class RandomShare:
 
 @dataclass(frozen=True, slots=True)
 class AtTime:
-    """Rule that disturbs the bit on the bus at a given time; the rule has no effect on an idle bus.
+    """Rule that disturbs the bit sent at a given time. It has no effect on an idle bus.
 
     Raises:
         ConfigError: if the time is negative.
@@ -77,7 +77,7 @@ class AtTime:
 
     time_ns: int
     station: int | None = None
-    """Only station that sees the disturbance; None if all stations see it."""
+    """Station that sees the disturbance; None for all stations."""
 
     def __post_init__(self) -> None:
         if self.time_ns < 0:
@@ -88,22 +88,21 @@ Disturbance = NthFrame | RandomShare | AtTime
 
 
 class Attempt(NamedTuple):
-    """Transmission attempt, as passed to the disturbance rules."""
+    """Transmission attempt, as seen by disturbance rules."""
 
     frame: CanFrame
     n_bits: Callable[[], int]
     """Function that returns the number of bits in the frame that can be disturbed."""
     bit_at: Callable[[int], int | None]
-    """Function that takes a time (ns) and returns the position of the bit that is being sent at this time, or
-    None if the frame is not being sent."""
+    """Function from a time (ns) to the position of the bit sent at that time; None outside the frame."""
 
 
 class Hit(NamedTuple):
-    """Disturbed bit of a frame. Instances are ordered by bit position."""
+    """Disturbed bit of a frame. Instances sort by position."""
 
     bit: int
     station: int
-    """Only station that sees the disturbance; -1 if all stations see it."""
+    """Station that sees the disturbance; -1 for all stations."""
 
 
 Rule = Callable[[Attempt], int | None]
@@ -125,7 +124,7 @@ class Disturbances:
         return bool(self._rules)
 
     def add(self, rule: Disturbance) -> None:
-        """Add a rule, which counts transmission attempts from now on.
+        """Add a rule. It counts transmission attempts from now on.
 
         Args:
             rule: disturbance rule to add.
@@ -137,7 +136,7 @@ class Disturbances:
         """Remove a rule.
 
         Args:
-            rule: disturbance rule, the same object as in :meth:`add`.
+            rule: the object that was passed to :meth:`add`.
 
         Raises:
             ValueError: if the rule is not active.
@@ -148,9 +147,9 @@ class Disturbances:
         self._rules = kept
 
     def hit(self, attempt: Attempt) -> Hit | None:
-        """Return the first bit of a transmission attempt that any rule disturbs, or None.
+        """Return the first disturbed bit of a transmission attempt, or None.
 
-        Call this method exactly once per attempt, because the rules count the calls.
+        Call this method exactly once per attempt: rules count the calls.
 
         Args:
             attempt: transmission attempt to check.

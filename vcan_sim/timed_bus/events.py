@@ -23,34 +23,34 @@ class Cause(enum.StrEnum):
 
 
 class Delivered(NamedTuple):
-    """Event: a frame was sent without error; its time is the end of the frame's last bit."""
+    """Event: a frame was sent without error. The event time is the end of its last bit."""
 
     time_ns: int
     station: int
     """Station that sent the frame."""
     frame: CanFrame
     receivers: tuple[int, ...]
-    """Stations that received the frame. If several stations sent identical frames simultaneously, each has
-    its own event, but only the first event lists the receivers."""
+    """Stations that received the frame. If several stations sent the same frame at once, each has its own
+    event, and only the first event lists the receivers."""
     queued_ns: int
-    """Time (ns) when the station queued the frame."""
+    """Time at which the station queued the frame, ns."""
     started_ns: int
     """Start of frame of the successful attempt, ns."""
 
 
 class ErrorFrame(NamedTuple):
-    """Event: an error flag; its time is the start of the flag's first bit."""
+    """Event: an error flag. The event time is the start of its first bit."""
 
     time_ns: int
     stations: tuple[int, ...]
-    """Stations whose frame failed and will be retransmitted; empty if only a receiver lost the frame."""
+    """Stations whose frame failed and will be sent again; empty if only a receiver lost the frame."""
     frames: tuple[CanFrame, ...]
-    """Frame on the bus; if different frames collided, all colliding frames in the order of ``stations``."""
+    """Frame on the bus, or the colliding frames in the order of ``stations``."""
     bit: int
-    """Position of the bit in which the error was detected; the start of frame has position 0."""
+    """Position of the bit in which the error was detected; the start of frame is 0."""
     cause: Cause
     detected_by: tuple[int, ...]
-    """Stations that detected the error in bit ``bit``; other stations detect the resulting error flag."""
+    """Stations that detected the error in this bit. The others detect the error flag."""
     destroyed: bool
     """Whether the error flag destroyed the frame. Passive error flags of receivers do not."""
 
@@ -64,14 +64,14 @@ class CountersChanged(NamedTuple):
 
 
 class BusOff(NamedTuple):
-    """Event: a station went bus-off; its transmit queue is kept."""
+    """Event: a station went bus-off. Its transmit queue is kept."""
 
     time_ns: int
     station: int
 
 
 class Recovered(NamedTuple):
-    """Event: a station recovered from bus-off, with both error counters at 0."""
+    """Event: a station recovered from bus-off, and both error counters are 0."""
 
     time_ns: int
     station: int

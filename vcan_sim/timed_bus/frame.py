@@ -1,4 +1,4 @@
-"""CAN frames, as passed from a station to its controller."""
+"""CAN frames, as a station hands them to its controller."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ _VALID_FD_LENGTHS: Final = frozenset(FD_LENGTHS)
 class CanFrame:
     """Data frame or remote frame, classic CAN or CAN FD.
 
-    This class does not contain a CAN FD frame's error state indicator (ESI), because the controller sets it:
-    ESI is dominant while the station is error-active, and recessive while the station is error-passive.
+    The error state indicator (ESI) of a CAN FD frame is not included, because the controller sets it:
+    dominant in an error-active station, recessive in an error-passive one.
 
     Raises:
         ValueError: if the identifier, the length or the combination of flags is not valid.
@@ -27,8 +27,7 @@ class CanFrame:
     can_id: int
     """Identifier of 11 bits, or of 29 bits if ``extended``."""
     data: bytes = b""
-    """Data of 0 to 8 bytes, or with CAN FD also 12, 16, 20, 24, 32, 48 or 64 bytes; empty for a remote
-    frame."""
+    """Data: 0 to 8 bytes, and in CAN FD also 12, 16, 20, 24, 32, 48 or 64 bytes; empty in a remote frame."""
     extended: bool = False
     remote: bool = False
     dlc: int = 0
@@ -59,11 +58,11 @@ class CanFrame:
 
 
 def arbitration_key(frame: CanFrame) -> int:
-    """Return the arbitration field's bits as a number: the frame with the lowest number wins arbitration.
+    """Return the arbitration field as a number. The frame with the lowest number wins arbitration.
 
-    The bits are in the order in which they are sent: base identifier, RTR or SRR, IDE, identifier extension,
-    RTR (ISO 11898-1:2015). Dominant bits are 0. A base frame has zeros in place of the extension, because an
-    extended frame loses to a base frame with the same base identifier at SRR or IDE.
+    The bits are in transmission order: base identifier, RTR or SRR, IDE, identifier extension, RTR
+    (ISO 11898-1:2015). Dominant bits are 0. A base frame has zeros in place of the extension: an extended
+    frame with the same base identifier has already lost at SRR or IDE.
 
     Args:
         frame: frame to send.
@@ -78,16 +77,16 @@ def arbitration_key(frame: CanFrame) -> int:
 
 
 def frame_bits(frame: CanFrame, esi: bool = False) -> tuple[int, int]:
-    """Return the exact number of bits from the start of frame to the end of the inter-frame space.
+    """Return the exact number of bits from the start of frame to the end of the intermission.
 
     Args:
         frame: frame to measure.
         esi: whether the error state indicator of a CAN FD frame is recessive.
 
     Returns:
-        Number of bits at the nominal bit rate and at the data bit rate. The bit rate changes at the sample
-        points of the BRS bit and the CRC delimiter. Counting BRS as one nominal bit and the CRC delimiter as
-        one data bit yields the same total duration.
+        Number of bits at the nominal bit rate, and number at the data bit rate. The bit rate really changes
+        at the sample points of BRS and the CRC delimiter. Counting BRS as a nominal bit and the CRC delimiter
+        as a data bit gives the same total duration.
     """
     if frame.fd:
         return exact_fd_bits(frame.can_id, frame.data, extended=frame.extended, brs=frame.brs, esi=esi)

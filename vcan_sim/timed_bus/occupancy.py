@@ -1,4 +1,4 @@
-"""Intervals in which a bus was busy, and the bus load in any interval."""
+"""Busy intervals of a bus, from which the bus load follows."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ from array import array
 
 
 class Occupancy:
-    """Record of a bus's busy intervals.
+    """Record of the busy intervals of a bus.
 
-    Adjacent intervals are merged, so a saturated bus needs only one entry. Each entry uses
-    24 bytes; :meth:`forget` limits the memory in long runs.
+    Adjacent intervals are merged, so a saturated bus needs a single entry of 24 bytes. In long runs,
+    :meth:`forget` limits the memory.
     """
 
     def __init__(self) -> None:
@@ -19,7 +19,7 @@ class Occupancy:
         self._busy_before = array("q")
 
     def add(self, start_ns: int, end_ns: int) -> None:
-        """Add a busy interval, which must not start before the end of the previous interval.
+        """Add a busy interval. It must not start before the end of the last one.
 
         Args:
             start_ns: start of the interval, ns.
@@ -35,15 +35,15 @@ class Occupancy:
         self._busy_before.append(before)
 
     def end_last_at(self, end_ns: int) -> None:
-        """Set the end of the most recent busy interval, ns."""
+        """Change the end of the last busy interval, ns."""
         self._ends[-1] = end_ns
 
     def busy_ns(self, from_ns: int, to_ns: int) -> int:
-        """Return the total busy time of the bus between two times, in ns."""
+        """Return the busy time between two times, ns."""
         return self._busy_until(to_ns) - self._busy_until(from_ns)
 
     def forget(self, before_ns: int) -> None:
-        """Delete all intervals that ended before ``before_ns``; later queries must not start before then."""
+        """Discard the intervals that ended before ``before_ns``, which is the earliest start of later queries."""
         n = bisect.bisect_left(self._ends, before_ns)
         for column in (self._starts, self._ends, self._busy_before):
             del column[:n]

@@ -1,6 +1,6 @@
-"""Stations of a simulated bus: controller options, station state, and the transmission attempt in progress.
+"""Stations of a simulated bus, and the transmission attempt in progress.
 
-Only :mod:`vcan_sim.timed_bus.bus` changes a station's state.
+Only :mod:`vcan_sim.timed_bus.bus` changes this state.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ class StationOptions:
     """
 
     queue: Literal["fifo", "priority"] = "fifo"
-    """Transmission order: ``fifo`` for first in, first out, as in a SocketCAN interface; ``priority`` for
-    highest priority first."""
+    """Transmission order: ``fifo`` is first in, first out, as in SocketCAN; ``priority`` is highest priority
+    first."""
     capacity: int | None = None
-    """Maximum number of queued frames, including the frame being sent; None for no limit."""
+    """Maximum number of queued frames, including the one in transmission; None for no limit."""
     restart_ns: int | None = 0
-    """Delay from bus-off to the start of the recovery, ns. If None, the recovery starts only when
-    :meth:`vcan_sim.timed_bus.bus.TimedBus.restart` is called."""
+    """Delay from bus-off to the start of the recovery, ns; None to wait for a call of
+    :meth:`vcan_sim.timed_bus.bus.TimedBus.restart`."""
 
     def __post_init__(self) -> None:
         if self.queue not in ("fifo", "priority"):
@@ -65,12 +65,11 @@ class Station:
         self.passive = False
         self.connected = True
         self.ready = 0
-        """Earliest start of the station's next frame, ticks."""
+        """Earliest start of the next frame, ticks."""
         self.recovers_from: int | None = None
         """Start of the recovery from bus-off, ticks; None if the station is not recovering."""
         self.runs_seen = 0
-        """Number of complete recessive runs since the recovery began, counted up to the last start of
-        frame."""
+        """Number of complete recessive runs between the start of the recovery and the last start of frame."""
 
     @property
     def on_bus(self) -> bool:
@@ -94,17 +93,17 @@ class Flight:
         self.start = start
         self.course = course
         self.waiting = waiting
-        """Frames being sent in the attempt, by station."""
+        """Frames in transmission, by station."""
         self.senders = senders
         """Stations that were sending at the start of frame."""
         self.receivers = receivers
-        """Stations that were on the bus at the start of frame but do not send."""
+        """Stations that were on the bus at the start of frame and were not sending."""
         self.side = 0
-        """Number of errors in ``course.side_errors`` that have already occurred."""
+        """Number of ``course.side_errors`` that have occurred so far."""
 
     @property
     def next(self) -> int:
-        """Time of the attempt's next event, ticks."""
+        """Time of the next event of the attempt, ticks."""
         course = self.course
         if not course.side_errors:
             return self.start + course.end

@@ -10,18 +10,18 @@ from vcan_sim.timed_bus.frame import CanFrame
 
 
 class Waiting(NamedTuple):
-    """Frame in a transmit queue; frames sort by priority, then by age."""
+    """Frame in a transmit queue. Instances sort by priority, then by age."""
 
     key: int
     """Arbitration key from :func:`vcan_sim.timed_bus.frame.arbitration_key`."""
     number: int
-    """Sequence number of the frame among all frames queued on the bus."""
+    """Sequence number among all frames queued on the bus."""
     queued_ns: int
     frame: CanFrame
 
 
 class TransmitQueue(Protocol):
-    """Transmit queue of one station, without the frame that is being sent."""
+    """Transmit queue of one station, excluding the frame in transmission."""
 
     def push(self, waiting: Waiting) -> None:
         """Add a frame to the queue."""
@@ -42,7 +42,7 @@ class TransmitQueue(Protocol):
 
 
 class FifoQueue:
-    """First-in, first-out transmit queue, as in a SocketCAN interface."""
+    """First-in, first-out transmit queue, as in SocketCAN."""
 
     def __init__(self) -> None:
         self._frames: deque[Waiting] = deque()
@@ -72,7 +72,7 @@ class FifoQueue:
 
 
 class PriorityQueue:
-    """Transmit queue ordered by priority; frames with equal priority keep their order."""
+    """Transmit queue ordered by priority. Frames of equal priority are sent in the order of arrival."""
 
     def __init__(self) -> None:
         self._frames: list[Waiting] = []

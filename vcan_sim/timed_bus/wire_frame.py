@@ -1,7 +1,7 @@
-"""Bits of CAN frames on the bus, for placing errors in individual bits (ISO 11898-1:2015).
+"""Bit sequences of CAN frames, for errors in individual bits (ISO 11898-1:2015).
 
-Building the bits of a frame is slow. :mod:`vcan_sim.timed_bus.bus` therefore builds them only if a rule
-disturbs the frame, no station acknowledges it, or two stations send the same identifier.
+Building a bit sequence is slow. :mod:`vcan_sim.timed_bus.bus` does so only if a rule disturbs the frame, no
+station acknowledges it, or two stations send the same identifier.
 """
 
 from __future__ import annotations
@@ -14,8 +14,7 @@ from skinnode.canopen.data_length import FD_LENGTHS
 from vcan_sim.timed_bus.frame import CanFrame
 
 FLAG_BITS: Final = 6
-"""Length of one station's error flag, bits; also the length of a run of equal bits that violates the stuff
-rule."""
+"""Length of the error flag of one station, bits. A run of this many equal bits violates the stuff rule."""
 
 ACK_TO_END_BITS: Final = 9
 """Total length of ACK slot, ACK delimiter and end of frame, bits."""
@@ -30,21 +29,21 @@ _CRC_21: Final = 0x102899
 
 @dataclass(frozen=True, slots=True)
 class WireFrame:
-    """Bits of an acknowledged frame on the bus, including stuff bits; 0 is dominant."""
+    """Bit sequence of an acknowledged frame, with stuff bits. Dominant bits are 0."""
 
     bits: tuple[int, ...]
-    """All bits from start of frame to the last bit of the end of frame."""
+    """Bits from the start of frame to the last bit of the end of frame."""
     stuffed_end: int
-    """Number of bits, including stuff bits, that follow the stuff rule: up to the CRC sequence, or in CAN FD
-    up to the data."""
+    """Number of bits subject to the stuff rule, including stuff bits: up to the end of the CRC sequence, or
+    of the data in CAN FD."""
     plain: int
-    """Number of bits that follow the stuff rule, without the stuff bits."""
+    """Number of bits subject to the stuff rule, excluding stuff bits."""
     fixed_stuff: tuple[int, ...]
-    """Positions of the fixed stuff bits of CAN FD."""
+    """Positions of the fixed stuff bits; empty for a classic frame."""
     delimiter: int
     """Position of the CRC delimiter."""
     data_phase: range
-    """Positions of the bits sent at the data bit rate; empty if the frame does not switch the bit rate."""
+    """Positions of the bits sent at the data bit rate; empty without a bit rate switch."""
 
     @property
     def ack_slot(self) -> int:
@@ -52,20 +51,20 @@ class WireFrame:
         return self.delimiter + 1
 
     def bits_through(self, position: int) -> tuple[int, int]:
-        """Return the numbers of nominal and data bits from the start of frame to ``position``, inclusive."""
+        """Return the numbers of nominal and data bits up to and including ``position``."""
         fast = max(0, min(position + 1, self.data_phase.stop) - self.data_phase.start)
         return position + 1 - fast, fast
 
 
 def wire_frame(frame: CanFrame, esi: bool = False) -> WireFrame:
-    """Build the bits of a frame on the bus.
+    """Build the bit sequence of a frame.
 
     Args:
         frame: frame to send.
         esi: whether the error state indicator of a CAN FD frame is recessive.
 
     Returns:
-        Bits of the frame, with a dominant ACK slot.
+        Bit sequence with a dominant ACK slot.
     """
     tail = (1, 0, 1, *(1,) * 7)  # CRC delimiter, ACK slot, ACK delimiter, end of frame
     head = tuple(_head(frame, esi))
@@ -77,7 +76,7 @@ def wire_frame(frame: CanFrame, esi: bool = False) -> WireFrame:
         return WireFrame((*stuffed, *tail), n, n - len(places), (), n, range(0))
 
     stuffed, places = _stuffed((*head, *payload))
-    if places[-1:] == [len(stuffed) - 1]:  # the first fixed stuff bit replaces this stuff bit
+    if places[-1:] == [len(stuffed) - 1]:  # the first fixed stuff bit takes its place
         del stuffed[-1], places[-1]
     count = len(places) % 8
     gray = count ^ count >> 1
@@ -100,22 +99,21 @@ def wire_frame(frame: CanFrame, esi: bool = False) -> WireFrame:
 
 
 def receiver_lag(wire: WireFrame, position: int, seen: int, flag: int) -> int:
-    """Return the number of error flag bits that a receiver sees before it detects an error itself.
+    """Return the number of bits of an error flag after which a receiver detects an error.
 
-    The error flag starts after ``position``. The flag violates the stuff rule, the rule for fixed stuff bits,
-    or the fixed form of the delimiters and the end of frame. If the flag violates none of these, the CRC is
-    wrong, which a receiver reports after the ACK delimiter (ISO 11898-1:2015). The receiver removes stuff
-    bits from the bits it sees.
+    The flag starts after ``position``. It violates the stuff rule, the rule for fixed stuff bits, or the form
+    of the delimiters and the end of frame. Failing that, it makes the CRC wrong, which a receiver signals
+    after the ACK delimiter (ISO 11898-1:2015). The receiver destuffs the bits that it sees.
 
     Args:
-        wire: bits of the frame on the bus.
-        position: position of the bit in which the first station detects the error.
-        seen: value of the bit at ``position`` as seen by the receiver.
+        wire: bit sequence of the frame.
+        position: position of the bit in which another station detects the error.
+        seen: value that the receiver sees at ``position``.
         flag: 0 for an active error flag, 1 for a passive error flag.
 
     Returns:
-        Number of bits: 0 to 6 for an active error flag, 0 to 7 for a passive error flag; 0 if the bit at
-        ``position`` is itself an error for the receiver.
+        0 to 6 bits of an active error flag, or 0 to 7 bits of a passive one. 0 means that the bit at
+        ``position`` is itself an error to the receiver.
     """
     stream = (*wire.bits[:position], seen, *(flag,) * _MAX_LAG)
     last = run = plain = 0
@@ -149,7 +147,7 @@ def receiver_lag(wire: WireFrame, position: int, seen: int, flag: int) -> int:
 
 
 def _head(frame: CanFrame, esi: bool) -> Iterator[int]:
-    """Yield a frame's bits from the start of frame to the data length code."""
+    """Yield the bits of a frame from the start of frame to the data length code."""
 
     def field(value: int, width: int) -> Iterator[int]:
         return (value >> shift & 1 for shift in range(width - 1, -1, -1))
@@ -172,7 +170,7 @@ def _head(frame: CanFrame, esi: bool) -> Iterator[int]:
 
 
 def _stuffed(bits: Sequence[int]) -> tuple[list[int], list[int]]:
-    """Insert stuff bits; return the stuffed bits and the positions of the stuff bits."""
+    """Return a bit sequence with stuff bits inserted, and the positions of the stuff bits."""
     out: list[int] = []
     places: list[int] = []
     run = 0
@@ -187,7 +185,7 @@ def _stuffed(bits: Sequence[int]) -> tuple[list[int], list[int]]:
 
 
 def _with_stuff_bits(place: int, stuff_places: Sequence[int]) -> int:
-    """Return the stuffed-frame position of the bit at ``place`` in the unstuffed frame."""
+    """Convert a position in the unstuffed frame to the position in the stuffed frame."""
     for stuff in stuff_places:
         if stuff > place:
             break

@@ -1,7 +1,7 @@
-"""Faults of a CAN bus, and a rogue device that sends frames to cause some of these faults.
+"""Faults of a CAN bus, and the rogue device that causes some of them.
 
-The rogue device has its own endpoint on the bus. The rogue frames take part in arbitration and are received
-by all nodes and hosts.
+The rogue device has its own endpoint on the bus. Its frames take part in arbitration, and all nodes and hosts
+receive them.
 """
 
 from __future__ import annotations
@@ -22,44 +22,44 @@ from vcan_sim.timed_bus import CanFrame
 from vcan_sim.timed_bus.wire_frame import wire_frame
 
 FLOOD_COB_ID: Final = 0x001
-"""COB-ID of the frames that starve the bus. Only NMT commands, with COB-ID 0x000, have a higher priority."""
+"""COB-ID of flood frames. Only NMT commands, with COB-ID 0x000, have a higher priority."""
 FLOOD_DATA: Final = bytes([0x55] * 8)
 _INTERMISSION_BITS: Final = 3
 _TICK_NS: Final = 1_000_000
-"""Minimum time between two batches of rogue frames, ns."""
+"""Minimum interval between two batches of rogue frames, ns."""
 _AHEAD_NS: Final = 2 * _TICK_NS
-"""Time by which flood frames are queued in advance, ns, to prevent gaps on a completely starved bus."""
+"""Time by which flood frames are queued in advance, ns. This prevents gaps on a fully starved bus."""
 _MOST_AT_ONCE: Final = 256
-"""Maximum number of overdue rogue frames of one kind in a batch. Further overdue frames are never sent."""
+"""Maximum number of overdue rogue frames of one kind in a batch. The rest are dropped."""
 _RETRY_S: Final = 0.05
-"""Time after which the rogue device reopens its endpoint following a bus error, s."""
+"""Time from a bus error until the rogue device reopens its endpoint, s."""
 _SHARES: Final = ("starved", "disturbed")
 _RATES: Final = ("rogue_nmt_per_s", "rogue_sync_per_s")
 _COUNTERS: Final = 240
-"""Maximum value of the counter in the rogue SYNC messages."""
+"""Highest SYNC counter of the second master."""
 
 
 @dataclass(frozen=True, slots=True)
 class BusFaults:
-    """Faults of one bus. By default, there are no faults.
+    """Faults of one bus. The default is no faults.
 
     Raises:
         ConfigError: If a fraction is not between 0 and 1, or a rate is negative.
     """
 
     seed: int = 1
-    """Seed of the random numbers that decide when faults occur."""
+    """Random seed of the faults."""
     bus_off: bool = False
-    """Whether the nodes' CAN controller is bus-off, so that the nodes neither send nor receive frames."""
+    """Whether the nodes' CAN controller is bus-off: the nodes neither send nor receive frames."""
     starved: float = 0.0
-    """Bus load caused by a rogue device, as a fraction. The rogue device sends frames with COB-ID 0x001, the
-    highest priority after NMT."""
+    """Bus load caused by a rogue device, as a fraction. Its frames have COB-ID 0x001, the highest priority
+    after NMT."""
     rogue_nmt_per_s: float = 0.0
-    """Rate of random NMT commands from a second master to one or all nodes, 1/s."""
+    """Rate of random NMT commands from a second master, each to one node or to all nodes, 1/s."""
     rogue_sync_per_s: float = 0.0
     """Rate of SYNC messages from a second master, 1/s."""
     disturbed: float = 0.0
-    """Fraction of all transmissions that are aborted by an error frame and repeated by the sender. Only the
+    """Fraction of transmissions that an error frame aborts, so that the sender repeats them. Only the
     interface ``timed`` supports this fault."""
 
     def __post_init__(self) -> None:
@@ -72,16 +72,16 @@ class BusFaults:
 
     @property
     def needs_attacker(self) -> bool:
-        """Whether a rogue device must send frames to cause these faults."""
+        """Whether these faults require the rogue device."""
         return bool(self.starved or self.rogue_nmt_per_s or self.rogue_sync_per_s)
 
 
 @dataclass(slots=True)
 class InjectedOnBus:
-    """Counts of the faults that have been injected into one bus."""
+    """Counts of the faults injected into one bus."""
 
     bus_off: int = 0
-    """Number of times that the nodes' controller went bus-off."""
+    """Number of times the nodes' controller went bus-off."""
     starved: int = 0
     """Number of flood frames sent."""
     rogue_nmt: int = 0
@@ -111,12 +111,12 @@ def check_bus(faults: BusFaults, bus: BusConfig) -> None:
 
 
 class BusAttacker:
-    """Rogue device on a bus, with a thread that starts when a fault first requires this device.
+    """Rogue device on a bus. Its thread starts with the first fault that requires it.
 
     Args:
         bus: Configuration of the bus.
         node_ids: Node-IDs on the bus.
-        counts: Counts of the injected faults; the thread updates these counts.
+        counts: Counts of injected faults, which the thread updates.
     """
 
     def __init__(self, bus: BusConfig, node_ids: Sequence[int], counts: InjectedOnBus) -> None:
@@ -130,14 +130,14 @@ class BusAttacker:
         self._syncs = 0
 
     def set(self, faults: BusFaults) -> None:
-        """Replace the faults, and start the thread with the first fault that requires the rogue device."""
+        """Replace the faults, and start the thread if they require it for the first time."""
         self._faults = faults
         self._changed.set()
         if faults.needs_attacker and self._thread.ident is None:
             self._thread.start()
 
     def stop(self) -> None:
-        """Stop the thread. This method must be called only once."""
+        """Stop the thread. Call this method only once."""
         self._stopping = True
         self._changed.set()
         if self._thread.ident is not None:
@@ -152,11 +152,11 @@ class BusAttacker:
             try:
                 with CanPort(self._bus) as port:
                     self._attack(port)
-            except BusError:  # for example because another fault made the bus unavailable
+            except BusError:  # for example, another fault has made the bus unavailable
                 clock.sleep(_RETRY_S)
 
     def _attack(self, port: CanPort) -> None:
-        """Send rogue frames until no fault requires them any more."""
+        """Send rogue frames for as long as a fault requires them."""
         chance = random.Random(self._faults.seed)
         due_ns: dict[str, float] = {}
         while not self._stopping and self._faults.needs_attacker:
@@ -166,7 +166,7 @@ class BusAttacker:
             for name, period_ns in periods_ns.items():
                 ahead_ns = _AHEAD_NS if name == "starved" else 0
                 due_ns[name] = self._send_due(port, name, chance, due_ns[name], period_ns, now_ns + ahead_ns)
-            while port.recv(0.0) is not None:  # prevents the receive queue from filling up
+            while port.recv(0.0) is not None:  # keeps the receive queue from filling up
                 pass
             first_ns = min(due_ns[name] - (_AHEAD_NS if name == "starved" else 0) for name in due_ns)
             wait_ns = max(first_ns - clock.monotonic_ns(), _TICK_NS if "starved" in due_ns else 0)
@@ -193,7 +193,7 @@ class BusAttacker:
         period_ns: float,
         until_ns: float,
     ) -> float:
-        """Send all due rogue frames of one kind; return the time (ns) at which the next frame is due."""
+        """Send the due rogue frames of one kind, and return the time (ns) at which the next is due."""
         make: Callable[[random.Random], tuple[int, bytes]] = getattr(self, f"_{name}")
         for _ in range(_MOST_AT_ONCE):
             if due_ns > until_ns:

@@ -1,12 +1,12 @@
-"""Parsing and printing of faults in text form, such as ``palm:lost=0.1,frozen`` or ``can0:bus_off``.
+"""Text form of faults, such as ``palm:lost=0.1,frozen`` or ``can0:bus_off``.
 
 ::
 
     text     [PLACE:]FAULT[,FAULT...]    PLACE is a patch or a bus; default: all patches or all buses
     FAULT    NAME | NAME=VALUE | none    none ends all faults of the patch or bus
 
-Faults have the same text form in the option ``--fault``, in the command ``vcan-sim inject`` and in the
-``[[faults]]`` tables of scene files.
+The option ``--fault``, the command ``vcan-sim inject`` and the ``[[faults]]`` tables of scene files share
+this form.
 """
 
 from __future__ import annotations
@@ -21,8 +21,7 @@ from vcan_sim.bus_attacker import NO_BUS_FAULTS, BusFaults
 from vcan_sim.faults import NO_FAULTS, Faults
 
 NONE: Final = "none"
-"""Keyword that ends all faults of a patch or bus. As the value of a wire fault, the keyword ends only this
-fault."""
+"""Keyword that ends all faults of a patch or bus. As the value of a wire fault, it ends only that fault."""
 
 Value = int | float | bool | None
 AnyFaults = TypeVar("AnyFaults", Faults, BusFaults)
@@ -43,7 +42,7 @@ class FaultChange:
     values: Mapping[str, Value] = field(default_factory=dict)
     """New values of the faults, by name."""
     clears: bool = False
-    """Whether the change first ends all current faults of the patch or bus."""
+    """Whether all current faults of the patch or bus end first."""
 
     def of(self, faults: AnyFaults) -> AnyFaults:
         """Return ``faults`` after this change.
@@ -58,12 +57,11 @@ class FaultChange:
 def parse_changes(
     texts: Sequence[str], patches: Sequence[str], buses: Sequence[str], key: str = "--fault"
 ) -> list[FaultChange]:
-    """Parse faults in text form, and return the changes in the same order.
+    """Parse faults in text form. Returns one or more changes per string, in the same order.
 
     Args:
         texts: Strings such as ``palm:lost=0.1,frozen``, ``can0:bus_off``, ``palm:none`` or ``none``.
-        patches: Names of the hand's patches. If a patch and a bus have the same name, the name refers to the
-            patch.
+        patches: Names of the hand's patches. They take precedence over buses of the same name.
         buses: Names of the hand's buses.
         key: Name of the command-line option, for error messages.
 
@@ -86,11 +84,11 @@ def parse_changes(
 
 
 def parse_values(text: str, *, on_bus: bool, key: str = "--fault") -> dict[str, Value]:
-    """Parse faults that name no patch or bus, such as ``lost=0.01,silent``; return their values by name.
+    """Parse faults without a patch or bus, such as ``lost=0.01,silent``. Returns values by fault name.
 
     Args:
-        text: One or more faults with their values, separated by commas.
-        on_bus: Whether the text describes faults of a bus.
+        text: One or more faults, separated by commas.
+        on_bus: Whether the faults are those of a bus.
         key: Name of the command-line option, for error messages.
 
     Raises:
@@ -100,7 +98,7 @@ def parse_values(text: str, *, on_bus: bool, key: str = "--fault") -> dict[str, 
 
 
 def text_of(faults: Faults | BusFaults) -> str:
-    """Return the text form of faults, without the seed; ``none`` if there are no faults."""
+    """Return faults in text form, without the seed; ``none`` if there are none."""
     defaults = OF_BUSES if isinstance(faults, BusFaults) else OF_PATCHES
     shown = [
         name_and_value(name, getattr(faults, name))
@@ -111,7 +109,7 @@ def text_of(faults: Faults | BusFaults) -> str:
 
 
 def name_and_value(name: str, value: Value) -> str:
-    """Return the text form of a fault: its name, and its value unless the value is True."""
+    """Return one fault in text form, as its name if the value is True, otherwise as ``NAME=VALUE``."""
     return name if value is True else f"{name}={_shown(value)}"
 
 
@@ -136,7 +134,7 @@ def _change(place: str, listed: str, key: str, *, on_bus: bool) -> FaultChange:
 
 
 def _everywhere(listed: str, patches: Sequence[str], buses: Sequence[str], key: str) -> Iterator[FaultChange]:
-    """Yield the changes to all patches and buses that have the named faults."""
+    """Yield the changes to every patch and bus to which the named faults apply."""
     parts = _parts(listed, key)
     clears = NONE in parts
     values = _values([part for part in parts if part != NONE], OF_PATCHES | OF_BUSES, key)
@@ -179,5 +177,5 @@ def _allowed(kind: type) -> str:
 
 
 def none_of(*, on_bus: bool) -> Faults | BusFaults:
-    """Return the faults of a patch or bus that has no faults."""
+    """Return an empty set of faults, for a bus or for a patch."""
     return NO_BUS_FAULTS if on_bus else NO_FAULTS

@@ -1,4 +1,4 @@
-"""Simulated bus with faults, and the port through which the simulated nodes use the bus."""
+"""Bus of simulated nodes with injected faults, and their port on this bus."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from vcan_sim.virtual_time import VirtualClock
 
 
 class Passed:
-    """Counts of the data and remote frames that passed through a port, by kind of frame."""
+    """Counts of data and remote frames at a port, by kind."""
 
     def __init__(self) -> None:
         self.sent: Counter[Kind] = Counter()
@@ -29,7 +29,7 @@ class Passed:
 
 
 class FaultyPort(CanPort):
-    """Port with a simulated bus-off state, in which the port neither sends nor delivers frames."""
+    """Port that can be bus-off, when it neither sends nor delivers frames."""
 
     off = False
 
@@ -38,7 +38,7 @@ class FaultyPort(CanPort):
         self.passed = Passed()
 
     def send(self, can_id: int, data: bytes, *, remote: bool = False) -> None:
-        """Send a frame. Raises BusError if the bus refuses the frame or the controller is bus-off."""
+        """Send a frame. Raises BusError if the bus rejects it or the controller is bus-off."""
         if self.off:
             raise BusError(f"{self.config.name}: bus-off, 0x{can_id:03X} not sent")
         super().send(can_id, data, remote=remote)
@@ -78,7 +78,7 @@ class FaultyBus:
         self._rule: RandomShare | None = None
 
     def connect(self, port: FaultyPort) -> None:
-        """Apply the faults to the nodes' ``port``, which must be open."""
+        """Apply the faults through ``port``, the open port of the nodes."""
         self._port = port
         self._attacker = BusAttacker(self._config, self._node_ids, self._counts)
         virtual = clock.current()
@@ -90,7 +90,7 @@ class FaultyBus:
         self._apply()
 
     def stop(self) -> None:
-        """End all faults that affect the bus itself, and stop using the port."""
+        """End the rogue frames and disturbances, and release the port."""
         if self._attacker is not None:
             self._attacker.stop()
             self._attacker = None
@@ -112,7 +112,7 @@ class FaultyBus:
             self._apply()
 
     def injected(self) -> InjectedOnBus:
-        """Return the counts of the faults that have been injected into the bus."""
+        """Return the counts of the faults injected into the bus."""
         if self._segment is not None:
             self._segment.catch_up()
         return replace(self._counts)
@@ -125,7 +125,7 @@ class FaultyBus:
         self._disturb(self._faults.disturbed)
 
     def _disturb(self, share: float) -> None:
-        """From now on, abort the fraction ``share`` of all transmissions by error frames."""
+        """Let error frames abort the fraction ``share`` of all transmissions from now on."""
         if self._segment is None or share == (0.0 if self._rule is None else self._rule.share):
             return
         if self._rule is not None:

@@ -1,4 +1,4 @@
-"""Simulated converter with faults of its wires and of the converter itself."""
+"""Simulated converter, with faults of its own and of the wires connected to it."""
 
 from __future__ import annotations
 
@@ -15,24 +15,23 @@ from vcan_sim.injector import Injector
 from vcan_sim.skin.imperfections import EXACT
 
 MOST_DRIFT: Final = 10.0
-"""Maximum factor by which drift increases or decreases a resistance."""
+"""Largest factor by which drift multiplies or divides a resistance."""
 WIRE_NOISE: Final = 3e-3
-"""Relative standard deviation of a resistance measured through a bad contact."""
+"""Noise of a resistance measured through a bad contact: relative standard deviation."""
 
 
 class FaultyConverter:
-    """Analogue-to-digital converter with faults of its readings and of the wires of the patch.
+    """Analogue-to-digital converter with injected faults.
 
-    While the node boots, the wires are intact, so that the tare at power-on is valid. Drift and temperature
+    Wire faults take effect after the node has booted, so the tare at power-on is valid. Drift and temperature
     changes affect all readings, including the tare.
 
     Args:
-        source: Resistances that an intact converter would measure.
+        source: Source of the resistances that an intact converter would measure.
         injector: The node's faults, random generator and counts.
         booting: Function that returns whether the node is booting.
-        baseline_ohm: Function that returns the node's baseline R0 (U, K) in ohm, from which codes are
-            computed.
-        scale: Scale of the node's codes.
+        baseline_ohm: Function that returns the baseline R0 (U, K) to which codes refer, ohm.
+        scale: Code scale of the node.
         temperature_per_k: Temperature coefficient of all resistances, 1/K.
     """
 
@@ -52,15 +51,15 @@ class FaultyConverter:
         self._drift, self._drifted_to_ns = 0.0, 0
         self._reading: Float | None = None
         self._conversions: int | None = None
-        self._held: dict[tuple[str, object], Float] = {}  # readings stored at the start of each fault
+        self._held: dict[tuple[str, object], Float] = {}  # readings from the start of each fault
 
     @property
     def conversions(self) -> int | None:
-        """Number of completed conversions; None if the converter does not count its conversions."""
+        """Number of completed conversions; None if the converter does not count."""
         return None if self._injector.faults.uncounted else self._conversions
 
     def read(self, t_ns: int) -> Float:
-        """Return the resistances (U, K) in ohm at time ``t_ns``; the previous reading if frozen."""
+        """Return the resistances (U, K) at ``t_ns``, ohm. A frozen converter repeats its last reading."""
         self._injector.injected.uncounted += self._injector.faults.uncounted
         if self._injector.faults.frozen and self._reading is not None:
             self._injector.injected.frozen += 1
@@ -70,7 +69,7 @@ class FaultyConverter:
         return self._reading
 
     def _shifted(self, read: Float, t_ns: int) -> Float:
-        """Apply drift and the temperature change to a reading."""
+        """Return a reading with drift and temperature change applied."""
         faults, injected = self._injector.faults, self._injector.injected
         factor = 1.0
         if faults.drift_per_s:
@@ -111,7 +110,7 @@ class FaultyConverter:
         return read
 
     def _hold(self, read: Float, faults: Faults) -> None:
-        """Replace the resistances of frozen wires and stuck crossings by those at the start of the fault."""
+        """Reset frozen wires and stuck crossings to their resistances at the start of the fault."""
         stuck = None if faults.stuck_upper is None else (faults.stuck_upper, faults.stuck_lower)
         held: dict[tuple[str, object], Float] = {}
         for name, place, ohm in (
@@ -126,7 +125,7 @@ class FaultyConverter:
         self._held = held
 
     def _flip(self, read: Float) -> Float:
-        """With probability ``flipped``, flip one bit of one code in a reading."""
+        """Return a reading in which, with probability ``flipped``, one bit of one code is flipped."""
         if not self._injector.draw(self._injector.faults.flipped) or self._booting():
             return read
         random, scale, baseline_ohm = self._injector.random, self._scale, self._baseline_ohm()

@@ -1,7 +1,7 @@
-"""Current faults of a simulated hand's patches and buses, and a log of all fault changes.
+"""Current faults of the patches and buses of a simulated hand, and a log of their changes.
 
-Faults are changed by :meth:`vcan_sim.fleet.Fleet.inject`, by the command ``vcan-sim inject`` and by a scene's
-fault schedule. A set of changes is checked first. If one change is invalid, none of them takes effect.
+Faults are changed by :meth:`vcan_sim.fleet.Fleet.inject`, the command ``vcan-sim inject`` and the fault
+schedule of a scene. Changes made together are checked first: if one is invalid, none takes effect.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ class FaultEvent:
     on: bool
     """True if the fault starts, False if it ends."""
     refused: str = ""
-    """Reason why a scheduled change did not take effect; empty if it took effect."""
+    """Reason why a scheduled change was refused; empty if it took effect."""
 
     def __str__(self) -> str:
         what = f"{self.place}:{name_and_value(self.fault, self.value)} {'on' if self.on else 'off'}"
@@ -50,9 +50,9 @@ class FaultEvent:
 
 @dataclass(frozen=True, slots=True)
 class Places:
-    """Names of a fleet's patches and buses, and functions that check and set their faults.
+    """Patches and buses of a fleet, by name, and functions that check and set their faults.
 
-    The ``check`` functions raise ConfigError if the patch or bus cannot have the given faults.
+    The ``check`` functions raise ConfigError if a patch or bus cannot have the given faults.
     """
 
     patches: Sequence[str]
@@ -64,7 +64,7 @@ class Places:
 
 
 class FleetFaults:
-    """Faults of a fleet's patches and buses. The methods may be called from any thread.
+    """Faults of the patches and buses of a fleet. Methods may be called from any thread.
 
     Args:
         places: Patches and buses of the fleet.
@@ -93,23 +93,23 @@ class FleetFaults:
         return self._of_buses[name]
 
     def texts(self) -> list[str]:
-        """Return the current faults as one string per faulty patch or bus, such as ``palm:lost=0.1``."""
+        """Return the current faults, one string such as ``palm:lost=0.1`` per faulty patch or bus."""
         found = [(name, text_of(faults)) for name, faults in (self._of_patches | self._of_buses).items()]
         return [f"{place}:{text}" for place, text in found if text != NONE]
 
     @property
     def log(self) -> tuple[FaultEvent, ...]:
-        """Starts and ends of all faults since the log was last cleared, oldest first."""
+        """Starts and ends of faults since the log was last cleared, oldest first."""
         return tuple(self._log)
 
     def forget_log(self) -> None:
-        """Clear the log of fault changes, which otherwise grows without limit."""
+        """Clear the log, which otherwise grows without limit."""
         self._log.clear()
 
     # --- changes
 
     def inject(self, *texts: str, key: str = "--fault") -> None:
-        """Change the faults named in the given strings; all other faults remain unchanged.
+        """Change the named faults. All others remain unchanged.
 
         Args:
             *texts: Strings such as ``palm:unplugged`` or ``palm:none``; see :mod:`vcan_sim.fault_text`.
@@ -154,9 +154,7 @@ class FleetFaults:
             self._replace({}, {name: faults})
 
     def follow(self, ended: Iterable[TimedFault], started: Iterable[TimedFault]) -> None:
-        """Apply the changes that are due in a fault schedule.
-
-        A change that contradicts other faults is refused, and the refusal is logged.
+        """Apply scheduled changes. A change that contradicts other faults is refused and logged.
 
         Args:
             ended: Scheduled faults to end.
@@ -208,7 +206,7 @@ class FleetFaults:
             self._places.set_bus(name, of_bus)
 
     def _note(self, place: str, before: Faults | BusFaults, after: Faults | BusFaults) -> None:
-        """Log which faults start and end when one set of faults replaces another."""
+        """Log the faults that start and end when ``after`` replaces ``before``."""
         now_ns = clock.time_ns()
         on_bus = isinstance(after, BusFaults)
         for name in OF_BUSES if on_bus else OF_PATCHES:

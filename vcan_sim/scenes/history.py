@@ -113,9 +113,7 @@ class History:
             self._contact, self._pose = untouched(self.window.grid), pose
             self._depth_and_force = None
             return None
-        start = (
-            self._contact
-        )  # as initial guess, before _follow: in sliding contact, tractions move with the body
+        start = self._contact  # in sliding contact, the tractions move with the body
         self._follow(pose)
         offset = self.cell_m(self._first_cell) - np.asarray(pose.place_m)
         slide = np.zeros(2) if last is None else np.subtract(pose.slid_m, last.slid_m)

@@ -1,18 +1,17 @@
-"""Resistances measured by a crossbar read-out, computed by nodal analysis of the complete network.
+"""Read-out of the crossbar: measured resistances, by nodal analysis of the complete network.
 
-Each electrode of a resistive wire is a node, and the wire is a chain of resistors that starts at the
-connector. A wire without resistance is a single node. Each path between an upper and a lower electrode has a
-conductance C. In series with each wire are its contact and either a multiplexer (upper wires) or an amplifier
-input (lower wires). With the conductances T of the resistor chains and connectors, the voltages v of the
-upper nodes and w of the lower nodes obey Kirchhoff's current law (Ho, Ruehli and Brennan, IEEE Trans.
-Circuits Syst. 22, 1975):
+A resistive wire is a chain of resistors that starts at the connector, with a node at each electrode. A wire
+without resistance is a single node. C is the matrix of conductances between upper and lower nodes. In series
+with each wire are its contact and a multiplexer (upper wires) or an amplifier input (lower wires). With the
+conductance matrices T of the chains and connectors, Kirchhoff's current law determines the voltages v of the
+upper nodes and w of the lower nodes (Ho, Ruehli and Brennan, IEEE Trans. Circuits Syst. 22, 1975):
 
     ⎡ A_u   −C ⎤ ⎡ v ⎤   ⎡ currents fed ⎤
     ⎢          ⎥ ⎢   ⎥ = ⎢              ⎥,    A_u = diag(C 1) + T_u,    A_l = diag(Cᵀ 1) + T_l
     ⎣ −Cᵀ  A_l ⎦ ⎣ w ⎦   ⎣ into nodes   ⎦
 
-A_l is tridiagonal, so w is eliminated first; the system with the Schur complement A_u − C A_l⁻¹ Cᵀ is then
-solved for v.
+A_l is tridiagonal, so w is eliminated first. What remains for v is a system with the Schur complement
+A_u − C A_l⁻¹ Cᵀ.
 """
 
 from __future__ import annotations
@@ -30,9 +29,9 @@ class Side:
     """Upper or lower wires of a crossbar, with their resistances.
 
     Args:
-        series_ohm: (W,) float64, ohm: resistance in series with each wire: contact plus multiplexer or
-            amplifier input.
-        wire_ohm: Resistance of a wire per electrode pitch, ohm; 0 for wires that are single nodes.
+        series_ohm: (W,) float64, ohm: resistance in series with each wire, of its contact and its multiplexer
+            or amplifier input.
+        wire_ohm: Wire resistance per electrode pitch, ohm; 0 makes each wire a single node.
         electrodes: Number of electrodes per wire.
     """
 
@@ -47,16 +46,16 @@ class Side:
 
     @property
     def feed_ohm(self) -> Float:
-        """Resistance (W,) in ohm between the source or amplifier and each wire's first node."""
+        """Resistance (W,) between the source or amplifier and the first node of each wire, ohm."""
         return np.asarray(self.series_ohm + self.wire_ohm)
 
     @property
     def ideal(self) -> bool:
-        """Whether the wires are connected to their sources or amplifiers without any resistance."""
+        """Whether no wire has any resistance to its source or amplifier."""
         return not self.feed_ohm.any()
 
     def first(self) -> Float:
-        """Return the incidence matrix (W · nodes, W): 1 for each wire's first node, 0 for all other nodes."""
+        """Return the incidence matrix (W · nodes, W): 1 at the first node of each wire, otherwise 0."""
         wires = len(self.series_ohm)
         found = np.zeros((wires * self.nodes, wires))
         found[np.arange(wires) * self.nodes, np.arange(wires)] = 1.0
@@ -83,11 +82,11 @@ class Side:
 
 
 def grounded_ohm(conductance: Float, upper: Side, lower: Side) -> Float:
-    """Return the resistances (U, K) in ohm measured by amplifiers at the lower wires (read-out ``grounded``).
+    """Return the resistances (U, K) that the read-out ``grounded`` measures, ohm.
 
-    The upper wires are driven one after another while all other upper wires are grounded. A reading is the
-    driving voltage divided by the current into the lower wire's amplifier. Without series and wire
-    resistances, a reading is the resistance of the crossing.
+    Upper wires are driven one at a time, with all others grounded. A reading is the driving voltage divided
+    by the current into the amplifier of a lower wire. Without series and wire resistances, it is the
+    resistance of the crossing.
 
     Args:
         conductance: Conductances (upper nodes, lower nodes) of the paths between nodes, S.
@@ -95,7 +94,7 @@ def grounded_ohm(conductance: Float, upper: Side, lower: Side) -> Float:
         lower: Lower wires.
     """
     above, below = conductance.sum(axis=1), conductance.sum(axis=0)
-    if lower.ideal:  # all lower wires are grounded, so the upper wires do not influence each other
+    if lower.ideal:  # with all lower wires grounded, upper wires are independent
         return np.asarray(1.0 / (_driven(above, upper).T @ conductance))
     feed = 1.0 / lower.feed_ohm
     if upper.ideal:
@@ -109,11 +108,11 @@ def grounded_ohm(conductance: Float, upper: Side, lower: Side) -> Float:
 
 
 def floating_ohm(conductance: Float, upper: Side, lower: Side) -> Float:
-    """Return the resistance (U, K) in ohm of each wire pair while all other wires float (``floating``).
+    """Return the resistances (U, K) that the read-out ``floating`` measures, ohm.
 
-    A reading is the effective resistance between two nodes of the network, Z_uu + Z_kk − 2 Z_uk, with the
-    inverse Z of the nodes' conductance matrix (Klein and Randić, J. Math. Chem. 12, 1993), plus the
-    resistances in series with the two wires.
+    One pair of wires is measured while all other wires float. A reading is the effective resistance between
+    two nodes, Z_uu + Z_kk − 2 Z_uk, plus the series resistances of the two wires. Z is the inverse of the
+    conductance matrix of the network (Klein and Randić, J. Math. Chem. 12, 1993).
 
     Args:
         conductance: Conductances (upper nodes, lower nodes) of the paths between nodes, S.
@@ -125,8 +124,8 @@ def floating_ohm(conductance: Float, upper: Side, lower: Side) -> Float:
     solved = _tridiagonal(lower.diagonals(below, 0.0), np.hstack([conductance.T, ends]))
     across, own = np.split(solved, [len(above)], axis=1)
     schur = _dense(upper.diagonals(above, 0.0)) - conductance @ across
-    # The network floats, so its matrix is singular. Adding a constant to all elements of the matrix fixes the
-    # mean of v without changing any voltage difference.
+    # The matrix of a floating network is singular. A constant added to all of its elements fixes the mean of
+    # v and changes no voltage difference.
     schur += above.mean()
     z = np.linalg.inv(schur)
     between = across[:: lower.nodes] @ z  # (K, upper nodes): Z_lu
@@ -137,7 +136,7 @@ def floating_ohm(conductance: Float, upper: Side, lower: Side) -> Float:
 
 
 def _driven(above: Float, upper: Side) -> Float:
-    """Return the voltages (upper nodes, U) per volt on the driven wire, with all lower nodes grounded."""
+    """Return the voltages (upper nodes, U) for 1 V at each driven wire, with all lower nodes grounded."""
     if upper.ideal:
         return upper.first()
     feed = 1.0 / upper.feed_ohm

@@ -1,8 +1,8 @@
 """Conductances between the electrodes of a patch.
 
-An exact patch has point electrodes. The path between two point electrodes at distance d has the resistance
-ρ d. Its conductance 1 / (ρ d) has the form of the potential of a point charge. :class:`ExactForward` sums the
-conductances of an exact patch directly. :class:`Paths` adds two effects:
+An exact patch has point electrodes. The path between two of them at distance d has the conductance 1 / (ρ d),
+which has the form of the potential of a point charge. :class:`ExactForward` sums these conductances directly.
+:class:`Paths` adds two effects:
 
 finite electrodes   A conducting disc of radius a has the potential arcsin(2a / (l₁ + l₂)) / a instead of 1/d,
                     where l₁ and l₂ are the distances to the nearest and the farthest point of its rim
@@ -29,13 +29,13 @@ from skinnode.model.layout import Float
 class ExactForward:
     """Resistances of a patch with point electrodes, by direct summation.
 
-    This class shares no code with the solvers' kernels, so the ground truth and the solvers
-    cannot share a bug. It allocates no temporary arrays of shape (…, 3), which makes it fast.
+    This class shares no code with the solver kernels, so the ground truth and the solvers cannot share a bug.
+    For speed, it allocates no temporary arrays of shape (…, 3).
 
     Args:
-        shape: (U, N, K, M): upper wires, electrodes per upper wire, lower wires, electrodes per lower wire.
+        shape: (U, N, K, M): numbers of upper wires, electrodes on each, lower wires, and electrodes on each.
         lower_m: (K, M, 3) float64, m: lower electrodes.
-        resistivity_ohm_per_m: Resistance per metre between two electrodes, ohm/m.
+        resistivity_ohm_per_m: Path resistance per metre between two electrodes, ohm/m.
     """
 
     def __init__(
@@ -46,7 +46,7 @@ class ExactForward:
         self._resistivity = resistivity_ohm_per_m
 
     def __call__(self, upper_m: Float) -> Float:
-        """Return the resistances (U, K) in ohm for upper electrodes (U, N, 3) in m."""
+        """Return the resistances (U, K), ohm, given the upper electrodes (U, N, 3), m."""
         distance = np.zeros((upper_m.size // 3, self._lower.shape[1]))
         for here, there in zip(upper_m.reshape(-1, 3).T, self._lower, strict=True):
             distance += (here[:, None] - there) ** 2
@@ -70,7 +70,7 @@ class Paths:
         self._lower = np.ascontiguousarray(lower_m.reshape(-1, 3).T)
         self._radius_m = math.sqrt(2.0) * radius_m
         self._strain = strain
-        # reused work arrays: mapping the pages of new arrays would take longer than the arithmetic
+        # reused, because mapping the pages of new arrays would take longer than the arithmetic
         self._work = np.empty((3, upper_m.size // 3, self._lower.shape[1]))
         self._lock = threading.Lock()
         self._per_m: Float | None = None
@@ -78,7 +78,7 @@ class Paths:
             self._per_m = strain / np.sqrt(self._squares(upper_m)[1])
 
     def sums(self, upper_m: Float, shape: tuple[int, ...], axes: tuple[int, ...]) -> Float:
-        """Return the conductances of the paths, summed over electrodes of the same wire.
+        """Return conductances summed over the electrodes of each wire.
 
         Args:
             upper_m: (U, N, 3) float64, m: upper electrodes.
@@ -86,13 +86,13 @@ class Paths:
             axes: Axes of ``shape`` to sum over: 1, 3, both or none.
 
         Returns:
-            (U, N or 1, K, M or 1) float64, 1/m. Divide by the resistivity in ohm/m to obtain siemens.
+            (U, N or 1, K, M or 1) float64, 1/m; divide by the resistivity (ohm/m) for siemens.
         """
         with self._lock:
             return np.asarray(self._each(upper_m).reshape(shape).sum(axis=axes, keepdims=True))
 
     def _each(self, upper_m: Float) -> Float:
-        """Return the conductances (U N, K M) of all paths, 1/m, in an array that the next call overwrites."""
+        """Return the conductances (U N, K M) of all paths, 1/m. The next call overwrites the array."""
         plane, square = self._squares(upper_m)
         found: Float = self._work[2]
         with np.errstate(divide="ignore"):
@@ -108,7 +108,7 @@ class Paths:
         return found
 
     def _squares(self, upper_m: Float) -> tuple[Float, Float]:
-        """Return the squared distances (U N, K M), m², in the x-y plane and in space, in reused arrays."""
+        """Return the squared distances (U N, K M) in the x-y plane and in space, m², in reused arrays."""
         here, there = np.ascontiguousarray(upper_m.reshape(-1, 3).T), self._lower
         plane, square, gap = self._work
         for axis, out in ((0, plane), (1, gap), (2, square)):
@@ -120,16 +120,15 @@ class Paths:
 
 
 def _disc(plane: Float, square: Float, radius_m: float, out: Float) -> None:
-    """Write the potential in 1/m of a conducting disc of unit charge to ``out``; overwrites ``plane``.
+    """Write the potential (1/m) of a conducting disc of unit charge to ``out``. Overwrites ``plane``.
 
-    The potential depends on (l₁ + l₂)² / 4 = (s + √(s² − 4 a² p)) / 2, where s = d² + a². This
-    follows from l₁² l₂² = s² − 4 a² p.
+    With s = d² + a², the identity l₁² l₂² = s² − 4 a² p gives (l₁ + l₂)² / 4 = (s + √(s² − 4 a² p)) / 2.
 
     Args:
-        plane: p, squared distances in m² from the disc's axis.
-        square: d², squared distances in m² from the disc's centre.
-        radius_m: a, radius in m.
-        out: Receives the potentials.
+        plane: p, squared distances from the axis of the disc, m².
+        square: d², squared distances from the centre of the disc, m².
+        radius_m: a, radius of the disc, m.
+        out: Array for the potentials, 1/m.
     """
     a2 = radius_m * radius_m
     np.multiply(plane, 4.0 * a2, out=plane)

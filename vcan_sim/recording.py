@@ -1,4 +1,4 @@
-"""Record a simulated run in a new folder: bus trace, ground truth, faults and scene.
+"""Recording of a simulated run in a folder: bus trace, ground truth, faults and scene.
 
 ===============  =======================================================================================
 file             content
@@ -37,19 +37,19 @@ SCENE: Final = "scene.json"
 
 
 def channel_of(bus: str) -> str:
-    """Return a bus name with underscores instead of spaces, for the channel column of a trace."""
+    """Return the channel name of a bus in a trace: its name, with underscores for spaces."""
     return re.sub(r"\s", "_", bus)
 
 
 class Recording:
-    """Recording of a fleet during a ``with`` block, which must enclose the ``with`` block of the fleet.
+    """Recording of a fleet during a ``with`` block, which must enclose that of the fleet.
 
-    Call :meth:`poll` at least once a minute, because each patch stores only a limited number of readings.
+    Call :meth:`poll` at least once a minute, because patches store a limited number of readings.
 
     Args:
         folder: New folder for the files.
         fleet: Fleet to record.
-        scene: Scene that the fleet plays, if any.
+        scene: Scene that the fleet plays; None for random strokes.
 
     Raises:
         ConfigError: On entry, if the folder exists already or cannot be created.
@@ -93,7 +93,7 @@ class Recording:
         np.savez_compressed(self._folder / TRUTH, **arrays)
 
     def poll(self) -> None:
-        """Record the ground truth of all scans and all fault changes since the previous call."""
+        """Record the ground truth of the scans, and the fault changes, since the last call."""
         if self._failure is not None:
             raise self._failure
         wall_ns = clock.time_ns() - clock.monotonic_ns()

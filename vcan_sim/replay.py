@@ -1,4 +1,4 @@
-"""Replay a recorded CAN trace with the original timing."""
+"""Replay of recorded CAN traces, with the original timing."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ FROM_NODES: Final = frozenset(
         Kind.LSS_RESPONSE,
     }
 )
-"""Kinds of frames that nodes send. A host sends frames of all other kinds, and may also send heartbeats."""
+"""Kinds of frames that nodes send. Hosts send the other kinds, and possibly heartbeats."""
 _DRAINED_EVERY: Final = 64
-"""Number of sent frames after which the receive queues of all endpoints are emptied."""
+"""Number of sent frames between two clearings of the receive queues."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,7 +37,7 @@ class Replayed:
 
     sent: int
     left_out: int
-    """Number of frames left out: excluded frames, extended frames and error frames."""
+    """Number of frames left out: frames that were not selected, extended frames and error frames."""
     refused: int
     """Number of frames that the bus refused."""
     seconds: float
@@ -86,10 +86,9 @@ def replay(
     """Send recorded frames with their original timing.
 
     Args:
-        frames: Recorded frames. If a frame has an earlier time than the preceding frame, it is sent
-            immediately.
-        ports: Open endpoint for each channel; frames of channels without an endpoint are not sent.
-        wait: Function that waits for a given number of seconds, and returns whether to end the replay.
+        frames: Recorded frames. A frame whose time is already past is sent immediately.
+        ports: Open endpoint of each channel. Frames of other channels are left out.
+        wait: Function that waits for a number of seconds, and returns True to end the replay.
         from_nodes: Whether to send only the frames that nodes send.
 
     Returns:
@@ -120,9 +119,9 @@ def replay(
 
 
 def _drain(port: CanPort) -> None:
-    """Discard all received frames, so that the receive queue does not fill up."""
+    """Discard all received frames, to keep the receive queue from filling up."""
     try:
         while port.recv(0.0) is not None:
             pass
-    except BusError:  # sending reports it
+    except BusError:  # sending will report it
         return

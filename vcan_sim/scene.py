@@ -1,13 +1,12 @@
-"""Scene in which a sphere repeatedly presses into the skin, slides in a random direction and lifts off.
+"""Scene in which a sphere presses into the skin, slides in a random direction and lifts off, repeatedly.
 
-The displacement of the electrodes is the closed-form solution for a sliding Hertz contact on a half-space
-(:class:`skinnode.model.elastic.HertzContact`), so the ground truth contains no
-discretisation error. A scene is a pure function of scene time and the seed: its state can be computed for any
-time, in any order.
+The ground truth is free of discretisation error: the displacement of the electrodes is the closed-form
+solution for a sliding Hertz contact on a half-space (:class:`skinnode.model.elastic.HertzContact`). A scene
+is a pure function of scene time and seed, so its state can be computed at any time, in any order.
 
-The onset of sliding is simplified: while the sphere accelerates, the ratio of shear stress to pressure rises
-from zero to the coefficient of friction everywhere in the contact. In a real contact, slip starts at the rim
-and spreads inwards (Cattaneo, Mindlin).
+The onset of sliding is simplified. While the sphere accelerates, the ratio of shear stress to pressure rises
+from zero to the coefficient of friction, uniformly across the contact. In a real contact, slip starts at the
+rim and spreads inwards (Cattaneo, Mindlin).
 """
 
 from __future__ import annotations
@@ -25,21 +24,17 @@ from skinnode.model.layout import Float, PatchLayout
 from vcan_sim.smooth import GLIDE_RAMP, ease, glide
 
 LEAD_S: Final = 0.8
-"""Minimum time (s) before the first press, so that the baseline can be measured on the untouched skin."""
+"""Minimum time before the first press, s, for measuring the baseline of the untouched skin."""
 
 PRESS, SLIDE, LIFT = 0.36, 0.40, 0.14
-"""Durations of press, slide and lift as fractions of a cycle. For the rest of the cycle, the skin is
-untouched."""
+"""Durations of press, slide and lift, as fractions of a cycle. The skin is untouched for the rest."""
 
 _GOLDEN: Final = 0.5 * (math.sqrt(5.0) - 1.0)
 
 
 @dataclass(frozen=True, slots=True)
 class Stroke:
-    """Stroke of a sphere: press, slide and lift.
-
-    ``heading`` is the unit vector of the sliding direction.
-    """
+    """Press, slide and lift of a sphere. ``heading`` is the unit vector of the slide."""
 
     radius_m: float
     depth_m: float
@@ -52,7 +47,7 @@ class Stroke:
     lift_s: float
 
     def contact(self, rubber: Rubber, t_s: float) -> HertzContact | None:
-        """Return the contact ``t_s`` seconds into the stroke; None if the sphere does not touch the skin."""
+        """Return the contact ``t_s`` seconds into the stroke; None without contact."""
         lifting = t_s - self.press_s - self.slide_s
         depth = self.depth_m * ease(t_s / self.press_s) * (1.0 - ease(lifting / self.lift_s))
         if depth <= 0.0:
@@ -74,12 +69,12 @@ class Scene:
     """Scene in which a sphere makes random strokes over one patch.
 
     Args:
-        layout: Layout of the patch at rest. The upper electrodes are on the surface of the rubber; a curved
-            skin is treated as its projection onto the x-y plane.
+        layout: Layout of the patch at rest, with the upper electrodes on the surface of the rubber. Curved
+            skin is projected onto the x-y plane.
         simulation: Seed, sphere radius, depth, friction, speed and timing of the strokes.
-        number: Number of the patch in the hand. Patches differ in their random strokes and in the time of the
-            first touch.
-        rubber: Material of the skin. Its Young's modulus affects the force but not the displacement.
+        number: Number of the patch in the hand, on which the random strokes and the time of the first touch
+            depend.
+        rubber: Material of the skin. Its Young's modulus affects forces but not displacements.
     """
 
     layout: PatchLayout
@@ -89,7 +84,7 @@ class Scene:
 
     @property
     def lead_s(self) -> float:
-        """Scene time (s) of the first touch, which differs between patches by up to a quarter of a cycle."""
+        """Scene time of the first touch, s. It varies by up to a quarter of a cycle between patches."""
         return LEAD_S + 0.25 * self.simulation.cycle_s * math.fmod(self.number * _GOLDEN, 1.0)
 
     def stroke(self, index: int) -> Stroke:
@@ -105,7 +100,7 @@ class Scene:
         slide_m = min(options.slide_speed_m_per_s * (1.0 - GLIDE_RAMP) * slide_s, room)
         way = slide_m * heading
         first, last = low - np.minimum(way, 0.0), high - np.maximum(way, 0.0)
-        start = random.uniform(first, np.maximum(first, last))  # due to rounding, `first` may exceed `last`
+        start = random.uniform(first, np.maximum(first, last))  # rounding can make `first` exceed `last`
         return Stroke(
             radius_m=options.indenter_radius_m,
             depth_m=options.depth * self.layout.height_m,
@@ -127,9 +122,9 @@ class Scene:
         return () if contact is None else (contact,)
 
     def upper_m(self, t_s: float) -> Float:
-        """Return the positions (U, N, 3) of the upper electrodes in m at scene time ``t_s``.
+        """Return the positions (U, N, 3) of the upper electrodes at scene time ``t_s``, m.
 
-        At rest, the method returns ``layout.upper_m`` itself.
+        At rest, the result is ``layout.upper_m`` itself.
         """
         contacts = self.contacts(t_s)
         if not contacts:
@@ -145,8 +140,8 @@ class Scene:
     def _field_m(self) -> tuple[Float, Float]:
         """Lower and upper corner of the rectangle in which the centre of the sphere moves.
 
-        The rectangle is one pitch smaller on each side than the area of the electrodes. If the patch is too
-        small, the rectangle shrinks to the middle of the patch.
+        The rectangle lies one pitch inside the outermost electrodes on each side. On a patch too small for
+        that, it shrinks to the middle of the patch.
         """
         low, high = self._surface_m.min(axis=0), self._surface_m.max(axis=0)
         inset = np.minimum(self.layout.pitch_m, 0.5 * (high - low))

@@ -1,4 +1,4 @@
-"""Simulated resistance readings of a patch, for a node's analogue inputs."""
+"""Simulated resistance readings of a patch, for the converter of a node."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ from vcan_sim.skin.imperfections import EXACT, Imperfections
 from vcan_sim.skin.patch import PhysicalPatch
 
 REMEMBERED_READINGS: Final = 4096
-"""Number of most recent readings whose times are stored, enough for five minutes at 12.5 scans per second."""
+"""Number of recent readings whose times are stored: five minutes at 12.5 scans per second."""
 
 Fault = Callable[[Float, int], Float]
-"""Function that takes a reading (U, K) in ohm and its time in ns, and returns the faulty reading. The value
-inf stands for an open pair of wires, and 0 for a shorted pair."""
+"""Function from a reading (U, K), ohm, and its time, ns, to the faulty reading. An open pair of wires reads
+inf, and a shorted pair reads 0."""
 
 
 class SkinMotion(Protocol):
-    """Motion of a patch's skin, from :class:`vcan_sim.scene.Scene` or :class:`vcan_sim.scenes.PatchScene`."""
+    """Skin motion of a patch, from :class:`vcan_sim.scene.Scene` or :class:`vcan_sim.scenes.PatchScene`."""
 
     @property
     def layout(self) -> PatchLayout:
@@ -33,34 +33,33 @@ class SkinMotion(Protocol):
 
     @property
     def simulation(self) -> SimulationConfig:
-        """Simulation settings, with the seed and noise of the converter."""
+        """Simulation settings, such as the seed and noise of the converter."""
 
     @property
     def number(self) -> int:
-        """Number of the patch in the hand; the noise differs between patches."""
+        """Number of the patch in the hand. Patches with different numbers have different noise."""
 
     def upper_m(self, t_s: float) -> Float:
-        """Return the positions (U, N, 3) of the upper electrodes in m at a scene time.
+        """Return the positions (U, N, 3) of the upper electrodes at scene time ``t_s``, m.
 
-        At rest, the method returns ``layout.upper_m`` itself.
+        At rest, the result is ``layout.upper_m`` itself.
         """
 
 
 class SimulatedPatch:
     """Resistances of a patch in a scene, as read by a noisy converter.
 
-    This class implements :class:`skinnode.node.ResistanceSource`. The skin stays at rest until :meth:`start`
-    sets the scene's time origin, so that the patch is untouched during the tare at power-on. The ground truth
-    is computed on demand: :meth:`truth_m` returns it for any time, and :meth:`read_ns` returns the time of a
-    scan.
+    This class implements :class:`skinnode.node.ResistanceSource`. The skin is at rest until :meth:`start`
+    begins the scene, so the tare at power-on sees an untouched patch. :meth:`truth_m` returns the ground
+    truth at any time, and :meth:`read_ns` the time of a scan.
 
     Args:
         scene: Motion of the skin.
-        converter_noise: Standard deviation of a reading, relative to the resistance. Default: the value in
-            the scene's simulation settings.
-        fault: Function applied to each reading after noise has been added.
-        imperfections: Deviations of the patch from its layout. Patches with different numbers have different
-            random errors.
+        converter_noise: Standard deviation of a reading, relative to the resistance; default: that of the
+            simulation settings.
+        fault: Function applied to each noisy reading.
+        imperfections: Deviations of the patch from its layout. The number of the patch selects the random
+            errors.
 
     Raises:
         ConfigError: If the random errors make the gap between an upper and a lower electrode too small.
@@ -77,9 +76,9 @@ class SimulatedPatch:
         self.scene = scene
         self.fault = fault
         self.reads = 0
-        """Number of readings so far, including the readings for a tare."""
+        """Number of readings so far, including those of the tare."""
         self.last_read_ns = 0
-        """Time of the newest reading, ns."""
+        """Time of the last reading, ns."""
         self._noise = scene.simulation.converter_noise if converter_noise is None else converter_noise
         self._random = np.random.default_rng([scene.simulation.seed, scene.number])
         self.skin: Final = PhysicalPatch(scene.layout, imperfections, scene.number)
@@ -89,7 +88,7 @@ class SimulatedPatch:
 
     @property
     def conversions(self) -> int:
-        """Number of conversions so far. Each reading is one conversion of the whole matrix."""
+        """Number of conversions so far. A reading is one conversion of the whole matrix."""
         return self.reads
 
     @property
@@ -98,13 +97,13 @@ class SimulatedPatch:
         return self._origin_ns is not None
 
     def start(self, t_ns: int) -> None:
-        """Start or restart the scene at ``t_ns``."""
+        """Start the scene at ``t_ns``, or start it again."""
         self._origin_ns = t_ns
 
     def read(self, t_ns: int) -> Float:
-        """Return the resistances (U, K) in ohm at ``t_ns``, with converter noise.
+        """Return a noisy reading of the resistances (U, K) at ``t_ns``, ohm.
 
-        For a given seed, the noise of the k-th reading is always the same, regardless of its time.
+        The seed and the number of the reading determine the noise; the time does not matter.
         """
         self.reads += 1
         self.last_read_ns = t_ns
@@ -115,7 +114,7 @@ class SimulatedPatch:
         return read if self.fault is None else self.fault(read, t_ns)
 
     def exact_ohm(self, t_ns: int) -> Float:
-        """Return the resistances (U, K) in ohm at ``t_ns``, without converter noise."""
+        """Return the resistances (U, K) at ``t_ns`` without converter noise, ohm."""
         t_s = self.scene_s(t_ns)
         return self.skin.rest_ohm if t_s is None else self.skin.analogue_ohm(t_s, self.scene.upper_m)
 
@@ -123,8 +122,8 @@ class SimulatedPatch:
         """Return the time of a reading, ns.
 
         Args:
-            device_time_us: Lower 32 bits of the reading's time on the node's clock, µs. The lowest 6 bits are
-                ignored, because a summary with a scan check does not contain them.
+            device_time_us: Time of the reading on the clock of the node, µs, modulo 2³². The lowest 6 bits
+                are ignored, because a summary with a check does not contain them.
 
         Raises:
             LookupError: If no stored reading has this time.
@@ -144,8 +143,8 @@ class SimulatedPatch:
         """Return the true electrode positions during a reading at ``t_ns``.
 
         Returns:
-            (U, N, 3) float64, m: actual positions of the electrodes of each upper wire at the wire's sampling
-            time. With imperfections, these positions differ from ``layout.upper_m`` even at rest; see
+            (U, N, 3) float64, m: actual positions of the upper electrodes, each at the sampling time of its
+            wire. With imperfections, they differ from ``layout.upper_m`` even at rest; see
             :meth:`displacement_m`.
         """
         t_s = self.scene_s(t_ns)
@@ -155,13 +154,13 @@ class SimulatedPatch:
         """Return the true displacement of the electrodes during a reading at ``t_ns``.
 
         Returns:
-            (U, N, 3) float64, m: :meth:`truth_m` minus the positions of the same electrodes at rest. Solvers
-            estimate this displacement, because they compare readings with a baseline.
+            (U, N, 3) float64, m: :meth:`truth_m` minus the actual positions at rest. This is what solvers
+            estimate, because they compare readings with a baseline.
         """
         return np.asarray(self.truth_m(t_ns) - self.skin.rest_m)
 
     def scene_s(self, t_ns: int) -> float | None:
-        """Return the scene time (s) at ``t_ns``, or None if the scene has not begun."""
+        """Return the scene time at ``t_ns``, s; None if the scene has not begun."""
         return None if self._origin_ns is None else (t_ns - self._origin_ns) * 1e-9
 
     def _remember(self, t_ns: int) -> None:
@@ -171,9 +170,9 @@ class SimulatedPatch:
 
 
 def simulated(layout: PatchLayout) -> SimulatedPatch:
-    """Return a simulated patch that is touched at random: the source ``simulated`` of ``skinnode node``.
+    """Return a simulated patch with random touches: the source ``simulated`` of ``skinnode node``.
 
-    The scene starts immediately. The first touch occurs after 0.8 s, so that the patch is untouched during
+    The scene starts immediately. The first touch comes after 0.8 s, which leaves the patch untouched during
     the tare at power-on.
     """
     source = SimulatedPatch(Scene(layout))

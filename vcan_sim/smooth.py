@@ -5,12 +5,11 @@ from __future__ import annotations
 from typing import Final
 
 GLIDE_RAMP: Final = 0.2
-"""Durations of the acceleration and deceleration phases of :func:`glide`, as fractions of the total
-duration."""
+"""Duration of each ramp of :func:`glide`, acceleration and deceleration, as a fraction of the total."""
 
 
 def ease(share: float) -> float:
-    """Return the value of a minimum-jerk profile from 0 to 1 (Flash and Hogan 1985).
+    """Return a minimum-jerk profile from 0 to 1 (Flash and Hogan 1985).
 
     Speed and acceleration are zero at both ends.
 
@@ -22,7 +21,7 @@ def ease(share: float) -> float:
 
 
 def glide(share: float) -> float:
-    """Return the value of a profile from 0 to 1 at constant speed, with smooth acceleration and deceleration.
+    """Return a profile from 0 to 1 with constant speed between two smooth ramps.
 
     Args:
         share: Elapsed fraction of the duration. Values below 0 count as 0, and values above 1 as 1.

@@ -1,4 +1,4 @@
-"""Simulation of imperfect patches: deviations of a patch and its read-out from the layout file.
+"""Imperfect patches: how a patch and its read-out deviate from the layout file.
 
 ::
 
@@ -6,7 +6,7 @@
     scene -> history (hysteresis and creep of the rubber) -> forward (conductance of each path)
         -> crossbar (resistances between wires, as read out) -> front_end (amplifier, converter)
 
-The module ``patch`` performs these calculations for one patch at a given time. This package shares no code
-with the solvers. If all sizes are zero, the patch is exact: it has point electrodes at the positions in the
-layout file, and each reading is the resistance of an isolated pair of wires.
+The module ``patch`` combines these steps for one patch. The package shares no code with the solvers. With all
+sizes zero, the patch is exact: its point electrodes are where the layout file says, and a reading is the
+resistance of an isolated pair of wires.
 """

@@ -1,4 +1,4 @@
-"""Actual electrode positions of a simulated patch, with random deviations set by its imperfections."""
+"""Actual electrode positions of a simulated patch, including manufacturing errors."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from skinnode.model.layout import Float, PatchLayout
 from vcan_sim.skin.imperfections import Imperfections
 
 CLIPPED_AT: Final = 3.0
-"""Limit at which normal random draws are clipped, in standard deviations."""
+"""Limit at which normal draws are clipped, in standard deviations."""
 _LEAST_LEFT: Final = 0.1
 """Minimum gap between an upper electrode and its nearest lower electrode, relative to the nominal gap."""
 
 
 @dataclass(frozen=True, eq=False)
 class Body:
-    """Actual positions of a patch's electrodes at rest."""
+    """Actual positions of the electrodes of a patch at rest."""
 
     upper_m: Float
     """(U, N, 3) float64, m: upper electrodes."""
@@ -40,11 +40,11 @@ class Draws:
         self._seed, self._number = seed, number
 
     def stream(self, name: str, *more: int) -> np.random.Generator:
-        """Return a random generator for the imperfection ``name``; ``more`` selects an independent one."""
+        """Return the random generator of an imperfection. Different ``more`` give independent generators."""
         return np.random.default_rng([self._seed, self._number, *name.encode(), *more])
 
     def normal(self, name: str, *shape: int) -> Float:
-        """Return an array of the given shape with standard normal draws, clipped at :data:`CLIPPED_AT`."""
+        """Return an array of standard normal draws, clipped at :data:`CLIPPED_AT`."""
         drawn = self.stream(name).standard_normal(shape)
         return np.asarray(np.clip(drawn, -CLIPPED_AT, CLIPPED_AT))
 
@@ -52,8 +52,8 @@ class Draws:
 def made(layout: PatchLayout, imperfections: Imperfections, draws: Draws) -> Body:
     """Return the electrode positions of a patch as manufactured.
 
-    Thickness and tilt errors move each upper electrode along z by a fraction of its height above the
-    nearest lower electrode, on flat and curved patches alike.
+    On flat and curved patches alike, thickness and tilt errors move each upper electrode along z by a
+    fraction of its height above the nearest lower electrode.
 
     Args:
         layout: Layout of the patch.
@@ -61,7 +61,7 @@ def made(layout: PatchLayout, imperfections: Imperfections, draws: Draws) -> Bod
         draws: Random draws of the patch.
 
     Returns:
-        Actual electrode positions; the layout's own arrays if no imperfection moves the electrodes.
+        Actual electrode positions; the arrays of the layout itself if no imperfection moves the electrodes.
 
     Raises:
         ConfigError: If the random errors make the gap between an upper and a lower electrode too small.
@@ -96,7 +96,7 @@ def made(layout: PatchLayout, imperfections: Imperfections, draws: Draws) -> Bod
 
 
 def _from_middle(points_m: Float) -> Float:
-    """Scale x and y of points (U, N, 3) so that they range from −1 to 1 across the patch."""
+    """Return x and y (U, N, 2) of points (U, N, 3), scaled to −1 to 1 across the patch."""
     plane = points_m[..., :2]
     low, high = plane.min(axis=(0, 1)), plane.max(axis=(0, 1))
     half = 0.5 * (high - low)
@@ -104,7 +104,7 @@ def _from_middle(points_m: Float) -> Float:
 
 
 def _nearest(layout: PatchLayout) -> NDArray[np.intp]:
-    """Return the index (U, N), 0 to K M − 1, of the lower electrode nearest to each upper electrode."""
+    """Return the flat index (U, N) of the lower electrode nearest to each upper electrode."""
     gap = layout.upper_m[:, :, None] - layout.lower_m.reshape(-1, 3)
     return np.asarray(np.argmin((gap**2).sum(axis=-1), axis=-1))
 

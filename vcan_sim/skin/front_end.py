@@ -12,14 +12,14 @@ from vcan_sim.skin.body import Draws
 from vcan_sim.skin.imperfections import Imperfections
 
 FULL_SCALE: Final = 2.0
-"""Full scale of the converter, as a multiple of the maximum resistance at rest."""
+"""Full scale of the converter, as a multiple of the largest resistance at rest."""
 
 
 class FrontEnd:
     """Amplifier and converter of one patch.
 
-    The amplifier is balanced at rest, so its gain error acts on the change in each resistance. A gain error
-    of the whole reading would have no effect, because nodes send R divided by the baseline R0.
+    The amplifier is balanced at rest, so its gain error acts on changes in resistance. A gain error of the
+    whole reading would cancel out, because nodes send R divided by the baseline R0.
 
     Args:
         imperfections: Sizes of the errors.
@@ -42,17 +42,17 @@ class FrontEnd:
         self._amplifies = bool(imperfections.gain or imperfections.offset)
 
     def amplified_ohm(self, ohm: Float) -> Float:
-        """Return the resistances (U, K) in ohm at the converter's input, after gain and offset errors."""
+        """Return the amplifier output (U, K), with gain and offset errors, ohm."""
         if not self._amplifies:
             return ohm
         return np.asarray(ohm + self._gain * (ohm - self._rest_ohm) + self._offset_ohm)
 
     def converted_ohm(self, ohm: Float, reading: int) -> Float:
-        """Return the resistances (U, K) in ohm at the converter's output.
+        """Return the converter output (U, K), with noise and rounding, ohm.
 
         Args:
-            ohm: (U, K) float64, ohm: resistances at the converter's input.
-            reading: Number of the reading, at least 0, which seeds the noise.
+            ohm: (U, K) float64, ohm: converter input.
+            reading: Number of the reading, at least 0. It seeds the noise.
         """
         if self._noise_ohm:
             ohm = ohm + self._noise_ohm * self._draws.stream("noise", reading).standard_normal(ohm.shape)

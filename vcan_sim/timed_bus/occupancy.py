@@ -43,7 +43,7 @@ class Occupancy:
         return self._busy_until(to_ns) - self._busy_until(from_ns)
 
     def forget(self, before_ns: int) -> None:
-        """Discard the intervals that ended before ``before_ns``. Later queries must not reach further back."""
+        """Discard the intervals that ended before ``before_ns``. Later queries must not go further back."""
         n = bisect.bisect_left(self._ends, before_ns)
         for column in (self._starts, self._ends, self._busy_before):
             del column[:n]

@@ -15,13 +15,13 @@ interface. Each bus has a ``link`` (port, receive queue, reopening) and a ``serv
     node_monitor (evidence about a node) -> health (condition) -> health_watch -> events
 
 Other modules send SYNC (``sync``) and NMT commands (``nmt_master``), contain exceptions (``containment``),
-time the attempts to repeat an operation (``retry_pause``) and pass frames to recorders (``tap``).
+set the pauses between attempts (``retry_pause``) and pass frames to recorders (``tap``).
 
 **Containment.** An exception never ends a thread of the host. Its effect depends on what it concerns:
 
 - A patch: the patch is marked faulty, with the exception as the reason, and its scans are withheld. After a
   pause, the patch is brought up again. The pause starts at 0.1 s and doubles with each exception, up to 1 s.
-  A boot-up message from the node ends it early.
+  A boot-up message from the node ends the pause early.
 - A bus: the host stops serving the bus for 0.1 s to 1 s, or reopens its interface.
 - A subscriber, a callback or a tap: only the item for this recipient is lost.
 

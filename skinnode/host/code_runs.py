@@ -22,7 +22,7 @@ LAST, BEFORE, RUN, NAMED, ALONG, ACROSS, _ANCHORS = range(7)
 
 - ``LAST``: newest code; -1 before the first code.
 - ``BEFORE``: code before the last change; -1 if there is none.
-- ``RUN``: run.
+- ``RUN``: run, i.e. number of scans that have repeated the newest code.
 - ``NAMED``: nonzero if the crossing, or its wire, has been reported as frozen.
 - ``ALONG``, ``ACROSS``: lead along the upper wire and along the lower wire.
 - ``_ANCHORS``: first of four planes with the neighbours' codes at the start of the run.
@@ -43,7 +43,7 @@ MEASURED, CHANGED, RETURNED, LARGEST, RESERVED, LEAST, RELEASED, SUSPECT = range
 
 - ``MEASURED``: number of codes that are measurements.
 - ``CHANGED``: number of changed codes.
-- ``RETURNED``: number of codes that have changed back to the code before.
+- ``RETURNED``: number of codes that have changed back to their value before the last change.
 - ``LARGEST``: largest change of a code.
 - ``RESERVED``: number of crossings whose newest code is reserved.
 - ``LEAST``: smallest code that is a measurement.

@@ -1,8 +1,8 @@
 """Configure a node: check its identity and layout, write its parameters, and read its baseline.
 
-The device that answers at a node-ID may be something else entirely, such as a motor drive. The host therefore
-compares the device's identity and layout with the hand file before it writes anything. Every parameter
-written is read back.
+A node-ID may belong to a different kind of device, such as a motor drive. The host therefore compares the
+identity and the layout of a node with the hand file before it writes anything. It reads back every parameter
+that it writes.
 
 On a bus that another master runs, the host sends no NMT commands and leaves the SYNC parameters unchanged. It
 writes a patch-specific parameter only if the node's value differs from the hand file. With
@@ -39,7 +39,7 @@ total.
 """
 
 HEARTBEATS_WATCHED: Final = 3
-"""Timeout for the host's heartbeat, in heartbeat periods. A node that times out stops sending scans."""
+"""Time without a heartbeat from the host after which a node stops sending scans, in heartbeat periods."""
 
 _POLL_S: Final = 0.02
 
@@ -74,7 +74,7 @@ class Configurator:
 
         Raises:
             NodeTimeout: if the node does not respond in time.
-            NodeError: if the node does not match the hand file or does not keep a parameter value.
+            NodeError: if the node does not match the hand file or does not keep a parameter.
             SdoAbort: if the node aborts an SDO transfer.
             ConfigError: if the baseline file does not match the patch.
             Abandoned: if ``abandoned`` returned True.
@@ -173,7 +173,7 @@ class Configurator:
             raise _mismatch(patch, "electrode coordinates", counted(len(data), "byte"), str(error)) from None
 
     def _configure_communication(self, remote: RemoteOd) -> None:
-        """Write the SYNC and heartbeat consumer parameters, which belong to the NMT master of the bus."""
+        """Write the SYNC and heartbeat consumer parameters. Only the NMT master of the bus may set them."""
         self._go_on()
         sync = self.hand.sync
         remote.write_checked(od.COB_ID_SYNC, 0, "u32", od.SYNC_COB_ID)
@@ -245,13 +245,14 @@ class Configurator:
                     raise _mismatch(patch, what, f"0x{mapped:08X}", f"0x{entry:08X}")
 
     def settle_baseline(self, patch: PatchConfig, profile: PatchProfile, remote: RemoteOd) -> Float:
-        """Return the node's baseline, after writing the baseline file to the node if the hand file names one.
+        """Return the node's baseline.
 
-        A baseline that the node already has is not written again. The baseline of a node reads as zeros
-        during a tare; the tare must finish before the boot deadline.
+        If the hand file names a baseline file, its values are first written to the node, unless the node
+        already has them. During a tare, the baseline reads as zeros. The tare must finish before the boot
+        deadline.
 
         Returns:
-            Resistances at rest, (U, K), ohm.
+            (U, K) resistances at rest, ohm.
 
         Raises:
             NodeError: if the node does not keep the written baseline, or a resistance is not positive.

@@ -15,16 +15,16 @@ scans in which no code changes. A converter counts as stopped if all of these co
   larger.
 - The codes are known to be noisy: in at least ``FLICKERS`` earlier scans, a code has returned to the value it
   had before its last change.
-- The run is at least ``LONGER`` times as long as the longest run of the running converter so far. Runs at
-  rest and runs under a press are compared separately: a converter that repeats its codes for minutes at rest
-  may repeat them for only two or three scans under a press.
+- The run is at least ``LONGER`` times as long as any earlier run of the running converter. Runs at rest and
+  runs under a press are compared separately: a converter that repeats its codes for minutes at rest may
+  repeat them for only two or three scans under a press.
 
 **Doubt.** A few repeated scans do not prove that a converter has stopped, yet the fields may already show a
 press that is over. If all codes stop changing in mid-movement, the next ``DOUBT_RUN`` fields are therefore
 not trusted. This rule is limited to patches without a phase whose codes are noisy and have never all repeated
 before.
 
-If neither phase nor codes decide and no code has changed for a second, the state is unknown
+If neither the phase nor the codes are conclusive and no code has changed for a second, the state is unknown
 (:attr:`Alive.CANNOT_TELL`).
 """
 
@@ -66,7 +66,9 @@ DOUBT_RUN: Final = 64
 mid-press were detected within 11 scans, a few after more than 16.
 """
 FLICKERS: Final = 5
-"""Minimum number of scans with a returning code before the codes of a patch count as noisy."""
+"""Minimum number of scans in which a code returns to the value before its last change, for the codes of a
+patch to count as noisy.
+"""
 LONGER: Final = 4
 """Minimum length of a run that counts as frozen, as a multiple of the running converter's longest run."""
 PROOF_NS: Final = 1_000_000_000

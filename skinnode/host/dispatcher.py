@@ -61,13 +61,15 @@ class BusStats:
     waiting: int
     """Number of frames read from the interface but not dispatched yet."""
     kernel_dropped: int
-    """Number of frames dropped by a full kernel buffer; 0 if the interface does not report drops."""
+    """Number of frames dropped because the kernel's buffer was full; 0 if the interface does not report
+    drops.
+    """
     dropped: int
-    """Number of frames dropped by a full receive queue."""
+    """Number of frames dropped because the receive queue was full."""
     malformed: int
     """Number of frames with an expected COB-ID but a wrong length or format."""
     outages: int
-    """Number of failures of the CAN interface."""
+    """Number of times the CAN interface has failed."""
     bits: int
     """Total length (bits, including stuff bits) of the data frames received and sent, updated every 0.1 s."""
     load: float
@@ -161,7 +163,7 @@ class Dispatcher:
     def dispatch(self, batch: Sequence[Frame]) -> None:
         """Pass frames to their handlers, in order of arrival.
 
-        An exception in a handler costs only the current frame.
+        If a handler raises an exception, only the current frame is lost.
         """
         for listener in self._listeners:
             try:
@@ -221,7 +223,7 @@ class Dispatcher:
                     self.contain(owner, "polling", defect)
 
     def measure(self, now_ns: int) -> None:
-        """Update the bus load if the update is due.
+        """Update the bus load if an update is due.
 
         The update is slow. A mainline that serves several buses therefore calls this method for one bus per
         iteration.
@@ -269,7 +271,7 @@ class Dispatcher:
 
     def _on_error_frame(self, frame: Frame) -> None:
         self._error_frames += 1
-        if self.config.interface == "socketcan":  # this encoding of the controller state is SocketCAN's
+        if self.config.interface == "socketcan":  # only SocketCAN encodes the controller state in this way
             state, before = bus_state(frame), self._bus_state
             if state is not None:
                 self._bus_state = state

@@ -6,14 +6,14 @@ or more crossings, the codes of both adjacent wires rise, or both fall, by at le
 of the neighbours' codes is called the lead (:mod:`skinnode.host.code_runs`). The criteria do not depend on
 the converter's noise.
 
-The limits rest on simulated presses of patches without faults:
+Both limits are based on simulated presses of patches without faults:
 
 - In 696 presses, the largest lead of a crossing whose code was constant for five scans was 75 codes.
 - In 1,800 presses without converter noise, the largest lead of a wire whose codes were constant for one scan
   was 25 codes.
 
 **Noise.** A wire or crossing is also frozen if a running converter would produce its run with a probability
-of at most :data:`~skinnode.host.converter_liveness.FALSE_ALARM`. The noise assumed is a tenth of the stated
+of at most :data:`~skinnode.host.converter_liveness.FALSE_ALARM`. The assumed noise is a tenth of the stated
 noise, or half of the recently measured noise if that is larger. In addition, at least three quarters of the
 other crossings must have runs shorter than a quarter of this run. This second condition prevents false alarms
 if the converter has less noise than assumed, because then all crossings repeat their codes.
@@ -60,7 +60,9 @@ presses without faults.
 """
 _NEVER: Final = 2**62
 _OTHERS: Final = 0.75
-"""Minimum fraction of the other crossings that have a run shorter than a quarter of the frozen part's run."""
+"""Minimum fraction of the other crossings with a run shorter than a quarter of that of the frozen wire or
+crossing.
+"""
 
 
 class FrozenParts:
@@ -178,7 +180,7 @@ def _place(fault: DataFault) -> Any:
 
 
 def _lies_on(fault: DataFault, part: FaultyPart, number: int) -> bool:
-    """Return whether a fault is that of a single crossing on the given wire."""
+    """Return whether a fault concerns a single crossing on the given wire."""
     wire = fault.upper if part is FaultyPart.UPPER else fault.lower
     return fault.part is FaultyPart.CROSSING and wire == number
 

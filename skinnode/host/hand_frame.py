@@ -317,7 +317,7 @@ class HandSubscription:
         return frame
 
     def _wait_s(self, end_ns: int | None) -> float | None:
-        """Return the time (s) until ``end_ns`` or the next deadline; None if there is neither."""
+        """Return the time (s) until ``end_ns`` or the next deadline, whichever is first; else None."""
         times = [t_ns for t_ns in (end_ns, self._gatherer.next_deadline_ns()) if t_ns is not None]
         return max(0, min(times) - clock.monotonic_ns()) * 1e-9 if times else None
 

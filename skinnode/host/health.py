@@ -108,8 +108,8 @@ class PatchHealth:
     faults: tuple[DataFault, ...] = ()
     """Faults found in the data of the newest field, each with part, first scan and certainty."""
     defect: str | None = None
-    """Host operation that last raised an exception for this patch, and the exception; None after the next
-    bring-up.
+    """Last host operation that raised an exception while serving the patch, with the exception; reset to None
+    by the next bring-up.
     """
     slow_overruns: int = 0
     """Number of EMCY messages (code 0x8110) about scans that the node skipped because its computer or the bus
@@ -186,7 +186,7 @@ class BusHealth:
     outages: int
     kernel_dropped: int
     dropped: int
-    """Number of frames dropped by a full receive queue of the host."""
+    """Number of frames dropped because the host's receive queue was full."""
     malformed: int
     foreign: int
     """Number of frames with an unexpected COB-ID; ``foreign_ids`` lists these COB-IDs."""

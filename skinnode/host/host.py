@@ -47,8 +47,8 @@ class HostStats:
     malformed: tuple[CodecError, ...]
     """First malformed frame of each bus that has received one."""
     defects: Mapping[str, DefectStats]
-    """Contained exceptions by patch or bus name. The key ``host`` holds those that concern no single patch or
-    bus.
+    """Statistics of contained exceptions, by patch or bus name. The key ``host`` holds those that concern no
+    single patch or bus.
     """
 
     @property
@@ -153,13 +153,13 @@ class Host:
                 support.
 
         Raises:
-            ConfigError: if an option, EDS file or baseline file does not match the hand, or a layout has no
-                solution.
+            ConfigError: if an option, EDS file or baseline file does not match the hand, or the solver does
+                not support a layout.
             BusLoadError: if the planned traffic exceeds the load limit of a bus.
             BusError: if an interface cannot be opened, or no node on a bus responds and ``bring_up.missing``
                 is not ``wait``.
             NodeTimeout: if a node does not respond and ``bring_up.missing`` is not ``wait``.
-            NodeError: if a node does not match ``hand`` or does not keep a parameter value.
+            NodeError: if a node does not match ``hand`` or does not keep a parameter.
             BringUpCancelled: if ``cancelled`` returned True.
             ValueError: if ``boot_deadline_s`` is negative, infinite or not a number.
         """
@@ -196,7 +196,7 @@ class Host:
         """Subscribe to hand frames. A hand frame combines the fields of all patches for one SYNC.
 
         Iterate over the subscription with ``for`` or ``async for``. A hand frame is delivered at most two
-        SYNC periods after its first field. It does not wait for absent patches.
+        SYNC periods after its first field. Delivery does not wait for absent patches.
 
         Args:
             timeout_s: Maximum time (s) to wait for a hand frame before the iteration raises TimeoutError;
@@ -272,7 +272,7 @@ class Host:
         return served.health(no_sync=self._lacks_sync(served))
 
     def _lacks_sync(self, bus: ServedBus) -> bool:
-        """Return whether a bus whose patches need SYNC has none."""
+        """Return whether a bus has no SYNC although its patches need it."""
         if not bus.sync_is_late(self._t_up_ns, self.hand.sync.period_ms * 1_000_000):
             return False
         streams = [node.stream for node in self._nodes.values() if node.link is bus.link]

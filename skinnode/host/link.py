@@ -28,9 +28,9 @@ _REOPEN_S: Final = 0.1
 class BusLink(Dispatcher):
     """Connection to a bus, open from construction until :meth:`close` or the end of a ``with`` block.
 
-    An exception in a handler, poller, listener or job costs only the current frame or call. An exception in
-    the dispatcher itself pauses the dispatching for this bus, and received frames wait in the queue. If the
-    interface fails, a separate thread tries repeatedly to reopen it.
+    If a handler, poller, listener or job raises an exception, only the current frame or call is lost. If the
+    dispatcher itself raises an exception, dispatching pauses for this bus, and received frames wait in the
+    queue. If the interface fails, a separate thread tries repeatedly to reopen it.
 
     Threads: any thread may call :meth:`send`, :meth:`ask_remote`, :meth:`call` and :meth:`stats`. The other
     methods are reserved for the :class:`~skinnode.host.mainline.Mainline`.
@@ -38,7 +38,7 @@ class BusLink(Dispatcher):
     Args:
         config: Configuration of the bus.
         handlers: Handlers of the data frames, by COB-ID. The mainline calls them.
-        on_defect: Function called with each exception that has a new message, on the thread that raised it.
+        on_defect: Function called with each exception whose message is new, on the thread that raised it.
         open_port: Function that opens the interface.
 
     Raises:
@@ -85,7 +85,7 @@ class BusLink(Dispatcher):
         """
         t_ns = clock.monotonic_ns()
         self._port.send(can_id, data)
-        try:  # the frame has been sent: a listener must not fail the call
+        try:  # the frame has been sent, so exceptions in listeners must not reach the caller
             if can_id != SYNC_COB_ID:
                 self.intake.asked(t_ns)
             self.count_sent(can_id, data)
@@ -143,7 +143,7 @@ class BusLink(Dispatcher):
         self._sent_listeners = tuple(each for each in self._sent_listeners if each is not listener)
 
     def call(self, job: Callable[[], object], defects: Defects | None = None) -> None:
-        """Run ``job`` on the mainline, before the frames that arrive later are dispatched. Any thread.
+        """Run ``job`` on the mainline, before any frame that arrives later is dispatched. Any thread.
 
         Args:
             job: Function to run.
@@ -208,7 +208,7 @@ class BusLink(Dispatcher):
             self.defects.report("dispatching frames", error)
 
     def measure_load(self) -> None:
-        """Update the bus load if the update is due. Never raises."""
+        """Update the bus load if an update is due. Never raises."""
         try:
             if not self._rests and self.t_dispatched_ns * 1e-9 >= self._load_due_s:
                 self.measure(self.t_dispatched_ns)

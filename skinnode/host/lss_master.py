@@ -1,7 +1,7 @@
 """Find nodes without a node-ID, and set node-IDs and bit rates, as an LSS master (CiA 305 v3.0).
 
 A slave that does not match a request stays silent, so every negative result costs a full timeout. LSS
-responses carry no number, so a late response to an earlier request cannot be told from a response to the
+responses are not numbered, so a late response to an earlier request cannot be told from a response to the
 current one. The master therefore counts a node as found or selected only when the node has returned its own
 LSS address. After a timeout, the master waits until a late response can no longer arrive.
 """
@@ -57,7 +57,7 @@ _PARTS: Final = 4
 _REVISIONS: Final = od.REVISION_NUMBER, od.UNCHECKED_REVISION_NUMBER
 _LIKELY: Final = (od.VENDOR_ID,), (od.PRODUCT_CODE,), _REVISIONS
 """Likely values of the first three parts of an LSS address: those of a skinnode patch. A fastscan tries them
-first. If they match, three or four requests replace the 96 of a search bit by bit.
+first. If they match, three or four requests replace the 96 of a bit-by-bit search.
 """
 
 
@@ -216,7 +216,7 @@ class LssMaster:
     def set_node_id(self, node_id: int) -> None:
         """Set the node-ID of the node in configuration state.
 
-        The node uses it from its next communication reset on.
+        The node-ID takes effect at the next communication reset.
 
         Raises:
             LssFailed: if the node refuses the node-ID or does not respond.
@@ -227,7 +227,7 @@ class LssMaster:
     def set_bit_rate(self, bitrate_bps: int) -> None:
         """Set the bit rate of the node in configuration state.
 
-        The node uses the bit rate after its next power-on, if it has stored it by then.
+        The bit rate takes effect at the next power-on, and only if it has been stored.
 
         Raises:
             LssFailed: if the node refuses the bit rate or does not respond.
@@ -252,7 +252,7 @@ class LssMaster:
     def release(self) -> None:
         """Switch all nodes to waiting state.
 
-        A node that has received its first node-ID then boots.
+        A node that has just received its first node-ID boots on this command.
         """
         self._request(LssCommand.SWITCH_GLOBAL, bytes((LssState.WAITING,)))
 

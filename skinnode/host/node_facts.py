@@ -19,7 +19,7 @@ class NodeFacts:
     profile: PatchProfile
     scale: CodeScale
     baseline_ohm: Float
-    """Resistances at rest, (U, K), ohm. The codes of the scans are relative to them."""
+    """(U, K) resistances at rest, ohm. The codes of the scans are relative to them."""
     serial: int | None
     """Serial number of the node; None if the host must not read it."""
     heartbeat_s: float

@@ -28,7 +28,7 @@ RESTART_MEMORY_NS: Final = 5_000_000_000
 """Time (ns) for which a restart loop is reported after its last restart."""
 
 SETTLED_NS: Final = 500_000_000
-"""Minimum time (ns) after the last restart in a loop for which the condition stays *restarting*, even if the
+"""Minimum time (ns) for which the condition stays *restarting* after the last restart in a loop, even if the
 node is operational.
 """
 
@@ -38,8 +38,8 @@ LOOP_NS: Final = 10_000_000_000
 
 BEATS: Final = 12
 BEATS_TOO_OFTEN: Final = 0.7
-"""Test for two nodes with the same node-ID: ``BEATS`` heartbeats take less than ``BEATS_TOO_OFTEN`` times the
-time that one node needs. Two nodes need half of that time.
+"""Test for two nodes with the same node-ID: ``BEATS`` heartbeats arrive in less than ``BEATS_TOO_OFTEN``
+times the time that a single node needs to send them.
 """
 
 
@@ -121,7 +121,7 @@ class NodeMonitor:
         """Process an EMCY message.
 
         The message holds the error code (u16), the error register (u8) and five manufacturer-specific bytes.
-        Error code 0 means that no error is left.
+        Error code 0 means that all errors have been cleared.
         """
         if len(data) != 8:
             self.on_reject(CodecError(emcy_cob_id(self.node_id), data, "8 bytes (EMCY)"))
@@ -144,7 +144,7 @@ class NodeMonitor:
         return self._registers_said
 
     def on_register_read(self, register: int, said: int) -> None:
-        """Store an error register read by SDO, unless it has been reported anew since the request.
+        """Store an error register read by SDO, unless the node has reported a newer value since the request.
 
         Args:
             register: Value of the error register.

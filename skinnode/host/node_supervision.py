@@ -25,15 +25,15 @@ periods.
 """
 
 _PROBE_NS: Final = 250_000_000
-"""Interval (ns) between requests to an absent node. They find a node that sends no heartbeats and whose
-boot-up message was lost. For four nodes, they take 0.1 % of a bus's capacity.
+"""Interval (ns) between requests to an absent node. The requests reveal a node that sends no heartbeats and
+whose boot-up message was lost. For four nodes, the requests take 0.1 % of a bus's capacity.
 """
 
 _SEARCH_NS: Final = 1_000_000_000
 """Interval (ns) between LSS searches for an absent node."""
 
 _FORGET_NS: Final = 2_000_000_000
-"""Time (ns) after a node's last frame until it is no longer reported as refused or faulty."""
+"""Time (ns) without frames after which a node is no longer reported as refused or faulty."""
 
 _MUTE_NS: Final = 1_000_000_000
 """Minimum interval (ns) between reads of the configuration of a node that sends no scans."""

@@ -35,8 +35,8 @@ _BASELINE_CHANGED: Final = int(SummaryFlag.BASELINE_CHANGED)
 
 _EVER_NS: Final = 2**63
 WATCH_AFTER_NS: Final = 5_000_000
-"""Delay (ns) between the last frame of a scan and the search for noisy and drifting wires. Solving comes
-first, because applications wait for the fields of all patches at the same time.
+"""Delay (ns) between the last frame of a scan and the search for noisy and drifting wires. Solving has
+priority, because applications are waiting for the fields of all patches.
 """
 
 
@@ -45,7 +45,7 @@ class StreamStats:
     """Counters of a patch's scans.
 
     Every assembled scan counts as ``offered``, ``withheld`` or ``partial``. Every offered scan ends as
-    ``solved``, ``failed`` or ``skipped``; up to two are still in progress.
+    ``solved``, ``failed`` or ``skipped``; up to two may still be in progress.
     """
 
     frames: int
@@ -118,7 +118,7 @@ class StreamOptions:
     has been called with all earlier scans, so a replay gives the same verdicts as the host.
     """
     watch: Callable[[Scan], None] = _ignore
-    """Function called with each assembled scan, delayed by :data:`WATCH_AFTER_NS` or until the next scan."""
+    """Function called with each assembled scan after :data:`WATCH_AFTER_NS`, or at the next scan."""
     partial: Partial = "pass"
     """Treatment of incomplete scans: ``pass`` or ``withhold``."""
     under_way: bool = False
@@ -128,8 +128,8 @@ class StreamOptions:
 class PatchStream:
     """Stream of one patch's scans, from received frames to published fields.
 
-    Scans are withheld until :meth:`resume` sets a solver. An exception during decoding or solving costs only
-    the current scan.
+    Scans are withheld until :meth:`resume` sets a solver. If decoding or solving raises an exception, only
+    the current scan is lost.
 
     Threads: any thread may call :meth:`settled` and :meth:`stats`. The other public methods are for the
     mainline only.

@@ -107,7 +107,7 @@ class Subscription:
                     except queue.Empty:
                         await arrived.wait()
         except TimeoutError:
-            if not limit.expired():  # not a timeout here: the error that stopped the host
+            if not limit.expired():  # the error that stopped the host is a TimeoutError
                 raise
             raise queue.Empty from None
         finally:
@@ -161,7 +161,7 @@ class Subscription:
         self.close()
 
     def offer(self, item: FieldFrame | End, patch: str) -> None:
-        """Queue an end marker, or a field if its patch is subscribed. Any thread.
+        """Queue a field of a subscribed patch, or an end marker. Any thread.
 
         Never blocks.
         """
@@ -186,8 +186,8 @@ class Subscription:
 class Publisher:
     """Subscriptions of a host, and the newest field of each patch.
 
-    An exception on passing a field to a subscriber is reported to ``defects`` and costs only that subscriber
-    the field.
+    If passing a field to a subscriber raises an exception, only that subscriber loses the field. The
+    exception is reported to ``defects``.
 
     Threads: only workers may publish, one at a time per patch. Any thread may call the other methods.
     """
@@ -213,7 +213,7 @@ class Publisher:
         chosen = self._patches if patch is None else frozenset([patch])
         subscription = Subscription(capacity, timeout_s, chosen)
         key = next(self._keys)
-        # No lock: setting and removing an item of a dict are atomic, and readers copy the dict.
+        # No lock is needed: setting and removing an item of a dict are atomic, and readers copy the dict.
         forget = self._subscriptions
         self._subscriptions[key] = weakref.ref(subscription, lambda _: forget.pop(key, None))
         if self._last is not None:
@@ -233,7 +233,7 @@ class Publisher:
     def publish(self, field: FieldFrame, patch: str) -> None:
         """Pass a field to its subscribers. Never blocks.
 
-        Reserved for the worker that is processing the patch.
+        Only the worker that is processing the patch may call this method.
         """
         self._latest[patch] = field
         self._offer(field, patch)
@@ -244,7 +244,7 @@ class Publisher:
         return None if self._last is None else self._last.error
 
     def fail(self, error: SkinError) -> None:
-        """Stop the host: every subscription raises ``error`` after its queued fields."""
+        """End every subscription after its queued fields by raising ``error``, because the host has failed."""
         self._last = self._last or End(error)
         self._offer(self._last, "")
 

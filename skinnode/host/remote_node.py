@@ -34,7 +34,7 @@ The search prolongs a failed bring-up by at least twice this time.
 _MUTE_S: Final = 0.4
 _MUTE_SCANS: Final = 5
 """Time without a scan after which the configuration of a node is read back: ``_MUTE_S`` seconds or
-``_MUTE_SCANS`` SYNC periods, whichever is longer. It is short enough for scans to resume within a second.
+``_MUTE_SCANS`` SYNC periods, whichever is longer. This is short enough for scans to resume within a second.
 """
 
 
@@ -61,8 +61,8 @@ class RemoteNode:
         """Whether the hand file forbids sending frames to the node."""
         self.facts: NodeFacts | None = None
         self.boot_ups = 0
-        """Number of boot-up messages up to the start of bring-up. A later boot-up makes another bring-up
-        necessary.
+        """Number of boot-up messages received before bring-up. If another one arrives, bring-up must be
+        repeated.
         """
         self.t_answer_ns = 0
         """Monotonic time (ns) of the newest SDO response."""

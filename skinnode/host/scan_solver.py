@@ -81,7 +81,7 @@ def tracker_options(
         patch: Configuration of the patch.
         config: Settings of the solver.
         relative_noise: Standard deviation of a resistance, relative to the resistance.
-        baseline_ohm: Resistances at rest, (U, K), ohm; None if not known yet.
+        baseline_ohm: (U, K) resistances at rest, ohm; None if not known yet.
     """
     calibration = patch.calibration
     return TrackerOptions(

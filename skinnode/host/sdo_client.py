@@ -4,7 +4,7 @@ The SDO client of the canopen package blocks the calling thread until the mainli
 through :meth:`SkinNetwork.notify`. It sets no limit to the length or the duration of a transfer, so a faulty
 node could exhaust the memory or block a thread forever. This module adds both limits.
 
-Threads: one thread at a time per node. Different nodes may be accessed in parallel.
+Threads: only one thread at a time may access a node. Different nodes may be accessed in parallel.
 """
 
 from __future__ import annotations
@@ -152,11 +152,11 @@ class RemoteOd:
         return True
 
     def read_bytes(self, index: int, subindex: int, most: int = MAX_TEXT_BYTES) -> bytes:
-        """Return the undecoded value of an object, of at most ``most`` bytes."""
+        """Return the undecoded value (at most ``most`` bytes) of an object."""
         return bytes(self._transfer(index, subindex, "read", lambda: self._upload(index, subindex, most)))
 
     def read_block(self, index: int, most: int = MAX_UPLOAD_BYTES) -> bytes:
-        """Return a long value, of at most ``most`` bytes, by block transfer with CRC."""
+        """Return a long value (at most ``most`` bytes) by block transfer with CRC."""
 
         def ask() -> bytes:
             with BlockUpload(self._client, index) as stream:  # type: ignore[no-untyped-call]
@@ -258,7 +258,7 @@ class RemoteOd:
         """Read a stream to its end.
 
         Raises SdoCommunicationError if the data and the announced size differ in length, _UploadTooLong if
-        the data exceed ``most`` bytes or the transfer its time limit, and Abandoned if ``abandoned`` returns
+        the data exceed ``most`` bytes or the transfer takes too long, and Abandoned if ``abandoned`` returns
         True.
         """
         if stream.size is not None and stream.size > most:

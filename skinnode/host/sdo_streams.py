@@ -112,7 +112,7 @@ class BlockUpload(BlockUploadStream):
 
     canopen 2.4 requests a late segment twice and drops the first response. After a pause longer than
     canopen's timeout, the CRC is therefore wrong. A segment with a wrong sequence number is requested only
-    once, so this class turns a late segment into one of those.
+    once, so this class presents a late segment as one with a wrong sequence number.
     """
 
     def read(self, size: int = -1) -> bytes:

@@ -18,7 +18,7 @@ JOIN_DEADLINE_S: Final = 1.0
 """Time limit (s) for the first SDO response, and for the tare, of a node that has sent a frame."""
 
 LEAST_NS: Final = 300_000_000
-"""Minimum time (ns) between successive bring-ups of a node, in case it restarts in a loop."""
+"""Minimum time (ns) between two bring-ups of a node that restarts in a loop."""
 
 
 class Phase(enum.StrEnum):
@@ -87,7 +87,7 @@ class Supervised:
     rejoins: int = 0
     failures: int = 0
     baseline_ohm: Float | None = None
-    """Baseline used by the solver, (U, K), ohm; None before the first bring-up."""
+    """(U, K) baseline used by the solver, ohm; None before the first bring-up."""
     announced: bool = False
     """Whether the node has announced a baseline that the solver does not use yet."""
     baselines: int = 0

@@ -6,7 +6,7 @@ supervision of one node does not depend on the others.
 Fifty times a second, the supervisor's thread evaluates what the mainline has learned about each node, and
 decides what to do. Anything that waits for a node, such as its configuration, runs as a job on a thread pool.
 A node has at most one job at a time. The supervisor's thread also collects the results of the jobs, so that
-its state belongs to one thread.
+no other thread accesses its state.
 
 =========  ========================================  =========================================
 phase      meaning                                   next phase

@@ -1,4 +1,4 @@
-"""Produce SYNC with a counter and without drift, or follow the SYNC of another producer."""
+"""Produce SYNC with a counter at a drift-free rate, or follow the SYNC of another producer."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class SyncStats:
 
 
 class Ticks:
-    """Newest SYNC for each counter value.
+    """Record of the newest SYNC for each counter value.
 
     Threads: the thread that sends or follows SYNC writes; the mainline reads.
     """
@@ -98,7 +98,7 @@ class SyncProducer:
     """Producer of SYNC on one or more buses, simultaneous or staggered, until :meth:`close`.
 
     The counter runs from 1 to its overflow value (CiA 301, 0x1019). SYNC number n + 1 is due n periods after
-    the first SYNC. A thread that is a whole period late skips that period, so that two SYNC messages are
+    the first SYNC. If the thread is a whole period late, it skips that period, so that two SYNC messages are
     never sent in quick succession. A SYNC that has been sent on one bus is sent on the others too.
 
     Threads: a dedicated thread sends the SYNC messages.
@@ -174,7 +174,7 @@ class SyncProducer:
             self._wait(due_ns)
             now_ns = clock.monotonic_ns()
         self._latest_ns = max(self._latest_ns, now_ns - due_ns)
-        # store the time before sending, because a scan that arrives needs it
+        # store the time before sending: scans are matched with it as soon as they arrive
         payload = bytes([ticks.note(self._number, now_ns)])
         send(SYNC_COB_ID, payload)
 

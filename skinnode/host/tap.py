@@ -26,7 +26,7 @@ class HostTap(StreamTap, Protocol):
 class ContainedTap:
     """Wrapper that keeps the exceptions of a tap from affecting the host.
 
-    An exception is reported to ``defects`` and costs only the current entry of the recording.
+    An exception is reported to ``defects``. Only the current entry of the recording is lost.
     """
 
     def __init__(self, tap: HostTap, defects: Defects) -> None:

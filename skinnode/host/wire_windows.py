@@ -1,7 +1,7 @@
 """Detect noisy and drifting wires, and measure the noise of the codes.
 
-Both tests evaluate windows of ``WINDOW`` successive scans. A wire is reported once it has been noisy, or
-drifting, in ``WINDOWS`` consecutive windows.
+The tests for noise and drift evaluate windows of ``WINDOW`` successive scans. A wire is reported once it has
+been noisy, or drifting, in ``WINDOWS`` consecutive windows.
 
 **Noise.** The noise power of a wire is estimated from the second differences of its codes over time, which
 vanish for a steady change. A wire is noisy if its noise power exceeds ``NOISY`` times the expected noise
@@ -48,7 +48,7 @@ _SHOWN: Final = 8
 
 
 class WireWindows:
-    """Detector of noise and drift in the wires of one patch. Owned by the mainline.
+    """Detector of noise and drift in the wires of one patch. Used only by the mainline.
 
     Args:
         scale: Mapping of R/R0 to codes.
@@ -155,8 +155,8 @@ def _of_wires(
 ) -> NDArray[np.float64]:
     """Reduce the values of the crossings on each wire to one value; NaN if none was measured.
 
-    NaN in ``values`` marks a crossing that was not measured. Without NaN, ``plain`` does the reduction, which
-    takes a tenth of the time of ``without_nan``.
+    NaN in ``values`` marks a crossing that was not measured. If there is no NaN, ``plain`` replaces
+    ``without_nan``, because it takes a tenth of the time.
     """
     if not np.isnan(values).any():
         return np.asarray(plain(values, axis=axis))

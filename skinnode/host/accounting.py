@@ -1,4 +1,4 @@
-"""Check that the counters of a host add up, that is, that every frame and scan is accounted for.
+"""Check that the counters of a host add up: every frame and every scan must be accounted for.
 
 The counters of a running host are read one after another, so the sums agree only if the host is idle or
 closed.

@@ -20,9 +20,9 @@ _DOUBT_NS: Final = 2_000_000_000
 """Minimum interval (ns) between reads of a baseline that may have changed unannounced."""
 
 _REGISTER_NS: Final = 500_000_000
-"""Minimum interval (ns) between reads of a nonzero error register. With these reads, a patch is operational
-again within a second after its error, even if the EMCY message that clears the error is lost. They cost four
-SDO frames per second.
+"""Minimum interval (ns) between reads of a nonzero error register. With these reads, a patch is reported as
+operational within a second after its error has ended, even if the EMCY message that clears the error is lost.
+The reads take four SDO frames per second.
 """
 
 

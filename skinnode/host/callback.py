@@ -116,7 +116,7 @@ class Callbacks:
         return callback
 
     def join(self) -> None:
-        """Wait for all callbacks to end. Their subscriptions must have been ended before."""
+        """Wait for all callbacks to end. Call only after their subscriptions have ended."""
         for callback in self._all:
             callback.join()
 

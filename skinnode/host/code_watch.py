@@ -3,7 +3,7 @@
 Before a scan is solved, :meth:`CodeWatch.judge` compares its codes with the previous ones, which takes about
 5 µs. The resulting :class:`Verdict` says:
 
-- whether the converter's state permits trusting the field (:mod:`skinnode.host.converter_liveness`),
+- whether the field can be trusted, given the converter's state (:mod:`skinnode.host.converter_liveness`),
 - which frozen crossings are left out of the solve (:mod:`skinnode.host.frozen_parts`),
 - which wires are open or shorted.
 
@@ -40,7 +40,7 @@ class Verdict:
     distrust: str = ""
     """Human-readable reason not to trust the field of the scan; empty if there is none."""
     faults: tuple[DataFault, ...] = ()
-    """Frozen patch, wires and crossings, and open and shorted wires."""
+    """Faults found: frozen patch, frozen wires and crossings, open and shorted wires."""
     left_out: NDArray[np.bool_] | None = None
     """(U, K) mask of the crossings to leave out of the solve; None if there are none."""
 
@@ -170,7 +170,7 @@ class CodeWatch:
     def on_scan(self, scan: Scan) -> None:
         """Add a scan to the search for noisy and drifting wires.
 
-        :meth:`judge` must have been called with the scan before.
+        Call :meth:`judge` with the same scan first.
         """
         if scan.complete and not scan.flags & _CHANGED_ONLY:
             self._windows.on_scan(scan)

@@ -14,7 +14,9 @@ from skinnode.process import clock
 from skinnode.text.words import counted
 
 _CHECK_S: Final = 0.05
-"""Interval (s) between health checks. A shorter change may appear only in the counters."""
+"""Interval (s) between health checks. A change that lasts less than the interval may appear only in the
+counters.
+"""
 
 _QUIET_NS: Final = 1_000_000_000
 """Minimum interval (ns) between events for the same counter."""
@@ -90,7 +92,7 @@ class HealthWatch:
     def _turn(self) -> bool:
         """Wait for the next check and carry it out. Return False after the last check.
 
-        A check that raises an exception is repeated. This may publish an event twice but misses none.
+        A check that raises an exception is repeated, so an event may be published twice but is never missed.
         """
         if self._ended:
             return False
@@ -143,7 +145,7 @@ class HealthWatch:
         self._compare_counters(name, before, now, _PATCH_COUNTERS)
 
     def _compare_frozen_parts(self, name: str, before: PatchHealth, now: PatchHealth) -> None:
-        """Publish which frozen wires and crossings have been left out of the solve or used again."""
+        """Publish an event when a frozen wire or crossing is left out of the solve or used again."""
         was, are = (
             {each.place: each for each in health.faults if _is_frozen_part(each)} for health in (before, now)
         )

@@ -16,8 +16,7 @@ from skinnode.config import BusConfig
 _log = logging.getLogger(__name__)
 
 QUIET_NS: Final = 10_000_000_000
-"""Time (ns) without frames of one type from another master after which the next such frame is logged again.
-"""
+"""Minimum gap (ns) between two frames of one type from other masters for the second to be logged."""
 
 SYNC, NMT, SDO, HEARTBEAT = "SYNC", "NMT commands", "SDO requests to the hand's nodes", "the host's heartbeat"
 

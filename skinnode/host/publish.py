@@ -244,7 +244,7 @@ class Publisher:
         return None if self._last is None else self._last.error
 
     def fail(self, error: SkinError) -> None:
-        """End every subscription after its queued fields by raising ``error``, because the host has failed."""
+        """Make every subscription raise ``error`` after its queued fields, because the host has failed."""
         self._last = self._last or End(error)
         self._offer(self._last, "")
 

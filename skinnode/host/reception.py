@@ -25,8 +25,8 @@ from skinnode.protocol.profile import PatchProfile
 from skinnode.protocol.scan import Scan
 
 LEAST_GRACE_NS: Final = 5_000_000
-"""Minimum time (ns) to wait for the summary of a scan after its last chunk. The host also waits at least half
-a SYNC period, because the chunks of all patches take precedence on the bus.
+"""Minimum time (ns) to wait for the summary of a scan after its last chunk. The host waits at least half a
+SYNC period, because the chunks of all patches take precedence over the summary on the bus.
 """
 
 

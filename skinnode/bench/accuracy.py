@@ -50,8 +50,8 @@ def run(scenes: int, rounds: int) -> dict[str, Any]:
 def requirements(figures: dict[str, Any]) -> list[dict[str, Any]]:
     """Return one row per requirement: its name, the measured value, the limit as text, and whether it is met.
 
-    Limits on execution times are marked ``absolute``. They depend on the machine, so missing one does not
-    make the benchmark fail.
+    Limits on execution times are marked ``absolute``. Execution times depend on the machine, so exceeding
+    such a limit does not make the benchmark fail.
     """
     found = []
     for row in figures["noise"]:

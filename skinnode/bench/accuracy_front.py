@@ -2,7 +2,7 @@
 
 All solvers call the same compiled functions for the potential F and its Jacobian J. The samples are
 noise-free, and every solver starts from rest. Only the four middle upper wires are solved, where the press is
-deepest. Some runs solve only the last sample. The others solve a sequence of samples, each from the solution
+deepest. Some runs solve only the last sample. Other runs solve a sequence of samples, each from the solution
 of the previous one, as in the paper (:mod:`skinnode.bench.path`). Each solver is run with several tolerances,
 and each run yields one data point. Only the time of ``solve_path`` includes setting up the patch, following
 the path and estimating the error.
@@ -30,8 +30,8 @@ from skinnode.solve.wires.problem import PatchProblem
 
 SCENES: Final = (("staggered", 0.5, 0.3), ("staggered", 1.0, 0.3), ("aligned", 0.5, 0.1))
 """Scenes as (preset, layer height in pitches, press depth divided by the layer height). Every solver can
-solve the first press from rest. The second requires intermediate samples. The third uses the paper's
-layout."""
+solve the first press from rest. The second press requires intermediate samples. The third press uses the
+paper's layout."""
 TOLERANCES: Final = (1e-4, 1e-7, 1e-10, 1e-13)
 SAMPLES: Final = (1, 5, 10, 20)
 SOLVED: Final = 0.01
@@ -79,7 +79,7 @@ def scene_of(name: str, height: float, depth: float) -> Scene:
 
 
 def _timed_us(call: Callable[[], object]) -> float:
-    """Return the shortest of up to seven call times (µs), which other programs have delayed least."""
+    """Time up to seven calls; return the shortest time (µs), which other programs have affected least."""
     times: list[float] = []
     while len(times) < REPEATS and sum(times) < LONG_S:
         start = time.perf_counter()

@@ -1,4 +1,4 @@
-"""Measures the error against noise, code width and layout, and checks the standard deviations.
+"""Measures how noise, code width and layout affect the error, and checks the standard deviations.
 
 Each scene consists of four frames, which a tracker solves in sequence from rest. Only the last frame is
 scored. Errors and standard deviations are RMS values over the coordinates of all converged wires in all
@@ -112,7 +112,7 @@ class Parts:
         """Return a row of statistics for each interval of b / (n + b), the prior's share of the variance.
 
         A row contains the RMS, the quantiles and the kurtosis of error / √(n + b), the RMS that noise alone
-        would cause, and the ratio of observed to predicted prior variance.
+        would cause, and the ratio of the observed to the predicted variance due to the prior.
         """
         if not self._error:
             return []
@@ -224,7 +224,7 @@ class Follower:
         self._solvers = {name: methods.solver_of(self.case, name) for name in METHODS}
 
     def last(self, taken: Stream) -> dict[str, FieldFrame]:
-        """Solve a stream with each method; return the field of the last frame for each of them."""
+        """Solve a stream with each method; return the field of the last frame, keyed by method."""
         return {
             name: methods.fields(self.case, name, solver, taken)[-1] for name, solver in self._solvers.items()
         }

@@ -43,7 +43,7 @@ class Case:
     """Methods known to fail in this case (see ``docs/limits.md``). Their wrong results are reported but do
     not make the benchmark fail."""
     model_error: float = 0.0
-    """Relative error of the predicted resistance change ΔR, a solver option."""
+    """Solver option: relative error of the predicted resistance change ΔR."""
     tolerances: Tolerances | None = None
     """Manufacturing tolerances passed to the solver; None for the solver's default."""
 

@@ -1,7 +1,7 @@
 """Hard cases 14 to 16 of ``skinnode bench stability``: wrong data, imperfect patches and wide touches.
 
 The data of case 14 are wrong but not marked invalid. Only wires that are CONVERGED and trusted must be
-accurate. The case is limited to trackers, the only solvers that test their input. A tracker receives
+accurate. Case 14 is limited to trackers, the only solvers that test their input. A tracker receives
 resistances, not codes, so it cannot recognise a frozen wire by its repeated codes; the host does
 (:mod:`skinnode.host.frozen_parts`).
 """

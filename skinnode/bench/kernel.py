@@ -24,8 +24,8 @@ from skinnode.solve.operators.work import LIMIT, Work, workspace
 from skinnode.solve.wires.problem import PatchProblem
 
 SHORT: Final = 1e-3
-"""Trust radius, pitches per coordinate. It is much smaller than a Newton step, so that every operator must
-shorten its step."""
+"""Trust radius, pitches per coordinate. The radius is much smaller than a Newton step, so that every operator
+must shorten its step."""
 
 
 class NumpyWire:
@@ -120,7 +120,7 @@ def compiled_steps(  # noqa: PLR0913 - a kernel takes its buffers
 ) -> None:
     """Take one step for every wire from ``start`` (U, n), with the functions that make up the solver loop.
 
-    The loop itself would compute a second step before checking its step limit.
+    The loop itself is not timed, because it would compute a second step before checking its step limit.
     """
     for u in range(start.shape[0]):
         for j in range(w.x.size):

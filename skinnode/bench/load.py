@@ -1,9 +1,9 @@
 """Generates load for ``skinnode bench pipeline``: a child process replays the frames of simulated nodes.
 
 The nodes run the code of ``skinnode node`` on simulated patches. Whenever the simulated bus is free, the
-pending frame with the lowest identifier wins arbitration. It occupies the bus for the duration of its bits,
-including stuff bits. The resistances come from the simulator, because those of the solver's own model would
-be unrealistically easy to solve.
+pending frame with the lowest identifier wins arbitration. The frame occupies the bus for the duration of its
+bits, including stuff bits. The resistances come from the simulator, because those of the solver's own model
+would be unrealistically easy to solve.
 """
 
 from __future__ import annotations
@@ -36,8 +36,8 @@ from vcan_sim.scene import Scene
 from vcan_sim.sensor import SimulatedPatch
 
 TICK_S: Final = 0.25e-3
-"""Polling interval of the sender, s. On a fully loaded bus, about two frames fall due in each interval. They
-are sent together, as a USB adapter would send them."""
+"""Polling interval of the sender, s. On a fully loaded bus, about two frames fall due in each interval.
+Frames that are due together are sent together, as by a USB adapter."""
 LEAD_S: Final = 0.5
 """Delay between the call of :meth:`Generator.begin` and the first SYNC, s."""
 _BEAT_S: Final = 0.1
@@ -81,7 +81,7 @@ class Generator:
         self._receive()
 
     def send_heartbeats(self, buses: Sequence[str]) -> None:
-        """Start sending the heartbeats of the patches on ``buses``, by which a host detects the patches."""
+        """Start sending the heartbeats of the patches on ``buses``, from which a host detects the patches."""
         self._pipe.send(list(buses))
 
     def begin(self) -> int:

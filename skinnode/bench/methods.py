@@ -24,7 +24,7 @@ Method = Callable[[Stream], Solved]
 
 
 def set_up(case: Case, name: str) -> Method:
-    """Set up the method ``name`` for ``case``. It resets its solver before each stream."""
+    """Set up the method ``name`` for ``case``. The method resets its solver before each stream."""
     if last_only(name):
         return functools.partial(_path, case, name.removeprefix("path "))
     solver = solver_of(case, name)

@@ -5,20 +5,20 @@ press. A sphere with a radius of 6 to 12 mm presses into the rubber at a random 
 patch. The displacement is Hertz's closed-form solution with friction. A press consists of 1000 samples; a
 path of n steps uses n of them, evenly spaced.
 
-The paper counts calls of the potential function F. It approximates each Jacobian by finite differences, which
-takes 30 additional calls. Our code evaluates F and an analytic Jacobian J together, at about twice the cost
-of F alone. One such evaluation replaces 31 calls, so our counts are multiplied by 31 for comparison. As in
-the paper, the number of calls per step is averaged over all samples except the last. The accuracy is the
-relative error ‖X − X*‖ / ‖X* − X(0)‖, averaged over the experiments that converged. The first-order
-optimality ‖Jᵀr‖∞ refers to the dimensionless residual r = a F − 1, with lengths in pitches. The paper's
-values come from MATLAB: they are larger by a factor of F² and depend on the unit of length, which the paper
-does not state.
+The paper counts calls of the potential function F. The paper approximates each Jacobian by finite
+differences, which takes 30 additional calls. Our code evaluates F and an analytic Jacobian J together, at
+about twice the cost of F alone. One joint evaluation replaces 31 calls, so our counts are multiplied by 31
+for comparison. As in the paper, the number of calls per step is averaged over all samples except the last.
+The accuracy is the relative error ‖X − X*‖ / ‖X* − X(0)‖, averaged over the experiments that converged. The
+first-order optimality ‖Jᵀr‖∞ refers to the dimensionless residual r = a F − 1, with lengths in pitches. The
+paper's values come from MATLAB: they are larger by a factor of F² and depend on the unit of length, which the
+paper does not state.
 
 At the paper's press depth of 10 %, our Gauss-Newton solved every experiment on ``aligned``, for layer heights
-h from 0.3 to 1 pitch and any number of steps. At this depth, the benchmark therefore uses the hardest of
-these layouts, h = 1. The setting with h = 0.7 and a depth of 30 % was chosen because Gauss-Newton fails there
-as often as in the paper: in 6 of 10 experiments with 5 steps, in 2 with 10 steps, and in none with 20 or
-more.
+h from 0.3 to 1 pitch and any number of steps. For a depth of 10 %, the benchmark therefore uses the hardest
+of these layouts, with h = 1. The setting with h = 0.7 and a depth of 30 % was chosen because Gauss-Newton
+fails there as often as in the paper: in 6 of 10 experiments with 5 steps, in 2 with 10 steps, and in none
+with 20 or more.
 """
 
 from __future__ import annotations
@@ -442,7 +442,7 @@ def _print_operators(setting: dict[str, Any], paper: dict[str, Any], count: int,
                 f"  {_accuracy(own, count)}"
             )
     say(
-        f"table cells that our path solver solved completely and more accurately than the paper: {better} of "
+        f"table cells in which our solver never failed and was more accurate than the paper: {better} of "
         f"{len(LABELS) * len(STEPS)}"
     )
 

@@ -36,8 +36,8 @@ CLASSIC_MS: Final = 50
 """SYNC period with classic CAN, ms. Four patches send 101 frames each per period, 8,080 frames/s in all."""
 FD_MS: Final = 25
 STAGGER_MS: Final = 3.0
-"""Offset between the SYNCs of successive buses in staggered scenes, ms. It lets the host solve the four
-patches of one bus before the scans of the next bus are complete."""
+"""Offset between the SYNCs of successive buses in staggered scenes, ms. The offset lets the host solve the
+four patches of one bus before the scans of the next bus are complete."""
 SCENES: Final = (
     (False, True, 0.0),
     (False, True, STAGGER_MS),

@@ -4,7 +4,8 @@ A simulated hand has four patches per bus, and spheres press on some of its patc
 time, so that every patch sends every scan even on a slow machine. The simulated buses take account of the
 duration of each frame. CPU time is read from the CPU clock of each thread: node threads count as simulator,
 all other threads as host. A bus has no thread of its own. When all threads wait, the last one to wait
-simulates the bus. The CPU time of the bus is measured separately and subtracted from that of this thread.
+simulates the bus. The CPU time of the bus is measured separately and subtracted from that of the thread that
+simulated it.
 """
 
 from __future__ import annotations
@@ -97,7 +98,7 @@ def measure(patches: int, touched: int, scans: int, *, changed_only: bool = Fals
             clock.sleep(scans * PERIOD_MS * 1e-3)
             real_s = time.perf_counter() - start
             fields = _solved(host) - solved
-            for bus in segments:  # measuring its CPU time slows the bus, so this is left to a second run
+            for bus in segments:  # measuring the CPU time of a bus slows it down, hence the second run
                 bus.cpu_ns = Counter()
             before = _cpu_ns(segments)
             clock.sleep(scans * PERIOD_MS * 1e-3)

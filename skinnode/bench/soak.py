@@ -4,9 +4,9 @@ The host and the simulated nodes run in one process and communicate over two vir
 one to three kinds of fault, such as dropped frames, into one or all patches, while subscribers join and
 leave. In some rounds, child processes also keep all processors busy. At the end of a round, the faults are
 removed. The next round starts when every patch is operational and publishes fields again. Memory use is
-measured twice, without faults: after a warm-up and at the end. It comprises the resident memory and the
-number of blocks allocated by Python (:func:`sys.getallocatedblocks`), which reveals even a leak of one object
-per scan. This module imports the simulator to inject the faults.
+measured twice, without faults: after a warm-up and at the end. The test measures the resident memory and the
+number of blocks allocated by Python (:func:`sys.getallocatedblocks`). The number of blocks reveals even a
+leak of one object per scan. This module imports the simulator to inject the faults.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ RESIDENT_MB: Final = 8.0
 increases are normal."""
 BACK_S: Final = 15.0
 """Time limit for the recovery of all patches after a round, s. Recovery normally takes less than a second,
-but longer on a loaded machine."""
+but can take longer on a loaded machine."""
 SLOW_S: Final = 1.0
 """Recovery time above which a round is reported as slow, s."""
 STARVED: Final = 0.1
@@ -63,7 +63,7 @@ TARED: Final = 0.2
 CALM_S: Final = 1.5
 _PATCHES: Final = 4
 _MANY: Final = 8
-"""Number of faults per round at and above which the report gives their number instead of their names."""
+"""Minimum number of faults in a round for which the report gives their number, not their names."""
 
 _KINDS: Final[tuple[dict[str, Any], ...]] = (
     {"lost": 0.05},

@@ -12,7 +12,8 @@ from typing import Final
 
 CACHE_ENVIRONMENT: Final = "SKINNODE_CACHE_DIR"
 _DAMAGED: Final = 4
-"""Number of cache files to damage. It is small, because recompiling a kernel takes up to a few seconds."""
+"""Number of cache files to damage. The number is small, because recompiling a kernel can take a few
+seconds."""
 _COMPILE_S: Final = 600.0
 """Time limit for compiling all kernels on a slow machine, s."""
 

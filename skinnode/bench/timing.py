@@ -1,4 +1,4 @@
-"""Times functions on a shared machine: they take turns, and ratios are taken within each round."""
+"""Times functions that take turns on a shared machine, and computes ratios within each round."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ burst of background load."""
 
 @dataclass(frozen=True)
 class Timing:
-    """Median time of a call (µs), and median of its ratio to the first function in the same round."""
+    """Median time per call (µs), and median ratio of this time to that of the first function in the round."""
 
     call_us: float
     ratio: float

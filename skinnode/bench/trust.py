@@ -46,9 +46,9 @@ SHORT: Final[dict[str, Any]] = {
 }
 """Options for a short run of :func:`run`."""
 WATCHED: Final = 4000
-"""Number of scans in a stream that counts false alarms; it contains ten touches."""
+"""Number of scans in a stream in which false alarms are counted; it contains ten touches."""
 QUIET: Final = Timeline(rest=200, press=10, hold=30, slide=40, release=10, after=110)
-"""Timeline of a touch in a stream that counts false alarms."""
+"""Timeline of a touch in a stream in which false alarms are counted."""
 PAIRED: Final = Timeline(rest=9, press=6, hold=7, slide=6, release=4, after=6)
 """Timeline of a stream with two faults. The phases are short, because there are many such streams."""
 
@@ -77,7 +77,7 @@ def items(seed: int, *, pairs: int = PAIRS, hours: float = 0.1, settings: Sequen
     Args:
         seed: Seed for choosing the fault pairs.
         pairs: Number of streams with two faults.
-        hours: Total length of the streams that count false alarms, patch-hours.
+        hours: Total length of the streams in which false alarms are counted, patch-hours.
         settings: Layouts and noise levels.
     """
     found = [Item("healthy", load, setting, load) for load in LOADS for setting in settings]
@@ -198,7 +198,7 @@ def run(  # noqa: PLR0913 - options of a command
     Args:
         seed: Seed of all streams.
         pairs: Number of streams with two faults.
-        hours: Total length of the streams that count false alarms, patch-hours.
+        hours: Total length of the streams in which false alarms are counted, patch-hours.
         only: Substrings of the names of the sections and rows to run; default: all.
         settings: Layouts and noise levels; default: all.
         jobs: Number of processes that solve streams in parallel; the results do not depend on this number.

@@ -1,7 +1,7 @@
 """Faults for ``skinnode bench trust``, applied to arrays of readings and codes.
 
-The faults include every simulator fault that changes values. Each is applied at the stage at which it occurs
-in a real patch:
+The faults include every simulator fault that changes values. Each fault is applied at the stage at which it
+occurs in a real patch:
 
 made    deviation of the patch from its layout, present when the baseline is measured
 wired   wiring, before the converter adds noise
@@ -37,7 +37,7 @@ InPlace = Callable[[Signal], None]
 
 @dataclass(frozen=True, eq=False)
 class Fault:
-    """A fault, which each stream places at a random location and time."""
+    """A fault, at a random location and time in each stream."""
 
     name: str
     made: Callable[[Skin, np.random.Generator], Skin] | None = None

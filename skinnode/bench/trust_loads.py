@@ -31,7 +31,7 @@ LINES: Final = 16
 WAVES: Final = 1500
 """Number of wave numbers at which Hankel transforms are sampled."""
 WAVE_MAX: Final = 60.0
-"""Maximum product of wave number and contact radius. Higher wave numbers contribute 1e-4 of Hertz's
+"""Maximum product of wave number and contact radius. Higher wave numbers contribute only 1e-4 of Hertz's
 pressure."""
 
 _UNKNOWN: Final = np.full(3, np.nan)

@@ -94,9 +94,9 @@ HEAD: Final = (
 LEGEND: Final = (
     "trusted: fraction of fields that are trusted. beyond 5: fraction of trusted coordinates whose error\n"
     "exceeds 5 reported standard deviations. worst: largest such error, in standard deviations.\n"
-    "named: fraction of streams in which the fault was identified. scans: median number of scans until\n"
-    "then. then: fraction of trusted fields from then on. false: faults reported for correct readings.\n"
-    "contacts: fraction of trusted fields with the right number of contacts.\n"
+    "named: fraction of streams in which the fault was identified. scans: median number of scans until it\n"
+    "was identified. then: fraction of trusted fields from that scan on. false: faults reported for correct\n"
+    "readings. contacts: fraction of trusted fields with the right number of contacts.\n"
     "force: fraction of contact forces within 5 standard deviations."
 )
 

@@ -20,7 +20,7 @@ METHODS: Final = ("exact, no tests", "exact", "posterior")
 
 
 def rows(seed: int) -> list[dict[str, Any]]:
-    """Solve the same streams with each method; return the times and errors of each in a row."""
+    """Solve the same streams with each method; return one row of times and errors per method."""
     times: dict[str, list[float]] = {name: [] for name in METHODS}
     errors: dict[str, list[float]] = {name: [] for name in METHODS}
     worst = dict.fromkeys(METHODS, 0.0)

@@ -2,9 +2,9 @@
 
 Displacements are closed-form solutions for rigid spheres on rubber
 (:class:`skinnode.model.elastic.HertzContact`), which need neither grid nor prior. :class:`Skin` computes the
-resistances. Unlike the solver's model, it can have electrodes of finite size, strain-dependent resistivity, a
-different layer height, or a contact resistance in series. :class:`Converter` adds noise and quantises the
-readings to codes.
+resistances. Unlike the solver's model, a skin can have electrodes of finite size, strain-dependent
+resistivity, a different layer height, or a contact resistance in series. :class:`Converter` adds noise and
+quantises the readings to codes.
 """
 
 from __future__ import annotations
@@ -23,7 +23,8 @@ from skinnode.protocol.codes import CodeScale, decode, encode
 
 RUBBER: Final = Rubber()
 EXACT_NOISE: Final = 1e-9
-"""Relative noise passed to a tracker for noise-free data. It determines the tolerance of the solver."""
+"""Relative noise passed to a tracker for noise-free data. This noise determines the tolerance of the
+solver."""
 RING: Final = 4
 """Number of points on the rim of a finite electrode. The potential between two electrodes is the mean over
 all 16 pairs of points."""
@@ -59,8 +60,8 @@ class Press:
     depth_m: float
     traction_ratio: tuple[float, float] = (0.0, 0.0)
     shear_only: bool = False
-    """Whether only the tangential traction acts. Its displacement is that of a contact with friction minus
-    that of a frictionless contact."""
+    """Whether only the tangential traction acts. The displacement is then that of a contact with friction
+    minus that of a frictionless contact."""
 
     def contacts(self, share: float) -> tuple[tuple[int, HertzContact], ...]:
         """Return the closed-form solutions to superpose, each with its sign (+1 or −1)."""
@@ -228,7 +229,7 @@ class Converter:
 
     @property
     def relative_std(self) -> float:
-        """Relative standard deviation of a reading at rest, which the solver is given as the noise."""
+        """Relative standard deviation of a reading at rest, passed to the solver as the noise."""
         if self.exact:
             return EXACT_NOISE
         rounding = (self.hi - self.lo) / ((1 << self.bits) - 4) / math.sqrt(12.0) if self.bits else 0.0

@@ -19,8 +19,8 @@ row violates each condition with a probability of 1e-4.
   counts seeds, not coordinates, because only seeds are independent.
 
 If too many seeds have an error above 5 standard deviations, every wire with such an error is wrong. With
-exact data, nothing is left to chance: the limit is 5 reported standard deviations or 1e-6 of the wire's
-largest displacement, whichever is larger.
+exact data, no error is attributed to chance: the limit is 5 reported standard deviations or 1e-6 of the
+wire's largest displacement, whichever is larger.
 """
 
 from __future__ import annotations

@@ -111,7 +111,7 @@ def _scatter(axes: Any, rows: list[dict[str, Any]]) -> None:
 
 
 def _list(axes: Any, wrong: list[dict[str, Any]], most: int) -> None:
-    """Write a list of the rows with the largest errors as text."""
+    """Write the rows with the largest errors as text."""
     axes.axis("off")
     worst = sorted(wrong, key=lambda row: -row["wrong"] / row["wires"])
     lines = [named(row) for row in worst[:most]]

@@ -1,4 +1,4 @@
-"""Simulator that runs the patches of a hand as CANopen nodes, pressed by simulated bodies.
+"""Simulator of a hand: its patches, touched by simulated bodies, run as CANopen nodes.
 
 ::
 
@@ -6,11 +6,11 @@
         -> faulty_node (node with faults) -> faulty_scans (scan faults) -> fleet (all nodes and buses)
         -> commands (vcan-sim)
 
-The module ``scene`` generates random strokes, and ``scenes`` reads scene files. For scene files, ``contact``
-computes the contact mechanics of a bonded layer, independently of all models in ``skinnode``. ``smooth``
-defines smooth ramps. ``virtual_time`` provides a clock that jumps from event to event. ``timed_bus``
-simulates a CAN bus with bit times, arbitration, error frames and error counters. ``timed_interface`` provides
-access to this bus through python-can, and ``trace`` records the frames on this bus. ``pytest_plugin`` and
-``testing`` provide fixtures and helpers for tests of other programs. ``faults`` declares the faults,
-``injector`` draws and counts faults, and ``tally`` counts frames by kind.
+``scene`` generates random strokes, and ``scenes`` plays scene files. For the latter, ``contact`` computes the
+contact mechanics of a bonded layer, independently of the models in ``skinnode``. ``smooth`` contains motion
+profiles. ``virtual_time`` is a clock that jumps from event to event. ``timed_bus`` simulates a CAN bus with
+bit times, arbitration, error frames and error counters. ``timed_interface`` makes this bus available to
+python-can, and ``trace`` records its frames. ``pytest_plugin`` and ``testing`` contain fixtures and helpers
+for the tests of other programs. ``faults`` declares the faults, ``injector`` draws and counts them, and
+``tally`` counts frames by kind.
 """

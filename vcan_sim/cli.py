@@ -1,7 +1,6 @@
 """Entry point of ``vcan-sim``.
 
-The commands are defined in :mod:`vcan_sim.commands`. The exit statuses are defined in
-:mod:`skinnode.cli._exit_status`.
+:mod:`vcan_sim.commands` defines the commands, and :mod:`skinnode.cli._exit_status` the exit statuses.
 """
 
 from __future__ import annotations
@@ -13,7 +12,7 @@ from skinnode.cli._exit_status import main_of
 
 
 def main(argv: Sequence[str] | None = None) -> NoReturn:
-    """Run ``vcan-sim`` with the arguments ``argv``; default: the command-line arguments of the process."""
+    """Run ``vcan-sim`` with the arguments ``argv``; default: those of the process."""
     main_of("vcan_sim.commands._app", argv)
 
 

@@ -15,10 +15,10 @@ Ts = TypeVarTuple("Ts")
 
 
 def run(main: Coroutine[Any, Any, T]) -> T:
-    """Run a coroutine like :func:`asyncio.run`, with the thread's clock: the system clock or a virtual clock.
+    """Run a coroutine like :func:`asyncio.run`, in real or virtual time according to the clock of the thread.
 
-    In virtual time, the event loop waits only for timers and for callbacks from other threads. Sockets and
-    pipes are polled in each iteration, but the event loop does not wait for them.
+    In virtual time, the event loop waits only for timers and callbacks from other threads. It polls sockets
+    and pipes in each iteration, without waiting for them.
 
     Args:
         main: Coroutine to run.
@@ -32,14 +32,14 @@ def run(main: Coroutine[Any, Any, T]) -> T:
 
 
 class VirtualEventLoop(asyncio.SelectorEventLoop):
-    """Event loop for a thread that runs in virtual time."""
+    """Event loop of a thread in virtual time."""
 
     def __init__(self) -> None:
         self._woken = clock.event()
         super().__init__(_Selector(self._woken.wait, self._woken.clear))
 
     def time(self) -> float:
-        """Return the time of the thread's monotonic clock, s."""
+        """Return the monotonic time of the thread, s."""
         return clock.monotonic()
 
     def call_soon_threadsafe(
@@ -52,7 +52,7 @@ class VirtualEventLoop(asyncio.SelectorEventLoop):
 
 
 class _Selector(selectors.DefaultSelector):
-    """Selector that waits for an event, instead of waiting for file descriptors."""
+    """Selector that waits for an event instead of file descriptors."""
 
     def __init__(self, wait: Callable[[float | None], bool], clear: Callable[[], None]) -> None:
         super().__init__()

@@ -1,4 +1,4 @@
-"""Thread that starts and ends a scene's faults at the scheduled scene times."""
+"""Thread that starts and ends the faults of a scene on schedule."""
 
 from __future__ import annotations
 
@@ -14,25 +14,25 @@ class FaultPlayer:
 
     Args:
         schedule: Faults of the scene and their times.
-        faults: Current faults of the fleet, which the thread changes.
+        faults: Faults of the fleet, which the thread changes.
     """
 
     def __init__(self, schedule: FaultSchedule, faults: FleetFaults) -> None:
         self._schedule, self._faults = schedule, faults
         self._inbox = clock.queue()
-        """Queue for the monotonic start time of the scene, ns; None stops the thread."""
+        """Queue that receives the start of the scene (monotonic time, ns), or None to stop the thread."""
         self._active: tuple[TimedFault, ...] = ()
         self._thread = clock.thread(self._run, "faults of the scene")
 
     def start(self) -> None:
-        """Start the thread, which waits for the scene to begin."""
+        """Start the thread. It waits for :meth:`begin`."""
         self._thread.start()
 
     def begin(self, origin_ns: int) -> None:
-        """Begin the schedule. This method must be called only once.
+        """Begin the schedule. Call this method only once.
 
         Args:
-            origin_ns: Monotonic time (ns) that corresponds to scene time 0.
+            origin_ns: Monotonic time of scene time 0, ns.
         """
         self._inbox.put(origin_ns)
 
@@ -59,7 +59,7 @@ class FaultPlayer:
         self._inbox.get()
 
     def _follow(self, t_s: float) -> None:
-        """Start and end the faults that are scheduled for scene time ``t_s``."""
+        """Start and end the faults that are due at scene time ``t_s``."""
         before, self._active = self._active, self._schedule.active(t_s)
         ended = [each for each in before if each not in self._active]
         started = [each for each in self._active if each not in before]

@@ -15,17 +15,17 @@ CLOSE_S: Final = 1e-9
 
 @dataclass(frozen=True, slots=True)
 class TimedFault:
-    """Faults of one patch or bus, with their start and end times."""
+    """Faults of one patch or bus that start and end together."""
 
     number: int
-    """Index of the fault among the scene's ``[[faults]]`` tables."""
+    """Index of the ``[[faults]]`` table in the scene file."""
     place: str
     """Name of the faulty patch or bus."""
     on_bus: bool
     from_s: float
-    """Scene time at which the fault starts, s."""
+    """Scene time at which the faults start, s."""
     to_s: float
-    """Scene time at which the fault ends, s; infinity if the fault does not end."""
+    """Scene time at which the faults end, s; inf if they last until the end of the simulation."""
     values: Mapping[str, Value] = field(hash=False)
     """Values of the faults, by name."""
 
@@ -39,10 +39,10 @@ class FaultSchedule:
     """Period of the scene, s; None if the scene plays once."""
 
     def active(self, t_s: float) -> tuple[TimedFault, ...]:
-        """Return the faults that are active at a scene time, in the order of the scene file.
+        """Return the faults active at a scene time, in the order of the scene file.
 
         Args:
-            t_s: Scene time, s. No faults are active at negative scene times.
+            t_s: Scene time, s. At negative scene times, no faults are active.
         """
         if t_s < -CLOSE_S:
             return ()
@@ -50,7 +50,7 @@ class FaultSchedule:
         return tuple(each for each in self.faults if each.from_s - CLOSE_S <= at_s < each.to_s - CLOSE_S)
 
     def next_change_s(self, t_s: float) -> float | None:
-        """Return the next scene time (s) at which any fault starts or ends; None if there is no such time.
+        """Return the next scene time (s) at which a fault starts or ends; None if there is none.
 
         Args:
             t_s: Current scene time, s.
@@ -63,7 +63,7 @@ class FaultSchedule:
         return (t_s - at_s) + min(later) if later else None
 
     def _within(self, t_s: float) -> float:
-        """Return the time (s) in the first period of the scene that corresponds to ``t_s``."""
+        """Return the scene time (s) that corresponds to ``t_s`` in the first period of the scene."""
         if self.repeat_s is None:
             return t_s
         at_s = math.fmod(max(t_s, 0.0), self.repeat_s)

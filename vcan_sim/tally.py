@@ -1,4 +1,4 @@
-"""Counts of frames by kind, to compare the frames of a simulated node with those that a host receives."""
+"""Counts of frames by kind, for comparison of simulated nodes with the host that receives them."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _BOOT_UP_DATA: Final = bytes((NmtState.INITIALISING,))
 
 
 class Kind(enum.StrEnum):
-    """Kind of a frame, determined by its COB-ID in the predefined connection set (CiA 301, 7.3.3)."""
+    """Kind of a frame, which follows from its COB-ID in the predefined connection set (CiA 301, 7.3.3)."""
 
     NMT = "NMT"
     SYNC = "SYNC"
@@ -55,7 +55,7 @@ _KIND_OF_ID: Final = [
 def kind_of(can_id: int, data: bytes, remote: bool = False) -> Kind:
     """Return the kind of a frame with an 11-bit identifier.
 
-    Remote frames are a separate kind. The COB-ID determines the kind even if the frame has the wrong length.
+    Remote frames are a kind of their own. The length of a frame does not matter.
     """
     if remote:
         return Kind.REMOTE
@@ -64,7 +64,7 @@ def kind_of(can_id: int, data: bytes, remote: bool = False) -> Kind:
 
 
 class Tally:
-    """Counts of one node's frames, by kind.
+    """Counts of the frames of one node, by kind.
 
     For sent frames, ``handed = emitted + lost + silenced + refused + waiting``. For received frames,
     ``heard = taken + lost_in + unheard``.
@@ -80,9 +80,9 @@ class Tally:
         self.silenced: Counter[Kind] = Counter()
         """Frames not sent because the node was silent, unplugged or being reset."""
         self.refused: Counter[Kind] = Counter()
-        """Frames that the bus refused."""
+        """Frames that the bus rejected."""
         self.waiting: Counter[Kind] = Counter()
-        """Chunks that are held back by faults that delay or reorder chunks."""
+        """Chunks held back by the faults ``late`` and ``reordered``."""
         self.heard: Counter[Kind] = Counter()
         """Frames that reached the node's controller."""
         self.taken: Counter[Kind] = Counter()
@@ -93,7 +93,7 @@ class Tally:
         """Frames not received because the node was deaf or unplugged."""
 
     def discrepancies(self) -> list[str]:
-        """Return one line of text for each kind of frame with inconsistent counts.
+        """Return a description of each kind of frame whose counts are inconsistent.
 
         Call this method only while the node is idle.
         """

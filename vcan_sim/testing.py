@@ -1,4 +1,4 @@
-"""Functions for waiting in tests, in virtual time or real time."""
+"""Waiting in tests, in virtual or real time."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ def eventually(
     """Wait until a condition is true.
 
     Args:
-        condition: Function without arguments. Its result is interpreted as true or false.
+        condition: Function without arguments that returns a true or false value.
         within_s: Maximum wait, s.
-        every_s: Time between two calls of ``condition``, s.
+        every_s: Interval between calls of ``condition``, s.
         what: Description of the condition, for the error message.
 
     Raises:
@@ -32,13 +32,13 @@ def eventually(
 
 @contextmanager
 def within(seconds: float) -> Iterator[None]:
-    """Check that a ``with`` block takes no longer than a maximum duration; the block is not interrupted.
+    """Check that a ``with`` block ends in time. The check comes at the end and does not interrupt the block.
 
     Args:
         seconds: Maximum duration, s.
 
     Raises:
-        AssertionError: If the block takes longer.
+        AssertionError: If the block takes longer than ``seconds``.
     """
     begin_s = clock.monotonic()
     yield

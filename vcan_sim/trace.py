@@ -14,14 +14,14 @@ from vcan_sim.timed_bus import CanFrame, Delivered, Event
 from vcan_sim.timed_interface import Segment
 
 _POLL_S: Final = 0.05
-"""Maximum time to wait for the next frame, s."""
+"""Maximum wait for the next frame, s."""
 
 _LAST_FRAMES: Final = 10_000
-"""Maximum number of frames that a listener reads after it has been told to stop."""
+"""Maximum number of frames that a listener still reads after it has been told to stop."""
 
 
 class Trace:
-    """Recorder of all subsequent frames on a timed bus, with the time at which each frame ends.
+    """Recorder of the frames on a timed bus from now on. The time stamp of a frame is its end.
 
     Args:
         of: Bus to record.
@@ -49,13 +49,13 @@ class Trace:
 
 
 class Listener:
-    """Recorder of all frames on a bus during a ``with`` block. It opens its own endpoint on the bus.
+    """Recorder of the frames on a bus during a ``with`` block, through an endpoint of its own.
 
     Args:
         bus: Bus to record.
-        write: Function that is called with each line of the trace, in the listener's thread. By default, the
-            lines are stored for :meth:`text`.
-        channel: Channel name in the trace; default: the channel of the bus.
+        write: Function called with each line of the trace, in the thread of the listener; by default, lines
+            are kept for :meth:`text`.
+        channel: Name of the channel in the trace; default: the channel of the bus.
 
     Raises:
         BusError: If the bus cannot be opened.
@@ -94,7 +94,7 @@ class Listener:
                 return
 
     def _record(self, timeout_s: float) -> bool:
-        """Record the next frame, and return whether a frame was received."""
+        """Record the next frame, and return whether there was one."""
         try:
             frame = self._port.recv(timeout_s)
         except BusError:

@@ -10,22 +10,22 @@ from typer.core import TyperGroup
 from vcan_sim.commands import inject, list_scenes, replay, run
 
 DEFAULT: Final = "run"
-"""Command that runs if no command is named."""
+"""Command to run if none is named."""
 _OF_GROUP: Final = ("-h", "--help", "--install-completion", "--show-completion")
 
 
 class _Group(TyperGroup):
-    """Group of commands in which the name of the default command may be omitted."""
+    """Command group in which the name of the default command may be omitted."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Parse the arguments, after adding the name of the default command if no command is named."""
+        """Parse the arguments, after inserting the default command if none is named."""
         completes_first_word = ctx.resilient_parsing and not args
         if not completes_first_word and (not args or args[0] not in (*self.commands, *_OF_GROUP)):
             args = [DEFAULT, *args]
         return super().parse_args(ctx, args)
 
     def shell_complete(self, ctx: Any, incomplete: str) -> Any:
-        """Return completions for the first word: commands, and options of the default command."""
+        """Return completions of the first word: commands, and options of the default command."""
         own, of_default = (
             super().shell_complete(ctx, incomplete),
             self.commands[DEFAULT].shell_complete(ctx, incomplete),

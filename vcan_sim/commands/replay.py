@@ -56,7 +56,7 @@ def replay(
 def _buses(
     trace: Path, hand: Path | None, interface: str | None, channel: str | None
 ) -> dict[str, BusConfig]:
-    """Return the bus to use for each channel in a trace.
+    """Return the bus on which to replay each channel of a trace.
 
     Raises:
         ConfigError: If the hand has no bus for a channel, or the trace has several channels and no hand is

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from vcan_sim.scenes import SceneConfig
 
 _WARN_AGAIN_S = 10.0
-"""Minimum time between warnings about a busy machine, s."""
+"""Minimum interval between warnings about a busy machine, s."""
 
 
 def run(  # noqa: PLR0913 - Typer derives a command's options from its arguments
@@ -129,7 +129,7 @@ def _preview(hand: HandConfig, scene: Path | None, plot: Path) -> None:
 def _watch(
     fleet: Fleet, wait: Callable[[float], bool], seconds: float | None, poll: Callable[[], None]
 ) -> None:
-    """Print a status line per second until ``wait`` returns True, ``seconds`` pass or a thread fails."""
+    """Print one status line per second until ``wait`` returns True, ``seconds`` pass or a thread fails."""
     start = clock.monotonic()
     before = fleet.report()
     silent_until_s = 0.0
@@ -158,7 +158,7 @@ def _progress(elapsed_s: float, before: Sequence[NodeReport], now: Sequence[Node
 
 
 def _too_slow(before: Sequence[NodeReport], now: Sequence[NodeReport]) -> str:
-    """Return a warning if scans were skipped because this machine was too busy; otherwise an empty string."""
+    """Return a warning if this machine was too busy for all scans; otherwise, return ""."""
     steps = list(zip(before, now, strict=True))
     skipped = sum(new.slow_overruns - old.slow_overruns for old, new in steps)
     if not skipped:
@@ -181,7 +181,7 @@ def _summary(reports: Sequence[NodeReport]) -> str:
 
 
 def _injected(fleet: Fleet) -> list[str]:
-    """Return the counts of injected faults: one line per patch, and one per bus that had faults."""
+    """Return the counts of injected faults, one line per patch and per bus with faults."""
     lines = []
     for place, counts in fleet.counts().items():
         shown = ", ".join(f"{count} {name}" for name, count in counts.items())
@@ -192,7 +192,7 @@ def _injected(fleet: Fleet) -> list[str]:
 
 @contextmanager
 def _recorded(fleet: Fleet, scene: SceneConfig | None, folder: Path | None) -> Iterator[Callable[[], None]]:
-    """Record the fleet in ``folder``, if given; yield a function that must be called once per second."""
+    """Record the fleet in ``folder``, if given. Yields a function to be called once per second."""
     if folder is None:
         yield lambda: None
         return
@@ -204,7 +204,7 @@ def _recorded(fleet: Fleet, scene: SceneConfig | None, folder: Path | None) -> I
 
 @contextmanager
 def _controlled(fleet: Fleet) -> Iterator[None]:
-    """Open the control socket for `vcan-sim inject`; if this is impossible, print a note."""
+    """Open the control socket for `vcan-sim inject`. If this is impossible, print a note."""
     from vcan_sim.control import ControlError, ControlServer
 
     with ExitStack() as entered:

@@ -1,4 +1,4 @@
-"""Scenes defined in files: rigid bodies press on a hand's patches, and slide, roll or turn while in contact.
+"""Scenes from files: rigid bodies press on the patches of a hand, and slide, roll or turn in contact.
 
 ::
 
@@ -8,9 +8,9 @@
         -> response (displacement of the electrodes) -> patch (state at any time) -> truth
     faults (checks with the hand) -> vcan_sim.fault_schedule
 
-The contact mechanics are computed in :mod:`vcan_sim.contact`, which shares no code with the solvers. The skin
-is undeformed before and after each touch. Each touch is computed at fixed time steps, always from its start.
-The state at a given time therefore does not depend on which times are requested, or in which order.
+:mod:`vcan_sim.contact`, which shares no code with the solvers, computes the contact mechanics. The skin is
+undeformed before and after each touch. A touch is always computed from its start, at fixed time steps, so the
+state at a given time does not depend on which times are requested, or in which order.
 """
 
 from vcan_sim.scenes.bind import bind_scene, load_scene

@@ -1,4 +1,4 @@
-"""Apply a scene to a hand: check the touches on each patch, and create one :class:`PatchScene` per patch."""
+"""Application of a scene to a hand: checks of the touches, and a :class:`PatchScene` for each patch."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ from vcan_sim.scenes.touch_checks import check_apart, check_on_patch, error_at, 
 
 
 def load_scene(path: Path | str, hand: HandConfig) -> SceneConfig:
-    """Read a scene file, and check that a given hand can play the scene.
+    """Read a scene file, and check that a hand can play it.
 
     Args:
         path: Scene file.
         hand: Hand whose patches the scene touches.
 
     Raises:
-        ConfigError: If the file cannot be read, is not a scene, or contains a touch or fault that is
-            impossible for the hand. The message states the file, line and column of the error.
+        ConfigError: If the file cannot be read, is not a valid scene, or contains a touch or fault that is
+            impossible on the hand. The message gives the file, line and column of the error.
     """
     scene = read_scene(path)
     bind_scene(scene, hand)
@@ -35,7 +35,7 @@ def load_scene(path: Path | str, hand: HandConfig) -> SceneConfig:
 
 
 def bind_scene(scene: SceneConfig, hand: HandConfig) -> dict[str, PatchScene]:
-    """Return a mapping from patch name to scene, for all patches of a hand including untouched patches.
+    """Return the scene of each patch of a hand, by patch name, including untouched patches.
 
     Args:
         scene: Scene of the hand.
@@ -57,12 +57,12 @@ def bind_scene(scene: SceneConfig, hand: HandConfig) -> dict[str, PatchScene]:
 def layer_of(skin: SkinConfig, patch: PatchConfig, layout: PatchLayout) -> Layer:
     """Return the elastic layer of a patch.
 
-    Values in the scene file override those in the hand file.
+    Values of the scene file override those of the hand file.
 
     Args:
         skin: The scene file's ``[skin]`` table.
         patch: The patch in the hand file.
-        layout: Layout of the patch. The default thickness is the height of the upper electrodes.
+        layout: Layout of the patch. The height of its upper electrodes is the default thickness.
     """
     calibration = patch.calibration
     return Layer(

@@ -1,4 +1,4 @@
-"""Convert a scene's ``[[faults]]`` tables to a fault schedule, and check that the faults are possible."""
+"""Fault schedule of a scene, from its ``[[faults]]`` tables, with checks against the hand."""
 
 from __future__ import annotations
 
@@ -16,20 +16,20 @@ from vcan_sim.faults import NO_FAULTS, OF_WIRES, check_wires
 from vcan_sim.scenes.tables import FaultConfig, SceneConfig
 
 _WIRE: Final = re.compile(r"(?P<patch>.+) (?P<side>upper|lower) (?P<number>\d{1,4})")
-"""Pattern for the name of a wire in the key ``where``, such as ``palm upper 3``."""
+"""Name of a wire in the key ``where``, such as ``palm upper 3``."""
 
 
 def schedule_of(scene: SceneConfig, hand: HandConfig) -> FaultSchedule:
-    """Return the schedule of a scene's faults.
+    """Return the fault schedule of a scene.
 
     Args:
         scene: Scene with faults.
-        hand: Hand with the patches and buses named by the faults.
+        hand: Hand with the patches and buses that the faults name.
 
     Raises:
-        ConfigError: If a fault names a patch, a wire or a bus that the hand does not have, is unknown or out
-            of range, or contradicts a simultaneous fault. The message states the file, line and column of
-            the error.
+        ConfigError: If a fault is unknown or out of range, names a patch, a wire or a bus that the hand does
+            not have, or contradicts a simultaneous fault. The message gives the file, line and column of the
+            error.
     """
     found = []
     for i, fault in enumerate(scene.faults):
@@ -59,7 +59,7 @@ def _timed(number: int, fault: FaultConfig, hand: HandConfig, repeat_s: float | 
 
 
 def _place_and_text(fault: FaultConfig, hand: HandConfig) -> tuple[str, bool, str]:
-    """Return the name of the faulty patch or bus, whether it is a bus, and the fault as a string."""
+    """Return the faulty patch or bus, whether it is a bus, and the fault in text form."""
     patches, buses = [patch.name for patch in hand.patches], [bus.name for bus in hand.buses]
     if fault.where in patches:
         return fault.where, False, fault.fault
@@ -77,7 +77,7 @@ def _place_and_text(fault: FaultConfig, hand: HandConfig) -> tuple[str, bool, st
 
 
 def _check_alone(scene: SceneConfig, late: TimedFault, earlier: list[TimedFault]) -> None:
-    """Raise ConfigError if an earlier ``[[faults]]`` table sets the same fault at an overlapping time."""
+    """Raise ConfigError if an earlier ``[[faults]]`` table sets the same fault at the same time."""
     for early in earlier:
         same = early.place == late.place and early.on_bus == late.on_bus and early.values.keys() & late.values
         if same and early.from_s < late.to_s and late.from_s < early.to_s:
@@ -90,7 +90,7 @@ def _check_alone(scene: SceneConfig, late: TimedFault, earlier: list[TimedFault]
 def _check_together(
     schedule: FaultSchedule, late: TimedFault, hand: HandConfig, shapes: dict[str, tuple[int, int]]
 ) -> None:
-    """Raise ConfigError if a fault contradicts other faults that are active when it starts."""
+    """Raise ConfigError if a fault contradicts those that are active when it starts."""
     values: dict[str, Any] = {}
     for each in schedule.active(late.from_s):
         if (each.place, each.on_bus) == (late.place, late.on_bus):
@@ -105,7 +105,7 @@ def _check_together(
 
 
 def _with_place(scene: SceneConfig, number: int, error: ConfigError) -> ConfigError:
-    """Return a copy of an error that also states where the fault is defined in the scene file."""
+    """Return a copy of an error that also gives the position of the fault in the scene file."""
     key = f"faults[{number}].{'where' if error.key == 'where' else 'fault'}"
     shown = error.key.removeprefix("fault").strip()
     allowed = f"{shown}: {error.allowed}" if shown and error.key != "where" else error.allowed

@@ -1,4 +1,4 @@
-"""Named scenes that are shipped with the simulator."""
+"""Scenes shipped with the simulator."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ _FOLDER: Final = Path(__file__).with_name("shipped")
 
 
 def shipped_scenes() -> dict[str, Path]:
-    """Return a mapping from the names of the shipped scenes to their files."""
+    """Return the files of the shipped scenes, by name."""
     return {path.stem: path for path in sorted(_FOLDER.glob("*.toml"))}
 
 
 def scene_file(scene: Path) -> Path:
-    """Return the path of a scene file, given the path or the name of a shipped scene.
+    """Return the path of a scene file.
 
     Args:
-        scene: Path of a scene file, or name of a scene shipped with the simulator.
+        scene: Path of the file, or name of a shipped scene. An existing file takes precedence.
     """
     return scene if scene.exists() else shipped_scenes().get(str(scene), scene)

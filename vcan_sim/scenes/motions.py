@@ -12,7 +12,7 @@ from vcan_sim.scenes.tables import MotionConfig, TouchConfig
 from vcan_sim.smooth import ease, glide
 
 _EVERY_S = 0.5
-"""Default time between two consecutive targets of a random walk, s."""
+"""Default interval between the targets of a random walk, s."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -20,12 +20,12 @@ class Pose:
     """Pose of a body at one instant.
 
     Attributes:
-        place_m: Position (x, y) of the body's lowest point in the patch frame, metres.
-        slid_m: Distance (x, y) by which the body's surface has slid along the skin since the touch began,
-            metres. Rolling does not change this distance.
+        place_m: Position (x, y) of the lowest point of the body in the patch frame, metres.
+        slid_m: Displacement (x, y) of the body along the skin since the touch began, excluding rolling,
+            metres.
         yaw_rad: Rotation about z, rad.
-        level: Depth (m) of a depth-controlled touch, or normal force (N) of a force-controlled touch; 0
-        without contact.
+        level: Depth (m) of a depth-controlled touch, or normal force (N) of a force-controlled one; 0 without
+            contact.
     """
 
     place_m: tuple[float, float]
@@ -35,10 +35,10 @@ class Pose:
 
 
 def pose_at(touch: TouchConfig, t_s: float) -> Pose:
-    """Return the pose of a touch's body at a given scene time.
+    """Return the pose of the body at a given scene time.
 
     Args:
-        touch: Touch whose body moves.
+        touch: Touch that the body performs.
         t_s: Scene time, s.
     """
     x, y = touch.at_m
@@ -63,14 +63,14 @@ def pose_at(touch: TouchConfig, t_s: float) -> Pose:
 
 
 def highest_level(touch: TouchConfig) -> float:
-    """Return the maximum normal force (N) of a force-controlled touch, or the maximum depth (m) otherwise."""
+    """Return the maximum normal force (N) or depth (m) of a touch, whichever controls it."""
     levels = [touch.force_n if touch.by_force else touch.depth_m]
     levels += [motion.force_n if touch.by_force else motion.depth_m for motion in touch.motions]
     return max(level for level in levels if level is not None)
 
 
 def yaws_rad(touch: TouchConfig) -> tuple[float, ...]:
-    """Return yaw angles (rad) that cover the rotation during a touch in steps of at most 0.25 rad."""
+    """Return yaw angles (rad) that span the rotation during a touch, at most 0.25 rad apart."""
     turned = sum(abs(motion.by_rad or 0.0) for motion in touch.motions)
     if not turned:
         return (touch.yaw_rad,)
@@ -78,7 +78,7 @@ def yaws_rad(touch: TouchConfig) -> tuple[float, ...]:
 
 
 def _way_m(motion: MotionConfig, share: float, t_s: float) -> tuple[float, float]:
-    """Return a body's displacement (x, y) along the skin in metres since the motion began."""
+    """Return the displacement (x, y) since a motion began, metres."""
     if motion.kind == "walk":
         return _walked_m(motion, t_s)
     way_x, way_y = motion.by_m or (0.0, 0.0)
@@ -88,9 +88,9 @@ def _way_m(motion: MotionConfig, share: float, t_s: float) -> tuple[float, float
 
 
 def _walked_m(motion: MotionConfig, t_s: float) -> tuple[float, float]:
-    """Return the displacement (x, y) of a random walk in metres.
+    """Return the displacement (x, y) of a random walk, metres.
 
-    The motion between consecutive targets follows a minimum-jerk profile.
+    Between targets, the body follows a minimum-jerk profile.
     """
     targets = _targets_m(motion)
     elapsed = min(max(t_s, motion.from_s), motion.to_s) - motion.from_s
@@ -103,9 +103,9 @@ def _walked_m(motion: MotionConfig, t_s: float) -> tuple[float, float]:
 
 @functools.lru_cache(maxsize=256)
 def _targets_m(motion: MotionConfig) -> tuple[tuple[float, float], ...]:
-    """Return the targets (x, y) of a random walk in metres, uniformly distributed in a disc.
+    """Return the targets (x, y) of a random walk relative to its start, metres.
 
-    The disc has the radius ``reach_m`` and is centred on the start of the walk.
+    They are distributed uniformly over a disc of radius ``reach_m``. The first target is the start itself.
     """
     count = max(1, round((motion.to_s - motion.from_s) / (motion.every_s or _EVERY_S)))
     random = np.random.default_rng(1 if motion.seed is None else motion.seed)

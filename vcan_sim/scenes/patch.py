@@ -1,9 +1,9 @@
-"""Scene of one patch: state of the skin at any time, interpolated between the time steps of the touches.
+"""Skin of one patch in a scene, interpolated between the time steps of the touches.
 
-The state at a given time is the mean of the four nearest time steps, weighted by the uniform cubic B-spline
-(de Boor, A Practical Guide to Splines, 1978, chapter IX). The weights are positive and sum to 1. The mean is
-therefore physically consistent: its pressure is not negative, its shear traction does not exceed the friction
-limit, and its displacement is the layer's response to its tractions. All quantities are twice continuously
+The state at a given time is the mean of the four nearest time steps, with the weights of a uniform cubic
+B-spline (de Boor, A Practical Guide to Splines, 1978, chapter IX). The weights are nonnegative and sum to 1,
+so the mean is physically consistent: pressure is nonnegative, shear traction stays within the friction limit,
+and the displacement is the response of the layer to the tractions. All quantities are twice continuously
 differentiable in time. Motions shorter than four time steps are smoothed.
 """
 
@@ -29,9 +29,9 @@ class PatchScene:
     """Skin of one patch in a scene, as returned by :func:`vcan_sim.scenes.bind_scene`.
 
     Attributes:
-        layout: Layout of the patch at rest. The upper electrodes are on the surface of the elastic layer; a
-            curved skin is treated as its projection onto the x-y plane.
-        simulation: Simulation settings, with the seed and noise of the converter.
+        layout: Layout of the patch at rest, with the upper electrodes on the surface of the elastic layer.
+            Curved skin is projected onto the x-y plane.
+        simulation: Simulation settings, such as the seed and noise of the converter.
         number: Number of the patch in the hand.
         step_s: Time step of the contact mechanics, s.
         repeat_s: Period of the scene, s; None if the scene plays once.
@@ -47,13 +47,13 @@ class PatchScene:
 
     @property
     def end_s(self) -> float:
-        """End time (s) of the last touch on this patch; 0 if no body touches the patch."""
+        """Scene time at which the last touch ends, s; 0 without touches."""
         return max((history.touch.to_s for history in self.histories), default=0.0)
 
     def upper_m(self, t_s: float) -> Float:
-        """Return the positions (U, N, 3) of the upper electrodes in metres.
+        """Return the positions (U, N, 3) of the upper electrodes, metres.
 
-        At rest, the method returns ``layout.upper_m`` itself.
+        At rest, the result is ``layout.upper_m`` itself.
 
         Args:
             t_s: Scene time, s.
@@ -68,7 +68,7 @@ class PatchScene:
         return np.asarray(self.layout.upper_m + moved.reshape(self.layout.upper_m.shape))
 
     def truth(self, t_s: float) -> PatchTruth:
-        """Return the patch's ground truth at scene time ``t_s``.
+        """Return the ground truth of the patch.
 
         Args:
             t_s: Scene time, s.
@@ -82,19 +82,17 @@ class PatchScene:
         return PatchTruth(t_s, moved.reshape(self.layout.upper_m.shape), tuple(contacts), wrench)
 
     def prepare(self, until_s: float = math.inf) -> None:
-        """Compute the time steps of all touches in advance.
-
-        Without this call, each time step is computed when it is first needed.
+        """Compute the time steps of all touches in advance, rather than on demand.
 
         Args:
-            until_s: Scene time up to which the touches are computed, s.
+            until_s: End of the computed part of the scene, s.
         """
         for history in self.histories:
             if history.touch.from_s < until_s:
                 history.step(min(history.last, math.ceil(min(until_s / self.step_s, history.last))))
 
     def _touching(self, t_s: float) -> Iterator[tuple[History, Weighted]]:
-        """Yield each touch with contact near ``t_s``, and its time steps with their weights."""
+        """Yield the touches in contact around ``t_s``, with their weighted time steps."""
         t_s = t_s if self.repeat_s is None or t_s < 0.0 else math.fmod(t_s, self.repeat_s)
         low = math.floor(t_s / self.step_s)
         weights = _spline(t_s / self.step_s - low)
@@ -108,7 +106,7 @@ class PatchScene:
 
 
 def _spline(share: float) -> tuple[float, float, float, float]:
-    """Return the cubic B-spline weights of four time steps, at a time between the second and third step."""
+    """Return the cubic B-spline weights of four time steps, at ``share`` between the second and third."""
     s, rest = share, 1.0 - share
     cube, other = s * s * s / 6.0, rest * rest * rest / 6.0
     second = 2.0 / 3.0 - s * s * (1.0 - 0.5 * s)
@@ -116,7 +114,7 @@ def _spline(share: float) -> tuple[float, float, float, float]:
 
 
 def _contact(history: History, steps: Weighted) -> BodyContact:
-    """Return the weighted mean of several time steps of a touch, in a window that covers all their cells."""
+    """Return the weighted mean of time steps of a touch, in a window that covers their cells."""
     firsts = np.array([step.first for _, step in steps])
     low = firsts.min(axis=0)
     size = (firsts - low).max(axis=0) + np.array(steps[0][1].traction_pa.shape[1:])

@@ -1,6 +1,6 @@
-"""Plot a preview of a scene: force of each body over time, and pressure at maximum depth.
+"""Preview plot of a scene: the force of each body over time, and the pressure at maximum depth.
 
-This module requires matplotlib.
+Requires matplotlib.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ def write_plot(scene: SceneConfig, hand: HandConfig, file: Path) -> None:
     Args:
         scene: Scene to plot.
         hand: Hand whose patches the scene touches.
-        file: Image file to write; its suffix determines the format.
+        file: Image file. Its suffix selects the format.
 
     Raises:
         ConfigError: If the scene has no touches, a touch is impossible on its patch, or the file cannot be
@@ -64,7 +64,7 @@ def _depth_m(truth: PatchTruth) -> float:
 
 
 def _forces(axes: Any, times_s: Any, truths: list[PatchTruth], colours: dict[str, str]) -> None:
-    """Plot each body's normal force and shear force over time."""
+    """Plot the normal and shear forces of each body over time."""
     present = {contact.body for truth in truths for contact in truth.contacts}
     for body, colour in colours.items():
         if body not in present:
@@ -80,7 +80,7 @@ def _forces(axes: Any, times_s: Any, truths: list[PatchTruth], colours: dict[str
 
 
 def _pressures(axes: Any, patch: PatchScene, truth: PatchTruth, colours: dict[str, str]) -> Any:
-    """Plot the pressure of all contacts at one instant, and the electrodes. Return the pressure image."""
+    """Plot the electrodes and the pressure of all contacts at one instant, and return the pressure image."""
     highest_kpa = 1e-3 * max(float(contact.pressure_pa.max()) for contact in truth.contacts)
     image = None
     for contact in truth.contacts:

@@ -1,7 +1,7 @@
-"""Shapes of rigid bodies, as the height of the body's surface above its lowest point.
+"""Shapes of rigid bodies, given by the height of the lower surface.
 
-A shape is a function from positions (…, 2) in the body frame, metres, to heights (…,), metres. The body's
-lowest point has height 0; where no part of the body is above the skin, the height is inf.
+A shape is a function from positions (…, 2) in the body frame, metres, to heights (…,) above the lowest point
+of the body, metres. The height is inf at positions outside the body.
 """
 
 from __future__ import annotations
@@ -19,12 +19,13 @@ Height = Callable[[Float], Float]
 
 @dataclass(frozen=True, slots=True)
 class Shape:
-    """Shape of a rigid body, given by the height of its surface above its lowest point.
+    """Shape of a rigid body.
 
     Attributes:
-        height: Function from positions (…, 2) in the body frame, metres, to heights (…,), metres.
+        height: Function from positions (…, 2) in the body frame to heights (…,) above the lowest point,
+            metres.
         round: Whether the height depends only on the horizontal distance from the lowest point.
-        key: Values that determine the height; shapes with equal keys are equal.
+        key: Values that determine the height. Shapes with equal keys are equal.
     """
 
     height: Height
@@ -32,10 +33,11 @@ class Shape:
     key: tuple[object, ...]
 
     def over(self, places_m: Float, yaw_rad: float) -> Float:
-        """Return the height of the rotated body's surface at given positions.
+        """Return the heights of the rotated body at given positions.
 
         Args:
-            places_m: (…, 2) positions relative to the body's lowest point, in the axes of the patch, metres.
+            places_m: (…, 2) positions relative to the lowest point of the body, along the axes of the patch,
+                metres.
             yaw_rad: Rotation of the body about z, rad.
 
         Returns:
@@ -53,7 +55,7 @@ def ellipsoid(radii_m: tuple[float, float, float], name: str = "ellipsoid") -> S
 
     Args:
         radii_m: Semi-axes along x, y and z, metres, each positive.
-        name: Name of the shape, which is part of its key.
+        name: Name of the shape, the first part of its key.
     """
     rx, ry, rz = radii_m
 
@@ -90,14 +92,14 @@ def punch(radius_m: float, edge_radius_m: float) -> Shape:
 
 
 def box_edge(length_m: float, slope_rad: float, edge_radius_m: float) -> Shape:
-    """Return the shape of a box edge that runs along x and points down, with a flank on each side.
+    """Return the shape of a downward-pointing box edge along x, with a flank on each side.
 
     Args:
         length_m: Length of the edge along x, metres.
         slope_rad: Angle between each flank and the skin, rad.
         edge_radius_m: Rounding radius of the edge, metres.
     """
-    tangent_m = edge_radius_m * math.sin(slope_rad)  # half width of the rounding
+    tangent_m = edge_radius_m * math.sin(slope_rad)  # half width of the rounded part
     tangent_height_m = edge_radius_m * (1.0 - math.cos(slope_rad))
 
     def height(places_m: Float) -> Float:
@@ -126,5 +128,5 @@ def ridge(radius_m: float, length_m: float) -> Shape:
 
 
 def _rounded(distance_m: Float, radius_m: float) -> Float:
-    """Return the height of a circle above its lowest point at a given horizontal distance from this point."""
+    """Return the height of a circle above its lowest point, at a horizontal distance from that point."""
     return np.asarray(radius_m - np.sqrt(np.maximum(radius_m**2 - distance_m**2, 0.0)))

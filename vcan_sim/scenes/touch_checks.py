@@ -1,6 +1,6 @@
-"""Checks of a touch on its patch: depth or force, position, and distance from other touches.
+"""Checks of a touch against its patch: depth or force, position, and distance from other touches.
 
-Checks that do not depend on the patch (keys, times, bodies) are in :mod:`vcan_sim.scenes.tables`.
+Checks that need no patch (keys, times, bodies) are in :mod:`vcan_sim.scenes.tables`.
 """
 
 from __future__ import annotations
@@ -18,18 +18,18 @@ from vcan_sim.scenes.tables import KEY_OF_TRAVEL, SceneConfig, TouchConfig
 from vcan_sim.scenes.window import FRICTION_MARGIN, MARGIN, BodyKey, TooMuch, Window, window_of
 
 DEEPEST: Final = 0.9
-"""Maximum depth of a body, as a fraction of the layer thickness or electrode height, whichever is smaller."""
+"""Maximum depth of a body, as a fraction of the lesser of layer thickness and electrode height."""
 APART: Final = 3.0
-"""Minimum distance between simultaneous contacts on a patch, as a multiple of the layer thickness or of the
-larger contact's half width, whichever is smaller. At this distance or more, the simulator can neglect the
-displacement that one contact causes at another: at most 3 % of the depth for a sphere of radius 40 mm on an
-incompressible layer 2 mm thick."""
+"""Minimum gap between simultaneous contacts on a patch, as a multiple of the layer thickness or of the larger
+contact's half width, whichever is smaller. Contacts are computed independently of each other. At this gap,
+the neglected displacement is at most 3 % of the depth, for a sphere of radius 40 mm on an incompressible
+layer 2 mm thick."""
 
 
 def window_of_touch(
     scene: SceneConfig, number: int, touch: TouchConfig, layer: Layer, layout: PatchLayout
 ) -> Window:
-    """Return the window of cells for a touch. Raises ConfigError if the touch is too deep for the layer."""
+    """Return the window of a touch. Raises ConfigError if the touch is too deep for the layer."""
     most = DEEPEST * min(layer.thickness_m, layout.height_m)
     level, key = highest_level(touch), "force_n" if touch.by_force else "depth_m"
     path = f"touches[{number}].{key}"
@@ -51,7 +51,7 @@ def window_of_touch(
 
 
 def path_of(touch: TouchConfig, step_s: float) -> dict[int, Pose]:
-    """Return the body's pose at each time step of a touch and its repetitions, by step number."""
+    """Return the poses of the body during a touch and its repetitions, by number of the time step."""
     return {
         number: pose_at(each, number * step_s)
         for each in touch.each
@@ -122,5 +122,5 @@ def check_apart(
 
 
 def error_at(scene: SceneConfig, key: str, got: object, allowed: str) -> ConfigError:
-    """Return a ConfigError that states the file, line and column of an invalid value in a scene file."""
+    """Return a ConfigError that gives the file, line and column of an invalid value in a scene."""
     return ConfigError(key, got, allowed, where=scene.where(key))

@@ -19,12 +19,12 @@ class BodyContact:
         centre_m: (2,) centre of pressure in the patch frame, metres.
         area_m2: Area of contact, m².
         depth_m: Depth of the body's lowest point below the undeformed surface, metres.
-        force_n: (3,) force on the skin in the patch frame, N; its z component points into the skin and is
-            negative.
+        force_n: (3,) force on the skin in the patch frame, N. The z component is negative: it points into the
+            skin.
         origin_m: (2,) centre of the first cell, metres.
         cell_m: Side length of a cell, metres.
-        traction_pa: (3, X, Y) tractions on the skin in the patch frame (force per area), Pa. Cells are
-            indexed along x first, then along y.
+        traction_pa: (3, X, Y) tractions on the skin (force per area) in the patch frame, Pa. X and Y number
+            the cells along x and y.
     """
 
     body: str
@@ -38,7 +38,7 @@ class BodyContact:
 
     @property
     def radius_m(self) -> float:
-        """Radius (m) of a circle with the same area as the contact."""
+        """Radius of a circle with the area of the contact, metres."""
         return math.sqrt(self.area_m2 / math.pi)
 
     @property
@@ -55,12 +55,12 @@ class BodyContact:
 
 @dataclass(frozen=True, eq=False)
 class PatchTruth:
-    """Contacts on a patch and displacement of the patch's skin at one instant.
+    """Contacts and displacement of a patch at one instant.
 
     Attributes:
         t_s: Scene time, s.
         displacement_m: (U, N, 3) displacement of the upper electrodes, metres.
-        contacts: Contacts, in the order of the touches in the scene.
+        contacts: Contacts, in the order of touches in the scene.
         wrench: (6,) force on the patch (N), and moment about the origin of the patch frame (N m).
     """
 

@@ -91,7 +91,7 @@ class KernelCache:
 
     def save_overload(self, signature: Any, compiled: Any) -> None:
         """Write the compiled code of ``signature`` to the cache, if possible."""
-        if compiled.lifted or compiled.library.has_dynamic_globals:  # numba's cache excludes these too
+        if compiled.lifted or compiled.library.has_dynamic_globals:  # numba's own cache excludes these, too
             return
         path = self._path(signature, compiled.codegen)
         try:

@@ -73,7 +73,7 @@ def disable(dut: Dut, pdo: Pdo) -> int:
 
 
 def mapped(dut: Dut, pdo: Pdo) -> list[int]:
-    """Read and return the mapping entries of a PDO."""
+    """Read the mapping entries of a PDO."""
     count = dut.sdo.integer(pdo.mapping, 0)
     return [dut.sdo.integer(pdo.mapping, subindex) for subindex in range(1, count + 1)]
 

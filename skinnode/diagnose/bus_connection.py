@@ -83,7 +83,7 @@ class BusConnection:
         return self._remotes[node_id]
 
     def abandon(self) -> None:
-        """Make the SDO transfers of all threads end by raising Abandoned."""
+        """End the SDO transfers of all threads; each transfer raises Abandoned."""
         self._abandoned.set()
 
     def wait_until(self, condition: Callable[[], object], within_s: float) -> bool:

@@ -168,10 +168,10 @@ def _examine(
 
 
 def _asked(question: Callable[[], Answer]) -> tuple[Answer | None, str]:
-    """Return the result of ``question`` and "", or None and the reason if four attempts fail.
+    """Call ``question`` up to four times; return its result and "", or None and the text of the last error.
 
-    An attempt fails if a running host accesses the node at the same time, because an SDO server handles only
-    one transfer at a time.
+    A call fails if a running host accesses the node at the same time, because an SDO server handles only one
+    transfer at a time.
     """
     failure = ""
     for pause_s in _PAUSES_S:

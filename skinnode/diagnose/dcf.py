@@ -36,7 +36,7 @@ _AMBIGUOUS: Final = ";#$%\"'\\"
 
 
 class Dcf(NamedTuple):
-    """A DCF, and which values it contains."""
+    """Text of a DCF, and information about the values in it."""
 
     text: str
     values: int

@@ -1,7 +1,8 @@
 """Finds the nodes on a bus by SDO, heartbeat and LSS.
 
 The search requests the device type (0x1000) from every node-ID and records heartbeats meanwhile. Nodes
-without a node-ID are found by LSS, which switches their LSS mode. Nothing else on any node is changed.
+without a node-ID are found by LSS, which switches their LSS mode. The search changes nothing else on any
+node.
 """
 
 from __future__ import annotations
@@ -33,7 +34,8 @@ LISTEN_S: Final = 1.2
 """Minimum listening time, s. A stopped node answers no SDO request and is found only by its heartbeats."""
 
 LSS_S: Final = 1.5
-"""Maximum duration of the search for nodes without a node-ID, s. Further nodes are then left unidentified."""
+"""Maximum duration of the search for nodes without a node-ID, s. The search then
+ends, even if further nodes remain unidentified."""
 
 OTHERS_S: Final = 1.0
 """Maximum wait for the SDO transfers of other clients to end, s."""
@@ -253,7 +255,8 @@ def _only_heard(connection: BusConnection, node_id: int, asked_ns: int) -> Found
 def _two_serials(connection: BusConnection, node_id: int) -> str:
     """Return evidence that two nodes have this node-ID.
 
-    Empty if a new request gets only one response: the extra response seen before answered another request.
+    Empty if a new request gets only one response; the second response during the sweep then belonged to an
+    earlier request.
     """
     answers = connection.ask_all(node_id, _ASK_SERIAL, ANSWER_S)
     answers = [data for data in answers if data[1:4] == _ASK_SERIAL[1:4]]

@@ -28,7 +28,7 @@ LEAST_SCANS: Final = 20
 deviation exceeds 25 %."""
 
 _MOST_SCANS: Final = 64
-"""Number of scans analysed, counted back from the newest. The computing time grows with the square of it."""
+"""Number of scans analysed, counted back from the newest. The computing time grows with its square."""
 
 _FLOOR: Final = 8
 """Number of singular values in the noise floor of a patch. They determine the noise to within 20 %."""
@@ -74,9 +74,9 @@ class NoiseAnalysis:
     """(U,) noise of each upper wire relative to the stated noise, with little influence of a touch; 0 if
     unknown."""
     lower: Float
-    """(K,) noise of each lower wire, like ``upper``."""
+    """(K,) noise of each lower wire, in the same form as ``upper``."""
     floor: float
-    """Noise of the whole patch, like ``upper``."""
+    """Noise of the whole patch, in the same form as ``upper``."""
     supply: float
     """Noise common to all crossings, relative to the stated noise; 0 unless the individual noise of the
     crossings is much smaller."""

@@ -106,7 +106,7 @@ def monotonic() -> float:
 
 
 def perf_counter() -> float:
-    """Return the performance counter, s; on a virtual clock, computation takes no time."""
+    """Return the performance counter, s. A virtual clock does not advance during computations."""
     clock = _here.clock
     return system_time.perf_counter() if clock is _SYSTEM else clock.monotonic_ns() * 1e-9
 

@@ -1,4 +1,4 @@
-"""Orderly shutdown of programs that run until Ctrl-C."""
+"""Orderly shutdown of programs that run until a signal stops them."""
 
 from __future__ import annotations
 

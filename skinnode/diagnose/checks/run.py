@@ -36,7 +36,7 @@ def run_checks(facts: BusFacts) -> list[Finding]:
 
 
 def others(facts: BusFacts) -> list[str]:
-    """Describe each device that is neither a patch nor in the hand file in one line.
+    """Return one line for each device that is neither a patch nor in the hand file.
 
     Such a device is not a fault.
     """

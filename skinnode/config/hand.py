@@ -101,9 +101,9 @@ class HandConfig(Table):
     @model_validator(mode="before")
     @classmethod
     def _counts(cls, table: Any) -> Any:
-        """Limit the numbers of buses and patches before their models are built.
+        """Check the numbers of buses and patches before their models are built.
 
-        The models of ten thousand patches would take minutes to build.
+        Building the models of ten thousand patches would take minutes.
         """
         if isinstance(table, Mapping):
             buses, patches = table.get("buses"), table.get("patches")

@@ -26,12 +26,12 @@ class Verdict(StrEnum):
 class NotApplicable(Exception):
     """Raised if the device does not have the feature that the case checks.
 
-    The message names the evidence, such as a missing EDS entry or the response of the device.
+    The message gives the evidence, such as a missing EDS entry or the response of the device.
     """
 
 
 class Warned(Exception):
-    """Raised if the device passes with a warning, which is the message of the exception."""
+    """Raised if the device passes with a warning; the message explains the warning."""
 
 
 @dataclass(frozen=True, slots=True)

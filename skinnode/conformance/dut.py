@@ -108,7 +108,7 @@ class Dut:
     # --- error control
 
     def start_heartbeat(self, period_ms: int = 20) -> None:
-        """Start the node's heartbeat. A node that supports only guarding needs no start.
+        """Start the node's heartbeat; do nothing if the node supports only guarding.
 
         Raises:
             NotApplicable: The node supports neither heartbeat nor guarding.
@@ -121,8 +121,8 @@ class Dut:
     def state(self, what: str) -> int:
         """Return the NMT state from a heartbeat, or by node guarding if the node has no heartbeat.
 
-        Call :meth:`start_heartbeat` first. The second heartbeat counts, because the first may have been sent
-        before the call.
+        Call :meth:`start_heartbeat` first. The state is taken from the second heartbeat received, because the
+        first may have been sent before the call.
         """
         if self.eds.find(HEARTBEAT) is None:
             return (self.guard(what) or 0) & 0x7F

@@ -1,4 +1,4 @@
-"""Checks the period of periodic frames.
+"""Checks that frames arrive with an expected period.
 
 The check must tolerate individual frames that a busy machine receives late. A late frame lengthens one
 interval and shortens the next, so it hardly changes the mean, and a few late frames do not change the median.

@@ -1,4 +1,4 @@
-"""Provokes errors of the device: RPDOs that are too short, missing heartbeats or guarding requests."""
+"""Provokes errors of the device by short RPDOs, missing heartbeats and missing guarding requests."""
 
 from __future__ import annotations
 

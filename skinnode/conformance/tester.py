@@ -20,7 +20,7 @@ Devices respond much faster. The limit is generous, so that a delay on the teste
 """
 
 QUIET_S: Final = 0.06
-"""Waiting time after which an absent frame counts as not sent, s."""
+"""Time to wait for a frame that must not be sent, s."""
 
 _INBOX_FRAMES: Final = 20_000
 _TRACE_FRAMES: Final = 400

@@ -5,6 +5,6 @@
     hand -> vcan_sim.fleet (nodes on a virtual bus) -> skinnode.host -> run (score against the truth) -> view,
     plot
 
-This package, apart from some benchmarks, is the only one that imports both the simulator and the host. The
-two communicate only over the bus. The true displacements of the simulator are used only for scoring.
+Apart from some benchmarks, only this package imports both the simulator and the host. The two communicate
+only over the bus. The true displacements of the simulator are used only for scoring.
 """

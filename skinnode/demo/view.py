@@ -20,8 +20,8 @@ from skinnode.monitor.field_map import MapStyle, Surface, mean_shear_m, paint_ma
 from skinnode.monitor.patch_panel import shear_text
 
 MAP_SIZE = 16
-"""Width of a height map, characters. A character shows two pixels, one above the other, so that the map is
-square."""
+"""Width of a height map, characters. Each character shows two pixels, one above the other, so that the map
+is square."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -47,7 +47,7 @@ def _compare(dut: Dut, wanted: Mapping[int, bytes], when: str) -> None:
 
 
 def _wrong_signature(dut: Dut, index: int, subindex: int) -> None:
-    """Check that a wrong signature is refused and has no effect, neither at once nor after a reset."""
+    """Check that a wrong signature is refused and has no effect, even after a reset."""
     dut.need_storage(index, subindex)
     before, after = _change(dut)
     # A device that accepts a wrong signature has stored or restored parameters.

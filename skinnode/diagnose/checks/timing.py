@@ -92,7 +92,7 @@ def _check_sync(bus: BusFacts) -> Iterator[Finding]:
 
 
 def check_losses(bus: BusFacts) -> Iterator[Finding]:
-    """Check for frames lost by this machine, on the bus or by a node, and for scan frames of another sender."""
+    """Check for frames lost by this machine, on the bus or by a node, and for unexpected scan frames."""
 
     def found(where: str, what: str, sure: Sure, evidence: str, advice: str) -> Finding:
         return Finding("losses", where, what, sure, evidence, advice)

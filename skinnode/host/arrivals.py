@@ -17,7 +17,7 @@ APART_NS: Final = 1_000_000
 the clock of the SYNC producer shift a scan end by less.
 """
 MOST: Final = 3
-"""Maximum number of predicted end times. If there would be more, no prediction is made."""
+"""Maximum number of predicted end times. If recent scans have ended at more phases, no prediction is made."""
 
 
 class ArrivalPredictor:

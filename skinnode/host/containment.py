@@ -26,8 +26,8 @@ several patches or buses.
 """
 
 _COMPLAINTS: Final = 64
-"""Maximum number of messages that a record remembers as logged. When it is full, it forgets them all and may
-log them again.
+"""Maximum number of messages that a record remembers as logged. A full record is cleared, so an earlier
+message may be logged again.
 """
 
 

@@ -36,7 +36,8 @@ class HandFrame:
     """
 
     scan: int
-    """Scan number of all fields: number of the SYNC since the host started. The number does not wrap around.
+    """Scan number of all fields: number of the SYNC, counted from the start of the host. It does not wrap
+    around.
     """
     t_sync_ns: int
     """Monotonic time (ns) of the SYNC; 0 if unknown. With staggered SYNC (``sync.stagger_ms``), the buses

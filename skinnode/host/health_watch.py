@@ -150,7 +150,7 @@ class HealthWatch:
             {each.place: each for each in health.faults if _is_frozen_part(each)} for health in (before, now)
         )
         for place in are.keys() - was.keys():
-            sure = f"{are[place].deviations:.0f} deviations"
+            sure = f"{are[place].deviations:.0f} standard deviations"
             self._publish(name, "left out", f"{place} repeats its codes; left out of the solve ({sure})")
         for place in was.keys() - are.keys():
             self._publish(name, "readmitted", f"{place} no longer repeats its codes")

@@ -40,7 +40,7 @@ class Limitation:
     patches: tuple[str, ...]
     """Names of the patches."""
     key: str
-    """Key in the hand file that removes the limitation when changed."""
+    """Key of the hand file that can be changed to remove the limitation."""
     text: str
     """Missing result, and the reason why it is missing."""
 
@@ -116,7 +116,7 @@ def _of_deadline(layout: PatchLayout, options: TrackerOptions, deadline_us: int)
 
 
 def _of_place(patch: PatchConfig, hand: HandConfig) -> Iterator[tuple[str, str]]:
-    """Yield the key and text of each missing pose that limits the coordinate frames of a patch's contacts."""
+    """Yield the key and text of each limitation due to a missing pose."""
     if "pose" not in patch.model_fields_set:
         yield "patches.pose", "no pose: contacts are in the patch's own coordinate frame"
     if patch.link is not None and patch.link not in [link.name for link in hand.links]:

@@ -9,7 +9,9 @@ from skinnode.process import clock
 
 FIRST_PAUSE_S: Final = 0.1
 LONGEST_PAUSE_S: Final = 1.0
-"""First and longest pause (s) before a failed operation is retried. Each pause is twice the previous one."""
+"""First and longest pause (s) before a failed operation is retried. Each pause is twice the previous one, up
+to the longest.
+"""
 
 
 class Pause:

@@ -61,7 +61,7 @@ class ScanSolver:
         return ResistanceFrame(resistance_ohm, valid, stamp)
 
     def solve(self, scan: Scan, stamp: ScanStamp) -> tuple[FieldFrame, int]:
-        """Solve a scan, with the noise of the converter and the quantization error of the codes.
+        """Solve a scan, allowing for converter noise and for the quantization error of the codes.
 
         Returns:
             Stamped field with read-only arrays, and the number of codes that are not measurements.
